@@ -16,17 +16,14 @@ from support.paths import ROOT
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.separation.stage import Separation
 from thirdhand.recordings.shipped import shipped_skill
-from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import load, robot_description
-from thirdhand.settings.urdf import Urdf, UrdfError
+from thirdhand.settings.urdf import Urdf
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.first_cell.first_cell import (
-    DEMO_TOOL_M,
     Proposal,
     proposed,
     written,
 )
-from thirdhand.workbench.first_cell.plate import plate_of, turn_of_tool
 from thirdhand.workbench.first_cell.rates import rates
 from thirdhand_sim.lab.rehearsal import rehearse
 from thirdhand_sim.scene import Scene
@@ -101,31 +98,6 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
     run = rehearse(HandScript(scene, seed=1), lambda _: taught, settings=cell, rate_hz=100)
     assert run.events.success
     assert max(run.errors_mm) < 15.0, run.errors_mm
-
-
-def test_the_places_are_those_of_the_demo() -> None:
-    scene = Scene()
-    places = {"start": scene.robot_start, "handover": scene.offer, "glass": scene.glass, "soldering": scene.carry}
-    for name, place in DEMO_TOOL_M.items():
-        assert place == pytest.approx(places.pop(name))
-    assert not places
-
-
-def test_the_only_end_is_the_plate_and_several_ends_are_listed() -> None:
-    text = (SHIPPED / "ur5.urdf").read_text()
-    assert plate_of(Urdf(text)) == "tool0"
-    camera = '<link name="camera"/><joint name="mount" type="fixed"><parent link="wrist_3_link"/><child link="camera"/>'
-    two_ends = Urdf(text.replace("</robot>", f"{camera}</joint></robot>"))
-    with pytest.raises(UrdfError, match=r"has 2 ends: name .* by --plate; the ends are tool0, camera, and"):
-        plate_of(two_ends)
-
-
-def test_the_tool_of_a_plate_that_points_along_its_x_is_turned() -> None:
-    z1 = Urdf(description(published("z1.urdf"), cover=False))
-    assert turn_of_tool(z1.chain("gripperStator")) == pytest.approx((0.0, 0.5**0.5, 0.0, 0.5**0.5), abs=1e-6)
-    for arm, plate in (("wam", "tool_plate"), ("ur5", "tool0"), ("fr3", "fr3_hand_tcp")):
-        urdf = Urdf((SHIPPED / f"{arm}.urdf").read_text())
-        assert turn_of_tool(urdf.chain(plate)) == (0.0, 0.0, 0.0, 1.0), arm
 
 
 def test_accelerations_follow_from_velocities_and_less_where_efforts_are_small(

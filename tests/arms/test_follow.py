@@ -5,7 +5,6 @@ which follows again once there is another.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import signal
 import subprocess
@@ -18,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from zenoh.handlers import RingChannel
 
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
@@ -27,7 +25,6 @@ from support.paths import ROOT
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import (
-    Client,
     UnreachableError,
     endpoints,
     open_session,
@@ -35,7 +32,6 @@ from thirdhand.client import (
 from thirdhand.contract import cdr
 from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
-from thirdhand_sim.scene import Scene
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
 STILL_RADPS = 0.02  # of a measured joint at rest
@@ -166,25 +162,6 @@ def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path
     assert_allowed(there.velocity[there.new], there.joints[there.new])
 
 
-@pytest.mark.timed
-def test_hands_alone_are_published_and_score_the_arm_that_follows_elsewhere(tmp_path: Path) -> None:
-    (tmp_path / "arm.toml").write_text(PATIENT)
-    with serving(tmp_path, network=PATIENT) as daemon:
-        at = ("--connect", daemon.endpoint)
-        with following("simulated", *at, "--config", str(tmp_path / "arm.toml")) as running:
-            running.until("driving simulated")
-            Client(daemon.session, timeout_s=60.0).add(Scene().via_points())
-            done = thirdhand("sim", *at, "--hands-only", "--once", timeout=120)
-            assert done.returncode == 0, done.stderr
-            running.until("commands arrive")
-            assert running.ended() == 0
-    report = json.loads(done.stdout)
-    for name in ("handover", "grasp", "carry"):
-        assert report["events"][name]["reached"]
-        assert report["events"][name]["error_mm"] < 10.0  # as late as this machine is; in step it is below 1
-    assert "ended at rest" in running.said[-1]
-
-
 # --- bad input -----------------------------------------------------------------------------------
 
 
@@ -233,22 +210,6 @@ def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program:
     )
 
 
-@pytest.mark.timed
-def test_an_arm_follows_a_daemon_at_1000_hz_without_being_told_its_rate(tmp_path: Path) -> None:
-    with serving(tmp_path, "--rate", "1000", network=PATIENT) as daemon, Tracker(daemon.session) as tracker:
-        joints = Joints(daemon.session)
-        with following("simulated", "--connect", daemon.endpoint) as running:
-            running.until("commands arrive")
-            for attempt in range(20):
-                tracker.left = LEFT if attempt % 2 else NEAR_LEFT
-                with contextlib.suppress(TimeoutError):
-                    running.waits(joints.moving, 3.0)
-                    break
-            assert daemon.client.status().mode != "fault"
-            assert running.ended() == 0
-    assert "0 commands were refused" in running.said[-1]
-
-
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     arm, told_so = (
         SimulatedArm(Settings()),
@@ -257,17 +218,3 @@ def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
         follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)
-
-
-def test_the_joints_are_told_by_their_names() -> None:
-    with open_session() as session:
-        heard = session.declare_subscriber("thirdhand/joints/state", RingChannel(1))
-        stop = threading.Event()
-        arm = threading.Thread(
-            target=follow, args=(SimulatedArm(Settings()), session, "thirdhand"), kwargs={"stop": stop}
-        )
-        arm.start()
-        state = cdr.decode_joints(heard.recv().payload.to_bytes())
-        stop.set()
-        arm.join(20)
-    assert (state.names, state.position) == (Settings().joints.names, Settings().arm.posture)

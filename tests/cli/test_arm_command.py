@@ -11,7 +11,6 @@ from PIL import Image
 from support.cell import told
 from support.cell_commands import succeeded
 from support.paths import ROOT
-from support.turning import sliding_cell
 from thirdhand.settings.config import Settings, load
 
 UR5 = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
@@ -55,29 +54,12 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
         assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20  # something is drawn
 
 
-def test_a_rail_is_in_metres_and_a_missing_shape_has_a_place(tmp_path: Path) -> None:
-    sliding_cell(tmp_path)
-    done = succeeded("arm", str(tmp_path / "arm.urdf"), "--output", str(tmp_path / "first.toml"))
-    assert "no collision shape before rail_joint: a capsule of" in done.stdout
-    assert "prismatic joints are in m, m/s, m/s², m/s³" in done.stdout
-    assert "rad, m for prismatic joints" in done.stdout
-    assert "# [rad/s²; m/s² if prismatic]" in (tmp_path / "first.toml").read_text()
-
-
 def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     folder, _ = made
     before = {file: file.read_bytes() for file in folder.iterdir()}
     done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
     assert (done.returncode, "cell.toml exists already: name another file by --output" in done.stderr) == (1, True)
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
-
-
-def test_an_arm_stands_where_it_is_told_with_its_meshes(tmp_path: Path) -> None:
-    shutil.copy(UR5, tmp_path / "my.urdf")
-    told("arm", str(tmp_path / "my.urdf"), "--at", "0.1", "-0.3", "0.05", "--output", str(tmp_path / "c.toml"))
-    cell = load(tmp_path / "c.toml")
-    assert cell.reach.centre == pytest.approx((0.1, -0.3, 0.139), abs=1e-3)
-    assert cell.arm.urdf == str(tmp_path / "c.urdf")
 
 
 ONE_JOINT = """<robot name="r"><link name="l0"/><link name="l1"/><joint name="j0" type="revolute"><parent link="l0"/>

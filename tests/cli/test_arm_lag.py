@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from support.examples import example
 from thirdhand.cli.arm_lag import Lag, lag
-from thirdhand.settings.config import Settings
 
 NAMES = ("a", "b", "c")
 SERVOS = ("delay", "servo")
@@ -75,38 +73,6 @@ def test_the_lag_of_a_servo_is_measured(servo: str, lag_ms: int, state_hz: float
     assert min(errors_ms) > -1.0 - (0.02 * lag_ms if servo == "servo" else 0.0)
 
 
-@pytest.mark.parametrize("moving", ["at the begin", "at the end", "at both ends", "between two samples"])
-def test_a_motion_outside_of_the_compared_times_shows_no_lag(moving: str) -> None:
-    times = np.arange(0.0, 3.0, PERIOD_S)
-    commanded = {
-        "at the begin": np.minimum(times, 0.4),
-        "at the end": np.where(times < 2.995, 0.0, 1.0),
-        "at both ends": np.minimum(times, 0.4) + np.where(times < 2.995, 0.0, 1.0),
-        "between two samples": np.where(times < 0.5, 0.0, 1.0),
-    }[moving]
-    still = np.full_like(times, commanded[len(times) // 2])
-    pairs = [list(zip(times.tolist(), values.tolist(), strict=True)) for values in (commanded, still)]
-    assert lag({"a": pairs[0]}, {"a": pairs[1]}) is None
-
-
-def test_an_arm_that_does_not_move_shows_no_lag() -> None:
-    assert simulated("delay", 0.05, size=0.0) is None
-    assert simulated("delay", 0.05, size=0.004, noise_rad=0.001) is None
-
-
-def test_neither_does_one_that_moves_by_itself_or_is_not_heard() -> None:
-    rng = np.random.default_rng(1)
-    times = np.arange(0.0, 3.0, PERIOD_S)
-    paths = {name: list(zip(times.tolist(), np.sin(times).tolist(), strict=True)) for name in NAMES}
-    strange = {
-        name: list(zip(times.tolist(), np.cumsum(rng.normal(0, 0.05, len(times))).tolist(), strict=True))
-        for name in NAMES
-    }
-    assert lag(paths, strange) is None
-    assert lag(paths, {}) is None
-    assert lag({}, paths) is None
-
-
 def test_a_continuous_joint_may_wrap() -> None:
     times = np.arange(0.0, 4.0, PERIOD_S)
     path = 3.0 + 0.4 * np.sin(2 * times)
@@ -116,25 +82,3 @@ def test_a_continuous_joint_may_wrap() -> None:
     found = lag({"a": pairs[0]}, {"a": pairs[1]})
     assert found is not None
     assert found.lag_s == pytest.approx(0.05, abs=0.001)
-
-
-def rms_mrad(lag_s: float, lead_s: float) -> float:
-    """The error of joints that the driver template moves through a servo of the second order."""
-    arm = example("own_arm").FakeArm(Settings())
-    arm.lag_s, written = lead_s, list[np.ndarray]()
-    arm.move = lambda position, velocity: written.append(position)
-    times = np.arange(0.0, 8.0, PERIOD_S)
-    paths = np.array(Settings().arm.posture) + 0.3 * np.sin(2.5 * times[:, None] - 1.0)
-    for position, velocity in zip(paths, np.gradient(paths, PERIOD_S, axis=0), strict=True):
-        arm.write(position, velocity)
-    measured = followed(np.array(written), lag_s)
-    settled = times > 2.0
-    return float(1000 * np.sqrt(np.mean((measured - paths)[settled] ** 2)))
-
-
-def test_the_driver_template_leads_by_the_lag_of_its_servo() -> None:
-    """At 100 ms the error falls to less than a tenth."""
-    plain, led = rms_mrad(0.1, 0.0), rms_mrad(0.1, 0.1)
-    assert 40 < plain < 60
-    assert led < 0.1 * plain
-    assert rms_mrad(0.0, 0.0) == 0.0

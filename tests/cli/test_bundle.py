@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import resource
 import tarfile
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from support.cell import Tracker, serving, thirdhand, told
+from support.cell import Tracker, serving, thirdhand
 from support.cell_commands import succeeded
 from support.certificates import make_certificates
 from thirdhand.command_line import main
@@ -129,17 +128,6 @@ def test_without_a_daemon_the_archive_says_so_and_has_the_newest_recording(tmp_p
     assert "nothing listens" in found["doctor.txt"].decode()
     assert found["log.txt"]
     assert [name for name in found if "recordings/" in name] == ["recordings/thirdhand-20260102T000000Z.mcap"]
-
-
-@pytest.mark.parametrize(("named", "words"), [(False, "--config"), (True, r"\[files\] record")])
-def test_an_archive_without_recordings_says_who_could_have_named_their_folder(
-    named: bool, words: str, tmp_path: Path
-) -> None:
-    (tmp_path / "bench.toml").write_text("rate_hz = 500\n")
-    config = ("--config", str(tmp_path / "bench.toml")) if named else ()
-    done = told("bundle", "--output", str(tmp_path / "b.tar.gz"), *config, "--connect", "tcp/127.0.0.1:1")
-    assert re.search(rf"no recordings of cell thirdhand: neither a daemon .* nor {words} names", done.stdout), done
-    assert re.search(r"^versions\.txt: \d+\.\d kB$", done.stdout, re.MULTILINE)
 
 
 def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_archive(tmp_path: Path) -> None:

@@ -159,15 +159,6 @@ def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytes
     assert "opens no Zenoh session" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "unixsock-stream/nowhere"])
-def test_an_endpoint_that_cannot_be_probed_is_no_wrong_one(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--connect", endpoint]) == 1
-    said = capsys.readouterr().out
-    assert f"nobody answers at {endpoint}" in said
-    assert f"required: a daemon that listens on {endpoint}" in said
-    assert "start thirdhand serve" in said
-
-
 def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = near.liveliness().declare_token("lab/bench2/daemon/1")
@@ -190,29 +181,3 @@ def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: py
     for said in (doctor, status):
         assert "its daemon is alive, but it is starting or ending" in said
         assert "start `thirdhand serve`" not in said
-
-
-@pytest.mark.thorough
-def test_an_arm_whose_drives_are_off_is_told_with_a_joints_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own_arm = example("own_arm")
-    with (
-        launched(tmp_path, network=PATIENT) as service,
-        open_session(connect=[service.endpoint]) as session,
-        driven(own_arm, service.endpoint) as arm,
-        Tracker(session) as tracker,
-    ):
-        daemon = Daemon(service, session)
-        arm.write = lambda position, velocity: None  # type: ignore[attr-defined]
-        daemon.until(lambda status: status["mode"] == "follow")
-        mover = threading.Timer(0.7, setattr, (tracker, "left", NEAR_LEFT))
-        mover.start()
-        code, found = findings(daemon, capsys, "--seconds", "3")
-        mover.join()
-    told = [finding for finding in found if finding["what"] == "arm's drives"]
-    assert (code, len(told)) == (1, 1), found
-    assert told[0] == found[0]
-    assert told[0]["found"].split()[0] in Settings().joints.names
-    assert "has not moved since commands began" in told[0]["found"]
-    assert "are the drives on?" in told[0]["remedy"]

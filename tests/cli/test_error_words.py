@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 
 from support.cell import thirdhand, told
 from support.paths import RECORDINGS, ROOT
-from thirdhand.contract.explain import in_file, in_words
+from thirdhand.contract.explain import in_file
 
 INTERNAL = re.compile(r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at 0x|\b(?:OS|Type|Value|Key|Validation)Error")
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
@@ -95,9 +94,3 @@ def test_what_the_operating_system_and_codecs_say_is_never_printed_as_it_is() ->
 def test_a_path_in_json_is_named_as_in_a_file_except_in_what_was_given(text: str, words: str) -> None:
     assert in_file(text) == words
     assert in_file(words) == words
-
-
-def test_an_error_of_the_operating_system_names_its_file_once() -> None:
-    error = FileNotFoundError(2, os.strerror(2), "a.toml")
-    assert in_words(error) == "a.toml: No such file or directory"
-    assert in_words(error, named=False) == "No such file or directory"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from support.fine_motion import fine
 from support.paths import RECORDINGS
 from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.stored_demonstrations import stored_demonstrations
-from thirdhand.workbench.learning.records import Figures
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import demonstrations
@@ -38,21 +36,6 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
     assert plot.stat().st_size > 10_000
     skill = decoded(out.read_bytes(), origin="skill")
     assert f"the target's standard deviation is above {1000 * skill.threshold:.0f} mm" in done.stdout
-
-
-def test_a_skill_is_set_beside_what_needs_no_learning(tmp_path: Path) -> None:
-    people = sorted((RECORDINGS / "people").glob("*.mcap"))[:4]
-    out = tmp_path / "skill.npz"
-    done = succeeded("learn", *map(str, people), "--output", str(out))
-    head, *lines = done.stdout.splitlines()
-    assert head.endswith("held   without places   linear   look-up   same elapsed time")
-    assert "of blocks" not in head
-    figures = msgspec.json.decode(decoded(out.read_bytes(), origin="skill").figures, type=Figures)
-    for line, row in zip(lines, (*figures.demonstrations, figures.all), strict=False):
-        assert line.split()[-8::2] == [f"{mm:.0f}" for mm in row.other_mm.values()]
-    helds = [row.held for row in figures.demonstrations]
-    assert figures.held_std == pytest.approx(np.std(helds))
-    assert f"{min(helds):.1f} to {max(helds):.1f} % of a demonstration, standard deviation" in done.stdout
 
 
 def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import shutil
-import socket
-import subprocess
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,8 +16,8 @@ from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
-from support.cell import Tracker, serving, thirdhand, until
-from support.cell_commands import python, started
+from support.cell import Tracker, serving, until
+from support.cell_commands import started
 from support.paths import ROOT
 from thirdhand.client import Client
 from thirdhand.contract.records import Mode, Reason
@@ -91,17 +88,6 @@ def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_
         assert scrape() == {("thirdhand_up", frozenset()): 0.0}
         with serving(tmp_path, *arguments, network=network):
             until(lambda: value(scrape(), "up") == 1, "it did not connect again", within_s=30)
-
-
-def test_silent_connections_are_closed_and_others_answered(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed") as daemon, page(daemon.endpoint) as address:
-        port = urllib.parse.urlsplit(address).port
-        silent = [socket.create_connection(("127.0.0.1", port or 0), timeout=20) for _ in range(200)]
-        for one in silent:
-            with one, contextlib.suppress(ConnectionResetError):
-                assert one.recv(1) == b""
-        with urllib.request.urlopen(address, timeout=20) as reply:
-            assert b"thirdhand_up" in reply.read()
 
 
 STATUS = {
@@ -182,23 +168,3 @@ def test_the_alerts_use_metrics_that_exist() -> None:
     assert len(rules) == 11
     assert len(named) > 8
     assert named <= known
-
-
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
-def test_prometheus_accepts_the_alerts_and_the_metrics() -> None:
-    page_text = exposition({"lab/one": msgspec.convert(STATUS, Status)})
-    for command in (["promtool", "check", "metrics"], ["promtool", "check", "rules", str(RULES)]):
-        done = subprocess.run(command, input=page_text, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-
-
-def test_what_prevents_the_page_is_a_sentence_and_an_exit_code(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed") as daemon, socket.create_server(("127.0.0.1", 0)) as taken:
-        address = f"127.0.0.1:{taken.getsockname()[1]}"
-        done = thirdhand("metrics", "--listen", address, "--connect", daemon.endpoint)
-        assert (done.returncode, f"--listen {address}: Address already in use" in done.stderr) == (1, True)
-    code = (
-        "import sys; sys.modules['prometheus_client'] = None; from thirdhand.command_line import main; sys.exit(main())"
-    )
-    done = python(code, "metrics")
-    assert (done.returncode, "pip install 'thirdhand[metrics]'" in done.stderr) == (1, True)

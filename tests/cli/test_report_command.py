@@ -4,23 +4,14 @@ from __future__ import annotations
 
 import csv
 import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from support.paths import RECORDINGS, ROOT
-from support.wam import STATE
 from thirdhand.command_line import main
-from thirdhand.core.frame import blank
-from thirdhand.daemon.launch import ENGINES
-from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.recording import Recording
 from thirdhand.settings import palette
-from thirdhand.settings.config import Settings
-from thirdhand.workbench.report.page import thinned
 
 
 def rows(path: Path) -> list[list[str]]:
@@ -98,57 +89,3 @@ def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
     assert float(totals["followed [%]"]) == pytest.approx(
         100 * float(one["follow [s]"]) / float(one["duration [s]"]), abs=1
     )
-
-
-def test_a_recording_without_a_tick_and_a_cut_one_are_told_of_too(
-    tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    empty, cut = tmp_path / "empty.mcap", tmp_path / "cut.mcap"
-    with Recorder(empty, settings=Settings(), skill=(RECORDINGS / "soldering.npz").read_bytes(), state=blank(STATE)):
-        pass
-    whole = golden.read_bytes()
-    cut.write_bytes(whole[: len(whole) // 8])
-    page = tmp_path / "page.html"
-    assert main(["report", str(empty), str(cut), "--html", str(page), "--csv", str(tmp_path / "tables")]) == 0
-    said = capsys.readouterr().out
-    assert "never: it holds no tick" in said
-    assert "Something is missing in it, once." in said
-    assert "cut at byte" in said
-    assert "<svg" in page.read_text(encoding="utf-8")
-    assert len(rows(tmp_path / "tables" / "empty" / "ticks.csv")) == 1
-
-
-def test_a_thinned_curve_keeps_its_extremes_and_its_gaps() -> None:
-    x = np.arange(100_000.0)
-    y = np.sin(x / 3000)
-    y[77_777], y[40_000:45_000] = 9.0, np.nan
-    thin_x, thin_y = thinned(x, y, points=1000)
-    assert len(thin_x) <= 1000
-    assert np.nanmax(thin_y) == 9.0
-    assert thin_x[np.nanargmax(thin_y)] == 77_777
-    assert (np.diff(thin_x) >= 0).all()
-    assert np.isnan(thin_y[(thin_x > 40_200) & (thin_x < 44_800)]).all()
-
-
-def test_the_bench_has_its_options_by_both_names_whatever_the_working_directory_holds(tmp_path: Path) -> None:
-    (tmp_path / "thirdhand_sim.py").write_text("raise SystemExit('not this one')\n")
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "thirdhand", "sim", "--help"],
-        capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "--hands-rate HZ" in done.stdout
-
-
-@pytest.mark.parametrize("arguments", [["sim", "--once"], ["demo", "--output", "nowhere"]])
-def test_without_its_library_the_bench_says_so_in_one_line(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for engine in ENGINES:
-        monkeypatch.setitem(sys.modules, engine, None)
-    assert main(arguments) == 1
-    [line] = capsys.readouterr().err.splitlines()
-    said = "the bench needs PyBullet or MuJoCo, none of which is installed: pip install"
-    assert line.startswith(f"thirdhand {arguments[0]}: {said}")
-    assert not Path("nowhere").exists()

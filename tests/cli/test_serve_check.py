@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 from support.cell import serving, told
 from support.cell_commands import python, succeeded
 from support.certificates import make_certificates
-from support.paths import RECORDINGS, ROOT
+from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
 from thirdhand.daemon.launch import free_port
 
@@ -83,28 +82,16 @@ def test_too_few_files_that_may_be_open_prevent_a_start(tmp_path: Path, option: 
     assert "this process may open 100 files, 256 or more needed: raise its limit with" in done.stdout + done.stderr
 
 
-def test_the_settings_name_the_skill_beside_them(tmp_path: Path) -> None:
-    named = 'skill = "mytask.npz"'
-    assert f"{tmp_path}/mytask.npz" in lines(tmp_path, files=named, code=1)["wrong skill"][0]
-    shutil.copy(RECORDINGS / "soldering.npz", tmp_path / "mytask.npz")
-    assert "mytask.npz" in lines(tmp_path, files=named, code=0)["ok skill"][0]
-    assert "soldering.npz" in lines(tmp_path, "--skill", str(RECORDINGS / "soldering.npz"), code=0)["ok skill"][0]
-
-
 @pytest.mark.parametrize(
     ("condition", "words", "settings", "arguments"),
     [
         ("configuration", "rate_hz: 3 given; a whole number from 50 to 1000", {"before": "rate_hz = 3\n"}, ()),
-        ("configuration", "cannot read configuration nowhere.toml", {}, ("--config", "nowhere.toml")),
         ("configuration", "other machines could move the arm", {}, ("--listen", "tcp/10.0.0.1:7447")),
-        ("configuration", "no-arm.urdf", {"before": '[arm]\nurdf = "no-arm.urdf"\n'}, ()),
         ("skill", "nowhere.npz", {}, ("--skill", "nowhere.npz")),
-        ("skill", "golden.mcap", {}, ("--skill", str(RECORDINGS / "golden.mcap"))),
         ("state", "is not a folder", {"before": "cell = 'lab/x'\n"}, ()),
         ("recordings", "README.md is not a folder", {}, ("--record", str(ROOT / "README.md" / "x"))),
         ("disk", "room on that disk needed", {"files": "segment_mb = 9e8"}, ()),
         ("certificates", "certificate.pem: a folder with", {"listen": TLS, "network": "certificate = 'none'"}, ()),
-        ("certificates", "cannot read the Zenoh configuration", {"network": "zenoh_config = 'none.json5'"}, ()),
         ("router", "Connection refused; a program that listens there needed", {}, ("--connect", "tcp/127.0.0.1:1")),
         ("port", "Address already in use", {}, ("--listen", "TAKEN")),
         ("port", "Cannot assign requested address", {"network": "allow_insecure = true"}, ("--listen", FOREIGN)),

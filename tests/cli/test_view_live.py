@@ -18,10 +18,8 @@ import pytest
 from PIL import Image
 
 from support import chromium
-from support.cell import Daemon, Tracker, serving, told
+from support.cell import Daemon, Tracker, serving
 from support.cell_commands import started
-from thirdhand.daemon.launch import free_port
-from thirdhand.settings import palette
 from thirdhand.workbench.cli.live_page import UNKNOWN
 from thirdhand.workbench.cli.view import FRESH_S, screenshot
 
@@ -149,53 +147,3 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         tab.picture(tmp_path / "page.png")
     with Image.open(tmp_path / "page.png") as image:
         assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # beside the word
-
-
-@pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
-@pytest.mark.thorough
-def test_a_phone_shows_hands_and_tool_from_above_and_goes_on_where_the_page_is_served_anew(
-    page: Page, tmp_path: Path
-) -> None:
-    address = f"127.0.0.1:{free_port()}"
-
-    def shown(name: str) -> str:
-        return f"getComputedStyle(document.querySelector('{name}')).display != 'none'"
-
-    with contextlib.ExitStack() as first:
-        url = first.enter_context(served(page.daemon, address))
-        with chromium.opened(url, tmp_path, timeout_s=TIMEOUT_S) as tab:
-            tab.hold_as_phone(390, 844)
-            assert tab.until(f"document.getElementById('mode').className == 'follow' && {shown('svg')}")
-            assert tab.ask(shown("iframe")) is False
-            assert tab.until("document.querySelector('iframe').src") == "about:blank"
-            assert tab.until("document.querySelector('#left text').textContent") == "left hand, 6 cm up"
-            assert tab.ask("document.getElementById('left').getAttribute('transform')").startswith("translate(0.9")
-            assert tab.until("document.querySelector('#tool text').textContent").startswith("tool, ")
-            assert tab.ask("document.documentElement.scrollWidth") == 390
-            tab.picture(tmp_path / "phone.png")
-            first.close()
-            assert tab.until("document.getElementById('mode').textContent == \"this page's server has ended\"")
-            assert tab.ask("document.querySelectorAll('button:enabled').length") == 0
-            with served(page.daemon, address):
-                tab.until(f"token != '{tab.ask('token')}' && document.getElementById('mode').className == 'follow'")
-                tab.ask("document.getElementById('hold').click()")
-                assert tab.until("document.getElementById('mode').textContent == 'hold: operator request'")
-                tab.ask("document.getElementById('resume').click()")
-                assert tab.until("document.getElementById('mode').textContent == 'follow'")
-    with Image.open(tmp_path / "phone.png") as image:
-        assert image.size == (780, 1688)
-        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
-    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, palette.ARM_BODY):
-        assert (np.abs(pixels - colour).max(axis=1) < 12).sum() > 100
-
-
-@pytest.mark.thorough
-def test_a_live_view_that_starts_is_waited_for_and_one_that_does_not_exist_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(variable, raising=False)
-    for options, code, words in ((("--live", "0"), 1, "there is no screen"), ((), 2, "start it with --live PORT")):
-        with serving(tmp_path, "--joints", "assumed", *options) as daemon:
-            done = told("view", "live", "--connect", daemon.endpoint)
-        assert (done.returncode, words in done.stderr) == (code, True), done.stderr

@@ -8,7 +8,6 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -107,11 +106,6 @@ def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: z
         assert stranger.zid() not in list(daemon.info.peers_zid())
 
 
-def test_a_certificate_that_is_none_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UnreachableError, match=r"cannot read .*certificate\.pem: a folder with"):
-        open_session(connect=["tls/127.0.0.1:1"], certificate=tmp_path)
-
-
 def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
     with pytest.raises(
         UnreachableError,
@@ -120,31 +114,7 @@ def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
         open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 
 
-@pytest.mark.parametrize("host", ["bench.invalid", "a" * 64])
-def test_a_name_that_nobody_knows_is_told_to_who_waits_too(host: str, tmp_path: Path) -> None:
-    file = tmp_path / "zenoh.json5"  # its endpoints are Zenoh's own matter
-    file.write_text(f'{{connect: {{endpoints: ["tcp/{host}:1"]}}}}')
-    reason = "cannot be reached: " if "." in host else "nobody answers at"
-    with pytest.raises(UnreachableError, match=reason):
-        open_session(otherwise=["tcp/127.0.0.1:1"], zenoh_config=file, timeout_s=0.2)
-
-
-@pytest.mark.parametrize("what", ["listen", "connect"])
-def test_an_endpoint_of_no_form_is_told(what: str) -> None:
-    with pytest.raises(UnreachableError, match=f"cannot {what} (on|to) somewhere: .*<protocol>/<address>"):
-        open_session(**{what: ["somewhere"]}, timeout_s=0.2)  # type: ignore[arg-type]
-
-
 # --- requests ------------------------------------------------------------------------------------
-
-
-def test_a_reply_ends_the_call_at_once(session: zenoh.Session, answering: Callable[[str, Answer], None]) -> None:
-    answering("bench/status", ready)
-    client = Client(session, "bench", timeout_s=20)
-    client.wait_until_ready()
-    begin = time.monotonic()
-    assert client.status() == STATUS
-    assert time.monotonic() - begin < 2
 
 
 def test_a_refusal_is_raised_with_the_daemons_words(

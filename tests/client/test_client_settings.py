@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from support.cell import serving, thirdhand
-from support.paths import ROOT
 from thirdhand.client import (
-    Client,
-    Tracker,
     UnreachableError,
     client_settings,
-    endpoints,
     open_session,
 )
 from thirdhand.command_line import main
-from thirdhand.contract import cdr
-from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
 from thirdhand.settings.file_content import SettingsError
 
@@ -66,17 +53,6 @@ def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
         open_session(listen=["tcp/127.0.0.1:0"])
 
 
-def test_without_the_variable_the_file_is_in_the_users_configuration(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    home = file.parent.parent
-    monkeypatch.setenv("HOME", str(home))
-    monkeypatch.delenv("XDG_CONFIG_HOME")
-    (home / ".config" / "thirdhand").mkdir(parents=True)
-    (home / ".config" / "thirdhand" / "client.toml").write_text('cell = "mine"')
-    assert client_settings().cell == "mine"
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -98,117 +74,4 @@ def test_a_wrong_file_is_told_with_what_is_accepted(
     assert str(file) in capsys.readouterr().err
 
 
-def test_a_wrong_variable_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("THIRDHAND_CONNECT", "localhost")
-    with pytest.raises(SettingsError, match=r"\$THIRDHAND_CONNECT: .*tcp/localhost:7447 \?"):
-        client_settings()
-
-
-@pytest.mark.parametrize("command", ["status", "record", "view", "hold", "metrics"])
-def test_help_says_where_it_is_taken_from(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    named = [f"$THIRDHAND_{name}" for name in VARIABLES if name != "CELL" or command != "metrics"]
-    assert all(name in told for name in (*named, "$XDG_CONFIG_HOME/thirdhand/client.toml"))
-
-
-def test_endpoint_and_cell_are_given_once(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving(tmp_path, "--cell", "lab/bench2", "--joints", "assumed") as daemon:
-        file.write_text(f'connect = "{daemon.endpoint}"\ncell = "lab/bench2"\n')
-        for command in (["status"], ["hold"], ["resume"], ["via-points", "list"], ["status", "--all"]):
-            assert main(command) == 0, capsys.readouterr().err
-        settings = client_settings()
-        with settings.session() as session:
-            assert Client(session, settings.cell).status().cell == "lab/bench2"
-
-
 # --- whoever is started first --------------------------------------------------------------------
-
-
-def test_a_tracker_needs_a_listener_and_no_daemon() -> None:
-    """As `thirdhand record --listen` is one."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as recorder:
-        took = recorder.declare_subscriber("thirdhand/hands/*")
-        with open_session(connect=endpoints(recorder)) as session, Tracker(session, timeout_s=10) as tracker:
-            tracker.publish("left", (0.1, 0.2, 0.3))
-            sample = took.recv()  # type: ignore[no-untyped-call]
-        assert cdr.decode_pose(sample.payload.to_bytes()).position == (0.1, 0.2, 0.3)
-        with (
-            open_session(connect=endpoints(recorder)) as session,
-            pytest.raises(UnreachableError, match="nobody listens to elsewhere/hands/left: is a daemon or `thirdhand"),
-        ):
-            Tracker(session, "elsewhere", timeout_s=0.1)
-
-
-class Example:
-    """A program of examples/ as a process; its words go to a file."""
-
-    def __init__(self, folder: Path, name: str, *arguments: str) -> None:
-        self.said = folder / f"{name}.said"
-        command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), *arguments]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("THIRDHAND_")}
-        with self.said.open("w") as said:
-            self.process = subprocess.Popen(
-                command, stdout=said, stderr=subprocess.STDOUT, env=environment | {"PYTHONPATH": str(ROOT)}
-            )
-
-    def waits(self, times: int = 1) -> None:
-        """Until it said that it waits."""
-        end = time.monotonic() + 30
-        while self.said.read_text().count("waiting, until Ctrl-C: ") < times:
-            assert time.monotonic() < end
-            assert self.process.poll() is None, self.said.read_text()
-            time.sleep(0.05)
-
-    def interrupted(self) -> str:
-        """What it said, after Ctrl-C."""
-        self.process.send_signal(signal.SIGINT)
-        assert self.process.wait(20) in (0, 130, -signal.SIGINT)
-        return self.said.read_text()
-
-
-@pytest.fixture
-def started() -> Iterator[list[Example]]:
-    """The programs that a test started; those that are left are ended."""
-    programs: list[Example] = []
-    yield programs
-    for one in programs:
-        one.process.kill()
-        one.process.wait()
-
-
-@pytest.mark.thorough
-def test_the_examples_wait_for_record_and_are_recorded(file: Path, tmp_path: Path, started: list[Example]) -> None:
-    """The tutorial's first step with a tracker and an arm of one's own, all started before it."""
-    at = f"tcp/127.0.0.1:{free_port()}"
-    posture = [0.1, 0.5, 0.2, 1.5, 0.3, -1.0, 0.4]
-    config = tmp_path / "cell.toml"
-    config.write_text(f"[arm]\nposture = {posture}\n")
-    started += [
-        Example(tmp_path, "tracker", "--connect", at),
-        Example(tmp_path, "own_arm", "--connect", at, "--config", str(config)),
-    ]
-    for one in started:
-        one.waits()
-    record = ("record", "take", "--folder", str(tmp_path / "takes"), "--listen", at, "--seconds", "2")
-    for name in ("one", "two"):  # and they stay for the next take
-        done = thirdhand(*record[:1], name, *record[2:])
-        assert (done.returncode, "joints" in done.stdout or "tool" in done.stdout) == (0, True), done.stderr
-    told = [one.interrupted() for one in started]
-    assert all(text.count("waiting, until Ctrl-C: ") <= 2 for text in told)
-    assert not any("Traceback" in text for text in told)
-
-
-def test_own_arm_begins_at_the_posture_of_the_cells_settings(
-    file: Path, tmp_path: Path, started: list[Example]
-) -> None:
-    posture = [0.1, 0.5, 0.2, 1.5, 0.3, -1.0, 0.4]
-    config = tmp_path / "cell.toml"
-    config.write_text(f'cell = "lab"\n[arm]\nposture = {posture}\n')
-    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
-        told = session.declare_subscriber("lab/joints/state")
-        started.append(Example(tmp_path, "own_arm", "--connect", *endpoints(session), "--config", str(config)))
-        state = cdr.decode_joints(told.recv().payload.to_bytes())  # type: ignore[no-untyped-call]
-    assert (state.names, list(state.position)) == (Settings().joints.names, posture)
-    started[0].interrupted()

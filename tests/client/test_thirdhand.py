@@ -8,7 +8,6 @@ import ast
 import itertools
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -250,45 +249,6 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
         for call in calls:
             with pytest.raises(UnreachableError, match="the connection was closed in this program: open a new one"):
                 call()
-
-
-def test_a_connection_that_another_thread_closes_says_so(listener: zenoh.Session) -> None:
-    ends: list[BaseException] = []
-
-    def publish(tracker: Tracker) -> None:
-        try:
-            while True:
-                tracker.publish("left", (0, 0, 0))
-        except Exception as error:
-            ends.append(error)
-
-    for _ in range(10):  # the call in which the session closes is met by chance
-        session = open_session(connect=endpoints(listener))
-        with Watch(listener, "bench", "hands/left"), Watch(listener, "bench", "hands/right"):
-            beside = threading.Thread(target=publish, args=(Tracker(session, "bench", timeout_s=10),), daemon=True)
-            beside.start()
-            time.sleep(0.02)
-            session.close()  # type: ignore[no-untyped-call]
-            beside.join(10)
-    assert [str(one) for one in ends] == 10 * ["the connection was closed in this program: open a new one"]
-
-
-def test_what_nobody_hears_is_refused(cell: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("thirdhand.client.connection.LISTENER_TIMEOUT_S", 0.2)
-    with pytest.raises(UnreachableError, match=r"nobody listens to bench/tool/pose: is a daemon or `thirdhand record`"):
-        cell.tool((0, 0, 0))
-
-
-def test_a_default_stamp_is_taken_once_somebody_listens(cell: Connection, listener: zenoh.Session) -> None:
-    """Else the next samples would seem to come too early."""
-    late: list[Watch] = []
-    timer = threading.Timer(0.5, lambda: late.append(Watch(listener, "bench", "hands/left", timeout_s=10)))
-    timer.start()
-    before_ns = time.time_ns()
-    cell.hands(left=(0, 0, 0))
-    timer.join()
-    assert next(late[0]).stamp_ns > before_ns + 400_000_000
-    late[0].close()
 
 
 def test_a_watch_yields_in_order_none_in_silence_and_skips_what_is_not_readable(

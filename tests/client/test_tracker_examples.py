@@ -109,8 +109,3 @@ def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name:
             running.send_signal(signal.SIGINT)
             _, errors = running.communicate(timeout=30)
     assert b"Traceback" not in errors
-
-
-@pytest.mark.parametrize("name", ["optitrack_hands", "vicon_hands", "hts_hands"])
-def test_an_example_is_short(name: str) -> None:
-    assert len((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 90

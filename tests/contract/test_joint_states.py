@@ -44,12 +44,6 @@ def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
     return JointState(stamp_ns, tuple(names), (value,) * len(names), (NAN,) * len(names))
 
 
-def test_a_message_with_all_joints_passes_as_it_is_whatever_else_it_carries() -> None:
-    states = JointStates(NAMES, 0.1)
-    message = JointState(1, ("finger", "c", "b", "a"), (9.0, 3.0, 2.0, 1.0), ())
-    assert states.take(message, 0.0) is message
-
-
 def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_comes() -> None:
     states, fingers = JointStates(NAMES, 0.1), part("xy", 1)
     for k in range(300):
@@ -97,14 +91,6 @@ def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> Non
     assert lacking is not None
     with pytest.raises(WireError, match=r"joints \['c'\] missing among 2, a, b"):
         measured(lacking, NAMES)
-
-
-def test_after_a_pause_nothing_is_missing_at_once() -> None:
-    states = JointStates(NAMES, 0.1)
-    assert states.take(STATE, 0.0) is STATE
-    for message in (part("xy", 2), part("a", 2)):
-        assert states.take(message, 5.0) is None
-        assert states.incomplete(message, 5.0) is None
 
 
 def test_parts_that_are_too_old_are_not_assembled() -> None:

@@ -12,20 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.wicked import WICKED, wicked_skill
+from support.wicked import WICKED
 from thirdhand.cli.serve import PrintableFormatter
 from thirdhand.client import RefusedError, decoded
 from thirdhand.command_line import main
 from thirdhand.contract.printable import (
-    as_markdown,
     printable,
     printable_lines,
-    printable_values,
 )
 from thirdhand.contract.requests import Status
 from thirdhand.skills.skill_file import SkillError
-from thirdhand.skills.skill_file import decoded as skill_of
-from thirdhand.viewer.learned import about, skill_contents
 
 
 @given(st.text())
@@ -35,25 +31,6 @@ def test_any_text_becomes_one_printable_line_and_stays_so(text: str) -> None:
     assert printable(shown) == shown
     assert shown == text or not text.isprintable()
     assert all(line.isprintable() for line in printable_lines(text).split("\n"))
-
-
-def test_letters_of_all_languages_stay_and_controls_are_named() -> None:
-    assert printable("Löten – 焊接 ±") == "Löten – 焊接 ±"
-    assert printable(WICKED) == r"a\nb\x1b[31mred\x07\u202egnirts\r<b>|`*_$x$"
-    assert printable_lines("one\ntwo\x1b[2J") == "one\ntwo\\x1b[2J"
-    assert printable("\udc80") == r"\udc80"
-    assert printable_values({"a\n": ["\x00", 1, None]}) == {r"a\n": [r"\x00", 1, None]}
-    assert as_markdown("<b>a|b</b>") == r"\<b\>a\|b\</b\>"
-
-
-def test_names_inside_a_skill_are_escaped_where_the_skill_is_read_and_drawn() -> None:
-    assert skill_of(wicked_skill(), origin="a file").name == printable(WICKED)
-    contents = skill_contents(wicked_skill())
-    assert contents.name == printable(WICKED)
-    text = about(contents)
-    assert text.count(as_markdown(WICKED)) == 3  # heading, a row of the table, a warning
-    assert "\x1b" not in text
-    assert "<b>" not in text
 
 
 def test_errors_logs_and_replies_quote_without_effects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,11 +19,9 @@ from zenoh.handlers import FifoChannel
 
 from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
 from support.cell_commands import assert_refused, python, succeeded
-from support.circling import circling
 from support.in_process import arm
 from support.paths import ROOT
 from support.wam import JOINT_NAMES
-from thirdhand.client import RefusedError
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, messages, requests
 from thirdhand.core.arm.stage import Arm
@@ -34,7 +32,6 @@ from thirdhand.daemon.status import MeasuredArm
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.workbench.learning.learn import learn
 
 HANDOVER = requests.ViaPoint(
     "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
@@ -152,14 +149,6 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
         assert daemon.end() == 0
 
 
-def test_a_place_out_of_reach_is_refused_and_nothing_changes(shared_daemon: Any) -> None:
-    before = shared_daemon.client.ask("via_points", {"op": "list"})["points"]
-    far = msgspec.structs.replace(HANDOVER, name="far", tool=(1.3, 0.0, 0.3))
-    with pytest.raises(RefusedError, match="accepted"):
-        shared_daemon.client.add([HANDOVER, far])
-    assert shared_daemon.client.ask("via_points", {"op": "list"})["points"] == before
-
-
 def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_daemon: Any) -> None:
     shared_daemon.client.ask("hold")
     replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
@@ -218,36 +207,6 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     np.testing.assert_allclose(point["tool"], status["tool_m"], atol=1e-3)
     shared_daemon.client.ask("via_points", {"op": "clear"})
     shared_daemon.client.ask("resume")
-
-
-@pytest.mark.thorough
-def test_of_a_skill_that_one_hand_conducts_a_place_is_taught_by_it_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    takes = [circling(seed, apart_m=0.03) for seed in range(3)]
-    (tmp_path / "one.npz").write_bytes(
-        learn([one._replace(left=one.right, conducts="right") for one in takes], points=60).file
-    )
-    with serving(tmp_path, "--joints", "assumed", "--skill", str(tmp_path / "one.npz")) as daemon:
-        add = ["via-points", "add", "spot", "--connect", daemon.endpoint]
-        daemon.until(lambda s: s["tick"] > 0)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 2.0)
-            assert main([*add, "--here"]) == 1
-        said = capsys.readouterr().err
-        assert "waiting until right, tool are seen" in said
-        assert said.count("the right hand has not been seen yet") == 2  # while it waits, and at its end
-        assert "left" not in said
-        with Tracker(daemon.session) as tracker:
-            tracker.left, tracker.right = None, (0.5, -0.2, 0.3)
-            assert main([*add, "--here"]) == 0
-        (point,) = daemon.client.places()
-        np.testing.assert_allclose([point.left, point.right], [(0.5, -0.2, 0.3)] * 2, atol=1e-3)
-        typed = ["--right", ".52", "-.2", ".3", "--tool", *map(str, point.tool)]
-        assert main([*add, *typed]) == 0
-        (point,) = daemon.client.places()
-        assert point.left == point.right == (0.52, -0.2, 0.3)
-        assert main([*add, "--left", *typed[1:]]) == 2
 
 
 def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:

@@ -4,19 +4,12 @@ stopped.
 
 from __future__ import annotations
 
-import signal
-import time
 from pathlib import Path
 
-import pytest
-
-from support.cell import Tracker, serving
-from thirdhand.cli.status import rows
 from thirdhand.contract.evidence import Evidence, explained
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import Source
 from thirdhand.daemon.machine import Machine
-from thirdhand.workbench.cli.demo import too_busy
 
 FOLLOWS, SILENT = (Mode.FOLLOW, Reason.NONE), (Mode.FAULT, Reason.ARM_SILENT)
 
@@ -45,13 +38,6 @@ class Watched:
             self.machine.update(self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=outcome)
 
 
-def test_a_machine_that_keeps_time_is_not_blamed(tmp_path: Path) -> None:
-    watched = Watched(tmp_path)
-    watched.goes_on(5.0, late_ms=2.0, waiting=0.6)
-    watched.goes_on(1.0, outcome=SILENT)
-    assert (watched.machine.now, watched.machine.at_stop) == ("", "")
-
-
 def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
     watched = Watched(tmp_path)
     watched.goes_on(5.0, missed=2)
@@ -62,22 +48,6 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
     assert watched.machine.now == "processes waited for a processor 95% of the time"
     watched.goes_on(5.0)
     assert watched.machine.now == ""
-
-
-def test_where_the_system_tells_nothing_the_loop_alone_is_judged(tmp_path: Path) -> None:
-    machine = Machine(tmp_path / "nothing")
-    for k in range(30):
-        machine.update(k / 10, tick=50 * k, missed=k, late_ms=1.0, outcome=FOLLOWS)
-    assert machine.now == "20 of 1000 deadlines were missed"
-
-
-def test_it_is_remembered_as_long_as_the_arm_stands_for_it(tmp_path: Path) -> None:
-    watched = Watched(tmp_path)
-    watched.goes_on(3.0, waiting=1.0)
-    watched.goes_on(60.0, outcome=SILENT)
-    assert (watched.machine.now, watched.machine.at_stop[:16]) == ("", "processes waited")
-    watched.goes_on(3.0)
-    assert watched.machine.at_stop == ""
 
 
 def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
@@ -92,28 +62,3 @@ def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
     for left, is_blamed in ((stale, True), (Source(rate_hz=60.0, age_ms=9.0, fresh=True), False)):
         sources = {"left": left, "right": stale}
         assert ("busy" in explained(Reason.STALE_HAND, seen._replace(sources=sources)).why) == is_blamed
-
-
-@pytest.mark.thorough
-def test_a_service_that_stood_still_names_the_machine_before_the_tracker(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as tracker:
-        daemon.until(lambda status: status["mode"] == "follow", timeout_s=60.0)
-        daemon.process.send_signal(signal.SIGSTOP)
-        tracker.left = tracker.right = None
-        time.sleep(0.5)
-        daemon.process.send_signal(signal.SIGCONT)
-        daemon.until(lambda status: status["reason"] == "stale_hand")
-        time.sleep(3.0)  # longer than what is looked at
-        status = daemon.client.status()
-    assert status.because.startswith("this machine was too busy, ")
-    assert "deadlines were missed" in status.busy
-    assert "hand was last seen" in status.because
-    assert rows(status)["machine"] == f"too busy: {status.busy}"
-
-
-def test_a_bench_that_skips_periods_is_told_by_the_demo() -> None:
-    calm = {"periods": 5000, "skipped": 20, "longest_pause_ms": 12.0}
-    assert too_busy(calm) == ""
-    assert too_busy(calm | {"skipped": 400, "longest_pause_ms": 90.0}) == (
-        "the bench missed 400 of its 5000 periods, the bench paused for 90 ms"
-    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,7 +17,6 @@ from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_ty
 from zenoh_ros2_sdk.session import ZenohSession
 
 from support.cell import LEFT, RIGHT, until
-from support.cell_commands import started
 from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
@@ -115,22 +113,6 @@ def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
     assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
 
 
-@pytest.mark.thorough
-def test_cells_are_watched_as_lines_and_one_that_ends_is_gone() -> None:
-    """The daemon of one is a publisher of a token, which then disappears."""
-    with (
-        open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as router,
-        open_session(connect=endpoints(router)) as daemon,
-    ):
-        token = daemon.liveliness().declare_token(channels.presence("lab/a", str(daemon.zid())))
-        with started("status", "--all", "--watch", "--connect", endpoints(router)[0]) as watching:
-            assert watching.stdout.readline() == "lab/a  no status  it is starting, is busy, or denies access\n"
-            token.undeclare()
-            assert watching.stdout.readline() == "lab/a  gone\n"
-            watching.send_signal(signal.SIGINT)
-            assert "interrupted" in watching.communicate(timeout=20)[1]
-
-
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
     play = ["play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "50", "--connect", lab.endpoint]
     assert main([*play, "--cell", NAMES[1]]) == 0
@@ -159,18 +141,6 @@ def _answering(lab: Lab, key: str, answer: bytes) -> Iterator[None]:
     queryable = lab.session.declare_queryable(key, lambda query: query.reply(key, answer), complete=True)
     yield
     queryable.undeclare()
-
-
-def test_what_a_storage_kept_passes_for_no_daemon(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
-    with open_session(connect=[lab.endpoint]) as asking:
-        live = Client(asking, NAMES[3])
-        kept = requests.encode_json(live.status()).replace(b'"hold"', b'"follow"')
-        with _answering(lab, f"{NAMES[3]}/status", kept), _answering(lab, "gone/status", kept):
-            assert {live.status().mode for _ in range(5)} == {"hold"}
-            with pytest.raises(UnreachableError, match="A Zenoh storage answered with an old reply"):
-                Client(asking, "gone", timeout_s=1.0).status()
-            assert main(["status", "--cell", "gone", "--connect", lab.endpoint]) == 1
-    assert "no daemon of this cell is alive" in capsys.readouterr().err
 
 
 # --- as ROS 2 sees it ----------------------------------------------------------------------------
@@ -233,23 +203,6 @@ def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.Cap
 # --- sessions ------------------------------------------------------------------------------------
 
 
-def test_who_listens_and_connects_meets_all_others_too(tmp_path: Path) -> None:
-    """Two that are behind a router and listen besides; one of their own clients."""
-    with contextlib.ExitStack() as closing:
-        listen = ["tcp/127.0.0.1:0"]
-        router = closing.enter_context(open_session(listen=listen, more={"mode": "router"}))
-        both = [closing.enter_context(open_session(connect=endpoints(router), listen=listen)) for _ in range(2)]
-        behind = closing.enter_context(open_session(connect=endpoints(both[0])))
-        tokens = [s.liveliness().declare_token(f"here/{i}") for i, s in enumerate((*both, behind))]
-        keys = {f"here/{i}" for i in range(len(tokens))}
-
-        def seen(session: zenoh.Session) -> set[str]:
-            return {str(reply.ok.key_expr) for reply in session.liveliness().get("here/*", timeout=5.0) if reply.ok}
-
-        for session in (*both, behind):
-            until(lambda session=session: seen(session) == keys)
-
-
 SAYS_ALL = """{
   // what a user may say, and what the service does not let it
   mode: "client",
@@ -276,15 +229,3 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
     with open_session(listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}) as listening:
         assert endpoints(listening)[0].startswith("tcp/127.0.0.1:")
         assert not list(listening.info.routers_zid())
-
-
-def test_a_zenoh_configuration_that_is_none_is_told(
-    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "broken.json5").write_text("{ mode: ")
-    for name, words in (("broken.json5", "broken.json5: "), ("missing.json5", "No such file")):
-        monkeypatch.setenv("THIRDHAND_ZENOH_CONFIG", str(tmp_path / name))
-        assert main(["status", "--connect", lab.endpoint]) == 1
-        assert words in (said := capsys.readouterr().err)
-        assert said.startswith("thirdhand status: cannot read the Zenoh configuration ")
-        assert said.count("\n") == 1

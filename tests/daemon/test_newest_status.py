@@ -5,7 +5,6 @@ comes.
 from __future__ import annotations
 
 import json
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,36 +13,9 @@ import pytest
 
 from support.cell import Daemon, Tracker, serving
 from thirdhand.client import Client
-from thirdhand.daemon.newest_status import NewestStatus
 from thirdhand_sim.scene import Scene
 
 ROUNDS = 12
-
-
-def test_a_status_is_begun_after_it_was_requested_and_a_flood_shares_one() -> None:
-    newest, made = NewestStatus(), 0
-    answers: list[bytes] = []
-    first = threading.Thread(target=lambda: answers.append(newest.requested()))
-    newest.begin()  # before any request: not new enough for one
-    first.start()
-    while not first.ident or not newest._is_wanted:  # noqa: SLF001
-        time.sleep(0.001)
-    newest.end(b"old")
-    first.join(0.05)
-    assert answers == []
-    crowd = [threading.Thread(target=lambda: answers.append(newest.requested(published=True))) for _ in range(20)]
-    for one in crowd:
-        one.start()
-    while len(answers) < 21:
-        newest.wait(1.0)
-        time.sleep(0.01)
-        assert newest.begin() == (made == 0)
-        made += 1
-        newest.end(b"new %d" % made)
-        time.sleep(0.01)
-    assert made <= 2
-    newest.close()
-    assert newest.requested() == b"new %d" % made
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from support.cell import Daemon, serving, told
+from support.cell import Daemon, serving
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.settings.config import Settings
@@ -80,23 +80,3 @@ def test_the_arm_is_found_whatever_else_its_topic_carries(daemon: Daemon, case: 
         found = daemon.until(lambda now: now["reason"] == "no_hands")
     lost = {cause: n - before.get(cause, 0) for cause, n in found["rejected"].items()}
     assert not any(lost.values()), lost
-
-
-def test_a_part_of_the_arm_that_nobody_publishes_is_named(daemon: Daemon) -> None:
-    publisher = daemon.session.declare_publisher("thirdhand/joints/state")
-    end = time.monotonic() + 1.5
-    while time.monotonic() < end:
-        publisher.put(cdr.encode_joints(state(*JOINTS[:3], finger=0.0)))
-        publisher.put(cdr.encode_joints(state(*JOINTS[4:])))
-        because = daemon.client.status().because
-        time.sleep(0.01)
-    assert because == (
-        f"what arrives from the arm is rejected as incomplete: joints ['{JOINTS[3]}'] missing among 6, "
-        + ", ".join(name for name in JOINTS if name != JOINTS[3])
-    )
-
-
-def test_doctor_names_the_number_that_was_wrong(daemon: Daemon) -> None:
-    with published(daemon, lambda k: [state(*JOINTS, velocity=(0.0,) * 6 + (math.inf,))]):
-        said = told("doctor", "--connect", daemon.endpoint, "--seconds", "1").stdout
-    assert f"rejected as not_finite: {JOINTS[6]} at inf rad/s; a finite number needed" in said

@@ -23,7 +23,7 @@ import zenoh
 from support.request_cell import PLACES, Cell
 from thirdhand.client import RefusedError, endpoints
 from thirdhand.command_line import main
-from thirdhand.contract import channels, requests
+from thirdhand.contract import requests
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.skill.skill import Skill
 from thirdhand.daemon.daemon import load_skill
@@ -121,21 +121,9 @@ NOT_EMPTY: list[tuple[Any, str]] = [
 REFUSED: dict[str, list[tuple[Any, str]]] = {
     "via_points": [
         (add(point(left=[1.0, 2.0])), "$.points[0].left: 2 numbers, 3 needed"),
-        (add(point(), point(name="b", tool=[0.1] * 4)), "$.points[1].tool: 4 numbers, 3 needed"),
-        (add(point(left=[0.1, "x", 0.3])), "$.points[0].left[1]: 'x' given; -10 to 10 m accepted"),
         (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
-        (add(point(left="here")), "$.points[0].left: 'here' given; 3 numbers needed"),
         (add(point(right=None)), "$.points[0]: field `right` is missing"),
-        (
-            add(point(nam="b")),
-            "$.points[0]: unknown field 'nam'; known are name, left, right, tool, std, radius, follow",
-        ),
         (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
-        (add(point(name="a/b")), "$.points[0].name: "),
-        (add(point(name="x" * 65)), "$.points[0].name: '"),
-        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
-        (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
-        (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
         (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
         (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, ("),
         (
@@ -144,9 +132,6 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         ),
         (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m"),
         (add(), "$.points: none given, 1 to 100 needed"),
-        (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
-        (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
-        ({"op": "add"}, "$: field `points` is missing"),
         (
             {"op": "remove", "names": ["nothing"]},
             "$.names[0]: no via-point 'nothing'; in force: handover, glass, soldering",
@@ -155,16 +140,8 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
             {"op": "remove", "names": ["glass", "nothing"]},
             "$.names[1]: no via-point 'nothing'; in force: handover, glass, soldering",
         ),
-        ({"op": "remove", "names": ["glass", "glass"]}, "$.names[1]: 'glass' given twice"),
-        ({"op": "remove", "names": []}, "$.names: none given, 1 to 100 needed"),
-        ({"op": "lst"}, "$.op: 'lst' given; add, remove, clear, list accepted"),
         ({}, "$: field `op` is missing"),
-        ([], "$: [] given; an object with its fields needed"),
-        (b'{"op":', "not JSON: Input data was truncated"),
-        (b'{"op": "list"}}', "not JSON: JSON is malformed: trailing characters"),
-        (b"\xff\xfe", "not JSON: JSON is malformed"),
         (b'{"op": "list", "op": "clear"}', "'op' given twice in one object; each name once needed"),
-        (b'{"op": "add", "points": [{"std": 1, "std": 2}]}', "'std' given twice in one object"),
         (b"[" * 100_000, "not JSON: maximum recursion depth"),
         (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
     ],
@@ -188,20 +165,6 @@ def test_a_request_is_refused_whole_and_with_a_reason(
     taught_cell: Cell, suffix: str, request_: Any, message: str
 ) -> None:
     assert taught_cell.refusal(suffix, request_).startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("suffix", "request_"),
-    [
-        ("via_points", {"op": "list", "a - at `$.x`": 1}),
-        ("via_points", {"op": "add", "points": [{"a - at `$.points[7].x`": 1}]}),
-        ("skill", {"name": "soldering", "b - at `$.name[0]`": 1}),
-    ],
-)
-def test_a_field_whose_name_looks_like_a_path_is_unknown(
-    taught_cell: Cell, suffix: str, request_: dict[str, Any]
-) -> None:
-    assert "unknown field" in taught_cell.refusal(suffix, request_)
 
 
 @pytest.mark.parametrize(
@@ -393,12 +356,6 @@ def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suff
     first, second = cell.client.ask(suffix), cell.client.ask(suffix, {})
     assert 0 < first["tick"] < second["tick"]
     assert cell.kinds() == [suffix, suffix]
-
-
-def test_an_empty_payload_is_an_empty_request(cell: Cell) -> None:
-    (reply,) = cell.session.get(channels.key(cell.settings.cell, "hold"), timeout=10.0)
-    assert reply.ok is not None
-    assert cell.kinds() == ["hold"]
 
 
 def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(cell: Cell) -> None:

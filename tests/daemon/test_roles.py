@@ -5,9 +5,6 @@ of each role that try everything.
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-import re
 import shutil
 import stat
 import time
@@ -17,12 +14,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from support.cell import LEFT, Tracker, thirdhand, told, until
+from support.cell import LEFT, Tracker, thirdhand, until
 from support.cell_commands import assert_refused, succeeded
 from support.certificates import make_certificates
 from thirdhand.client import (
     Client,
-    cells,
     endpoints,
     living,
     open_session,
@@ -31,7 +27,6 @@ from thirdhand.client.session import CertificateError
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.roles import (
-    DAEMON,
     ROLES,
     ROUTER,
     TOPICS,
@@ -39,7 +34,7 @@ from thirdhand.contract.roles import (
     names,
 )
 from thirdhand.daemon.launch import launched
-from thirdhand.daemon.single_instance import NETWORK_BOUNDS, occupy
+from thirdhand.daemon.single_instance import NETWORK_BOUNDS
 
 CELL = "bench"
 NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
@@ -214,43 +209,6 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
     assert got["operator"] == {full[key] for key in OUTPUTS}
 
 
-@contextlib.contextmanager
-def serving_cell(secrets: Path, cell: str, *, listen: Iterable[str] = (), connect: Iterable[str] = ()) -> Iterator[str]:
-    """A session of a cell's daemon, which answers a request for its status with the cell's name;
-    its endpoint.
-    """
-    more = NETWORK_BOUNDS | access_control(cell)
-    with open_session(listen=[*listen], connect=[*connect], certificate=secrets / DAEMON, more=more) as session:
-        token = occupy(session, cell)  # noqa: F841  # the cell is free when the token is deleted
-        answering = session.declare_queryable(
-            channels.key(cell, "status"), lambda query: query.reply(query.key_expr, cell.encode())
-        )
-        yield "".join(endpoints(session))
-        answering.undeclare()
-
-
-@pytest.mark.parametrize("by_router", [True, False], ids=["by a router", "directly"])
-@pytest.mark.parametrize("listens", [True, False], ids=["listening", "connecting only"])
-@pytest.mark.one_case
-def test_every_role_sees_all_cells_that_are_connected(secrets: Path, by_router: bool, listens: bool) -> None:
-    here = ["tls/127.0.0.1:0"]
-    with contextlib.ExitStack() as stack:
-        meeting: tuple[str, ...] = ()
-        if by_router:
-            router = open_session(listen=here, certificate=secrets / ROUTER, more={"mode": "router"})
-            meeting = endpoints(stack.enter_context(router))
-        first = stack.enter_context(serving_cell(secrets, "lab/a", listen=here, connect=meeting))
-        second = serving_cell(secrets, "lab/b", listen=here * listens, connect=meeting or [first])
-        for at in filter(None, (*meeting, first, stack.enter_context(second))):
-            with open_session(connect=[at], certificate=secrets / "tracker") as session:
-                until(lambda session=session: {cell.name for cell in cells(session)} == {"lab/a", "lab/b"})
-                for cell in ("lab/a", "lab/b"):
-                    replies = session.get(channels.key(cell, "status"), payload=b"{}", timeout=10.0)
-                    assert [reply.ok and reply.ok.payload.to_bytes() for reply in replies] == [cell.encode()]
-                refused = session.get(channels.key("lab/b", "hold"), payload=b"{}", timeout=PATIENCE_S)
-                assert [reply.ok for reply in refused if reply.ok] == []
-
-
 def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     """A subject without a name would be everybody."""
     told = access_control(CELL, names("tracker"))["access_control"]
@@ -296,49 +254,6 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
         pytest.raises(CertificateError, match=r"the certificate of the daemon .* is not for this address"),
     ):
         open_session(connect=endpoints(session), certificate=own / "operator", timeout_s=0.3)
-
-
-@pytest.mark.thorough
-def test_daemons_of_two_cells_see_each_other_by_their_certificates(
-    secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of which one connects to the other; a third is of another authority, a fourth has none."""
-    at = ""
-    monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
-    with contextlib.ExitStack() as closing:
-        endpoints_of: dict[str, str] = {}
-        for name in ("lab/a", "lab/b"):
-            folder = tmp_path / name
-            folder.mkdir(parents=True)
-            network = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\nconnect = [{at}]\n'
-            arguments = ("--cell", name, "--joints", "assumed", "--rate", "100")
-            service = closing.enter_context(launched(folder, *arguments, network=network))
-            endpoints_of[name], at = service.endpoint, f'"{service.endpoint}"'
-        for endpoint in endpoints_of.values():
-            shown = until(
-                lambda endpoint=endpoint: (
-                    shown
-                    if len(shown := json.loads(told("status", "--all", "--json", "--connect", endpoint).stdout)) == 2
-                    and all(cell["status"] for cell in shown)
-                    else None
-                )
-            )
-            for cell in (cell["status"] for cell in shown):
-                assert (cell["mode"], cell["reason"], cell["skill"]) == ("hold", "no_hands", "soldering")
-                assert cell["version"]
-                assert cell["lateness_us"]["p99"] > 0
-        make_certificates(tmp_path / "other")
-        serve = ("serve", "--cell", "lab/c", "--joints", "assumed", "--connect", endpoint)
-        config = tmp_path / "c.toml"
-        config.write_text(f'[network]\nlisten = []\ncertificate = "{tmp_path}/other/secrets/daemon"\n')
-        foreign = told(*serve, "--config", str(config))
-        assert (foreign.returncode, foreign.stdout) == (1, "")
-        assert re.search(
-            "^thirdhand serve: the certificate of the daemon .* is not from the authority in", foreign.stderr
-        )
-        without = thirdhand("status", "--all", "--connect", endpoint, env=os.environ | {"THIRDHAND_CERTIFICATE": ""})
-        assert (without.returncode, without.stdout) == (1, "")
-        assert re.search("^thirdhand status: .* requires a certificate, and none was given", without.stderr)
 
 
 def test_nobody_passes_for_the_daemon(secrets: Path) -> None:

@@ -23,10 +23,7 @@ from support.wam import JOINT_NAMES
 from thirdhand.client import endpoints, open_session
 from thirdhand.contract import cdr, ros2
 from thirdhand.contract.messages import JointState, Transform
-from thirdhand.core.frame import blank, frame_layout
-from thirdhand.core.transforms import Frames
 from thirdhand.daemon.ros2_domain import Ros2Domain
-from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings, parse, robot_description
 
 DOMAIN = 12
@@ -155,24 +152,6 @@ def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
     offset = settings.tool.plate_from_tool
     tool = pin.SE3(pin.Quaternion(np.array(offset[3:])).matrix(), np.array(offset[:3]))
     return np.array((data.oMf[model.getFrameId(settings.arm.plate)] * tool).homogeneous)
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("arm", ["wam", "franka", "ur5"])
-def test_frames_of_every_shipped_arm_are_one_tree_from_base(arm: str) -> None:
-    """Whatever its root is called; the links only where the cell describes them."""
-    settings = cell_of(arm)
-    frame, joints = blank(frame_layout(len(settings.joints.names))), np.array(settings.arm.posture)
-    frame["covariance"][:] = np.eye(3)
-    frames = Frames(settings, robot_description(settings))
-    told = [*frames.fixed, *frames.moving(frame, joints.tolist())]
-    assert len({one.child for one in told}) == len(told)
-    for name in ("setpoint", "target", "left_hand", "right_hand"):
-        np.testing.assert_allclose(placed(told, name)[:3, 3], 0.0)
-    np.testing.assert_allclose(placed(told, "tool"), kinematics(settings, joints), atol=1e-9)
-    without = Frames(settings, robot_description(settings), links=False)
-    left = {one.child for one in (*without.fixed, *without.moving(frame, joints.tolist()))}
-    assert left - {"base_link"} == set(ros2.OWN_FRAMES)
 
 
 def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:

@@ -48,30 +48,6 @@ def saved(tmp_path: Path) -> SavedViaPoints:
     return SavedViaPoints(Settings(cell="lab/bench2", files=Files(state=str(tmp_path))))
 
 
-def test_via_points_come_back_as_they_were_taught(saved: SavedViaPoints, skill: Skill) -> None:
-    assert saved.read(skill) is None
-    keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    assert saved.read(skill) == (POINTS, 0.03)
-    keep(saved, skill)
-    assert saved.read(skill) == ((), skill.tolerance)
-
-
-def test_via_points_of_another_skill_are_not_taken(saved: SavedViaPoints, skill: Skill) -> None:
-    keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    other = replace(skill, learned_from="other demonstrations")
-    assert saved.read(other) is None
-    saved.path(skill).rename(saved.path(other))
-    assert saved.read(other) is None
-
-
-def test_each_skill_keeps_its_own(saved: SavedViaPoints, skill: Skill) -> None:
-    other = replace(skill, learned_from="other demonstrations")
-    for one, count in ((skill, 2), (other, 1)):
-        keep(saved, adapted(one, POINTS[:count], tolerance=0.03))
-    assert saved.read(skill) == (POINTS[:2], 0.03)
-    assert saved.read(other) == (POINTS[:1], 0.03)
-
-
 def files_in(folder: Path) -> dict[Path, bytes]:
     """All files below a folder, with their contents."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -125,22 +101,6 @@ def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedVia
         assert saved.read(skill) in (None, (POINTS, 0.03))
 
 
-def test_a_file_that_somebody_edited_is_set_aside(
-    saved: SavedViaPoints, skill: Skill, caplog: pytest.LogCaptureFixture
-) -> None:
-    keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    whole = saved.path(skill).read_text()
-    edited = [whole.replace("0.03", "0.04"), whole.replace("checksum", "sum"), "{}", '{"learned_from": "x"}']
-    edited += ['{"learned_from": "x", "request": 3}', '{"request": {"points": 1}}']
-    for text in edited:
-        saved.path(skill).write_text(text)
-        assert saved.read(skill) is None
-        assert "the checksum is wrong, so the file was edited" in caplog.text
-        caplog.clear()
-    saved.path(skill).write_text(json.dumps(json.loads(whole)))  # laid out in another way
-    assert saved.read(skill) == (POINTS, 0.03)
-
-
 def another_arm(folder: Path, change: tuple[str, str]) -> Settings:
     """A cell's settings whose arm is the shipped one with something changed in its description."""
     urdf = folder / "own.urdf"
@@ -168,11 +128,6 @@ def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
     assert (saved.read(skill), other.read(skill)) == ((POINTS[:2], 0.03), (POINTS[:1], 0.03))
     other.path(skill).replace(saved.path(skill))  # nor by the file's name
     assert saved.read(skill) is None
-
-
-def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: Skill, tmp_path: Path) -> None:
-    keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)
 
 
 def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_taught_again(

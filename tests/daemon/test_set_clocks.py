@@ -76,20 +76,3 @@ def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(tmp_path: Path, monk
     assert len(stamps) > RATE_HZ * len(OFFSETS_S)
     assert all(a < b for a, b in itertools.pairwise(stamps))
     assert_replays(records)
-
-
-@pytest.mark.thorough
-def test_a_tracker_whose_clock_is_set_is_named_and_its_hands_are_taken_again(tmp_path: Path) -> None:
-    records = tmp_path / "records"
-    with serving(tmp_path, "--joints", "assumed", "--rate", str(RATE_HZ), "--record", str(records)) as daemon:
-        with Tracker(daemon.session) as tracker:
-            follows(daemon, 0)
-            for before_s, after_s in itertools.pairwise((0.0, *OFFSETS_S, 0.0)):
-                tick = daemon.client.ask("status")["tick"]
-                tracker.ahead_ns = round(after_s * 1e9)
-                cause = "ahead" if after_s > before_s else "older"
-                named = daemon.until(lambda now, cause=cause: now["sources"]["left"]["cause"] == cause, 60.0)
-                assert "clock" in named["sources"]["left"]["advice"]
-                follows(daemon, tick)
-        assert daemon.end() == 0
-    assert_replays(records)

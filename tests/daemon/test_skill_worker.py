@@ -4,25 +4,17 @@ that come back with their words.
 
 from __future__ import annotations
 
-import inspect
 import os
 import signal
 import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support.paths import RECORDINGS
-from thirdhand.client import Client
-from thirdhand.client.connection import Connection
-from thirdhand.contract.requests import ANSWER_TIMEOUT_S, ViaPoint
 from thirdhand.core.skill.skill import Skill
-from thirdhand.daemon.request_inbox import ADOPTION_TIMEOUT_S
-from thirdhand.daemon.skill_worker import WORK_TIMEOUT_S, SkillWorker
-from thirdhand.process import child
+from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import adapted, in_force
 from thirdhand_sim.scene import Scene
@@ -59,10 +51,6 @@ def bits(value: object) -> bytes:
     return b"" if value is None else np.asarray(value).tobytes()
 
 
-def test_a_skill_is_loaded_as_it_stands_in_its_file(skill_worker: SkillWorker, skill: Skill) -> None:
-    assert_same_bits(skill_worker.load(SOLDERING), skill)
-
-
 @pytest.mark.parametrize("count", [3, 1, 0])
 def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     skill_worker: SkillWorker, skill: Skill, count: int
@@ -71,11 +59,6 @@ def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     assert_same_bits(there, adapted(skill, PLACES[:count], tolerance=0.05))
     assert there.via_points == PLACES[:count]
     assert in_force(there) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
-
-
-def test_a_skill_that_came_back_is_adapted_again(skill_worker: SkillWorker, skill: Skill) -> None:
-    once = skill_worker.adapt(skill, PLACES, tolerance=0.05)
-    assert_same_bits(skill_worker.adapt(once, PLACES[1:], tolerance=0.05), adapted(skill, PLACES[1:], tolerance=0.05))
 
 
 def test_errors_come_back_with_their_words_and_do_not_end_the_process(
@@ -106,14 +89,6 @@ def test_a_killed_process_is_replaced_at_the_next_request(skill_worker: SkillWor
     assert not is_there(started)
 
 
-def test_askers_in_several_threads_get_their_own_answers(skill_worker: SkillWorker, skill: Skill) -> None:
-    def taught(place: ViaPoint) -> tuple[ViaPoint, ...]:
-        return skill_worker.adapt(skill, [place], tolerance=0.05).via_points
-
-    with ThreadPoolExecutor(3) as pool:
-        assert list(pool.map(taught, PLACES)) == [(place,) for place in PLACES]
-
-
 def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Skill) -> None:
     skill_worker = SkillWorker()
     skill_worker.close()
@@ -125,31 +100,6 @@ def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Ski
     assert_same_bits(there, adapted(skill, PLACES, tolerance=0.05))
     with pytest.raises(ValueError, match="read-only"):
         there.model.primitive.inputs[0, 0] = 1.0
-
-
-def test_a_slow_workshop_is_waited_for_and_what_it_has_imported_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A fork server of its own, which has to import all: as on a machine that is busy."""
-    monkeypatch.setattr(child, "_server", server := child.ForkServer())
-    worker = SkillWorker()
-    try:
-        said: list[str] = []
-        while not said or "is still starting" in said[-1]:
-            with pytest.raises(SkillError) as refused:
-                worker.load(tmp_path / "nothing.npz", timeout_s=0.2)
-            said.append(str(refused.value))
-        assert 1 < len(said) < 300  # each went on where the one before was
-        assert "cannot read skill" in said[-1]
-        first = process_of(worker)
-        with pytest.raises(SkillError, match="did not answer in time; nothing was changed"):
-            worker.load(SOLDERING, timeout_s=0.0001)
-        with pytest.raises(SkillError, match="cannot read skill"):  # a new one, which imports nothing
-            worker.load(tmp_path / "nothing.npz", timeout_s=2.0)
-        assert process_of(worker) != first
-    finally:
-        worker.close()
-        server.close()
 
 
 def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,18 +120,3 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
         assert process_of(worker) == slowed
     finally:
         worker.close()
-
-
-def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(skill_worker: SkillWorker) -> None:
-    with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
-
-        def late(left_s: float) -> None:
-            with skill_worker.due(time.monotonic() - WORK_TIMEOUT_S + left_s):
-                skill_worker.load(SOLDERING)
-
-        for left_s in (0.2, -1.0):
-            with pytest.raises(SkillError, match="busy with earlier requests; nothing was changed"):
-                pool.submit(late, left_s).result(2.0)
-    assert WORK_TIMEOUT_S + ADOPTION_TIMEOUT_S < ANSWER_TIMEOUT_S
-    for waiting in (Client, Connection):
-        assert inspect.signature(waiting).parameters["timeout_s"].default == ANSWER_TIMEOUT_S

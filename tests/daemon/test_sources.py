@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import re
@@ -13,12 +12,11 @@ import pytest
 
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES, URDF
-from thirdhand.contract.evidence import Evidence, explained
-from thirdhand.contract.incidents import what_to_do
+from thirdhand.contract.evidence import explained
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
-from thirdhand.contract.records import Cause, Reason
-from thirdhand.contract.requests import Percentiles, Source, Status
+from thirdhand.contract.records import Cause
+from thirdhand.contract.requests import Percentiles, Status
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import (
     Event,
@@ -131,40 +129,6 @@ def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: A
     assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEY_OF_SOURCE[source]])).why
 
 
-def test_a_joint_that_leapt_is_named_with_where_it_was(skill: Skill) -> None:
-    cell = Cell(skill)
-    for k in range(10):
-        cell.tell(("arm", joints(1 + k)))
-    cell.tell(("arm", joints(20, (*POSTURE[:3], POSTURE[3] - 1.0, *POSTURE[4:]))))
-    said = cell.status(0.1).sources["arm"]
-    assert (said.cause, said.refused) == (
-        "jumped",
-        "wam/elbow_pitch_joint from 2.541 to 1.541 rad, from one sample to the next",
-    )
-
-
-@pytest.mark.parametrize("unmeasured", [(), (math.nan,) * 7, (0.0,) * 3, (math.nan,) * 12])
-def test_an_arm_that_measures_positions_only_is_ready_and_followed(skill: Skill, unmeasured: tuple[float, ...]) -> None:
-    cell = Cell(skill)
-    for k in range(1, 200):
-        state = joints(k)._replace(velocity=unmeasured, effort=(math.nan,) * 7)
-        cell.tell(("arm", state), *resting_hands(k))
-    told = cell.status(0.4)
-    assert (told.mode, told.rejected) == ("follow", {})
-
-
-@pytest.mark.parametrize("rate_hz", [1, 5, 8])
-def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz: int) -> None:
-    cell = Cell(skill)
-    for k in range(1500):
-        cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
-        told = cell.status(k / 500)
-        if k > 1000:
-            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", told.because)
-            assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
-    assert told.reason == "arm_not_ready"
-
-
 @pytest.mark.parametrize("rate_hz", [3, 5, 8])
 @pytest.mark.one_case
 def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: int) -> None:
@@ -272,33 +236,6 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
     assert len(cell.log) == 3
 
 
-def test_of_two_kinds_at_once_each_is_said_in_its_own_words(skill: Skill) -> None:
-    cell = Cell(skill)
-    cell.tell(("left", pose(S, LEFT)))
-    cell.status(1.0)
-    cell.tell(("left", pose(S // 2, LEFT)))
-    cell.tell(("left", pose(S + 1, (0.5, 0.0, 0.3))))
-    cell.status(1.1)
-    older, jumped = sorted(cell.log, key=lambda line: "jumped" in line)
-    assert "rejected as older: stamped 500 ms before" in older
-    assert "rejected as jumped: at (0.5, 0, 0.3)" in jumped
-
-
-def test_hands_that_are_taken_for_each_other_are_named_so(skill: Skill) -> None:
-    cell = Cell(skill)
-    for k in range(300):
-        left, right = (LEFT, RIGHT) if k < 100 else (RIGHT, LEFT)
-        cell.tell(("left", pose(k + 1, left)), ("right", pose(k + 1, right)), ("arm", joints(k + 1)))
-        if k % 50 == 0:
-            cell.status(k / 500)
-    told = cell.status(0.6)
-    assert (told.mode, told.reason) == ("hold", "stale_hand")
-    assert "the left hand was last seen 400 ms ago, as what arrives is rejected as swapped: at (" in told.because
-    assert "where the other hand was; left and right look exchanged" in told.because
-    assert told.remedy == "let the tracker see both hands apart for a moment: it takes left for right"
-    assert sum("rejected as swapped" in line for line in cell.log) == 2
-
-
 def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     cell = Cell(skill)
     cell.tell(*resting_hands(S), ("left", pose(1, (900.0, 0.0, 0.0))))
@@ -358,25 +295,6 @@ def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
     assert {source.unit for name, source in told.sources.items() if name != "arm"} == {reported}
 
 
-def test_a_hand_that_jumps_away_is_explained_by_its_tracker(skill: Skill) -> None:
-    cell = Cell(skill)
-    for k in range(400):
-        far_m = 0.3 if k > 300 else 0.0
-        left = pose(1 + k * S // 500, (LEFT[0] + far_m, *LEFT[1:]))
-        cell.tell(("left", left), ("right", pose(left.stamp_ns, RIGHT)), ("arm", joints(left.stamp_ns)))
-        cell.status(k / 500)
-    told = cell.status(0.8)
-    assert (told.mode, told.reason) == ("hold", "far_from_demonstrations")
-    assert told.because.startswith("the left hand jumped in the last second; ")
-    assert told.remedy.startswith("look for reflections")
-
-
-def test_what_is_rejected_in_batches_is_told_the_remedy_of_its_rejection() -> None:
-    refused = Source(rate_hz=60.0, age_ms=300.0, cause="wrong_frame", refused="frame 'camera'", batches_ms=200.0)
-    remedy = explained(Reason.STALE_HAND, Evidence(sources={"left": refused})).what_to_do
-    assert remedy == what_to_do("wrong_frame")
-
-
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
 def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill, batch_ticks: int) -> None:
     cell, period_ns = Cell(skill), S // 500
@@ -397,28 +315,6 @@ def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill
             assert "raise [hands] stale_max_ms" in told.remedy
 
 
-def test_a_hand_that_the_skill_does_without_is_blamed_for_nothing_until_it_was_seen(skill: Skill) -> None:
-    cell = Cell(dataclasses.replace(skill, conductor=1))
-    for k in range(150):
-        cell.tell(("arm", joints(1 + k)))
-    told = cell.status(0.3)
-    assert (told.hands, told.needed, set(told.demonstrated_m)) == ("right", ("right",), {"right"})
-    assert (told.reason, told.because) == ("no_hands", "the right hand has not been seen yet")
-    for k in range(200):
-        cell.tell(("arm", joints(200 + k)), ("left", pose(1 + k)), ("right", pose(1 + k, RIGHT)))
-    cell.status(0.7)
-    for k in range(200):
-        cell.tell(("arm", joints(400 + k)), ("right", pose(300 + k, RIGHT)))
-    told = cell.status(1.1)
-    assert (told.reason, told.needed) == ("stale_hand", ("left", "right"))
-    assert told.because.startswith("the left hand was last seen")
-    for k in range(2300):  # 5 s since it was seen
-        cell.tell(("arm", joints(600 + k)), ("right", pose(500 + k, RIGHT)))
-    told = cell.status(5.7)
-    assert (told.reason != "stale_hand", told.needed) == (True, ("right",))
-    assert (Cell(skill).status(0.0).hands, set(Cell(skill).status(0.0).demonstrated_m)) == ("both", {"left", "right"})
-
-
 def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell = Cell(skill)
     cell.tell()
@@ -436,30 +332,6 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     for _ in range(60):
         cell.tell()
     assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 120 ms")
-
-
-def test_a_tool_that_was_too_fast_says_how_fast(skill: Skill) -> None:
-    cell = Cell(skill)
-    for k in range(80):
-        cell.tell(("arm", joints(1 + k)))
-    for k in range(40):
-        fast = JointState(100 + k, JOINT_NAMES, POSTURE, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        cell.tell(("arm", fast))
-    told = cell.status(1.0)
-    assert told.reason == "tool_speed"
-    said = re.fullmatch(r"the tool was measured at (.*) m/s, 1 accepted", told.because)
-    assert said is not None
-    assert told.tool_m is not None
-    assert float(said[1]) == pytest.approx(3.0 * math.hypot(*told.tool_m[:2]), abs=0.01)  # about the base's yaw
-
-
-def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:
-    cell = Cell(skill)
-    for k in range(10):
-        cell.tell(("left", pose(S + k)), late_ns=-5 * S)
-        told = cell.status(k / 10)
-    assert told.sources["left"].clock_ms == pytest.approx(-5000.0)
-    assert told.sources["right"].clock_ms is None
 
 
 def two_trackers(
@@ -493,14 +365,10 @@ def test_two_trackers_a_few_millimetres_apart_are_detected_while_the_hand_rests(
 
 
 LONE = {
-    "noise": lambda t, random: random.uniform(5e-4, 6e-3) * random.standard_normal((len(t), 3)),
-    "steps": lambda t, random: np.round(random.uniform(5e-4, 6e-3) * random.standard_normal((len(t), 3)), 2),
     "outliers": lambda t, random: 1e-3 * random.standard_t(2, size=(len(t), 3)),
     "tremor": lambda t, random: along_x(random.uniform(1e-3, 6e-3) * np.sin(2 * np.pi * random.uniform(3, 5) * t)),
-    "drift": lambda t, random: along_x(0.02 * t),
     "reaches": lambda t, random: along_x(0.15 * np.sin(2 * np.pi * random.uniform(0.2, 2) * t)),
     "moved once": lambda t, random: along_x(random.uniform(2e-3, 0.02) * (t > t.mean())),
-    "each twice": lambda t, random: along_x(0.2 * np.sin(3 * np.floor(0.5 * np.arange(len(t))) / 30)),
 }
 
 

@@ -4,8 +4,6 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
-import json
-import logging
 import os
 import re
 import select
@@ -15,7 +13,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -23,7 +20,6 @@ import pytest
 from support.cell import LISTENING, serving
 from support.cell_commands import python
 from support.cell_commands import started as command_started
-from support.paths import ROOT
 from thirdhand.client import (
     Client,
     StartingError,
@@ -35,13 +31,11 @@ from thirdhand.client import (
 from thirdhand.command_line import main
 from thirdhand.contract.channels import CHANNELS
 from thirdhand.daemon import launch
-from thirdhand.daemon.launch import LaunchError, launched
-from thirdhand.daemon.start import LOG_EVERY_S, Startup, starting
+from thirdhand.daemon.launch import LaunchError
+from thirdhand.daemon.start import Startup, starting
 from thirdhand.process.priority import AHEAD_NICE
 from thirdhand.settings.config import Files, Settings
 from thirdhand.settings.network import Network
-
-COUNTED = re.compile(r"starting: (?:compiling (\S+)|loading compiled functions), (\d+) of (\d+) functions are ready")
 
 NEVER_CACHED = """
 import numba
@@ -107,42 +101,6 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
             del sys.modules[name]
 
 
-@pytest.mark.thorough
-def test_a_cold_start_tells_which_function_is_compiled_and_how_many_are_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    endpoint = f"tcp/127.0.0.1:{launch.free_port()}"
-    (tmp_path / "cell.toml").write_text(
-        f'[network]\nlisten = ["{endpoint}"]\n[files]\nstate = "{tmp_path / "state"}"\n'
-    )
-    with command_started("serve", "--log", "json", "--config", str(tmp_path / "cell.toml")) as service:
-        begun_s = time.monotonic()
-        assert "starting: importing" in service.stderr.readline()  # first of all
-        answers: list[str] = []
-        compiled: dict[str, int] = {}
-        with open_session(connect=[endpoint]) as session:
-            while len(compiled) < 3 or max(compiled.values()) < 10:
-                with pytest.raises(StartingError) as starts:
-                    Client(session).status()
-                answers.append(str(starts.value))
-                found = COUNTED.search(answers[-1])
-                if found and found[1]:
-                    compiled[found[1]] = int(found[2])
-        lasted_s = time.monotonic() - begun_s
-        service.kill()
-        logged = service.communicate()[1].splitlines()
-    assert all(json.loads(line)["logger"] == "thirdhand" for line in logged)  # also what compilers say
-    counts = [found for line in answers if (found := COUNTED.search(line))]
-    there = [int(found[2]) for found in counts]
-    assert there == sorted(there)
-    own = {path.stem for room in ("service/thirdhand/core", "kmp") for path in (ROOT / room).rglob("*.py")}
-    assert {name.partition(".")[0] for name in compiled} <= own  # none of a library's own
-    assert len({found[3] for found in counts}) == 1
-    assert int(counts[0][3]) > 100  # of all that the loop may call
-    assert sum("starting:" in line for line in logged) <= 4 + lasted_s / LOG_EVERY_S
-
-
 def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that(tmp_path: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("this user may not put a process ahead of others")
@@ -163,40 +121,6 @@ def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that
     assert all(nice >= 0 for nice in kept.values()), kept
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-def test_a_long_start_is_one_line_of_a_terminal_and_a_handful_in_a_log(
-    started: tuple[Startup, str],
-    terminal: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    caplog.set_level(logging.INFO)
-    started[0].over()
-    capsys.readouterr()
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr("thirdhand.daemon.start.REPORT_EVERY_S", 0.01)
-    start = Startup(started[0].lock, started[0].session, "other")
-    caplog.clear()
-    functions = {str(number): SimpleNamespace(signatures=[]) for number in range(60)}
-    start._functions = functions  # noqa: SLF001
-    for one in functions.values():
-        time.sleep(0.03)
-        one.signatures = ["compiled"]
-    time.sleep(0.05)
-    start.over()
-    shown, logged = capsys.readouterr().err, [line for line in caplog.messages if "starting:" in line]
-    if terminal:
-        assert logged == []
-        assert "\n" not in shown
-        assert shown.count("\r\x1b[K") > 30
-        assert shown.endswith("60 of 60 functions are ready\r\x1b[K")
-    else:
-        assert shown == ""
-        assert [COUNTED.search(line)[2] for line in logged[-4:]] == ["15", "30", "45", "60"]  # type: ignore[index]
-        assert len(logged) <= 6
-
-
 @pytest.mark.thorough
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "START_STALL_S", 16.0)
@@ -206,20 +130,6 @@ def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkey
     with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
         raise AssertionError("it was ready")
     assert said[0].startswith("  starting: importing")
-
-
-@pytest.mark.thorough
-def test_a_service_that_gets_further_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that takes as many seconds as it says, and says so in time."""
-    monkeypatch.setattr(launch, "START_STALL_S", 3.0)
-    slow = (
-        "import sys, time\nfor i in range(8):\n    print('now starting:', i, file=sys.stderr, flush=True)\n"
-        "    time.sleep(0.5)\nprint('listening on tcp/127.0.0.1:1 as cell slow', flush=True)\ntime.sleep(600)"
-    )
-    said: list[str] = []
-    with launched(tmp_path, program=("-c", slow), say=said.append) as service:
-        assert service.endpoint == "tcp/127.0.0.1:1"
-    assert said == [f"  starting: {i}" for i in range(8)]
 
 
 @pytest.mark.parametrize(
@@ -234,16 +144,6 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
     assert done.returncode == 1
     assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    "command",
-    ["thirdhand.cli.serve", "thirdhand.workbench.cli.demo", "thirdhand.daemon.start", "thirdhand.daemon.launch"],
-)
-def test_what_says_that_it_starts_imports_nothing_heavy_before(command: str) -> None:
-    code = f"import sys, {command}\nassert not {{'numpy', 'numba', 'scipy', 'pinocchio'}} & set(sys.modules)"
-    done = python(code)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_daemon_that_can_cache_nothing_compiles_itself_and_starts(tmp_path: Path) -> None:

@@ -28,7 +28,6 @@ from thirdhand.client import (
 )
 from thirdhand.daemon.launch import free_port
 from thirdhand.daemon.single_instance import Lock
-from thirdhand.daemon.supervised_thread import supervised
 from thirdhand.recordings.replay import replay
 
 
@@ -98,19 +97,6 @@ def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> 
         assert "step is sabotaged" in daemon.log.read_text()
         assert "the arm gets no more commands" in daemon.log.read_text()
         until_gone(started, 10)
-
-
-def test_watched_work_begins_again_until_it_ends_by_itself() -> None:
-    runs, told = [], []
-
-    def work() -> None:
-        runs.append(len(runs))
-        if len(runs) < 3:
-            raise ValueError(f"run {len(runs)}")
-
-    supervised("work", work, told.append, pause_s=0.0)
-    assert len(runs) == 3
-    assert told == ["the work failed: ValueError('run 1')", "the work failed: ValueError('run 2')"]
 
 
 def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
@@ -202,28 +188,6 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
-@pytest.mark.thorough
-def test_a_daemon_is_ready_once_its_loop_takes_requests_and_says_so_until_then(tmp_path: Path) -> None:
-    """Also beside a scribe that does not begin: the loop does not wait for it."""
-    go, records = tmp_path / "go", tmp_path / "records"
-    before = (
-        "import pathlib, time\nfrom thirdhand.process import child\nfrom thirdhand.daemon import daemon\n"
-        "run = daemon.run\n"
-        f"def late(*arguments):\n    while not pathlib.Path({str(go)!r}).exists():\n        time.sleep(0.01)\n"
-        "    run(*arguments)\ndaemon.run = late\n"
-        "start = child.start\n"
-        "child.start = lambda name, module, kind: start(name, {'scribe': 'time'}.get(name, module), kind)\n"
-    )
-    said: list[str] = []
-    threading.Timer(10.0, go.touch).start()
-    with serving(tmp_path, "--joints", "assumed", "--record", str(records), before=before, say=said.append) as daemon:
-        assert go.exists()  # else it would not have been announced
-        assert daemon.client.wait_until_ready().tick >= 0
-        for request in ("hold", "resume", "reset", "hold"):
-            assert daemon.client.ask(request)["tick"] > 0
-        assert daemon.client.status().scribe["state"] == "starting"
-
-
 def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
@@ -260,32 +224,6 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
         until_gone([busy], 10)
     (recording,) = records.glob("*.mcap")
     assert replay(recording).exact
-
-
-def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
-    """A child that never looks at its socket, and a parent's thread that ends before it does."""
-    (tmp_path / "busy.py").write_text(
-        "import time\nfrom thirdhand.process import child\n"
-        "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"
-    )
-    parent = (
-        "import socket, sys, threading, time\nfrom thirdhand.process import child\nstarted = []\n"
-        "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
-        "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
-        "print(started[0].pid, flush=True)\ntime.sleep(60)\n"
-    )
-    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    running = subprocess.Popen(
-        [sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
-    )
-    assert running.stdout is not None
-    busy = int(running.stdout.readline())
-    time.sleep(0.5)
-    assert is_running(busy)
-    running.kill()
-    running.wait()
-    running.stdout.close()
-    until_gone([busy], 5)
 
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:

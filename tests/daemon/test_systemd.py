@@ -5,7 +5,6 @@ loop, restarts that do not follow by themselves, and the unit in examples/.
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import signal
 import socket
@@ -20,7 +19,6 @@ from support.cell import LISTENING, Daemon, Tracker, serving, told
 from support.paths import ROOT
 from thirdhand.client import Client, RefusedError
 from thirdhand.command_line import parser
-from thirdhand.daemon.systemd import Systemd
 from thirdhand_sim.scene import Scene
 
 UNIT = ROOT / "examples" / "thirdhand@.service"
@@ -140,35 +138,6 @@ def engaged_by_resume(daemon: Daemon) -> None:
         client.resume("somebody")
     client.resume()
     daemon.until(lambda now: now["mode"] == "follow")
-
-
-def test_without_a_manager_nothing_is_sent_and_a_wrong_environment_does_not_matter(
-    manager: Manager, tmp_path: Path
-) -> None:
-    address = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-    for environment in (
-        {"WATCHDOG_USEC": "1"},
-        address,
-        address | {"WATCHDOG_USEC": "soon"},
-        address | {"WATCHDOG_USEC": "1", "WATCHDOG_PID": str(os.getppid())},
-        {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1"},
-    ):
-        Systemd(environment).progressed(1)
-        Systemd(environment | {"NOTIFY_SOCKET": environment.get("NOTIFY_SOCKET", "")}).progressed(1)
-    assert manager.heard(0.1) == []
-    pinged = Systemd(address | {"WATCHDOG_USEC": "2", "WATCHDOG_PID": str(os.getpid())})
-    for tick in (5, 5, 5, 6):
-        pinged.progressed(tick)
-        time.sleep(0.001)
-    assert manager.heard(0.1) == ["WATCHDOG=1", "WATCHDOG=1"]
-
-
-def test_an_abstract_socket_is_reached() -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(f"\0thirdhand-{os.getpid()}")
-        manager.settimeout(5)
-        Systemd({"NOTIFY_SOCKET": f"@thirdhand-{os.getpid()}"}).notify("READY=1")
-        assert manager.recv(100) == b"READY=1"
 
 
 def commands() -> dict[str, list[str]]:

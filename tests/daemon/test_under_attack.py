@@ -23,11 +23,9 @@ from support.cell import Daemon, serving
 from support.paths import ROOT
 from thirdhand.client import (
     Client,
-    RefusedError,
     UnreachableError,
     open_session,
 )
-from thirdhand.contract import channels
 from thirdhand.daemon.daemon import MAX_NOTES_PER_S
 from thirdhand.daemon.single_instance import MAX_SESSIONS
 from thirdhand.process.priority import AHEAD_NICE
@@ -333,8 +331,3 @@ def test_commands_come_on_while_a_large_message_is_sent(daemon: Daemon) -> None:
     spans = zip(times[::2], times[1::2], strict=True)
     gaps = [max(b - a for a, b in pairs if begin <= b < end) for begin, end in spans]
     assert min(gaps[1::2]) < max(LONGEST_GAP_S, 2.0 * min(gaps[::2])), gaps
-
-
-def test_a_client_is_told_that_its_request_is_too_large(daemon: Daemon) -> None:
-    with pytest.raises(RefusedError, match=f"at most {channels.LARGEST_REQUEST} accepted"):
-        daemon.client.ask("via_points", {"op": "remove", "names": ["x" * channels.LARGEST_REQUEST]})

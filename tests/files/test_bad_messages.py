@@ -12,16 +12,13 @@ import pytest
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.recorded import write
-from thirdhand.contract import cdr
-from thirdhand.contract.channels import TAKE_KEYS, TRANSFORMS
-from thirdhand.contract.messages import Transform
+from thirdhand.contract.channels import TAKE_KEYS
 from thirdhand.recordings.mcap_file import McapFile, RecordingError
 from thirdhand.recordings.mcap_reader import Messages, full_name
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.workbench.report.columns import read
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
-from thirdhand.workbench.takes.pose_streams import PoseTopic
 
 TAKE = circling(0)._replace(gripper=np.full(600, 0.5))
 BAD: dict[str, Callable[[bytes], bytes]] = {
@@ -64,20 +61,6 @@ def test_a_bad_message_is_lost_and_counted(kind: str, key: str, tmp_path: Path) 
         assert remarks[-1].startswith(f"{path}: 2 of 1200 poses are not readable: {topic}: ")
         with pytest.raises(RecordingError, match="hands/left: 600 of 600 messages are not readable: "):
             read_demonstration(spoiled(tmp_path / "take.mcap", topic, kind, range(600)))
-
-
-def test_frames_that_nobody_asked_for_fail_no_take(tmp_path: Path) -> None:
-    path, remarks, turn = tmp_path / "take.mcap", list[str](), (0.0, 0.0, 0.0, 1.0)
-    with McapFile(path, joints=0, attached=False) as file:
-        for i, stamp_ns in enumerate((TAKE.stamps_ns + 10**9).tolist()):
-            rows = zip(TAKE_KEYS, (TAKE.left[i], TAKE.right[i], TAKE.tool[i]), strict=True)
-            poses = [Transform("base", name, tuple(row[:3]), turn) for name, row in rows]
-            elbow = Transform("world" if i else "base", "elbow", (0.0,) * 3, turn)  # two parents
-            data = cdr.encode_transforms(stamp_ns, [*poses, elbow, elbow._replace(child="\x7f")])
-            file.put("/tf", TRANSFORMS.type, data.replace(b"\x7f\0", b"\xff\0"), stamp_ns, i)
-    take = read_demonstration(path, topics={name: PoseTopic("/tf", name) for name in TAKE_KEYS}, say=remarks.append)
-    np.testing.assert_allclose(take.tool, TAKE.tool)
-    assert f"{path}: /tf: 600 transforms are not readable: a string that is not UTF-8" in remarks
 
 
 @pytest.mark.parametrize("key", ["hands/left", "tick", "frame"])

@@ -14,14 +14,9 @@ from support import spoiled
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.spoiled import SPOILS, START_NS, Streams, streams_of, write_streams
-from thirdhand.contract import cdr
-from thirdhand.contract.channels import JOINTS, POSE, STRING
-from thirdhand.contract.messages import JointState, PoseStamped
-from thirdhand.recordings.mcap_file import McapFile, RecordingError
+from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.takes.demonstration_files import summary
-from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration
 
 SEEDS = 3
 BRIDGED_S, OFF_M = 0.5, 0.02  # a shorter stretch is bridged: positions may be off by this much then
@@ -83,17 +78,6 @@ def test_a_stretch_that_is_wrong_is_named_and_left_out_and_the_rest_is_as_it_was
                 assert any(b < begin_s + 0.1 and e > begin_s + lasts_s - 0.1 for _, b, e in stretches), said
 
 
-def test_a_jump_is_named_with_its_times_by_learn_and_record_alike(clean: list[Demonstration], tmp_path: Path) -> None:
-    streams = streams_of(clean[1])
-    streams["left"].poses[300:450, :3] += [0.0, 0.3, 0.2]
-    path, said = write_streams(tmp_path / "a.mcap", streams), list[str]()
-    got = read_demonstration(path, say=said.append)
-    assert got.begins == (300,)
-    words = "left out, 1.5 of 10.6 s: hands/left 2.99 to 4.50 s: a motion that no hand can make"
-    assert said[-1].endswith(words)
-    assert words in summary(path).remarks
-
-
 @pytest.mark.parametrize("kept_s", [3.0, 8.0])
 def test_a_take_without_enough_of_the_rest_is_refused(
     kept_s: float, clean: list[Demonstration], tmp_path: Path
@@ -133,70 +117,3 @@ def test_where_a_clock_begins_anew_the_times_of_recording_count(
     assert f"the clock of {', '.join(spoiled.KEYS[name] for name in which)} restarts or was set" in said[0]
     np.testing.assert_array_equal(got.hands, take.hands)
     np.testing.assert_array_equal(got.tool, take.tool)
-
-
-def test_where_the_times_of_recording_begin_anew_too_the_longest_part_counts(
-    clean: list[Demonstration], tmp_path: Path
-) -> None:
-    take, path, said = clean[1], tmp_path / "a.mcap", list[str]()
-    anew_ns = np.where(np.arange(len(take.stamps_ns)) < 400, 0, 4 * 10**9)
-    write_demonstration(path, take._replace(stamps_ns=take.stamps_ns - anew_ns))
-    got = read_demonstration(path, say=said.append)
-    np.testing.assert_array_equal(got.tool, take.tool[400:])
-    assert "restarts, and the times of recording do too: part 2 of 2 is used, which lasts 6.6 s; 1200 poses" in said[0]
-
-
-def test_a_single_stamp_that_is_wrong_and_a_hold_up_are_no_clock_that_begins_anew(
-    clean: list[Demonstration], tmp_path: Path
-) -> None:
-    take, said = clean[1], list[str]()
-    streams = streams_of(take)
-    streams["left"].stamps_ns[400] -= 3 * 10**9
-    streams["tool"].logged_ns[500:560] = streams["tool"].logged_ns[560]  # came all at once
-    got = read_back(tmp_path / "a.mcap", streams, said)
-    assert not any("clock" in line for line in said)
-    np.testing.assert_allclose(got.hands, take.hands, atol=OFF_M)
-
-
-def test_what_is_learned_is_what_the_clean_rest_teaches(tmp_path: Path) -> None:
-    """By positions: so what is learned is a function of the samples that are left."""
-    takes = [circling(seed, apart_m=0.03) for seed in range(4)]
-    whole = learn(takes, points=80, ell=5.0)
-    for spoil in (spoiled.jump, spoiled.freeze, spoiled.gap, spoiled.nans, spoiled.zeros):
-        got, rest = [], []
-        for seed, take in enumerate(takes):
-            random = np.random.default_rng(seed)
-            mask = (take.seconds >= 3.0 + seed) & (take.seconds < 5.0 + seed)
-            streams = streams_of(take)
-            spoil(streams, "left", mask, random)
-            got.append(read_back(tmp_path / "a.mcap", streams))
-            at = np.isin(take.stamps_ns, got[-1].stamps_ns - START_NS)
-            rest.append(Demonstration._make(x[at] if isinstance(x, np.ndarray) else x for x in take))
-            rest[-1] = rest[-1]._replace(begins=got[-1].begins)
-        skill, wanted = learn(got, points=80, ell=5.0), learn(rest, points=80, ell=5.0)
-        held_out = circling(9, apart_m=0.03)
-        np.testing.assert_array_equal(skill.mean(held_out.hands), wanted.mean(held_out.hands))
-        assert skill.threshold == wanted.threshold
-        assert np.linalg.norm(skill.mean(held_out.hands) - whole.mean(held_out.hands), axis=1).max() < 0.01
-        assert skill.threshold == pytest.approx(whole.threshold, rel=0.25)
-
-
-def test_what_a_skill_does_not_use_never_refuses_a_take(clean: list[Demonstration], tmp_path: Path) -> None:
-    """Another stream in two frames, a gripper of NaN, and a topic `places` of somebody else."""
-    take, said, path = clean[1], list[str](), tmp_path / "a.mcap"
-    with McapFile(path, joints=1, attached=False) as file:
-        for i, stamp in enumerate((START_NS + take.stamps_ns).tolist()):
-            for side, key in spoiled.KEYS.items():
-                row = getattr(take, side)[i].tolist()
-                pose = PoseStamped(stamp, "base", tuple(row[:3]), tuple(row[3:]))
-                file.put(f"cell/{key}", POSE.type, cdr.encode_pose(pose), stamp, i)
-            other = PoseStamped(stamp, "ab"[i % 2], (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
-            file.put("camera/pose", POSE.type, cdr.encode_pose(other), stamp, i)
-            closure = cdr.encode_joints(JointState(stamp, ("gripper",), (float("nan"),), ()))
-            file.put("cell/gripper/state", JOINTS.type, closure, stamp, i)
-        file.put("shop/places", STRING.type, cdr.encode_string("Oslo, Rome"), START_NS, 0)
-    got = read_demonstration(path, say=said.append)
-    np.testing.assert_array_equal(got.hands, take.hands)
-    assert (got.gripper, got.places) == (None, ())
-    assert any("states of the gripper have no position" in line for line in said)
-    assert any("are not readable and not used" in line for line in said)

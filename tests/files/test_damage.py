@@ -13,13 +13,10 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from support.recorded import CELL, SKILL, at_ns, drawn, ticks, write
-from thirdhand.contract.cdr import encode_pose
-from thirdhand.contract.channels import POSE
-from thirdhand.contract.messages import PoseStamped
+from support.recorded import write
 from thirdhand.core.frame import encode
-from thirdhand.recordings.mcap_file import McapFile, RecordingError
-from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.mcap_file import RecordingError
+from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.recordings.steps import Step
 from thirdhand.skills.demonstration import Demonstration
@@ -109,20 +106,6 @@ def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
     assert all("lacks its settings: " in error for error in refused)
 
 
-def test_damage_and_a_cut_are_told_apart_also_in_one_file(tmp_path: Path, whole: bytes) -> None:
-    third, tenth = chunks(whole)[3], chunks(whole)[10]
-    cut = flipped(whole, third[0] + 100)[: (tenth[0] + tenth[1]) // 2]
-    recording, steps = read(tmp_path / "a.mcap", cut)
-    assert [fault.cut for fault in recording.faults] == [False, True]
-    assert recording.truncated
-    assert str(recording.faults[1]).startswith(f"cut at byte {tenth[0]}: the end is missing")
-    assert len([step for step in steps if step.damage]) == 1
-    between_records, _ = read(tmp_path / "a.mcap", whole[: tenth[0]])
-    assert [str(fault) for fault in between_records.faults] == [
-        f"cut at byte {tenth[0]}: the end is missing (the file ends before the recording does)"
-    ]
-
-
 @pytest.mark.parametrize("compression", ["zstd", "zstd of another size", "lz4"])
 def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whole: bytes, compression: str) -> None:
     size = 100 << 20
@@ -164,54 +147,3 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
         list(hand_samples(path))
-
-
-def test_what_a_cut_left_of_a_demonstration_is_learned_from_and_that_is_said(tmp_path: Path) -> None:
-    path, said, total = tmp_path / "a.mcap", list[str](), 300
-    file = McapFile(path, joints=0)
-    for i in range(total):
-        for key in ("x/hands/left", "x/hands/right", "x/tool/pose"):
-            pose = PoseStamped(i * 10_000_000, "base", (0.001 * i, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-            file.put(key, POSE.type, encode_pose(pose), i * 10_000_000, i)
-        if i % 50 == 49:
-            file.flush()
-    file.close()
-    assert len(read_demonstration(path, say=said.append).stamps_ns) == total
-    assert said == []
-    path.write_bytes(path.read_bytes()[: chunks(path.read_bytes())[3][0] + 100])
-    assert len(read_demonstration(path, say=said.append).stamps_ns) == 150
-    (line,) = said
-    assert "cut at byte" in line
-    assert line.endswith("150 poses on hands/left, 150 poses on hands/right, 150 poses on tool/pose were read")
-
-
-@pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])
-def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path: Path, whole: bytes, kind: str) -> None:
-    path, said = tmp_path / "a.mcap", list[str]()
-    start, end = chunks(whole)[5]
-    if kind == "lost":
-        with Recorder(path, settings=CELL, skill=SKILL) as recorder:
-            for tick, frame, timing in ticks(40):
-                if not 10 <= tick.index < 15:
-                    lost = 5 * (tick.index == 15)
-                    recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, lost=lost)
-    else:
-        path.write_bytes(flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2])
-    shown = convert(path, tmp_path / "a.rrd", say=said.append)
-    recording = Recording.open(path)
-    steps = [step for step in recording.steps() if step.frame is not None]
-    assert shown == len(steps) > 0
-    assert said[-1] == f"the other {shown} ticks are shown"
-    gaps = [step for step in steps if step.lost or step.damage]
-    assert len(said) == len(gaps) + 1 + (kind == "cut")
-    expected = {
-        "damaged": f"before tick {gaps[0].tick if gaps else ''}: damage at byte {start}",
-        "cut": f"cut at byte {start}: the end is missing",
-        "lost": "gap after tick 9, before tick 15: 5 ticks not recorded",
-    }[kind]
-    assert expected in said[0]
-    if kind != "lost":  # the same words; nothing here replays, for its frames are made up
-        faults = [str(fault) for fault in recording.faults]
-        assert all(any(fault in line for line in said) for fault in faults)
-    logged = [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"] if row.get("TextLog:text")]
-    assert set(said[:-1]) <= set(logged)

@@ -11,13 +11,13 @@ import pytest
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
-from support.recorded import START_NS, at_ns, write
+from support.recorded import START_NS
 from thirdhand.contract import cdr, channels, messages
 from thirdhand.contract.ros2msg import schema
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.settings.config import Settings, TrackerSettings
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.demonstration_reader import read_demonstration, write_demonstration
 
 
 def _swaying(count: int) -> np.ndarray:
@@ -151,30 +151,3 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
     for wrong, what in ((stamps * 1e-9, "float64 from 0 on"), (stamps - 1, "int64 from -1 on")):
         with pytest.raises(ValueError, match=rf"stamps_ns: {what} given, integers \[ns\] from 0 on needed"):
             write_demonstration(tmp_path / "b.mcap", Demonstration(wrong, *[good[1]] * 3))
-
-
-def test_hands_are_read_from_recordings_demonstrations_and_what_others_recorded(tmp_path: Path) -> None:
-    told = write(tmp_path / "a.mcap", 60)
-    wanted = [
-        (at_ns(tick.index), event.kind[6:], cdr.decode_pose(event.payload))
-        for tick, *_ in told
-        for event in tick.inbox
-        if event.kind[:5] == "hands"
-    ]
-    assert list(hand_samples(tmp_path / "a.mcap")) == wanted
-    data = (tmp_path / "a.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(data[:-1])
-    assert sorted(hand_samples(tmp_path / "cut.mcap")) == wanted
-    stamps = np.arange(5) * 1_000_000
-    good = (stamps, _line(stamps, 1))
-    _streams(tmp_path / "b.mcap", {"/t/hands/right": good, "/t/hands/left": (stamps + 1, good[1])})
-    hands = hand_samples(tmp_path / "b.mcap")
-    assert [(time, side) for time, side, _ in hands[:4]] == [
-        (5, "right"),
-        (6, "left"),
-        (1_000_005, "right"),
-        (1_000_006, "left"),
-    ]
-    _streams(tmp_path / "c.mcap", {"/t/tool/pose": good})
-    with pytest.raises(RecordingError, match=r"c.mcap has no topic ending in hands/left or hands/right"):
-        list(hand_samples(tmp_path / "c.mcap"))

@@ -32,10 +32,6 @@ def listed(taken: Demonstration, path: Path) -> Summary:
     return summary(path)
 
 
-def test_a_take_at_all_its_places_is_not_remarked_on(taken: Demonstration, tmp_path: Path) -> None:
-    assert listed(taken, tmp_path / "a.mcap").remarks == ()
-
-
 def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
     taken: Demonstration, tmp_path: Path
 ) -> None:
@@ -67,29 +63,6 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
     (first, _) = remarks_on_places(rested._replace(places=rested.places[1:]))
     assert first.startswith("hands and tool rest from 0.0 to ")  # as its start has no name
     assert remarks_on_places(rested._replace(places=())) == []  # who names none is not asked for one
-
-
-def test_a_rate_is_counted_only_while_the_hand_is_seen(taken: Demonstration, tmp_path: Path) -> None:
-    away = slice(200, 500)  # three of some ten seconds
-    seen = taken._replace(
-        stamps_ns=np.delete(taken.stamps_ns, away),
-        **{side: np.delete(getattr(taken, side), away, axis=0) for side in ("left", "right", "tool")},
-    )
-    for stream in listed(seen, tmp_path / "a.mcap").streams:
-        assert stream.rate_hz == pytest.approx(1 / taken.period_s, rel=0.02)
-        assert stream.gap_s == pytest.approx(3.0, abs=0.05)
-
-
-def test_what_is_left_out_is_no_rest(taken: Demonstration) -> None:
-    """Hands and tool that come back to where they were, after nobody saw them."""
-    seen = np.r_[0:3, 60 : len(taken.stamps_ns)]
-    same = {side: getattr(taken, side)[seen] for side in ("left", "right", "tool")}
-    for side in same:
-        same[side] = np.concatenate([same[side][:3], same[side][:1].repeat(3, axis=0), same[side][3:]])
-    stamps_ns = np.concatenate([taken.stamps_ns[:3], taken.stamps_ns[57:]])
-    one = taken._replace(stamps_ns=stamps_ns, **same)
-    assert any(begin_s < 0.1 for begin_s, _ in dwells(one))
-    assert not any(begin_s < 0.1 for begin_s, _ in dwells(one._replace(begins=(3,))))
 
 
 @pytest.mark.parametrize("end", ["begins", "ends"])

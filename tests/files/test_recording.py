@@ -5,14 +5,11 @@
 from __future__ import annotations
 
 import re
-import struct
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -21,20 +18,12 @@ from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
 from support.wam import FRAME
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.channels import EVENT_NUMBERS
-from thirdhand.contract.ros2msg import schema
 from thirdhand.core.frame import (
-    Event,
-    Tick,
     blank,
-    definitions,
     encode,
 )
 from thirdhand.recordings.mcap_file import McapFile, RecordingError
 from thirdhand.recordings.recording import Recorder, Recording
-from thirdhand.recordings.shipped import cell_of
-from thirdhand.recordings.urdf_markers import with_markers
-from thirdhand.settings.config import robot_description
-from thirdhand.settings.urdf import Urdf
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 
@@ -58,13 +47,6 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert list(recording.notes("status"))[:2] == [("status", "tick 0", at_ns(0)), ("status", "tick 50", at_ns(50))]
 
 
-def test_a_recording_names_the_machine_it_was_made_on(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", 1)
-    metadata = Recording.open(tmp_path / "a.mcap").metadata
-    assert metadata["numpy"] == np.__version__
-    assert all(metadata[name] for name in ("python", "cpu", "blas", "cell"))
-
-
 def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_and_skill(tmp_path: Path) -> None:
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):
@@ -81,13 +63,6 @@ def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_an
         (21, 1, SKILL),
     ]
     assert all(step.state is not None for step in steps[10:])
-
-
-def test_a_skill_adopted_in_a_tick_is_not_written_again_after_a_gap(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
-        recorder.write(Tick(0, (Event("skill", b"new", None),)), blank(FRAME), time_ns=0)
-        recorder.write(Tick(5), blank(FRAME), time_ns=10, state=state_after(5), skill=b"new", lost=4)
-    assert [step.skill for step in Recording.open(tmp_path / "a.mcap").steps()] == [None, None]
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
@@ -110,12 +85,6 @@ def test_what_was_flushed_survives_when_nothing_is_closed(tmp_path: Path) -> Non
     assert [step.tick for step in Recording.open(tmp_path / "a.mcap").steps()] == list(range(40))
     recorder.close()
     recorder.close()
-
-
-def test_a_recording_of_nothing_but_a_state_opens(tmp_path: Path) -> None:
-    Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL, state=state_after(41)).close()
-    (step,) = Recording.open(tmp_path / "a.mcap").steps()
-    assert (step.tick, step.events, step.frame) == (41, (), None)
 
 
 def test_errors_name_the_file_what_is_wrong_and_what_there_is(tmp_path: Path) -> None:
@@ -183,78 +152,3 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
         next(message.position.tolist() for topic, message in reversed(read) if topic.endswith("joints/command"))
         == told[-1][1]["joints"].tolist()
     )
-
-
-def test_the_links_of_the_arm_and_what_matters_around_it_are_one_tree_of_frames(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", 120)
-    with AnyReader([tmp_path / "a.mcap"]) as reader:
-        connections = [connection for connection in reader.connections if connection.topic == "/tf"]
-        *_, (_, _, data) = reader.messages(connections)
-        message = reader.deserialize(data, "tf2_msgs/msg/TFMessage")
-    parents = {item.child_frame_id: item.header.frame_id for item in message.transforms}
-    assert {
-        "turret",
-        "forearm",
-        "tool_plate",
-        "tool",
-        "setpoint",
-        "target",
-        "left_hand",
-        "right_hand",
-    } <= parents.keys()
-
-    def root(frame: str) -> str:
-        return root(parents[frame]) if frame in parents else frame
-
-    assert {root(frame) for frame in parents} == {"base"}
-
-
-@pytest.mark.parametrize("kind", sorted({channel.kept_as.type for channel in channels.CHANNELS} - {"JSON"}))
-def test_every_schema_tells_all_its_dependencies(kind: str) -> None:
-    text = schema(kind, definitions(7))
-    told = set(re.findall(r"^MSG: (\S+)$", text, re.MULTILINE))
-    needed = {name.removesuffix("[]") for name in re.findall(r"^(\w+/\w+(?:\[\])?) \w+$", text, re.MULTILINE)}
-    assert needed == told
-
-
-def test_rerun_by_itself_draws_hands_and_target_as_balls_in_frames_that_move(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", 120)
-    balls: dict[str, set[str]] = {}
-    frames: set[str] = set()
-    for chunk in rr.chunk.McapReader(tmp_path / "a.mcap").stream():
-        columns = chunk.to_record_batch().to_pydict()
-        for name in ("left_hand", "right_hand", "target", "setpoint"):
-            if f"/visual_geometries/{name}/" in chunk.entity_path:
-                told = [frame for found in columns.get("CoordinateFrame:frame", ()) for frame in found or ()]
-                balls.setdefault(name, set()).update(told)
-        for found in columns.get("Transform3D:child_frame", ()) if chunk.entity_path == "/tf" else ():
-            frames |= set(found or ())
-    assert balls.keys() == {"left_hand", "right_hand", "target", "setpoint"}
-    assert all(frame == {name} for name, frame in balls.items())
-    assert balls.keys() <= frames
-
-
-def test_an_arm_that_has_links_of_these_names_keeps_its_description() -> None:
-    text = '<robot name="a"><link name="base"/><link name="target"/></robot>'
-    assert with_markers(text) == text
-    assert with_markers("no robot") == "no robot"
-    for arm, root in (("wam", "base"), ("ur5", "base_link")):
-        assert Urdf(with_markers(robot_description(cell_of(arm)))).chain("left_hand")[0].parent == root
-
-
-def test_the_summary_of_every_file_tells_only_of_groups_that_are_there(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", 40)
-    poses = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (5, 1))
-    write_demonstration(tmp_path / "b.mcap", Demonstration(np.arange(5) * 10_000_000, poses, poses, poses))
-    for name in ("a.mcap", "b.mcap"):
-        data = (tmp_path / name).read_bytes()
-        start, at = struct.unpack_from("<QQ", data, len(data) - 28)
-        groups = []
-        while data[at] == Opcode.SUMMARY_OFFSET:
-            kind, first, length = struct.unpack_from("<BQQ", data, at + 9)
-            groups.append(kind)
-            assert length > 0
-            assert data[first] == kind
-            assert start <= first
-            at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
-        assert len(groups) == (6 if name == "a.mcap" else 4)

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import functools
 import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import (
     STAGES,
-    Event,
     Frame,
     Tick,
 )
@@ -34,8 +31,7 @@ from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.recordings.recording import DECISIONS, Recorder, Recording
 from thirdhand.recordings.replay import replay, ticks
 from thirdhand.skills.via_points import adapted
-from thirdhand_sim.closed_loop import joints_event
-from thirdhand_sim.golden import ENCODED, ENCODED_SPEED, refresh
+from thirdhand_sim.golden import refresh
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -97,42 +93,6 @@ def test_the_golden_session_holds_what_it_is_meant_to(golden: Path) -> None:
     assert (seen["rejected"][-1] > 0).sum() >= 4
     assert (np.diff(seen["tick"]) > 1).any()
     assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 5e6
-
-
-def packed_bytes(folder: Path) -> int:
-    """The size of a git history with the folder as it is now, once it is packed."""
-    as_somebody = ["-c", "user.name=a", "-c", "user.email=b"]
-    for one in (["add", "."], [*as_somebody, "commit", "--quiet", "--message", "c"], ["gc", "--quiet"]):
-        subprocess.run(["git", *one], cwd=folder, check=True, timeout=60)
-    return sum(path.stat().st_size for path in folder.glob(".git/objects/pack/*"))
-
-
-def test_another_golden_session_adds_little_to_a_history(tmp_path: Path) -> None:
-    """With other joint states, and other frames at every tick."""
-    subprocess.run(["git", "init", "--quiet", "."], cwd=tmp_path, check=True, timeout=60)
-    path = tmp_path / "golden.mcap"
-    shutil.copy(GOLDEN, path)
-    before, old, noise = packed_bytes(tmp_path), Recording.open(GOLDEN), np.random.default_rng(0)
-    start, *steps = old.steps(whole=False)
-
-    def moved(event: Event) -> Event:
-        if event.kind != "joints/state":
-            return event
-        position = event.value.position + ENCODED * noise.integers(-16, 16, 7)
-        velocity = event.value.velocity + ENCODED_SPEED * noise.integers(-16, 16, 7)
-        return joints_event(event.value.names, tuple(position), tuple(velocity), event.value.stamp_ns)
-
-    checksums = noise.integers(0, 1 << 32, len(old.checksums), dtype="<u4").tobytes()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state, checksums=checksums) as recorder:
-        for tick, step in zip(ticks(old), steps, strict=True):
-            if step.frame is not None:
-                step.frame["joints"] += noise.standard_normal(7)
-            other = Tick(tick.index, tuple(moved(event) for event in tick.inbox))
-            recorder.write(other, step.frame, time_ns=step.time_ns)
-    assert len(Recording.open(path).checksums) == len(old.checksums) > 10_000
-    added = packed_bytes(tmp_path) - before
-
-    assert 40_000 < added < 200_000
 
 
 @pytest.fixture(scope="module")

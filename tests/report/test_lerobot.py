@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
-from support.in_process import ASSUMED, resting, ticks_of
+from support.in_process import ASSUMED, resting
 from support.pictures import grey
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.command_line import main
@@ -25,8 +25,6 @@ from thirdhand.core.frame import Frame, Tick
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand_sim.scene import Scene
-from thirdhand_sim.script import HandScript
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)
@@ -219,42 +217,6 @@ def png(mode: str = "RGB", size: tuple[int, int] = (64, 48)) -> bytes:
     return out.getvalue()
 
 
-CUT = png()[:-40]
-STREAMS = {
-    "two sizes": [png(), png(size=(33, 21)), png(size=(640, 480))],
-    "odd size": [png(size=(65, 49))],
-    "one pixel": [png(size=(1, 1))],
-    "16 bits": [png("I;16")],
-    "grey": [png("L")],
-    "transparent": [png("RGBA")],
-    "damaged first": [CUT, png(), png()],
-    "damaged later": [png(), CUT, png(), png()[:60], CUT],
-    "damaged": [CUT],
-}
-
-
-@pytest.mark.parametrize("stream", STREAMS)
-def test_odd_images_become_a_video_with_a_picture_for_each_row(
-    stream: str, skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """At irregular times, beside a camera that starts late."""
-    av = pytest.importorskip("av", reason="videos need the extra `video`")
-    files = STREAMS[stream]
-    images = [(10 + 3 * i**2, "camera/odd", file) for i, file in enumerate(files)] + [(80, "late", png())]
-    path = recorded(tmp_path / "a.mcap", skill, resting(0, 100), images=images)
-    assert main(["report", str(path), "--lerobot", str(tmp_path / "data"), "--fps", "500"]) == 0
-    info = json.loads((tmp_path / "data" / "meta" / "info.json").read_text())
-    keys = {f"observation.images.{name}" for name in ("late", "camera_odd")[: 1 + (stream != "damaged")]}
-    assert {name for name in info["features"] if "images" in name} == keys
-    for key in keys:
-        shown = tmp_path / "data" / info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
-        with av.open(str(shown)) as container:
-            levels = [one.to_ndarray(format="rgb24").mean() for one in container.decode(container.streams.video[0])]
-        assert len(levels) == info["total_frames"] > 10
-        np.testing.assert_allclose(levels, 77, atol=4)
-    assert ("cannot be decoded" in capsys.readouterr().err) == ("damaged" in stream)
-
-
 def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -271,16 +233,6 @@ def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
     finally:
         subprocess.run(["umount", "--lazy", disk], check=True, timeout=10)
-
-
-def test_an_arm_that_tells_nothing_is_where_it_was_last_told_to_be(skill: StoredSkill, tmp_path: Path) -> None:
-    path = recorded(tmp_path / "a.mcap", skill, list(ticks_of(HandScript(Scene(), seed=4)))[:1500])
-    assert main(["report", str(path), "--lerobot", str(tmp_path / "data"), "--fps", "500"]) == 0
-    rows = parquet.read_table(tmp_path / "data" / "data" / FIRST).to_pydict()
-    assert rows["observation.state"][1:] == rows["action"][:-1]
-    assert np.ptp(rows["action"], axis=0).max() > 0.1
-    tasks = parquet.read_table(tmp_path / "data" / "meta" / "tasks.parquet").to_pydict()
-    assert tasks["task"] == [skill.name]
 
 
 def test_there_are_no_data_sets_of_two_arms_or_of_nothing(

@@ -82,14 +82,6 @@ def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rota
         assert alone.exact, alone.text()
 
 
-def test_recordings_in_a_row_are_said_to_join(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", *map(str, rotated), "--exact"]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        f"{COUNT} ticks, {COUNT} frames identical",
-        f"{len(rotated)} recordings join without a gap",
-    ]
-
-
 def test_a_recording_missing_in_a_row_is_a_gap(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(rotated[0]), str(rotated[2]), "--exact"]) == 1
     said = capsys.readouterr().out

@@ -43,33 +43,10 @@ def refusal(text: str) -> str:
     return str(caught.value)
 
 
-def test_an_empty_file_gives_the_defaults() -> None:
-    assert parse("", origin="cell.toml") == Settings()
-
-
-def test_the_defaults_pass_their_own_validation() -> None:
-    assert msgspec.convert(msgspec.to_builtins(Settings()), Settings) == Settings()
-
-
-def test_the_period_is_the_inverse_of_the_rate() -> None:
-    assert Settings().period_s == pytest.approx(0.002)
-    assert parse("rate_hz = 1000", origin="cell.toml").period_s == pytest.approx(0.001)
-
-
 def test_limits_may_be_lowered() -> None:
     given = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
     assert given.joints.velocity[6] == 0.5
     assert given.tool.max_speed == 0.3
-
-
-@pytest.mark.parametrize("text", ['"a - at `$.x`" = 1', '[tool]\n"a - at `$.tool.max_speed[1]`" = 1'])
-def test_a_name_that_looks_like_a_path_is_refused_in_words(text: str) -> None:
-    assert "unknown field" in refusal(text)
-
-
-@pytest.mark.parametrize("name", ["a", "bench", "lab/bench2", "a/b/c", "Wärmebank", "cell-1_x.y"])
-def test_a_cell_may_hold_slashes(name: str) -> None:
-    assert parse(f'cell = "{name}"', origin="cell.toml").cell == name
 
 
 @pytest.mark.parametrize(
@@ -77,21 +54,12 @@ def test_a_cell_may_hold_slashes(name: str) -> None:
     [
         "",
         "/",
-        "a/",
-        "/a",
         "*",
         "a/*/b",
-        "a/**",
-        "a$*",
-        "a?",
-        "a#",
-        "a b",
         r"a\nb",
         "a//b",
-        r"a\n",
         r"a\u0000b",
         "..",
-        "a/../b",
         "x" * 201,
         "ä" * 101,
         "/".join(["x" * 40] * 5),
@@ -105,31 +73,23 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
     ("text", "path", "accepted"),
     [
         ("rate_hz = 1001", "rate_hz", "from 50 to 1000"),
-        ("rate_hz = 49", "rate_hz", "from 50 to 1000"),
-        ("rate_hz = 100.5", "rate_hz", "whole number"),
-        ("rats = 1", "rats", "rate_hz"),
         ("[hands]\nunits = 'mm'", "hands", "stale_ms"),
         ("[hands]\nunit = 'inch'", "[hands] unit", "mm"),
         ("[hands]\nstale_ms = 0", "[hands] stale_ms", "above 0"),
         ("[hands]\nstale_ms = nan", "[hands] stale_ms", "accepted"),
-        ("[hands]\nbase_from_tracker = [0, 0, 0]", "[hands] base_from_tracker", "7"),
         ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "[hands] base_from_tracker", "1 needed (x y z w)"),
-        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "[hands] base_from_tracker", "1 needed (x y z w)"),
         ("[trackers.mocap]\nunit = 'inch'", "[trackers.mocap] unit", "'inch' given; cm, m, mm accepted"),
         (
             "[trackers.a]\nunit = 'm'\n[trackers.b]\nbase_from_tracker = [1]",
             "[trackers.b] base_from_tracker",
             "7 needed",
         ),
-        ("[trackers.a]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 2]", "[trackers.a] base_from_tracker", "norm 1 needed"),
         ("[trackers.a]\nunits = 'm'", "[trackers] a: unknown field 'units'", "did you mean unit?"),
         ("[trackers.'a b']\nunit = 'm'", "trackers", "'a b' given; 1 to 64 letters, digits and _ . / -"),
         ("[hands]\nframe = 'a'\n[trackers.a]\nunit = 'm'", "[trackers] a", "another one than 'base' and [hands] frame"),
-        ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "[tool] plate_from_tool", "1 needed (x y z w)"),
         ("[tool]\nmax_speed = -1", "[tool] max_speed", "above 0"),
         ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "1.5"),
         ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "finite"),
-        ("[joints]\njerk = [1, 1, 0, 1, 1, 1, 1]", "[joints] jerk, entry 3", "500"),
         ("[joints]\nlower = [-3, -1, -1, 0, -1, -1, -1]", "[joints] lower, entry 1", "-2.6"),
         ("[joints]\nupper = [1, 1, 1, 3.2, 1, 1, 1]", "[joints] upper, entry 4", "3.1"),
         (
@@ -138,12 +98,8 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "less than [joints] upper, entry 1 =",
         ),
         ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "[arm] posture, entry 6", "-1.5707 to 1.5707 accepted"),
-        ("[arm]\nsource = 'guess'", "[arm] source", "assumed"),
         ("[network]\nlisten = 'tcp/0.0.0.0:1'", "[network] listen", "'tcp/0.0.0.0:1' given; a list needed"),
-        ("[network]\nallow_insecure = 3", "[network] allow_insecure", "3 given; true or false needed"),
-        ("[hand]\nunit = 'mm'", "unknown field 'hand'", "did you mean hands?"),
         ("[obstacles]\nclearence = 1", "unknown field 'clearence'", "did you mean clearance?"),
-        ("[files]\nrecord = 3", "[files] record", "a text needed"),
         ("[files]\nstate = '~nobody-of-this-name/x'", "[files] state", "no user of this name"),
         ('[network]\ncertificate = "a\\u0000b"', "[network] certificate", "no zero bytes"),
         (
@@ -169,15 +125,14 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[network] connect, entry 1",
             "tls/... needed",
         ),
+        ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "[tool] plate_from_tool", "1 needed (x y z w)"),
         ("[network]\nrevoked = ['tracker']", "[network] revoked", "no client has a certificate"),
         (
             "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', 'tracer']",
             "[network] revoked, entry 2",
             "with a number, like tracker-2",
         ),
-        ("[tool]\nplate_from_tool = [101, 0, 0, 0, 0, 0, 1]", "[tool] plate_from_tool", "100 m or less on each axis"),
         ("[hands]\nbase_from_tracker = [101, 0, 0, 0, 0, 0, 1]", "[hands] base_from_tracker", "100 m or less on each"),
-        ("[tool]\nfollow = 'fast'", "[tool] follow", "'fast' given; calmly, closely, default accepted"),
         ("[reach]\ninner = 0.9\nouter = 0.5", "[reach] inner", ""),
     ],
 )
@@ -219,10 +174,6 @@ def test_a_urdf_that_cannot_be_used_is_reported_first(arm: str, first: str) -> N
     assert refusal(text).startswith(f"cell.toml: {first}: ")
 
 
-def test_what_follows_from_another_error_is_not_told() -> None:
-    assert "posture" not in refusal("[joints]\nnames = 3\n[arm]\nposture = [0, 0, 0]")
-
-
 def test_a_toml_error_is_told_with_its_place() -> None:
     for text in ("rate_hz = 500\nhands = [", f"rate_hz = {'9' * 4301}", f"rate_hz = {'9' * 9000}"):
         assert refusal(text).startswith("cell.toml: ")
@@ -259,22 +210,6 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
 )
 def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, local: bool) -> None:
     assert is_local(endpoint) == local
-
-
-@pytest.mark.parametrize(
-    ("network", "endpoints"),
-    [
-        ({}, ("tcp/127.0.0.1:7447",)),
-        ({"listen": ("tcp/0.0.0.0:1", "tcp/[::]:2"), "allow_insecure": True}, ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2")),
-        ({"listen": ("tcp/127.0.0.1:0",)}, ()),
-        ({"listen": ("tcp/127.0.0.1:0",), "connect": ("tcp/[::1]:5",)}, ("tcp/[::1]:5",)),
-        ({"listen": ("unixsock-stream//run/th.sock",)}, ("unixsock-stream//run/th.sock",)),
-    ],
-)
-def test_programs_of_this_machine_reach_the_daemon_where_it_listens(
-    network: dict[str, Any], endpoints: tuple[str, ...]
-) -> None:
-    assert Network(**network).reached_at == endpoints
 
 
 def test_an_endpoint_of_the_command_line_or_the_environment_is_used_before_that_of_the_settings(

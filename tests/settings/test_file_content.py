@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import threading
 from collections.abc import Iterator
@@ -11,18 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from support.cell import told
 from thirdhand.contract.explain import in_words
-from thirdhand.daemon.skill_worker import skill_of
 from thirdhand.settings.file_content import UnusableError, content
-from thirdhand.skills.skill_file import SkillError
 
 LARGEST = 1000
-COMMANDS = {
-    "configuration": ("serve", "--joints", "assumed", "--config"),
-    "via-points": ("via-points", "add", "--file"),
-    "recording": ("view",),
-}
 
 
 @pytest.fixture(autouse=True)
@@ -84,40 +75,3 @@ def test_a_file_or_pipe_is_read_whole_up_to_what_is_accepted(tmp_path: Path, siz
         if is_pipe:
             writer.join()
             os.close(ends[0])
-
-
-@pytest.mark.parametrize(
-    ("what", "kind"),
-    [
-        (what, kind)
-        for what in COMMANDS
-        for kind in KINDS
-        if kind != "a pipe" or what not in ("configuration", "via-points")
-    ],
-)
-def test_commands_refuse_it_in_one_line_that_names_it(tmp_path: Path, what: str, kind: str) -> None:
-    """A configuration or via-points may come from a pipe, which is waited for."""
-    path = odd(tmp_path, kind)
-    done = told(*COMMANDS[what], str(path))
-    assert done.returncode in (1, 2)
-    last = done.stderr.splitlines()[-1]
-    assert re.search(rf"{path}\b", last), done.stderr
-    assert "Errno" not in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_skill_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
-    path = odd(tmp_path, kind)
-    with pytest.raises(SkillError, match=rf"cannot read skill {path}: \w"):
-        skill_of(path)
-
-
-@pytest.mark.parametrize("kind", ["a file", "a pipe", "a full device"])
-def test_a_folder_of_recordings_that_is_none_is_refused(tmp_path: Path, kind: str) -> None:
-    path = odd(tmp_path, kind)
-    if kind == "a file":
-        path.write_bytes(b"")
-    done = told("serve", "--joints", "assumed", "--record", str(path))
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"cannot record in {path}: it is not a folder\n")

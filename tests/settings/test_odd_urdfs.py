@@ -21,7 +21,6 @@ from thirdhand.core.separation.body import body_of
 from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.file_content import SettingsError
-from thirdhand.settings.urdf import Urdf
 from thirdhand.viewer.static import ArmModels
 
 SPHERE = '<collision><geometry><sphere radius="0.01"/></geometry></collision>'
@@ -240,11 +239,3 @@ def test_a_spoilt_description_is_refused_or_has_finite_numbers_alone(
 ) -> None:
     with contextlib.suppress(SettingsError):
         tried(tmp_path_factory.getbasetemp(), text)
-
-
-def test_a_description_says_only_what_moves_to_the_kinematics() -> None:
-    text = Urdf(UR5).kinematics(("elbow_joint",))
-    joints = {joint.name: joint for joint in Urdf(text).joints}
-    assert [name for name, joint in joints.items() if joint.kind != "fixed"] == ["elbow_joint"]
-    assert joints["elbow_joint"].axis == next(one.axis for one in Urdf(UR5).joints if one.name == "elbow_joint")
-    assert not Urdf(text).shapes

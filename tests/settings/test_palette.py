@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-
 from thirdhand.contract.records import Mode
 from thirdhand.settings import palette
 from thirdhand.settings.palette import (
-    BACKGROUND,
     BY_MODE,
     LEAST_CONTRAST,
     PAPER,
     contrast,
-    written,
 )
 from thirdhand.workbench.report.page import MODE_COLOURS, TINT
 
@@ -25,17 +21,6 @@ def channels(colour: str) -> palette.Colour:
     """A colour from how it is written."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
-
-
-def test_contrast_is_that_of_wcag() -> None:
-    assert contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21.0)
-    assert contrast((119, 119, 119), (255, 255, 255)) == pytest.approx(4.48, abs=0.005)  # known: just too light
-
-
-@pytest.mark.parametrize("name", LINES)
-def test_lines_stand_out_from_the_dark_and_on_paper(name: str) -> None:
-    assert contrast(LINES[name], BACKGROUND) >= LEAST_CONTRAST
-    assert contrast(channels(written(LINES[name])), PAPER) >= LEAST_CONTRAST
 
 
 def test_words_on_a_mode_are_read_in_the_banner_and_on_a_page() -> None:

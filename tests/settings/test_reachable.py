@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from support.turning import sliding_cell
-from support.ur5_cell import CELL, UR5, cell_in
+from support.ur5_cell import UR5, cell_in
 from thirdhand.core.arm.stage import Arm
 from thirdhand.recordings.shipped import ARMS, cell_of
-from thirdhand.settings.config import Settings, parse, robot_description
+from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.reachable import Shell, workspace_of
 from thirdhand.settings.urdf import Urdf
@@ -103,12 +103,6 @@ def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
     assert reached(cell, targets(cell, 40)) >= 0.95
 
 
-def test_the_tool_belongs_to_the_reach(tmp_path: Path) -> None:
-    plain = cell_in(tmp_path, UR5)
-    longer = cell_in(tmp_path, UR5, "[tool]\nplate_from_tool = [0, 0, 0.2, 0, 0, 0, 1]\n")
-    assert longer.reach.outer == pytest.approx(plain.reach.outer + 0.19, abs=0.03)
-
-
 @pytest.mark.parametrize(
     ("mount", "reach", "share"),
     [
@@ -123,12 +117,3 @@ def test_a_reach_that_the_arm_has_not_is_refused_with_what_it_has(
 ) -> None:
     with pytest.raises(SettingsError, match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics"):
         cell_in(tmp_path, mounted(UR5, *mount), f"[reach]\n{reach}\n")
-
-
-def test_what_is_said_of_a_reach_stays(tmp_path: Path) -> None:
-    cell = cell_in(tmp_path, UR5, "[reach]\nouter = 0.7\nmin_z = 0.1\n")
-    assert (cell.reach.outer, cell.reach.min_z) == (0.7, 0.1)
-    assert cell.reach.inner < 0.7
-    assert cell.reach.centre == pytest.approx((0.0, 0.0, 0.0892), abs=1e-3)
-    with pytest.raises(SettingsError, match=r"\[reach\] inner: 0\.8 given; less than \[reach\] outer"):
-        parse(CELL.replace("arm.urdf", str(tmp_path / "arm.urdf")) + "[reach]\ninner = 0.8\nouter = 0.7\n", origin="c")

@@ -87,14 +87,6 @@ class Tab:
             self._session,
         )
 
-    def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """An event of fingers, which are at these pixels: `Start`, `Move` or `End`.
-
-        Its answer is not waited for, because the browser gives none where it merges movements.
-        """
-        fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
-        self._post("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": fingers}, self._session)
-
     def cover(self) -> None:
         """Hide the page behind another one."""
         self._call("Target.createTarget", {"url": "about:blank"})

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from support.chromium import Tab
 
@@ -15,13 +15,6 @@ DRAG_S = 0.5  # duration of a drag
 ARRIVE_S = 10.0
 PIXEL_M = 0.01  # [m] a drag may end this far beside a point, because it goes from pixel to pixel
 WHEEL_M = 0.0002  # [m] that the page lifts a hand by a unit of the wheel
-
-
-class Goal(NamedTuple):
-    """A place on the page to which a hand belongs."""
-
-    side: str
-    at: tuple[float, float, float]
 
 
 class Person:
@@ -40,12 +33,6 @@ class Person:
         corner = "canvas.getBoundingClientRect()"
         x, y = self._found(f"(shown.plan ?? plan()).flat({list(at)}).map((v, i) => v + {corner}[i ? 'y' : 'x'])")
         return x, y
-
-    def goals(self) -> list[Goal]:
-        """The places that the page shows."""
-        return [
-            Goal(side, (at[0], at[1], at[2])) for side, at in self._found("places().map(one => [one.side, one.at])")
-        ]
 
     def _found(self, expression: str) -> Any:
         """The value of an expression, which may be an array or an object."""

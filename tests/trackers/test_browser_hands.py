@@ -18,24 +18,17 @@ from typing import Any
 
 import aiohttp
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from thirdhand.contract.explain import ExplainedError
-from thirdhand.contract.messages import WireError
 from thirdhand.workbench.trackers import browser_hands
 from thirdhand.workbench.trackers.browser_hands import (
-    FULL,
-    MAX_PAGES,
     NO_TOKEN,
     TAKEN,
 )
 from thirdhand.workbench.trackers.hand_message import (
-    HANDS_LAYOUT,
     PING,
     PING_MAGIC,
-    decode_hands,
 )
 from thirdhand.workbench.trackers.hands_page import WORKER, HeadsetPage
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
@@ -168,28 +161,6 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
         asyncio.run(scenario())
 
 
-def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
-    async def scenario() -> None:
-        async with serving_page(page) as at, contextlib.AsyncExitStack() as stack:
-            first = await stack.enter_async_context(opened(page, at))
-            await first.send_bytes(hands_message())
-            await heard.until("left", 1)
-            others = [await stack.enter_async_context(opened(page, at)) for _ in range(100)]
-            refused = [await reason(socket) for socket in others[MAX_PAGES - 1 :]]
-            assert set(refused) == {(4429, FULL)}
-            assert len(refused) == 101 - MAX_PAGES
-            await first.send_bytes(hands_message(number=1))
-            await heard.until("left", 2)
-            await others[0].close()
-            async with opened(page, at) as late:  # there is room again
-                await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
-                while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
-                    pass
-
-    with page_of_hands() as (page, heard):
-        asyncio.run(scenario())
-
-
 def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
@@ -264,12 +235,3 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
         server_certificate("localhost", tmp_path / "state")
     with pytest.raises(ExplainedError, match="a name in plain letters, or an address, needed"):
         server_certificate("not plain", tmp_path / "state")
-
-
-@given(
-    st.binary(max_size=200)
-    | st.binary(min_size=HANDS_LAYOUT.size, max_size=HANDS_LAYOUT.size).map(lambda b: hands_message()[:4] + b[4:])
-)
-def test_no_bytes_are_an_unexplained_error(data: bytes) -> None:
-    with contextlib.suppress(WireError):
-        decode_hands(data, time.time_ns())

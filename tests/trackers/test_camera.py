@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thirdhand.workbench.trackers import hand_model
 from thirdhand.workbench.trackers.camera import CameraError, HandCamera, pictures
-from thirdhand.workbench.trackers.hand_model import HandModelError
 from thirdhand.workbench.trackers.palm import (
     AVERAGE_PALM,
     PALM,
@@ -58,26 +55,6 @@ def test_a_palm_is_where_it_was_seen(seed: int) -> None:
         assert x @ right > 0.99
 
 
-def test_noise_of_a_pixel_costs_a_centimetre() -> None:
-    errors = []
-    for seed in range(100):
-        picture, shape, position = seen(*drawn(seed))
-        noise = np.random.default_rng(seed).standard_normal(picture.shape) / [LENS.width, LENS.height]
-        found = palm_pose("left", picture + noise, shape, LENS, LENGTH_M)
-        assert found is not None
-        errors.append(np.linalg.norm(found.position - position))
-    assert np.median(errors) < 0.01
-    assert max(errors) < 0.1
-
-
-@pytest.mark.parametrize("scale", [0.9, 1.1])
-def test_a_wrong_length_scales_the_distance(scale: float) -> None:
-    picture, shape, position = seen(*drawn(1))
-    found = palm_pose("left", picture, shape, LENS, scale * LENGTH_M)
-    assert found is not None
-    np.testing.assert_allclose(found.position, scale * position, rtol=1e-3)
-
-
 @pytest.mark.parametrize(
     "spoil",
     [lambda picture: np.full_like(picture, 0.5), lambda picture: np.random.default_rng(0).random(picture.shape)],
@@ -85,46 +62,6 @@ def test_a_wrong_length_scales_the_distance(scale: float) -> None:
 def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) -> None:
     picture, shape, _ = seen(*drawn(2))
     assert palm_pose("left", spoil(picture), shape, LENS, LENGTH_M) is None
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (None, "there is no such file"),
-        (b"no zip", "the wheel of mediapipe==0.10.21 needed"),
-        ({"other": b""}, "the wheel of mediapipe==0.10.21 needed"),
-        ({path: b"changed" for path, _ in hand_model.NETWORKS.values()}, "is not that of mediapipe==0.10.21"),
-    ],
-)
-def test_another_wheel_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | dict[str, bytes] | None, says: str
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    wheel = tmp_path / "mediapipe.whl"
-    if isinstance(content, bytes):
-        wheel.write_bytes(content)
-    elif content is not None:
-        with zipfile.ZipFile(wheel, "w") as package:
-            for name, data in content.items():
-                package.writestr(name, data)
-    with pytest.raises(HandModelError, match=says):
-        hand_model.hand_model(wheel, lambda _: None)
-    assert not (tmp_path / "cache").exists()
-
-
-def test_without_a_network_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.setenv("PIP_FIND_LINKS", "")
-    with pytest.raises(HandModelError, match="then give the wheel here by --model"):
-        hand_model.hand_model(None, lambda _: None)
-
-
-@pytest.mark.skipif(HAS_MEDIAPIPE, reason="MediaPipe is installed")
-def test_without_mediapipe_the_remedy_is_named(tmp_path: Path) -> None:
-    for call in (lambda: HandCamera(tmp_path, view_deg=60.0, hand_length=0.18), lambda: next(pictures("0"))):
-        with pytest.raises(CameraError, match=r"pip install 'thirdhand\[camera\]'"):
-            call()
 
 
 @pytest.mark.skipif(not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'")

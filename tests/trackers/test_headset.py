@@ -25,7 +25,6 @@ from support.chromium import Tab
 from support.page_hands import Heard
 from thirdhand.client import Client, endpoints, open_session
 from thirdhand.contract.messages import PoseStamped
-from thirdhand.daemon.launch import free_port
 
 pytestmark = pytest.mark.skipif(bool(lacks := headset.lacking()), reason=lacks)
 TIMEOUT_S = 60.0
@@ -200,27 +199,6 @@ def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
         for arrived, pose in zip(heard.arrived_ns[side], heard.poses[side], strict=True)
     ]
     assert max(ages_s) < 2.0  # the server drops from 0.5 s on; more only by a busy machine
-
-
-@pytest.mark.thorough
-def test_the_page_goes_on_by_itself_where_the_server_is_started_again(
-    hearing: tuple[zenoh.Session, str], tmp_path: Path
-) -> None:
-    session, endpoint = hearing
-    heard, port = Heard(session), free_port()
-    with contextlib.ExitStack() as first:
-        served = first.enter_context(headset.serving_hands(endpoint, tmp_path, port=port))
-        with headset.worn(served.url, tmp_path) as tab:
-            tab.ask(STILL)
-            until(lambda: heard.poses["left"], within_s=TIMEOUT_S)
-            first.close()
-            assert tab.until("link.problem") == "`thirdhand hands` has ended, or the network is down"
-            count = sent(tab)
-            with headset.serving_hands(endpoint, tmp_path, port=port) as again:
-                assert again.url == served.url  # the token is kept
-                heard.poses["left"].clear()
-                until(lambda: heard.poses["left"], within_s=TIMEOUT_S)
-                assert sent(tab) > count
 
 
 @pytest.mark.thorough

@@ -26,7 +26,6 @@ from support.dragging import Person
 from support.page_hands import Heard
 from thirdhand.client import RefusedError, UnreachableError
 from thirdhand.contract.messages import BASE
-from thirdhand.workbench.cli.demo import EVENT_TITLES
 from thirdhand.workbench.trackers.browser_hands import NO_TOKEN
 from thirdhand_sim.scene import HAND_ORIENTATION
 
@@ -192,49 +191,6 @@ def test_a_hidden_page_sends_nothing_and_its_hands_wait_where_they_were(
     daemon.until(lambda status: status["mode"] == "hold")  # the page was closed
 
 
-def test_fingers_on_a_phone_drag_both_hands_at_once_and_lift_them(daemon: Daemon, url: str, tmp_path: Path) -> None:
-    received = Heard(daemon.session)
-    with person_at(url, tmp_path, phone=True) as person:
-        tab = person.tab
-        daemon.until(lambda status: status["mode"] == "follow")
-        assert tab.ask("document.documentElement.scrollWidth <= innerWidth")
-        starts = [person.hand(side) for side in ("left", "right")]
-        at = [person.pixel(start) for start in starts]
-        tab.touch("Start", *at)
-        for i in range(1, 21):
-            tab.touch("Move", *((x, y - 2 * i) for x, y in at))  # 40 pixels away from the person
-            time.sleep(0.016)
-        tab.touch("End")
-        away_m = 40 / tab.ask("shown.plan.scale")
-        for side, start in zip(("left", "right"), starts, strict=True):
-            until_arrived(received, side, (start[0] - away_m, start[1], start[2]), 0.01)
-        x, y = person.pixel(person.hand("left"))
-        corner = json.loads(tab.ask("JSON.stringify([canvas.getBoundingClientRect().x, shown.plan.gauge])"))
-        tab.touch("Start", (x, y))  # a second finger on the bench lifts the hand that the first one holds
-        tab.touch("Start", (x, y), (x + 120, y - 60))
-        for i in range(1, 11):
-            tab.touch("Move", (x, y), (x + 120, y - 60 - 4 * i))
-            time.sleep(0.016)
-        tab.touch("End")
-        lift_m = 40 * 0.6 / (corner[1]["bottom"] - corner[1]["top"])
-        until_arrived(received, "left", (starts[0][0] - away_m, starts[0][1], starts[0][2] + lift_m), 0.01)
-
-
-def test_the_wheel_lifts_the_hand_that_was_dragged_there_though_it_has_not_arrived(url: str, tmp_path: Path) -> None:
-    """Not the other one, which is nearer to the pointer meanwhile."""
-    with person_at(url, tmp_path) as person:
-        x, y, z = person.hand("left")
-        beside = (x, y + 0.03, z)
-        begin, end = person.pixel(person.hand("right")), person.pixel(beside)
-        person.tab.mouse("Pressed", *begin)
-        person.tab.mouse("Moved", *end)
-        person.tab.mouse("Released", *end)
-        person.tab.mouse("Wheel", *end, deltaX=0, deltaY=-500)
-        person.tab.until(f"hands.left.aim[2] !== {z} || hands.right.aim[2] > {person.hand('right')[2]} + 0.05")
-        assert person.hand("left", "aim")[2] == z
-        assert math.dist(person.hand("right", "aim")[:2], beside[:2]) < 0.01
-
-
 def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None:
     parts = urlsplit(url)
     for query in ("", "?token=guessed"):
@@ -249,24 +205,3 @@ def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None
         tab.until("typeof link !== 'undefined'")
         tab.ask(f"{stale}; link.connect()")
         tab.until(f"at('why').textContent === {json.dumps(NO_TOKEN)}")
-
-
-@pytest.mark.timed
-def test_a_person_plays_the_demo_on_the_page_and_it_is_scored(tmp_path: Path) -> None:
-    arguments = ("demo", "--mouse", "--rate", "100", "--json", "--output", str(tmp_path / "out"))
-    errors = tmp_path / "said"
-    with errors.open("w") as said, started(*arguments, within_s=3 * TIMEOUT_S, stderr=said) as demo:
-        found = until(lambda: re.search(r"http://\S+", errors.read_text()), "it names no page", within_s=TIMEOUT_S)
-        with person_at(found[0], tmp_path) as person:
-            while not person.tab.ask("!!ended"):
-                for goal in person.goals():
-                    if math.dist(person.hand(goal.side), goal.at) > 0.01:
-                        person.drag(goal.side, goal.at)
-                        person.arrive(goal.side, goal.at)
-                time.sleep(0.2)
-            assert "3 of 3 events reached" in person.tab.ask("at('mode').textContent")
-        report = json.loads(demo.communicate(timeout=TIMEOUT_S)[0])
-    assert demo.returncode == 0, errors.read_text()
-    assert report["success"]
-    for name in EVENT_TITLES:
-        assert report["events"][name]["error_mm"] <= 30

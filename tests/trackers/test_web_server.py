@@ -10,7 +10,6 @@ import json
 import os
 import re
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +20,7 @@ import zenoh
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from thirdhand.client import Client, endpoints, open_session
 from thirdhand.contract import cdr
-from thirdhand.contract.explain import ExplainedError
-from thirdhand.contract.incidents import ORDERS
-from thirdhand.workbench.trackers import browser_hands, cell_view, web_server
-from thirdhand.workbench.trackers.cell_view import Latest, carried_out
+from thirdhand.workbench.trackers import browser_hands, web_server
 from thirdhand.workbench.trackers.pinch import Pinches
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 from trackers.test_browser_hands import opened, reason
@@ -55,23 +51,6 @@ def test_what_is_refused_is_answered_in_words(name: str) -> None:
             writer.close()
 
     with page_of_hands() as (page, _):
-        asyncio.run(scenario())
-
-
-def test_a_page_answers_to_all_names_of_its_certificate(tmp_path: Path) -> None:
-    (tmp_path / "a.pem").write_bytes(web_server.self_signed("*.Lab.example"))
-    with pytest.raises(ExplainedError, match=r"--https a: the certificate in .* is for \*.lab.example; one of"):
-        server_certificate("a", tmp_path)
-    (tmp_path / "a.pem").rename(tmp_path / "cell.lab.example.pem")
-    certificate = server_certificate("cell.lab.example", tmp_path)
-
-    async def scenario() -> None:
-        async with serving_page(page) as at, aiohttp.ClientSession() as session:
-            for host in ("x.LAB.example", "lab.example", "x.y.lab.example", "other"):
-                answer = await session.get(f"https://{at}/", headers={"Host": host}, ssl=False)
-                assert (FOREIGN in await answer.text()) == (host != "x.LAB.example"), host
-
-    with page_of_hands(certificate=certificate) as (page, _):
         asyncio.run(scenario())
 
 
@@ -209,37 +188,3 @@ STRANGE: dict[str, bytes] = {  # anybody may publish a status in an open network
     "a port that is none": json.dumps(STATUS | {"scribe": {"live": "rerun+http://x:999999"}}).encode(),
     "a long text": json.dumps(STATUS | {"because": "x" * 1_000_000}).encode(),
 }
-REPLIES = (b"", b"{}", b"[]", b'{"tick": {}, "mode": 5}', b'{"tick": 1, "mode": null}', b"\xff", b"[" * 9000)
-
-
-def test_strange_statuses_and_replies_leave_pages_their_status_and_an_answer() -> None:
-    with (
-        open_session(listen=["tcp/127.0.0.1:0"]) as daemon,
-        open_session(connect=[endpoints(daemon)[0]]) as session,
-        daemon.liveliness().declare_token(f"thirdhand/daemon/{daemon.zid()}"),
-    ):
-        latest = Latest(session, "thirdhand")
-        deadline = time.monotonic() + 10
-        for name, strange in STRANGE.items():
-            mode = f"after {name}"
-            daemon.put("thirdhand/status", strange)
-            while (shown := latest.summary()).get("mode") != mode:
-                assert time.monotonic() < deadline, name
-                daemon.put("thirdhand/status", strange)
-                assert len(json.dumps(latest.summary())) < cell_view.MAX_STATUS_BYTES
-                daemon.put("thirdhand/status", json.dumps(STATUS | {"mode": mode}).encode())
-                time.sleep(0.02)
-            assert shown["facts"]
-        client, reply = Client(session, timeout_s=5), b""
-        queryables = [
-            daemon.declare_queryable(f"thirdhand/{name}", lambda query: query.reply(query.key_expr, reply))
-            for name in ORDERS
-        ]
-        for reply in REPLIES:
-            for name in ORDERS:
-                is_done, text = carried_out(client, name)
-                assert (is_done, text.startswith(f"{name} was NOT carried out: ")) == (False, True), (reply, text)
-        for one in queryables:
-            one.undeclare()  # type: ignore[no-untyped-call]
-        session.close()  # type: ignore[no-untyped-call]
-        assert carried_out(client, "hold")[0] is False

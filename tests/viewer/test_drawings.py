@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from support.recorded import TEXT, at_ns, drawn, ticks, values, views
+from support.recorded import TEXT, at_ns, drawn, ticks, values
 from support.wicked import WICKED, wicked_skill
 from thirdhand.command_line import main
 from thirdhand.contract.messages import SceneObject
@@ -20,9 +20,7 @@ from thirdhand.contract.printable import as_markdown, printable
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import encode_json
 from thirdhand.core.separation.body import body_of
-from thirdhand.core.skill.skill import Skill
 from thirdhand.settings.config import WAM, Settings
-from thirdhand.viewer.blueprint import blueprint
 from thirdhand.viewer.stream import Viewer
 from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 
@@ -30,24 +28,6 @@ from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 def viewer(**where: Any) -> Viewer:
     """A viewer of the shipped arm."""
     return Viewer(urdf=WAM, settings=Settings(), **where)
-
-
-def test_modes_lie_below_the_curves_and_end_with_them_and_most_of_the_time_axis_is_data() -> None:
-    arranged = blueprint(Settings(), live=False, end_s=20.0)
-    (task, timing, _) = arranged.root_container.contents
-    for tab in (task, timing):
-        *_, below = tab.contents[-1].contents
-        assert below.name == "Mode"
-        ends = [span_s(view, "TimeAxis") for view in views(tab.contents[-1]) if "TimeAxis" in view.properties]
-        assert len(ends) >= 3
-        assert len({end for _, end in ends}) == 1
-        assert 20.0 / ends[0][1] > 0.8
-
-
-def span_s(view: Any, part: str) -> tuple[float, float]:
-    """Begin and end [s] of a view's time axis."""
-    (found,) = view.properties[part].view_range.as_arrow_array().to_pylist()
-    return found["start"] / 1e9, found["end"] / 1e9
 
 
 @pytest.mark.usefixtures("drawing")
@@ -105,69 +85,6 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         assert len(said) == is_drawn
         assert re.search(words, "".join(said))
         assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
-
-
-def test_capsules_around_collision_meshes_are_drawn_with_the_arm(tmp_path: Path) -> None:
-    shape = re.compile("(<collision>.*?<geometry>).*?(</geometry>)", re.DOTALL)
-    mesh = r'\1<mesh filename="link.stl" covered_by="0 0 0 0 0 0.1 0.05"/>\2'
-    (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
-    one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    paths = [path for path in drawn(tmp_path / "a.rrd") if "/capsules/" in path]
-    assert len(paths) == len(Settings().joints.names) + 1
-    assert all(path.startswith("/arm/") for path in paths)
-
-
-def test_the_name_of_a_thing_that_a_place_has_too_is_shown_once(tmp_path: Path, skill: Skill) -> None:
-    at, size = (0.5, 0.38, 0.16), (0.1, 0.1, 0.006)
-    found = [SceneObject(name, "cylinder", "base", at, (0, 0, 0, 1), size, (1, 1, 1, 1)) for name in ("glass", "iron")]
-    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
-    for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-        if tick.index == 10:
-            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    shown = [values(rows[f"/scene/things/{name}/name"], "Points3D:show_labels")[-1] for name in ("glass", "iron")]
-    assert shown == [[False], [True]]
-    assert "glass" in values(rows["/skill/places/tool"], "Points3D:labels")[-1]
-
-
-def test_demonstrations_are_paler_and_thinner_than_the_ways_of_hands(tmp_path: Path, skill: Skill) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
-    for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    demonstrated, live = rows["/skill/demonstrations/left"], rows["/scene/left_trail"]
-    assert max(opacity(colour) for colour in values(demonstrated, "LineStrips3D:colors")[-1]) <= 40
-    assert opacity(values(live, "LineStrips3D:colors")[-1][0]) == 255
-    assert -1 < min(values(demonstrated, "LineStrips3D:radii")[-1]) < 0  # in pixels: less than one
-
-
-def opacity(colour: int) -> int:
-    """How opaque a colour is, of 255."""
-    return colour & 0xFF
-
-
-@pytest.mark.usefixtures("drawing")
-@pytest.mark.thorough
-def test_of_several_files_the_last_is_pictured_and_that_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("a", "b"):
-        one = viewer(rrd=tmp_path / f"{name}.rrd")
-        for tick, frame, timing in ticks(60):
-            one.add(frame, at_ns(tick.index), timing)
-        one.close()
-    files = [str(path) for path in sorted(tmp_path.glob("*.rrd"))]  # as a shell expands thirdhand-demo/*.rrd
-    assert main(["view", *files, "--screenshot", str(tmp_path / "scene.png")]) == 0
-    said = capsys.readouterr()
-    assert said.err == f"the picture shows {files[1]}, the last of 2 files\n"
-    with Image.open(tmp_path / "scene.png") as picture:
-        assert picture.width > 1000
 
 
 def test_without_vulkan_one_line_tells_what_a_picture_needs(

@@ -15,28 +15,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.recorded import TEXT, at_ns, drawn, ticks, values, views, write
-from support.turning import sliding_cell
+from support.recorded import TEXT, at_ns, drawn, ticks, values, write
 from support.wam import JOINT_NAMES
-from thirdhand.cli.usage import UsageError
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, SceneObject
-from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import ViaPoint, encode_json
 from thirdhand.core.skill.model import REGION_95
 from thirdhand.core.skill.pose import CLOSED
 from thirdhand.core.skill.skill import Skill
-from thirdhand.recordings.mcap_file import RecordingError
-from thirdhand.settings.config import WAM, Settings, parse
+from thirdhand.settings.config import WAM, Settings
 from thirdhand.skills.skill_file import with_file
-from thirdhand.viewer.banner import banner, headline
-from thirdhand.viewer.blueprint import blueprint
-from thirdhand.viewer.dynamic import REPEAT_S, DrawnFrame, DynamicScene
 from thirdhand.viewer.sentences import sentence
-from thirdhand.viewer.static import ArmModels
 from thirdhand.viewer.stream import Viewer, ViewerError
-from thirdhand.workbench.cli.view import convert, moment, screenshot
+from thirdhand.workbench.cli.view import convert
 
 
 def viewer(**where: Any) -> Viewer:
@@ -104,14 +96,6 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
     assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
 
 
-def test_a_live_viewer_gets_the_mode_again_while_a_clock_that_was_set_back_catches_up() -> None:
-    """The times of its frames grow by a microsecond a tick."""
-    scene = DynamicScene(ArmModels(WAM, Settings()), Settings(), start_ns=at_ns(0))
-    shown = [DrawnFrame(frame, at_ns(0) + 1000 * k, timing, None) for k, (_, frame, timing) in enumerate(ticks(1200))]
-    batches = [[chunk.entity_path for chunk in scene.chunks(shown[k : k + 100])] for k in range(0, 1200, 100)]
-    assert sum("/mode" in paths for paths in batches) >= 1200 // Settings().ticks_in(REPEAT_S)
-
-
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(900):
@@ -129,26 +113,6 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
     assert any(len(strip) == 0 for strip in strips)
 
 
-@pytest.mark.parametrize("conducts", [0, 1])
-def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(200):
-        frame["hand_ages"][1 - conducts] = -1
-        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
-        frame["tool"] += [0.02, 0.0, 0.0]
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    followed = list(range(10, 200))
-    assert values(rows["/scene/target"], "tick") == followed[::5]
-    for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
-        assert values(rows[path], "tick") == followed
-        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
-    ages = np.array(values(rows["/age"], "Scalars:scalars"))
-    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
-    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
-
-
 def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
     one = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(100):
@@ -160,56 +124,6 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
     assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
     assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
-
-
-def test_an_arm_that_slides_is_drawn_in_metres_where_it_is(tmp_path: Path) -> None:
-    cell = sliding_cell(tmp_path)
-    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(100):
-        frame["commanded"], frame["joints"][0] = 1, 0.002 * tick.index
-        told = JointState(at_ns(tick.index), cell.joints.names, tuple(frame["joints"] + 0.02), ())
-        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    (names,) = values(rows["/joints/velocity"], "SeriesLines:names")
-    assert (names[0], names[1]) == ("rail [m/s]", "shoulder pan [rad/s]")
-    places = np.array(values(rows["/arm/joints/0"], "Transform3D:translation"), np.float64).reshape(-1, 3)
-    assert np.ptp(places[:, 1]) == pytest.approx(0.002 * 95, abs=1e-5)
-    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
-
-
-def test_turns_of_a_continuous_joint_are_no_error(tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_text(WAM.read_text().replace('type="revolute"', 'type="continuous"', 1))
-    posture, limits = list(Settings().arm.posture), f"acceleration = {[5.0] * 7}\njerk = {[200.0] * 7}"
-    text = f'[arm]\nurdf = "arm.urdf"\nplate = "tool_plate"\nposture = {posture}\n[joints]\n{limits}\n'
-    cell = parse(text, origin="cell.toml", folder=tmp_path)
-    one = Viewer(urdf=tmp_path / "arm.urdf", settings=cell, rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(100):
-        frame["commanded"] = 1
-        frame["joints"][0] += 20.0
-        position = frame["joints"] + 0.02
-        position[0] = np.remainder(position[0] + np.pi, 2 * np.pi) - np.pi
-        told = JointState(at_ns(tick.index), cell.joints.names, tuple(position), ())
-        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))])
-    one.close()
-    found = values(drawn(tmp_path / "a.rrd")["/joints/error"], "Scalars:scalars")
-    assert np.ravel(found) == pytest.approx(np.full(100, 0.02))
-
-
-def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(100):
-        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
-        one.add(
-            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
-        )
-    one.close()
-    rows = drawn(tmp_path / "a.rrd")
-    for number in range(len(JOINT_NAMES)):
-        first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
-        assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
-        assert np.max(first["Transform3D:scale"]) < 1e-3
-        assert not any(row.get("Transform3D:scale") for row in later)
 
 
 def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
@@ -297,38 +211,14 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     ("note", "said"),
     [
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
-        ('via_points {"op": "remove", "names": ["a"]}', "Removed: a."),
         ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
-        ('skill {"name": "soldering"}', "Skill soldering is in force."),
         ("hold {}", "The operator stopped the arm, which holds until it is resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),
-        ("hold what", "hold what"),
         ("3 ticks before tick 7 are not recorded", "3 ticks before tick 7 are not recorded"),
     ],
 )
 def test_the_log_speaks_in_sentences(note: str, said: str) -> None:
     assert sentence(note) == said
-
-
-def test_each_mode_has_a_banner_of_its_own_colour_that_holds_its_words() -> None:
-    assert banner(Mode.HOLD, Reason.FAR_FROM_DEMONSTRATIONS).shape == banner(Mode.FOLLOW, Reason.NONE).shape
-    assert headline(Mode.FOLLOW, Reason.NONE, True) == "follow: engaging"
-    assert (banner(Mode.FOLLOW, Reason.NONE, True) != banner(Mode.FOLLOW, Reason.NONE)).any()
-    corners = {tuple(banner(mode, Reason.NONE)[0, 0].tolist()) for mode in Mode}
-    assert len(corners) == len(Mode)
-    for reason in Reason:
-        picture = banner(Mode.FAULT, reason)
-        assert (picture[:, -4:] == picture[0, 0]).all()  # no letter is cut off
-        assert not (picture == picture[0, 0]).all()
-
-
-def test_missed_deadlines_stand_in_the_log(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(20):
-        timing["missed"] = 3 if tick.index > 10 else 0
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    assert "3 deadlines missed before tick 19" in [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"]]
 
 
 def test_a_full_disk_is_told(tmp_path: Path) -> None:
@@ -350,43 +240,13 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
     one.close()
 
 
-@pytest.mark.parametrize(("curves_mm", "is_shown"), [(30.0, True), (200.0, True), (20.0, False)])
-def test_where_it_holds_is_within_the_axis_or_far_off_and_left_out(curves_mm: float, is_shown: bool) -> None:
-    arranged = blueprint(Settings(), live=False, gate_m=0.104, tops={"/deviation": curves_mm}, end_s=14.0)
-    found = [view for view in views(arranged.root_container) if view.origin == "/deviation"]
-    assert len(found) == 2
-    for view in found:
-        (low, high) = view.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
-        assert low == 0
-        assert high == pytest.approx(1.25 * max(curves_mm, 104.0 if is_shown else 0.0))
-        assert ("- $origin/gate" in view.contents) != is_shown
-
-
-def test_a_picture_is_of_a_moment_that_there_is() -> None:
-    extent = (5_000_000_000, 19_258_000_000)
-    assert [moment(extent, time) for time in (None, 0.0, 14.25)] == [extent[1], extent[0], 19_250_000_000]
-    with pytest.raises(UsageError, match=r"--time 99: seconds from 0 to 14\.25 needed"):
-        moment(extent, 99.0)
-
-
-def test_errors_say_what_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"no recording .*a\.mcap"):
-        convert(tmp_path / "a.mcap", tmp_path / "a.rrd")
-    with pytest.raises(ViewerError, match=r"there is no .*a\.rrd"):
-        screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
-
-
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
         (["a.rrd", "--screenshot", "."], "is a folder; the name of a file needed"),
-        (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
         (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
         (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
-        (["a.rrd", "--web"], "thirdhand view live --web"),
-        (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
-        (["press.npz", "a.rrd"], "press.npz is neither"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
         (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),

@@ -13,7 +13,6 @@ import pytest
 
 from support.recorded import SKILL, TEXT, at_ns, drawn, ticks, values
 from support.wam import JOINT_NAMES
-from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.contract.records import Mode, Reason
@@ -90,17 +89,6 @@ def test_curves_and_trails_are_interrupted_where_frames_are_missing(
     after = min(tick for tick in trails if tick > 210)
     assert (trails[after] == 1) == is_broken
     assert (f"gap after tick 202, before tick 208: {lost} ticks not recorded" in log_of(rows)) == bool(lost)
-
-
-def test_a_drawing_that_was_not_made_is_offered_from_its_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "a.mcap").touch()
-    assert main(["view", str(tmp_path / "a.rrd")]) == 1
-    command = f"thirdhand view {tmp_path / 'a.mcap'}"
-    assert capsys.readouterr().err == (
-        f"thirdhand view: no such file: {tmp_path / 'a.rrd'}; `{command}` draws the recording\n"
-    )
 
 
 def test_a_recording_that_cannot_be_read_to_its_end_leaves_no_part_of_a_drawing(tmp_path: Path) -> None:
