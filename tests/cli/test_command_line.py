@@ -106,6 +106,7 @@ REFUSED = [  # exit code, words on standard error, command
     (2, "--web and --screenshot given", "view live --web --screenshot a.png"),
     (2, "--tab chooses the tab of a picture", "view live --web --tab timing"),
     (2, "--mouse needed with it", "demo --open"),
+    (2, "--workers: --each needed", "replay a.mcap b.mcap --workers 2"),
     (2, "--output writes the frames of one recording", "replay a.mcap b.mcap --each --output new.mcap"),
     (2, "there is no folder no/such", "report {golden} --html no/such/folder.html"),
     (2, "is a file; a folder needed", "report {golden} --csv {golden}"),

@@ -21,6 +21,7 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
 NAMES = ("a.mcap", "b.mcap", "broken.mcap", "c.mcap")
+
 DASK = """
 import sys
 from distributed import LocalCluster

@@ -37,13 +37,6 @@ from thirdhand.process.priority import AHEAD_NICE
 from thirdhand.settings.config import Files, Settings
 from thirdhand.settings.network import Network
 
-NEVER_CACHED = """
-import numba
-from thirdhand.daemon import daemon
-warm_up = daemon.warm_up
-daemon.warm_up = lambda *given, **more: (numba.njit(lambda x: x + 1)(1), warm_up(*given, **more))
-"""
-
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
@@ -144,13 +137,3 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
     assert done.returncode == 1
     assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
     assert "Traceback" not in done.stderr
-
-
-def test_a_daemon_that_can_cache_nothing_compiles_itself_and_starts(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed", before=NEVER_CACHED) as daemon:
-        log = Path(daemon.log).read_text()
-        assert len(re.findall(r"started in [\d.]+ s: .*, compilation [\d.]+ s, skill", log)) == 1
-        children = psutil.Process(daemon.process.pid).children(recursive=True)
-        assert {child.name() for child in children} == {"fork server", "skill worker"}
-        assert all(child.status() != psutil.STATUS_ZOMBIE for child in children)
-    assert daemon.process.returncode == 0

@@ -247,6 +247,9 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
         (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
         (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
+        (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
+        (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
         (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),
@@ -266,3 +269,19 @@ def test_what_cannot_be_shown_is_said_in_words(
     assert re.search(error, said)
     assert said.startswith("thirdhand view: ")
     assert len(said.splitlines()) == 1
+
+
+def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
+        one.add(
+            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
+        )
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    for number in range(len(JOINT_NAMES)):
+        first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
+        assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
+        assert np.max(first["Transform3D:scale"]) < 1e-3
+        assert not any(row.get("Transform3D:scale") for row in later)
