@@ -237,3 +237,15 @@ def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:
 
     system = SystemClock(now_ns=clock.now_ns, wall_ns=wall_ns)
     assert [system.set_by() for _ in range(3)] == ["", "", ""]
+
+
+def test_the_rate_is_that_achieved() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    assert deadlines.rate_hz() == 0.0
+    for _ in range(501):
+        deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(500, rel=0.01)
+    clock.now += 500 * PERIOD_NS
+    deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(250, rel=0.01)

@@ -211,6 +211,8 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     ("note", "said"),
     [
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
+        ('via_points {"op": "remove", "names": ["a"]}', "Removed: a."),
+        ('skill {"name": "soldering"}', "Skill soldering is in force."),
         ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
         ("hold {}", "The operator stopped the arm, which holds until it is resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),
