@@ -152,9 +152,6 @@ def folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch
     Path("twice.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
     Path("demonstrations").mkdir()
     Path("demonstrations/there.mcap").write_bytes(b"")
-    Path("head.mcap").write_bytes((RECORDINGS / "golden.mcap").read_bytes()[:3000])
-    Path("text.mcap").write_text("no recording", encoding="utf-8")
-    Path("skill.npz").write_bytes(b"no skill")
     return working
 
 

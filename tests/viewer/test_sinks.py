@@ -287,3 +287,23 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
         assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
         assert np.max(first["Transform3D:scale"]) < 1e-3
         assert not any(row.get("Transform3D:scale") for row in later)
+
+
+@pytest.mark.parametrize("conducts", [1])
+def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(200):
+        frame["hand_ages"][1 - conducts] = -1
+        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
+        frame["tool"] += [0.02, 0.0, 0.0]
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    followed = list(range(10, 200))
+    assert values(rows["/scene/target"], "tick") == followed[::5]
+    for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
+        assert values(rows[path], "tick") == followed
+        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
+    ages = np.array(values(rows["/age"], "Scalars:scalars"))
+    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
+    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
