@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,7 +20,6 @@ from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
-from thirdhand.cli.cells import HEADS
 from thirdhand.client import (
     Client,
     Tracker,
@@ -71,46 +69,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         finally:
             process.kill()
             process.communicate()
-
-
-def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
-    lab: Lab, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """While the hands of one are followed, and then held by its client."""
-    encodings: dict[str, str] = {}
-    heard = lab.session.declare_subscriber(
-        f"{NAMES[0]}/**", lambda sample: encodings.setdefault(str(sample.key_expr), str(sample.encoding))
-    )
-    client = Client(lab.session, NAMES[0])
-    with Tracker(lab.session, NAMES[0]) as tracker:
-
-        def modes() -> dict[str, str]:
-            tracker.publish("left", LEFT)
-            tracker.publish("right", RIGHT)
-            return {cell.name: cell.status.mode for cell in cells(lab.session) if cell.status}
-
-        others = dict.fromkeys(NAMES[1:], "hold")
-        said = {f"{NAMES[0]}/tool/{pose}" for pose in ("target", "setpoint")}
-        until(lambda: modes() == {NAMES[0]: "follow"} | others and encodings.keys() >= said)
-        assert client.hold().tick > 0
-        until(lambda: modes() == {NAMES[0]: "hold"} | others)
-        assert client.status().reason == "operator"
-        assert client.resume().tick > 0
-    until(lambda: client.status().reason == "stale_hand")
-    heard.undeclare()
-    told = {
-        channels.key(NAMES[0], c.key): c.codec.encoding
-        for c in (*ros2.SAID, *ros2.HEARD[:2])
-        if c.key != "gripper/command"
-    }
-    assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}
-    assert main(["status", "--all", "--connect", lab.endpoint]) == 0
-    heads, *lines = capsys.readouterr().out.splitlines()
-    assert re.split("  +", heads.strip()) == list(filter(None, HEADS))
-    assert [line.split()[0] for line in lines] == sorted(NAMES)
-    assert all("  hold (no_hands)  " in line for line in lines[1:])
-    assert main(["status", "--all", "--json", "--connect", lab.endpoint]) == 0
-    assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
 
 
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
