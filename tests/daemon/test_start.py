@@ -4,22 +4,16 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
-import os
 import re
-import select
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
-from support.cell import LISTENING, serving
+from support.cell import serving
 from support.cell_commands import python
-from support.cell_commands import started as command_started
 from thirdhand.client import (
     Client,
     StartingError,
@@ -33,7 +27,6 @@ from thirdhand.contract.channels import CHANNELS
 from thirdhand.daemon import launch
 from thirdhand.daemon.launch import LaunchError
 from thirdhand.daemon.start import Startup, starting
-from thirdhand.process.priority import AHEAD_NICE
 from thirdhand.settings.config import Files, Settings
 from thirdhand.settings.network import Network
 
@@ -92,26 +85,6 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
         thread.join()
         for name in modules:
             del sys.modules[name]
-
-
-def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that(tmp_path: Path) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("this user may not put a process ahead of others")
-    files = f'[files]\nstate = "{tmp_path / "state"}"\nrecord = "{tmp_path / "recordings"}"\n'
-    (tmp_path / "cell.toml").write_text(LISTENING + files)
-    with command_started("serve", "--config", str(tmp_path / "cell.toml"), stderr=subprocess.DEVNULL) as service:
-        begun = set()
-        while not select.select([service.stdout], [], [], 0.02)[0]:
-            begun.add(os.getpriority(os.PRIO_PROCESS, service.pid))
-        kept: dict[str, int] = {}
-        end_s = time.monotonic() + 20.0
-        while not kept.keys() >= {"scribe", "skill worker"} and time.monotonic() < end_s:
-            processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
-            kept = {one.name(): one.nice() for one in processes}
-        service.terminate()
-    assert min(begun) == AHEAD_NICE
-    assert kept.keys() >= {"scribe", "skill worker"}
-    assert all(nice >= 0 for nice in kept.values()), kept
 
 
 @pytest.mark.thorough

@@ -394,10 +394,8 @@ def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_
     ("text", "cell", "words"),
     [
         (LAB, "", "no cell given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
-        (LAB, "bench4", "cell 'bench4' given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
         ("", "bench1", "cell 'bench1' given; FILE.toml:NAME with one of no cells needed"),
         ("cells = 3", "a", "tables by the cells' names needed, like [cells.bench1.tool]"),
-        ("[cells]\nrate_hz = 3", "a", "tables by the cells' names needed"),
         ("[cells.a.tool]\nmax_sped = 1", "a", "max_sped"),
         ("[cells.a]\ntool = 3", "a", "tool: 3 given"),
     ],
