@@ -407,3 +407,17 @@ def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
     assert np.abs(np.diff(written.velocity, axis=0) / 0.001).max() < 6.0
     assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(COMMANDED.jerk)
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.03
+
+
+def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None:
+    rng = np.random.default_rng(5)
+    commands = motion(sway(6.0))
+    late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))
+    playback, delays = Playback(STRONG, AT, period_s=0.001), []
+    for begin in range(0, 3000, 500):
+        play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0, 0.001)
+        delays.append(playback.delay_ticks)
+    assert delays[0] < 1.1
+    assert 2.5 < delays[1] < 8.0
+    assert delays[2] > delays[3] > delays[4]
+    assert delays[5] < 2.0

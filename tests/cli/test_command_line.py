@@ -105,6 +105,7 @@ REFUSED = [  # exit code, words on standard error, command
     (2, "nan given, -10 to 10 m needed", "via-points add here --left nan 0 0"),
     (2, "--web and --screenshot given", "view live --web --screenshot a.png"),
     (2, "--tab chooses the tab of a picture", "view live --web --tab timing"),
+    (2, "--workers: --each needed", "replay a.mcap b.mcap --workers 2"),
     (2, "--output writes the frames of one recording", "replay a.mcap b.mcap --each --output new.mcap"),
     (2, "there is no folder no/such", "report {golden} --html no/such/folder.html"),
     (2, "is a file; a folder needed", "report {golden} --csv {golden}"),
@@ -150,9 +151,6 @@ def folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch
     Path("twice.json").write_bytes(encode_json({"op": "add", "points": [glass, glass]}))
     Path("demonstrations").mkdir()
     Path("demonstrations/there.mcap").write_bytes(b"")
-    Path("head.mcap").write_bytes((RECORDINGS / "golden.mcap").read_bytes()[:3000])
-    Path("text.mcap").write_text("no recording", encoding="utf-8")
-    Path("skill.npz").write_bytes(b"no skill")
     return working
 
 

@@ -96,6 +96,13 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
 @pytest.mark.parametrize(
     ("changed", "what", "words"),
     [
+        ({"version": "0.9"}, "daemon", ("version 0.9", "version 0.1.0", "update")),
+        ({"tick": -1}, "loop", ("no tick yet", "wait")),
+        ({"sources": source("left", rate_hz=12.0)}, "left hand", ("12 Hz", "30 to 500 Hz", "as often")),
+        ({"lateness_us": Percentiles(1, 3000, 9000)}, "loop", ("late by 3000 µs", "what else runs")),
+        ({"realtime": False}, "real time", ("not granted", "SCHED_FIFO", "docs/hardware.md")),
+        ({"memory_locked": False}, "memory", ("not locked", "memlock")),
+        ({"scribe": {"state": "recording", "free_mb": 300.0}}, "disk", ("0.3 GB free", "more than 2 GB", "keep_mb")),
         (
             {
                 "mode": "fault",

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import ast
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from support.cell import thirdhand, told
-from support.paths import RECORDINGS, ROOT
+from support.paths import RECORDINGS
 from thirdhand.contract.explain import in_file
 
 INTERNAL = re.compile(r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at 0x|\b(?:OS|Type|Value|Key|Validation)Error")
@@ -56,26 +55,6 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
     assert path.name in done.stderr or "tcp/127.0.0.1:1" in done.stderr, done.stderr
     if wrong == "a link to itself":
         assert "Too many levels of symbolic links" in done.stderr
-
-
-def caught() -> Iterator[tuple[Path, ast.ExceptHandler]]:
-    """Each handler of errors that have numbers of the operating system or names of codecs."""
-    for path in (*(ROOT / "service").rglob("*.py"), *(ROOT / "sim").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ExceptHandler) and node.name and node.type is not None:
-                names = {getattr(one, "attr", getattr(one, "id", "")) for one in ast.walk(node.type)}
-                if names & {"OSError", "UnicodeDecodeError", "ValidationError", "PermissionError"}:
-                    yield path, node
-
-
-def test_what_the_operating_system_and_codecs_say_is_never_printed_as_it_is() -> None:
-    printed = [
-        f"{path.relative_to(ROOT)}:{node.lineno}"
-        for path, handler in caught()
-        for node in ast.walk(handler)
-        if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Name) and node.value.id == handler.name
-    ]
-    assert printed == []
 
 
 @pytest.mark.parametrize(

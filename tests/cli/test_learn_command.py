@@ -86,10 +86,3 @@ def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Pa
         done = told(*refine, str(skill))
         assert done.returncode == 1
         assert says in done.stderr
-
-
-@pytest.mark.quick
-def test_where_a_skill_is_to_go_is_looked_at_before_anything_is_read(tmp_path: Path) -> None:
-    done = told("learn", "no-such.mcap", "--output", str(tmp_path / "missing" / "skill.npz"))
-    assert done.returncode == 2
-    assert "there is no folder" in done.stderr

@@ -12,7 +12,6 @@ from thirdhand.contract.incidents import (
     INCIDENTS,
     Condition,
     what_happened,
-    what_to_do,
     word,
 )
 from thirdhand.contract.records import (
@@ -80,17 +79,6 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
     assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
-
-
-def test_where_all_of_a_source_is_rejected_the_remedy_is_that_of_the_cause() -> None:
-    refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'; 'base' or none accepted")
-    sources = {"left": Source(fresh=True), "right": refused}
-    found = explained(Reason.NO_HANDS, Evidence(sources))
-    assert found.what_to_do == what_to_do("wrong_frame")
-    assert found.why.startswith(
-        "the right hand has not been seen yet, as what arrives is rejected as wrong_frame: frame"
-    )
-    assert explained(Reason.NO_HANDS, Evidence({"right": Source()})).what_to_do == what_to_do("no_hands")
 
 
 @pytest.mark.parametrize("busy", ["", "the loop was up to 45 ms late"])

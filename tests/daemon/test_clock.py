@@ -18,6 +18,7 @@ from thirdhand.daemon.clock import (
     CREEP_NS,
     PREPARE_NS,
     PREPARING_NS,
+    READ_NS,
     STEP_NS,
     Deadlines,
     SystemClock,
@@ -223,3 +224,28 @@ def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(monk
         deadlines.wait()  # the tick has ended
         beside.join(0.1)
     assert not beside.is_alive()
+
+
+def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:
+    clock = FakeClock()
+
+    waits_ns = iter([0, 40 * READ_NS, 0])  # for a processor
+
+    def wall_ns() -> int:
+        clock.now += next(waits_ns)
+        return clock.wall_ns()
+
+    system = SystemClock(now_ns=clock.now_ns, wall_ns=wall_ns)
+    assert [system.set_by() for _ in range(3)] == ["", "", ""]
+
+
+def test_the_rate_is_that_achieved() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    assert deadlines.rate_hz() == 0.0
+    for _ in range(501):
+        deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(500, rel=0.01)
+    clock.now += 500 * PERIOD_NS
+    deadlines.wait()
+    assert deadlines.rate_hz() == pytest.approx(250, rel=0.01)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
 from support.cell import LEFT, RIGHT, until
@@ -21,7 +20,6 @@ from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
-from thirdhand.cli.cells import HEADS
 from thirdhand.client import (
     Client,
     Tracker,
@@ -36,7 +34,6 @@ from thirdhand.contract import (
     cdr,
     channels,
     requests,
-    ros2,
 )
 from thirdhand.contract.messages import PoseStamped
 
@@ -71,46 +68,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         finally:
             process.kill()
             process.communicate()
-
-
-def test_one_observer_sees_every_cell_and_all_says_how_it_is_encoded(
-    lab: Lab, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """While the hands of one are followed, and then held by its client."""
-    encodings: dict[str, str] = {}
-    heard = lab.session.declare_subscriber(
-        f"{NAMES[0]}/**", lambda sample: encodings.setdefault(str(sample.key_expr), str(sample.encoding))
-    )
-    client = Client(lab.session, NAMES[0])
-    with Tracker(lab.session, NAMES[0]) as tracker:
-
-        def modes() -> dict[str, str]:
-            tracker.publish("left", LEFT)
-            tracker.publish("right", RIGHT)
-            return {cell.name: cell.status.mode for cell in cells(lab.session) if cell.status}
-
-        others = dict.fromkeys(NAMES[1:], "hold")
-        said = {f"{NAMES[0]}/tool/{pose}" for pose in ("target", "setpoint")}
-        until(lambda: modes() == {NAMES[0]: "follow"} | others and encodings.keys() >= said)
-        assert client.hold().tick > 0
-        until(lambda: modes() == {NAMES[0]: "hold"} | others)
-        assert client.status().reason == "operator"
-        assert client.resume().tick > 0
-    until(lambda: client.status().reason == "stale_hand")
-    heard.undeclare()
-    told = {
-        channels.key(NAMES[0], c.key): c.codec.encoding
-        for c in (*ros2.SAID, *ros2.HEARD[:2])
-        if c.key != "gripper/command"
-    }
-    assert encodings == {key: f"application/{encoding}" for key, encoding in told.items()}
-    assert main(["status", "--all", "--connect", lab.endpoint]) == 0
-    heads, *lines = capsys.readouterr().out.splitlines()
-    assert re.split("  +", heads.strip()) == list(filter(None, HEADS))
-    assert [line.split()[0] for line in lines] == sorted(NAMES)
-    assert all("  hold (no_hands)  " in line for line in lines[1:])
-    assert main(["status", "--all", "--json", "--connect", lab.endpoint]) == 0
-    assert {cell["status"]["mode"] for cell in json.loads(capsys.readouterr().out)} == {"hold"}
 
 
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,12 +108,6 @@ def ros(lab: Lab) -> Iterator[dict[str, Any]]:
     """Where a ROS 2 node finds the domain."""
     yield port(lab.endpoint, ROS2_DOMAIN)
     ZenohSession.get_instance().close()
-
-
-def test_ros2_lists_the_topics_of_every_cell_with_their_types(ros: dict[str, Any]) -> None:
-    found = {name: kinds for name, kinds in get_topic_names_and_types(**ros, timeout=5.0) if name[:4] == "/lab"}
-    expected = {f"/{name}/{c.key}": [ros2.type_of(c)] for name in NAMES for c in (*ros2.HEARD[:2], *ros2.SAID)}
-    assert found == expected
 
 
 def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, Any]) -> None:

@@ -124,6 +124,9 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
         (add(point(right=None)), "$.points[0]: field `right` is missing"),
         (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
+        (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
+        (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
+        (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
         (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
         (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, ("),
         (
@@ -132,6 +135,8 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         ),
         (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m"),
         (add(), "$.points: none given, 1 to 100 needed"),
+        (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
+        (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
         (
             {"op": "remove", "names": ["nothing"]},
             "$.names[0]: no via-point 'nothing'; in force: handover, glass, soldering",

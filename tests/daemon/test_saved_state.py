@@ -258,3 +258,8 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
         assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
         assert daemon.end() == 0
         assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")
+
+
+def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: Skill, tmp_path: Path) -> None:
+    keep(saved, adapted(skill, POINTS, tolerance=0.03))
+    assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)

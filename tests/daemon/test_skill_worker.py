@@ -4,17 +4,24 @@ that come back with their words.
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support.paths import RECORDINGS
+from thirdhand.client import Client
+from thirdhand.client.connection import Connection
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S
 from thirdhand.core.skill.skill import Skill
-from thirdhand.daemon.skill_worker import SkillWorker
+from thirdhand.daemon.request_inbox import ADOPTION_TIMEOUT_S
+from thirdhand.daemon.skill_worker import WORK_TIMEOUT_S, SkillWorker
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import adapted, in_force
 from thirdhand_sim.scene import Scene
@@ -120,3 +127,18 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
         assert process_of(worker) == slowed
     finally:
         worker.close()
+
+
+def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(skill_worker: SkillWorker) -> None:
+    with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
+
+        def late(left_s: float) -> None:
+            with skill_worker.due(time.monotonic() - WORK_TIMEOUT_S + left_s):
+                skill_worker.load(SOLDERING)
+
+        for left_s in (0.2, -1.0):
+            with pytest.raises(SkillError, match="busy with earlier requests; nothing was changed"):
+                pool.submit(late, left_s).result(2.0)
+    assert WORK_TIMEOUT_S + ADOPTION_TIMEOUT_S < ANSWER_TIMEOUT_S
+    for waiting in (Client, Connection):
+        assert inspect.signature(waiting).parameters["timeout_s"].default == ANSWER_TIMEOUT_S

@@ -384,3 +384,24 @@ def test_a_tracker_alone_is_not_taken_for_two(kind: str) -> None:
         alone = LONE[kind](times, random) + random.uniform(1e-4, 1e-3) * random.standard_normal((KEPT, 3))
         assert apart_m(alone) == 0.0
     assert apart_m(np.zeros((KEPT, 3))) == 0.0
+
+
+def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:
+    cell = Cell(skill)
+    for k in range(10):
+        cell.tell(("left", pose(S + k)), late_ns=-5 * S)
+        told = cell.status(k / 10)
+    assert told.sources["left"].clock_ms == pytest.approx(-5000.0)
+    assert told.sources["right"].clock_ms is None
+
+
+@pytest.mark.parametrize("rate_hz", [1, 8])
+def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz: int) -> None:
+    cell = Cell(skill)
+    for k in range(1500):
+        cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
+        told = cell.status(k / 500)
+        if k > 1000:
+            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", told.because)
+            assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
+    assert told.reason == "arm_not_ready"

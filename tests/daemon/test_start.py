@@ -4,22 +4,16 @@ and is waited for as long as it gets further.
 
 from __future__ import annotations
 
-import os
 import re
-import select
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
-from support.cell import LISTENING, serving
+from support.cell import serving
 from support.cell_commands import python
-from support.cell_commands import started as command_started
 from thirdhand.client import (
     Client,
     StartingError,
@@ -33,16 +27,8 @@ from thirdhand.contract.channels import CHANNELS
 from thirdhand.daemon import launch
 from thirdhand.daemon.launch import LaunchError
 from thirdhand.daemon.start import Startup, starting
-from thirdhand.process.priority import AHEAD_NICE
 from thirdhand.settings.config import Files, Settings
 from thirdhand.settings.network import Network
-
-NEVER_CACHED = """
-import numba
-from thirdhand.daemon import daemon
-warm_up = daemon.warm_up
-daemon.warm_up = lambda *given, **more: (numba.njit(lambda x: x + 1)(1), warm_up(*given, **more))
-"""
 
 
 @pytest.fixture
@@ -101,26 +87,6 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
             del sys.modules[name]
 
 
-def test_the_start_goes_ahead_of_other_processes_and_the_loop_does_not_keep_that(tmp_path: Path) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("this user may not put a process ahead of others")
-    files = f'[files]\nstate = "{tmp_path / "state"}"\nrecord = "{tmp_path / "recordings"}"\n'
-    (tmp_path / "cell.toml").write_text(LISTENING + files)
-    with command_started("serve", "--config", str(tmp_path / "cell.toml"), stderr=subprocess.DEVNULL) as service:
-        begun = set()
-        while not select.select([service.stdout], [], [], 0.02)[0]:
-            begun.add(os.getpriority(os.PRIO_PROCESS, service.pid))
-        kept: dict[str, int] = {}
-        end_s = time.monotonic() + 20.0
-        while not kept.keys() >= {"scribe", "skill worker"} and time.monotonic() < end_s:
-            processes = [psutil.Process(service.pid), *psutil.Process(service.pid).children(recursive=True)]
-            kept = {one.name(): one.nice() for one in processes}
-        service.terminate()
-    assert min(begun) == AHEAD_NICE
-    assert kept.keys() >= {"scribe", "skill worker"}
-    assert all(nice >= 0 for nice in kept.values()), kept
-
-
 @pytest.mark.thorough
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "START_STALL_S", 16.0)
@@ -144,13 +110,3 @@ def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: 
     assert done.returncode == 1
     assert re.search(r"nothing listens at|nothing listens on", done.stdout + done.stderr)
     assert "Traceback" not in done.stderr
-
-
-def test_a_daemon_that_can_cache_nothing_compiles_itself_and_starts(tmp_path: Path) -> None:
-    with serving(tmp_path, "--joints", "assumed", before=NEVER_CACHED) as daemon:
-        log = Path(daemon.log).read_text()
-        assert len(re.findall(r"started in [\d.]+ s: .*, compilation [\d.]+ s, skill", log)) == 1
-        children = psutil.Process(daemon.process.pid).children(recursive=True)
-        assert {child.name() for child in children} == {"fork server", "skill worker"}
-        assert all(child.status() != psutil.STATUS_ZOMBIE for child in children)
-    assert daemon.process.returncode == 0

@@ -259,3 +259,29 @@ def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path
     finally:
         running.kill()
         running.wait()
+
+
+def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
+    """A child that never looks at its socket, and a parent's thread that ends before it does."""
+    (tmp_path / "busy.py").write_text(
+        "import time\nfrom thirdhand.process import child\n"
+        "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"
+    )
+    parent = (
+        "import socket, sys, threading, time\nfrom thirdhand.process import child\nstarted = []\n"
+        "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
+        "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
+        "print(started[0].pid, flush=True)\ntime.sleep(60)\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    running = subprocess.Popen(
+        [sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
+    )
+    assert running.stdout is not None
+    busy = int(running.stdout.readline())
+    time.sleep(0.5)
+    assert is_running(busy)
+    running.kill()
+    running.wait()
+    running.stdout.close()
+    until_gone([busy], 5)

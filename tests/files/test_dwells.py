@@ -60,9 +60,6 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
     (remark,) = remarks_on_places(rested)
     assert remark.startswith("hands and tool rest from ")
     assert remark.endswith("is a via-point missing here?")
-    (first, _) = remarks_on_places(rested._replace(places=rested.places[1:]))
-    assert first.startswith("hands and tool rest from 0.0 to ")  # as its start has no name
-    assert remarks_on_places(rested._replace(places=())) == []  # who names none is not asked for one
 
 
 @pytest.mark.parametrize("end", ["begins", "ends"])

@@ -113,19 +113,6 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
     return path
 
 
-@pytest.mark.parametrize(("separator", "time_code"), [(",", "15:26:01:12.02"), (",", ""), (";", None), ("\t", "x")])
-def test_motive_is_read_with_time_codes_and_as_a_spreadsheet_saves_it(
-    separator: str, time_code: str | None, take: Demonstration, tmp_path: Path
-) -> None:
-    rows = list(csv.reader(motive(tmp_path / "a.csv", take).read_text(encoding="utf-8").splitlines()))
-    for row in rows[2:]:
-        row[2:2] = [] if time_code is None else ["TimeCode" if row[0] == "Frame" else time_code if row[0] else ""]
-    lines = [separator.join(row).replace(*(".," if separator == ";" else "..")) for row in rows]
-    (tmp_path / "b.csv").write_text("\n".join(lines), encoding="utf-8")
-    got, wanted = (read_demonstration(tmp_path / name, settings=CAPTURE) for name in ("b.csv", "a.csv"))
-    np.testing.assert_array_equal(got.left, wanted.left)
-
-
 def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstration, tmp_path: Path) -> None:
     path, said = motive(tmp_path / "a.csv", take), list[str]()
     got = read_demonstration(path, settings=CAPTURE, say=said.append)

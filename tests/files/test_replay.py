@@ -17,7 +17,6 @@ from support.in_process import ASSUMED, ticks_of
 from support.paths import RECORDINGS
 from support.recorded import thin
 from support.wam import URDF
-from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import (
     STAGES,
@@ -83,16 +82,6 @@ def test_the_golden_session_replays_from_a_state_in_its_middle(golden: Path) -> 
     result = replay(golden, after=6000)
     assert result.within_tolerance
     assert 3000 < result.ticks < 5000
-
-
-def test_the_golden_session_holds_what_it_is_meant_to(golden: Path) -> None:
-    seen = np.array([step.frame for step in Recording.open(golden).steps() if step.frame is not None])
-    reasons = {Reason(r) for r in np.unique(seen["reason"])}
-    assert {Reason.NONE, Reason.STALE_HAND, Reason.OPERATOR, Reason.FAR_FROM_DEMONSTRATIONS} <= reasons
-    assert (seen["mode"] != Mode.FAULT).all()
-    assert (seen["rejected"][-1] > 0).sum() >= 4
-    assert (np.diff(seen["tick"]) > 1).any()
-    assert sum(path.stat().st_size for path in RECORDINGS.iterdir()) < 5e6
 
 
 @pytest.fixture(scope="module")

@@ -177,17 +177,6 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
         assert found[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
-def test_lerobot_itself_shows_the_pictures(filmed: Path) -> None:
-    """Of both episodes, which are equal; each picture is brighter by 2.5 than the one before."""
-    loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot brings PyTorch: not installed")
-    found = loader.LeRobotDataset("local/thirdhand", root=filmed)
-    shown = np.array([float(found[i]["observation.images.camera_front"].mean()) * 255 for i in range(len(found))])
-    length = len(found) // 2
-    began = 3000 - 1 - round((length - 1) / found.fps * 500)  # the tick of the first row, up to half a row
-    expected = [(began + row / found.fps * 500) // 50 * 2.5 for row in range(length)]
-    assert np.abs(shown - [*expected, *expected]).max() < 5.0
-
-
 def recorded(
     path: Path,
     skill: StoredSkill,

@@ -47,7 +47,7 @@ from thirdhand.workbench.report.report import (
     reported,
     why_missed,
 )
-from thirdhand.workbench.report.tables import tables, verdict
+from thirdhand.workbench.report.tables import verdict
 from thirdhand_sim.golden import (
     AWAY_S,
     BAD_S,
@@ -207,19 +207,6 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][known].min()
 
 
-def test_what_bound_and_what_the_arm_could_do_are_told(session: Report) -> None:
-    names = session.columns.recording.settings.joints.names
-    assert session.binding
-    assert all(one.name.startswith("[tool] ") or one.name.split(" of ")[1] in names for one in session.binding)
-    assert 0.0 < sum(one.lasts_s for one in session.binding) < session.seconds(Mode.FOLLOW)
-    least, along = session.tool_limits.values()
-    assert 0.1 < least.speed <= along.speed <= 0.8
-    assert 1.0 < least.acceleration <= along.acceleration <= 10.0
-    shown = {one.name: one for one in tables(session)}
-    assert shown["tool_limits"].rows[0][:2] == ("in any direction", f"{least.speed:.2f}")
-    assert shown["binding"].rows[0][0] == session.binding[0].name
-
-
 def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
     by_name = [(place.name, place.start_s) for place in session.places]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
@@ -357,3 +344,22 @@ def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page
     assert r"skill a\nb\x1b[31mred" in shown
     assert "<b>" not in page
     assert r"$\frac$ &lt;b&gt;\x1b[31m" in page
+
+
+@pytest.mark.parametrize("far_ticks", [900, None])
+def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: int | None) -> None:
+    columns = read(Recording.open(golden))
+    follows = np.flatnonzero(columns.frames["mode"] == Mode.FOLLOW)
+    columns.frames["tool"][follows[:far_ticks]] += (0.473, 0.0, 0.0)
+    report = Report(columns)
+    assert report.initial_mm is not None
+    assert report.initial_mm.largest > 400.0
+    if far_ticks is None:
+        assert report.lag_mm is None
+        report.spans = tuple(span for span in report.spans if span.mode is Mode.FOLLOW)  # else a stop is the worst
+        assert "did not reach the target" in verdict(report)
+        return
+    assert report.initial_mm.samples == far_ticks
+    assert report.initial_s == pytest.approx(far_ticks * columns.period_s)
+    assert report.lag_mm is not None
+    assert report.lag_mm.largest < 200.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from support.recorded import SKILL, at_ns, state_after, tell, ticks
 from thirdhand.contract.images import CompressedImage, encode_image
 from thirdhand.core.frame import Event, Tick, encode
 from thirdhand.process import child
+from thirdhand.process.child import Child, Progress
 from thirdhand.recordings.recording import Recording
 from thirdhand.scribe.protocol import pack, unpack
 from thirdhand.scribe.scribe import Scribe
@@ -303,3 +305,65 @@ def test_a_skill_larger_than_a_message_is_told_and_recorded(tmp_path: Path) -> N
         assert one.status()["lost"] == 0
     _, *steps = Recording.open(tmp_path / "a.mcap").steps()
     assert [payload for step in steps for _, payload in step.events] == [large[i:] for i in range(8)]
+
+
+SLOW = """
+import socket, time
+def run(channel):
+    channel.recv(1)
+    end = time.process_time() + {busy}
+    while time.process_time() < end:
+        pass
+    {then}
+"""
+
+
+@pytest.fixture
+def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Child]]:
+    """Children that compute for so long, and then do something, with a fork server of their own."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(child, "_server", server := child.ForkServer())
+    started: list[Child] = []
+
+    def begun(busy: float, then: str) -> Child:
+        name = f"slow_{len(started)}"
+        (tmp_path / f"{name}.py").write_text(SLOW.format(busy=busy, then=then))
+        started.append(child.start("slow", name, socket.SOCK_STREAM))
+        assert started[-1].has_begun(60.0)
+        return started[-1]
+
+    yield begun
+    for one in started:
+        one.kill()
+        one.wait()
+        one.socket.close()
+    server.close()
+
+
+@pytest.mark.thorough
+def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(slow_child: Callable[..., Child]) -> None:
+    """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
+
+    def seconds_until_hung(one: Child, limit_s: float, most_s: float) -> float:
+        progress, began = Progress(one), time.monotonic()
+        one.socket.send(b"0")
+        while not progress.is_hung(limit_s) and time.monotonic() - began < most_s and one.poll() is None:
+            time.sleep(0.02)
+        return time.monotonic() - began
+
+    slow = slow_child(0.4, "channel.recv(1)")
+    assert slow.pid is not None
+    os.sched_setaffinity(slow.pid, {min(os.sched_getaffinity(0))})
+    busy = f"import os\nos.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\nwhile True: pass"
+    hogs = [subprocess.Popen([sys.executable, "-c", busy], start_new_session=True) for _ in range(25)]
+    try:
+        assert seconds_until_hung(slow, 1.0, 4.0) > 3.9
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
+    assert 1.0 < seconds_until_hung(slow_child(0.1, "channel.recv(1)"), 1.0, 20.0) < 15.0
+    assert 1.0 < seconds_until_hung(slow_child(1e9, "pass"), 1.0, 60.0) < 50.0
+    stopped = slow_child(1e9, "pass")
+    stopped.send_signal(signal.SIGSTOP)
+    assert 1.0 < seconds_until_hung(stopped, 1.0, 20.0) < 15.0

@@ -394,10 +394,8 @@ def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_
     ("text", "cell", "words"),
     [
         (LAB, "", "no cell given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
-        (LAB, "bench4", "cell 'bench4' given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
         ("", "bench1", "cell 'bench1' given; FILE.toml:NAME with one of no cells needed"),
         ("cells = 3", "a", "tables by the cells' names needed, like [cells.bench1.tool]"),
-        ("[cells]\nrate_hz = 3", "a", "tables by the cells' names needed"),
         ("[cells.a.tool]\nmax_sped = 1", "a", "max_sped"),
         ("[cells.a]\ntool = 3", "a", "tool: 3 given"),
     ],
@@ -406,3 +404,19 @@ def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("network", "endpoints"),
+    [
+        ({}, ("tcp/127.0.0.1:7447",)),
+        ({"listen": ("tcp/0.0.0.0:1", "tcp/[::]:2"), "allow_insecure": True}, ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2")),
+        ({"listen": ("tcp/127.0.0.1:0",)}, ()),
+        ({"listen": ("tcp/127.0.0.1:0",), "connect": ("tcp/[::1]:5",)}, ("tcp/[::1]:5",)),
+        ({"listen": ("unixsock-stream//run/th.sock",)}, ("unixsock-stream//run/th.sock",)),
+    ],
+)
+def test_programs_of_this_machine_reach_the_daemon_where_it_listens(
+    network: dict[str, Any], endpoints: tuple[str, ...]
+) -> None:
+    assert Network(**network).reached_at == endpoints

@@ -1,4 +1,4 @@
-"""Colours: what is read or followed with the eye stands out from what is behind it."""
+"""Colours: words on the colour of a mode are legible."""
 
 from __future__ import annotations
 
@@ -11,10 +11,6 @@ from thirdhand.settings.palette import (
     contrast,
 )
 from thirdhand.workbench.report.page import MODE_COLOURS, TINT
-
-LINES = {name: getattr(palette, name) for name in ("LEFT", "RIGHT", "TOOL", "TARGET", "MEASURED", "NEAREST", "PLACE")}
-LINES |= {name: getattr(palette, name) for name in ("OFF", "GATE", "LATENCY", "WORK", "LATENESS", "ARM_BODY")}
-LINES |= {f"joint {number}": colour for number, colour in enumerate(palette.BY_JOINT)}
 
 
 def channels(colour: str) -> palette.Colour:

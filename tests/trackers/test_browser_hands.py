@@ -23,6 +23,8 @@ from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.workbench.trackers import browser_hands
 from thirdhand.workbench.trackers.browser_hands import (
+    FULL,
+    MAX_PAGES,
     NO_TOKEN,
     TAKEN,
 )
@@ -235,3 +237,25 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
         server_certificate("localhost", tmp_path / "state")
     with pytest.raises(ExplainedError, match="a name in plain letters, or an address, needed"):
         server_certificate("not plain", tmp_path / "state")
+
+
+def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
+    async def scenario() -> None:
+        async with serving_page(page) as at, contextlib.AsyncExitStack() as stack:
+            first = await stack.enter_async_context(opened(page, at))
+            await first.send_bytes(hands_message())
+            await heard.until("left", 1)
+            others = [await stack.enter_async_context(opened(page, at)) for _ in range(100)]
+            refused = [await reason(socket) for socket in others[MAX_PAGES - 1 :]]
+            assert set(refused) == {(4429, FULL)}
+            assert len(refused) == 101 - MAX_PAGES
+            await first.send_bytes(hands_message(number=1))
+            await heard.until("left", 2)
+            await others[0].close()
+            async with opened(page, at) as late:  # there is room again
+                await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
+                while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
+                    pass
+
+    with page_of_hands() as (page, heard):
+        asyncio.run(scenario())

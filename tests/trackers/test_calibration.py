@@ -655,3 +655,14 @@ def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
 def test_without_hands_or_arm_the_command_says_what_is_missing() -> None:
     words = "not received: hands/left or hands/right, joints/state. Are tracker and arm running"
     assert_refused(1, words, "calibrate", "--listen", f"tcp/127.0.0.1:{free_port()}", "--wait", "0")
+
+
+def test_a_point_that_decides_the_sense_of_an_axis_is_no_outlier() -> None:
+    """Seven points in the plane of the table, and one above it that is wrong."""
+    flat = np.array([[x, y, 0.0] for x in (0.4, 0.6, 0.8) for y in (-0.3, 0.3)] + [[0.7, 0.0, 0.0]])
+    base = np.concatenate([flat, [[0.5, -0.2, 0.25]]])
+    base[-1, 2] -= 0.2
+    hand = TURN.inv().apply(base - ORIGIN) + np.random.default_rng(0).normal(0.0, 0.002, base.shape)
+    base[-1, 2] += 0.2
+    with pytest.raises(CalibrationError, match=r"point 8 does not fit the others.*Touch it again, and two more points"):
+        solve_points(hand, base, CORNERS)

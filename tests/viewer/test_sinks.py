@@ -211,6 +211,8 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     ("note", "said"),
     [
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
+        ('via_points {"op": "remove", "names": ["a"]}', "Removed: a."),
+        ('skill {"name": "soldering"}', "Skill soldering is in force."),
         ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
         ("hold {}", "The operator stopped the arm, which holds until it is resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),
@@ -247,6 +249,9 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
         (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
         (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
+        (["a.rrd", "--web"], "thirdhand view live --web"),
+        (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
+        (["a.rrd", "--screenshot", "nowhere/a.png"], "there is no folder"),
         (["a.rrd", "--screenshot", "a.png"], r"no such file: .*a\.rrd"),
         ([".", "--screenshot", "a.png"], r"is a folder; an \.rrd or \.mcap file"),
         (["press.npz"], r"press\.npz is neither a recording \(\.mcap\) nor a drawing .*\(\.rrd\)"),
@@ -266,3 +271,39 @@ def test_what_cannot_be_shown_is_said_in_words(
     assert re.search(error, said)
     assert said.startswith("thirdhand view: ")
     assert len(said.splitlines()) == 1
+
+
+def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(100):
+        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
+        one.add(
+            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
+        )
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    for number in range(len(JOINT_NAMES)):
+        first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
+        assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
+        assert np.max(first["Transform3D:scale"]) < 1e-3
+        assert not any(row.get("Transform3D:scale") for row in later)
+
+
+@pytest.mark.parametrize("conducts", [1])
+def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
+    one = viewer(rrd=tmp_path / "a.rrd")
+    for tick, frame, timing in ticks(200):
+        frame["hand_ages"][1 - conducts] = -1
+        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
+        frame["tool"] += [0.02, 0.0, 0.0]
+        one.add(frame, at_ns(tick.index), timing)
+    one.close()
+    rows = drawn(tmp_path / "a.rrd")
+    followed = list(range(10, 200))
+    assert values(rows["/scene/target"], "tick") == followed[::5]
+    for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
+        assert values(rows[path], "tick") == followed
+        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
+    ages = np.array(values(rows["/age"], "Scalars:scalars"))
+    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
+    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
