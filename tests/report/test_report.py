@@ -47,7 +47,7 @@ from thirdhand.workbench.report.report import (
     reported,
     why_missed,
 )
-from thirdhand.workbench.report.tables import verdict
+from thirdhand.workbench.report.tables import tables, verdict
 from thirdhand_sim.golden import (
     AWAY_S,
     BAD_S,
