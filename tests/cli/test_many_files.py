@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from support.cell import told
 from support.in_process import ASSUMED, ticks_of
+from support.paths import ROOT
 from support.wam import URDF
 from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import Frame, Tick
@@ -17,6 +21,15 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
 NAMES = ("a.mcap", "b.mcap", "broken.mcap", "c.mcap")
+DASK = """
+import sys
+from distributed import LocalCluster
+from thirdhand.command_line import main
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        code = main([*sys.argv[1:], "--workers", f"dask:{cluster.scheduler_address}"])
+    sys.exit(code)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +69,17 @@ def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neith
     shared = told(*command, *files, "--workers", "2")
     assert (shared.returncode, shared.stdout) == (1, alone.stdout)
     assert named_failures(shared.stderr) == [first, last]
+
+
+@pytest.mark.thorough
+def test_cluster_prints_what_one_process_prints(files: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    script = tmp_path / "with_a_cluster.py"
+    script.write_text(DASK, encoding="utf-8")
+    command = ["replay", "--each", *files]
+    done = subprocess.run(
+        [sys.executable, str(script), *command], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
+    )
+    alone = told(*command)
+    assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr
+    assert named_failures(done.stderr) == named_failures(alone.stderr)
