@@ -69,6 +69,18 @@ def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
     assert not len(refused(np.outer(stop, (1.0, 0.5, 0.0)), rate_hz))
 
 
+@pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
+def test_hands_that_begin_with_an_exact_rest_are_accepted(rate_hz: float) -> None:
+    """As those of a page, which stop at once and go on with a leap, or of a bench with noise."""
+    count = round(3 * rate_hz)
+    dragged = LEFT + np.outer(np.linspace(0.0, 0.4, count + 1)[1:], (1.0, 0.0, 0.0))
+    for moves in (dragged, measured(3.0, rate_hz)):
+        pieces = [np.tile(LEFT, (round(rate_hz), 1))]
+        for away_m in (0.0, 0.3, 0.6):
+            pieces += [moves + away_m, np.tile(moves[-1] + away_m, (count, 1))]
+        assert not len(refused(np.concatenate(pieces), rate_hz))
+
+
 def test_noise_is_never_frozen() -> None:
     assert not len(refused(measured(30.0, 100.0), 100.0))
     coarse = np.round(measured(30.0, 100.0), 3)  # of a tracker that reports whole millimetres

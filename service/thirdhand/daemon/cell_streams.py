@@ -110,7 +110,8 @@ class FrozenHand:
     """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
 
     A program's hands rest exactly: repeated poses are accepted if the hand came to rest smoothly,
-    or if most rests so far began with its stream or ended without a leap, as `learn` does in takes.
+    if its stream began with a rest, or if most rests so far ended without a leap, as `learn` does
+    in takes.
     """
 
     def __init__(self) -> None:
@@ -119,6 +120,7 @@ class FrozenHand:
         self._repeated_ns = 0  # stamp of its newest repetition
         self._varies_since_ns = 0  # stamp since which each sample differs from the one before
         self._is_tracked = False
+        self._begins_exactly = False  # its stream began with a rest, as that of a page does
         self._rests = self._leaps = 0
 
     def is_frozen(self, pose: PoseStamped) -> bool:
@@ -129,12 +131,14 @@ class FrozenHand:
         elif (pose.position, pose.orientation) == (before.position, before.orientation):
             self._repeated_ns = self._varies_since_ns = pose.stamp_ns
             lasts_s = (pose.stamp_ns - before.stamp_ns) / 1e9
-            if not self._is_tracked or lasts_s < FROZEN_S or 2 * self._leaps < self._rests:
+            is_exact = self._begins_exactly or 2 * self._leaps < self._rests
+            if not self._is_tracked or lasts_s < FROZEN_S or is_exact:
                 return False
             return self._steps[-1] > SMOOTH_SHARE * median(self._steps)
         else:
             step = math.dist(pose.position, before.position)
             if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
+                self._begins_exactly |= not self._steps
                 self._rests += 1
                 self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
             self._steps.append(step)
