@@ -29,33 +29,24 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from kmp.arrays.checks import RankReached as RankReached
-    from kmp.arrays.checks import ViaPointMissed as ViaPointMissed
-    from kmp.constraints import LinearConstraints as LinearConstraints
+    from kmp.arrays.checks import RankReached, ViaPointMissed
+    from kmp.constraints import LinearConstraints
     from kmp.estimator import KMPRegressor as KMPRegressor
-    from kmp.gaussians import Gaussians as Gaussians
-    from kmp.kernel import GaussianKernel as GaussianKernel
-    from kmp.mixture import GaussianMixture as GaussianMixture
-    from kmp.orientation import OrientationKMP as OrientationKMP
-    from kmp.predictor import Uncertainty as Uncertainty
-    from kmp.primitive import KMP as KMP
-    from kmp.problem.hyperparameters import AffineMean as AffineMean
-    from kmp.query import MotionPrediction as MotionPrediction
-    from kmp.references.correlation import Correlation as Correlation
-    from kmp.references.correlation import Improvement as Improvement
-    from kmp.references.correlation import improve as improve
-    from kmp.references.frames import CoordinateFrame as CoordinateFrame
-    from kmp.references.frames import LocalKMP as LocalKMP
-    from kmp.references.gaussian_process import gaussian_process_reference as gaussian_process_reference
-    from kmp.references.superposition import superposed as superposed
-    from kmp.selection import Learned as Learned
-    from kmp.selection import Score as Score
-    from kmp.selection import learn as learn
-    from kmp.storage import Stored as Stored
-    from kmp.storage import load as load
-    from kmp.storage import save as save
-    from kmp.time_kernels import PeriodicKernel as PeriodicKernel
-    from kmp.time_kernels import VelocityKernel as VelocityKernel
+    from kmp.gaussians import Gaussians
+    from kmp.kernel import GaussianKernel
+    from kmp.mixture import GaussianMixture
+    from kmp.orientation import OrientationKMP
+    from kmp.predictor import Uncertainty
+    from kmp.primitive import KMP
+    from kmp.problem.hyperparameters import AffineMean
+    from kmp.query import MotionPrediction
+    from kmp.references.correlation import Correlation, Improvement, improve
+    from kmp.references.frames import CoordinateFrame, LocalKMP
+    from kmp.references.gaussian_process import gaussian_process_reference
+    from kmp.references.superposition import superposed
+    from kmp.selection import Learned, Score, learn
+    from kmp.storage import Stored, load, save
+    from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 __version__ = "0.1.0"
 
