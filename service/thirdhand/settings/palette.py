@@ -18,6 +18,7 @@ LEFT, RIGHT, TOOL, TARGET, MEASURED, NEAREST, PLACE = SKY, ORANGE, GREEN, PURPLE
 OFF = BLUE  # curve of the hands' deviation
 GATE = VERMILLION  # curve of the deviation above which the arm holds
 LATENCY, WORK, LATENESS = PURPLE, SKY, ORANGE
+BY_TRACK = {"left": LEFT, "right": RIGHT, "tool": TOOL}  # the paths of hands and tool
 BY_JOINT = (SKY, ORANGE, GREEN, PURPLE, YELLOW, BLUE, VERMILLION)
 BY_MODE: dict[Mode, Colour] = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: VERMILLION}
 ARM_BODY: Colour = (200, 203, 208)

@@ -24,7 +24,6 @@ from thirdhand.viewer.scene_objects import Column, row
 
 MAX_LINE_POINTS = 300
 Point = tuple[float, float, float]
-COLOURS = {"left": palette.LEFT, "right": palette.RIGHT, "tool": palette.TOOL}
 
 
 class MarkedViaPoint(NamedTuple):
@@ -98,7 +97,7 @@ def demonstrations(archive: bytes) -> list[Vector]:
 
 def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
     """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
-    for first, (name, colour) in enumerate(COLOURS.items()):
+    for first, (name, colour) in enumerate(palette.BY_TRACK.items()):
         columns = slice(3 * first, 3 * first + 3)
         lines = [one[:: 1 + len(one) // MAX_LINE_POINTS, columns] for one in skill.demonstrations]
         style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}

@@ -143,7 +143,7 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
         colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wireframe, labels=["target, 95 %"], show_labels=False
     )
     fix("/scene/target", region)
-    for name, colour in (("left", palette.LEFT), ("right", palette.RIGHT), ("tool", palette.TOOL)):
+    for name, colour in palette.BY_TRACK.items():
         fix(f"/scene/{name}_trail", rr.LineStrips3D.from_fields(colors=[colour], radii=[0.002]))
     fix("/scene/nearest", rr.LineStrips3D.from_fields(colors=[palette.NEAREST], radii=[0.0015], show_labels=True))
     _log_names(fix, settings)

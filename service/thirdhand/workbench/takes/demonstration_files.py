@@ -29,10 +29,7 @@ EDGE_S = 0.3  # a take begins or ends in motion if this first or last time is fa
 EDGE_SPEED_MPS = 0.1
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLOT_COLUMNS = 60  # characters in a line of the speed plot
-TRACK_COLOURS = {
-    side: palette.written(colour)
-    for side, colour in zip(TRACK_NAMES, (palette.LEFT, palette.RIGHT, palette.TOOL), strict=True)
-}
+TRACK_COLOURS = {name: palette.written(colour) for name, colour in palette.BY_TRACK.items()}
 
 
 class DemonstrationNameError(RecordingError):

@@ -17,9 +17,7 @@ from thirdhand.workbench.trackers.hands_page import HandsPage
 from thirdhand.workbench.trackers.web_server import JSON, answer
 
 PAGE_COLOURS = {
-    "left": palette.LEFT,
-    "right": palette.RIGHT,
-    "tool": palette.TOOL,
+    **palette.BY_TRACK,
     "target": palette.TARGET,
     "arm": palette.ARM_BODY,
     "grid": palette.GRID,
