@@ -12,7 +12,7 @@ import importlib
 import os
 
 from thirdhand.cli.options import RUN_TIME
-from thirdhand.cli.usage import House, Parser, UsageError, reaching
+from thirdhand.cli.usage import AddCommand, Parser, UsageError, reaching
 from thirdhand.contract.explain import ExplainedError, in_file, in_words
 from thirdhand.process import foreign_modules, interrupt
 from thirdhand.process.progress import say
@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     subparsers = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     abouts: dict[str, str] = {}
     for home, commands in (("thirdhand.cli", RUN_TIME), ("thirdhand.workbench.cli", WORKBENCH)):
-        add = House(subparsers, home, abouts)
+        add = AddCommand(subparsers, home, abouts)
         for add_options in commands:
             add_options(add)
     top.groups = {

@@ -8,6 +8,7 @@ import ast
 import itertools
 import math
 import threading
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from thirdhand.client import (
 from thirdhand.client.streams import wait_until_heard
 from thirdhand.contract import channels
 from thirdhand.contract.messages import JointState, PoseStamped
+from thirdhand.process.foreign_modules import EXTRAS
 
 DEPENDENCIES = ("zenoh", "msgspec")
 SAME = """
@@ -68,6 +70,11 @@ def test_a_command_whose_extra_is_missing_says_what_to_install(command: str, ext
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     assert f"installed: pip install 'thirdhand[{extra}]'" in done.stderr
+
+
+def test_extras_in_messages_are_those_of_the_project() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert EXTRAS.keys() <= project["optional-dependencies"].keys()
 
 
 # --- a connection --------------------------------------------------------------------------------

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from thirdhand.cli.usage import ARM_HELP, RATE_HELP, House, add_end_with, described, flag, option, reach, within
+from thirdhand.cli.usage import ARM_HELP, RATE_HELP, AddCommand, add_end_with, described, flag, option, reach, within
 from thirdhand.contract import channels
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import TOLERANCE_M, ViaPoint
 
 
-def follow(add: House) -> None:
+def follow(add: AddCommand) -> None:
     """Options of `follow`."""
     c = add(
         "follow",
@@ -22,7 +22,7 @@ def follow(add: House) -> None:
     reach(c)
 
 
-def serve(add: House) -> None:
+def serve(add: AddCommand) -> None:
     """Options of `serve`."""
     c = add(
         "serve",
@@ -56,7 +56,7 @@ def serve(add: House) -> None:
     add_end_with(c)
 
 
-def via_points(add: House) -> None:
+def via_points(add: AddCommand) -> None:
     """Options of `via-points`."""
     c = add(
         "via-points",
@@ -96,7 +96,7 @@ def via_points(add: House) -> None:
     reach(described(actions, "clear", "remove all via-points", f"{example} clear"))
 
 
-def segment(add: House) -> None:
+def segment(add: AddCommand) -> None:
     """Options of `segment`."""
     c = reach(
         add(
@@ -109,7 +109,7 @@ def segment(add: House) -> None:
     c.add_argument("name", metavar="NAME", help="the name of a via-point of the task")
 
 
-def correct(add: House) -> None:
+def correct(add: AddCommand) -> None:
     """Options of `correct`."""
     c = reach(
         add(
@@ -127,7 +127,7 @@ def correct(add: House) -> None:
     flag(c, "--undo", "undo the last correction")
 
 
-def status(add: House) -> None:
+def status(add: AddCommand) -> None:
     """Options of `status`."""
     about = "Shows the status of a running daemon, or of all."
     c = reach(add("status", about, "thirdhand status --json\n  thirdhand status --all"))
@@ -139,7 +139,7 @@ def status(add: House) -> None:
     c.add_argument("--all", action="store_const", dest="run", const="thirdhand.cli.cells.cells", help=every)
 
 
-def doctor(add: House) -> None:
+def doctor(add: AddCommand) -> None:
     """Options of `doctor`."""
     about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
     c = reach(add("doctor", about, "thirdhand doctor"))
@@ -147,7 +147,7 @@ def doctor(add: House) -> None:
     option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))
 
 
-def holding(add: House) -> None:
+def holding(add: AddCommand) -> None:
     """Options of `hold`, `resume` and `reset`."""
     reach(add("hold", "Stops the arm until `resume`.", "thirdhand hold", run="clients.hold"))
     reach(add("resume", "Ends an operator's hold.", "thirdhand resume", run="clients.resume"))

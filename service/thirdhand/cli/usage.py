@@ -69,7 +69,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message + (did_you_mean(found[1], words, cutoff=0.5) if found else ""))
 
 
-class House:
+class AddCommand:
     """Adds commands of one house, whose modules are in the package `home`, to the command line.
     `abouts` receives what each is for.
     """

@@ -261,5 +261,5 @@ def rerun_program() -> Path:
     """The Rerun program that is installed with the library; it need not be on the path."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
-        raise ViewerError("the Rerun program is not installed: pip install rerun-sdk")
+        raise ViewerError("the Rerun program is not installed: pip install 'thirdhand[view]'")
     return Path(found.origin).with_name("rerun.exe" if sys.platform == "win32" else "rerun")

@@ -1,4 +1,4 @@
-"""House on many files: one file that cannot be used does not stop the others."""
+"""Commands on many files: one file that cannot be used does not stop the others."""
 
 from __future__ import annotations
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thirdhand.cli.usage import ARM_HELP, RATE_HELP, WORKERS_HELP, House, flag, option, reach, within
+from thirdhand.cli.usage import ARM_HELP, RATE_HELP, WORKERS_HELP, AddCommand, flag, option, reach, within
 from thirdhand.contract.records import SIDES
 from thirdhand.skills.residual_risk import OPTION
 from thirdhand.workbench.cli import calibrate_options, record_options
 
 DEMO_RATE = (
-    "the rate of the control loop (default: the rate in the cell's settings; 100 Hz for a shipped arm with --mouse, "
-    "because a browser without a GPU needs a core for itself)"
+    "the rate of the control loop (default: the rate in the cell's settings; 100 Hz for a shipped arm with --mouse "
+    "or --open, because a browser without a GPU needs a core for itself)"
 )
 
 
-def demo(add: House) -> None:
+def demo(add: AddCommand) -> None:
     """Options of `demo`."""
     c = add(
         "demo",
@@ -40,7 +40,7 @@ def demo(add: House) -> None:
     flag(c, "--json", "print the report as one JSON object")
 
 
-def bench(add: House) -> None:
+def bench(add: AddCommand) -> None:
     """Options of `bench`."""
     c = add(
         "bench",
@@ -55,7 +55,7 @@ def bench(add: House) -> None:
     option(c, "--output", "DIR", "write bench.json, a picture of it and the recording to this folder")
 
 
-def play(add: House) -> None:
+def play(add: AddCommand) -> None:
     """Options of `play`."""
     c = add(
         "play",
@@ -69,7 +69,7 @@ def play(add: House) -> None:
     reach(c)
 
 
-def hands(add: House) -> None:
+def hands(add: AddCommand) -> None:
     """Options of `hands`."""
     c = add(
         "hands",
@@ -101,7 +101,7 @@ def hands(add: House) -> None:
     reach(c)
 
 
-def replay(add: House) -> None:
+def replay(add: AddCommand) -> None:
     """Options of `replay`."""
     c = add(
         "replay",
@@ -118,14 +118,14 @@ def replay(add: House) -> None:
     option(c, "--workers", "WORKERS", f"{WORKERS_HELP}; with --each")
 
 
-def record(add: House) -> None:
+def record(add: AddCommand) -> None:
     """Options of `record`."""
     c = add("record", record_options.ABOUT_RECORD, record_options.RECORD_EXAMPLE)
     record_options.add_options(c)
     reach(c)
 
 
-def report(add: House) -> None:
+def report(add: AddCommand) -> None:
     """Options of `report`."""
     c = add(
         "report",
@@ -143,7 +143,7 @@ def report(add: House) -> None:
     option(c, "--workers", "WORKERS", WORKERS_HELP)
 
 
-def learn(add: House) -> None:
+def learn(add: AddCommand) -> None:
     """Options of `learn`."""
     c = add(
         "learn",
@@ -189,7 +189,7 @@ def learn(add: House) -> None:
     option(c, OPTION, "NAME", accept)
 
 
-def bundle(add: House) -> None:
+def bundle(add: AddCommand) -> None:
     """Options of `bundle`."""
     about = "Writes settings without secrets, status, doctor, versions, log and recordings to an archive for support."
     c = add("bundle", about, "thirdhand bundle --config cell.toml")
@@ -201,7 +201,7 @@ def bundle(add: House) -> None:
     reach(c)
 
 
-def metrics(add: House) -> None:
+def metrics(add: AddCommand) -> None:
     """Options of `metrics`."""
     about = "Serves the statuses of all cells on a network as metrics for Prometheus."
     c = add("metrics", about, "thirdhand metrics --listen 127.0.0.1:9464")
@@ -209,7 +209,7 @@ def metrics(add: House) -> None:
     reach(c, one=False)
 
 
-def arm(add: House) -> None:
+def arm(add: AddCommand) -> None:
     """Options of `arm`."""
     c = add(
         "arm",
@@ -227,14 +227,14 @@ def arm(add: House) -> None:
     option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)
 
 
-def calibrate(add: House) -> None:
+def calibrate(add: AddCommand) -> None:
     """Options of `calibrate`."""
     c = add("calibrate", calibrate_options.ABOUT_CALIBRATE, calibrate_options.CALIBRATE_EXAMPLE)
     calibrate_options.add_options(c)
     reach(c)
 
 
-def sim(add: House) -> None:
+def sim(add: AddCommand) -> None:
     """Options of `sim`."""
     # `python -m thirdhand_sim` reads all arguments, so there are no options here, not even --help.
     about = "Runs the simulated bench: it publishes hands and joint states, and follows commands."
@@ -242,7 +242,7 @@ def sim(add: House) -> None:
     c.add_argument("options", nargs="*")
 
 
-def view(add: House) -> None:
+def view(add: AddCommand) -> None:
     """Options of `view`."""
     c = add(
         "view",
