@@ -43,7 +43,7 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "first-tracker.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"<!-- tracker -->\n```python\n(.*?)```", page, re.DOTALL)
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        environment = os.environ | {"THIRDHAND_CONNECT": daemon.endpoint, "PYTHONPATH": str(ROOT)}
+        environment = os.environ | {"THIRDHAND_CONNECT": daemon.endpoint}
         before = daemon.client.status().tool_m
         command = [sys.executable, "-c", code.replace("range(3000)", "range(315)")]
         done = subprocess.run(

@@ -5,7 +5,6 @@ glass and holds it over the board.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -54,8 +53,7 @@ seed = 7
 def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
     """The report of a demo that succeeds."""
     command = [sys.executable, "-m", "thirdhand", "demo", "--json", *arguments]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=320, check=False)
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=320, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["success"]

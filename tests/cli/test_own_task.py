@@ -72,7 +72,6 @@ def test_the_tutorial_runs_as_it_stands(
     monkeypatch.chdir(tmp_path)
     for kind in ("STATE", "CONFIG"):  # another HOME would have another cache, and compile
         monkeypatch.setenv(f"XDG_{kind}_HOME", str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     shell = Shell()
     try:
         for block in BLOCKS:

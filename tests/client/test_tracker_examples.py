@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import struct
@@ -95,7 +94,7 @@ def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(name:
             "--connect",
             *endpoints(session),
         ]
-        running = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
+        running = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
 
             def received() -> PoseStamped | None:

@@ -32,10 +32,9 @@ pwd.getpwuid = {}.__getitem__
 def run(command: str, *, before: str = "", folder: Path = ROOT, **variables: str) -> subprocess.CompletedProcess[str]:
     """A command in a terminal with these variables."""
     code = f"{before}\nimport sys\nfrom thirdhand.__main__ import main\nsys.exit(main())"
-    path = os.pathsep.join(filter(None, (variables.pop("PYTHONPATH", ""), str(ROOT))))
     return subprocess.run(
         [sys.executable, "-P", "-c", code, *command.split()],
-        env=os.environ | variables | {"PYTHONPATH": path},
+        env=os.environ | variables,
         cwd=folder, capture_output=True, timeout=60, check=False, encoding="utf-8", errors="replace",
     )  # fmt: skip
 

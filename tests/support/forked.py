@@ -24,7 +24,6 @@ from thirdhand.process.child import ForkServer
 MODULE = "tests.support.forked_command"
 STARTED = ("-m thirdhand", "-m thirdhand_sim")
 READ_AT_IMPORT = ("NUMBA_", "PYTHON", "OPENBLAS_", "LD_", "MUJOCO_", "HOME", "XDG_CACHE_HOME")
-ANY_TIME = {"PYTHONPATH"}  # the server has found its modules already
 BEGIN_POLL_S = 1.0
 
 _environment = dict(os.environ)
@@ -73,7 +72,7 @@ def _module_of(args: Any) -> str | None:
 def _is_read_at_import(environment: dict[str, str]) -> bool:
     """True if an environment differs from this process's first one in what imports read."""
     changed = {name for name, _ in environment.items() ^ _environment.items()}
-    return any(name.startswith(READ_AT_IMPORT) for name in changed - ANY_TIME)
+    return any(name.startswith(READ_AT_IMPORT) for name in changed)
 
 
 def use(is_on: bool) -> None:
