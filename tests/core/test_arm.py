@@ -148,7 +148,7 @@ def test_tool_velocity_is_the_derivative() -> None:
 
 
 def test_position_has_priority_over_direction() -> None:
-    """Position goes before a direction that cannot be had."""
+    """Position has priority over a direction that is out of reach."""
     for direction in (-AHEAD_AND_DOWN, np.array([0, 1.0, 0])):
         assert wait(np.array(POSTURE), START, direction, seconds=5.0).error[-1] < 1e-4
 
@@ -168,7 +168,7 @@ def test_arm_leaves_the_stretched_posture() -> None:
 
 
 def test_outside_limits_joints_move_inwards() -> None:
-    """From home outside the limits joints come inwards only."""
+    """From outside their limits, joints only move inwards."""
     home = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])
     run = wait(home, START, AHEAD_AND_DOWN, seconds=12.0)
     outside = np.maximum(np.maximum(run.position - UPPER, LOWER - run.position), 0.0)
@@ -189,7 +189,7 @@ def test_joint_slows_toward_its_limit() -> None:
 
 
 def test_fast_task_is_scaled() -> None:
-    """Too fast a task is scaled and keeps its direction."""
+    """A task that is too fast is scaled and keeps its direction."""
     q = np.array(POSTURE)
     position = ARM.at(q).position
     arm = Arm(changed(CELL, joints={"velocity": (0.7,) * 7}), URDF)
@@ -221,7 +221,7 @@ def test_a_step_never_raises_nor_returns_nan(
 
 
 def test_velocities_are_continuous_at_limits() -> None:
-    """The wanted velocity of the joints is continuous across their limits."""
+    """The wanted joint velocity is continuous across the limits."""
     rng = np.random.default_rng(7)
     for _ in range(200):
         q = random_joints(1, seed=int(rng.integers(1 << 30)))[0]

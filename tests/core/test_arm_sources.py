@@ -35,7 +35,7 @@ def rejected(loop: Loop) -> dict[Cause, int]:
 @pytest.mark.parametrize("ahead_ns", [10**9, HOUR_NS])
 @pytest.mark.parametrize("posture", [POSTURE, ELSEWHERE])
 def test_one_state_ahead_changes_nothing(skill: Skill, ahead_ns: int, posture: tuple[float, ...]) -> None:
-    """One state stamped ahead neither faults nor moves nor locks out."""
+    """A single state with a stamp ahead causes no fault, no motion and no rejection of later ones."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     seen = loop.run(1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5)
@@ -60,7 +60,7 @@ def test_state_ahead_is_no_start_after_reset(skill: Skill) -> None:
 
 @pytest.mark.parametrize("every", [5, 2])
 def test_two_arms_in_turns_are_not_ready(skill: Skill, every: int) -> None:
-    """Two arms that take turns are not believed to be ready."""
+    """Two alternating arms do not count as ready."""
     loop = Loop(SETTINGS, skill)
     seen = loop.run(2000, {k: arm(ELSEWHERE, stamp_ns(k) + 1) for k in range(0, 2000, every)}, every=5)
     assert not seen["commanded"].any()
@@ -111,7 +111,7 @@ def test_arm_outside_limits_is_brought_back(skill: Skill, joint: int, value: flo
 
 
 def test_hold_stops_the_return(skill: Skill) -> None:
-    """An operators hold stops the way back and lets it go on."""
+    """An operator's hold stops the return, and its end continues it."""
     loop = Loop(SETTINGS, skill, (2.75, *POSTURE[1:]))
     loop.run(300, every=5)
     held = loop.run(500, {0: order("hold")}, every=5)

@@ -56,7 +56,7 @@ def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
 def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
-    """A clutch that falls silent is released."""
+    """A clutch whose messages cease counts as released."""
     pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
     found = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
     silent = 10 + round(STALE_S * rate_hz)
@@ -121,7 +121,7 @@ def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
 
 
 def test_skill_decides_its_gripper_alone(skill: Skill) -> None:
-    """A skill with a gripper decides it alone."""
+    """A skill with a gripper decides the gripper's state alone."""
     first, *more = Scene().via_points()
     there = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
     closing = adapted(skill, (there, *more), tolerance=0.05)

@@ -66,7 +66,7 @@ def reference(cell: Settings, skill: Skill) -> Vector:
 
 
 def test_task_crosses_the_seam(reference: Vector) -> None:
-    """The task takes a joint over the seam."""
+    """The task moves a joint across its seam."""
     assert reference[:, 0].min() < math.pi - 0.05
     assert reference[:, 0].max() > math.pi + 0.05
 
@@ -79,7 +79,7 @@ def test_task_crosses_the_seam(reference: Vector) -> None:
 def test_any_turn_is_followed_alike(
     cell: Settings, skill: Skill, turns_on: Vector, reference: Vector, turns: int, how: str
 ) -> None:
-    """An arm in any turn is commanded in its own and goes as from the first."""
+    """An arm in any turn is commanded in that turn, and moves as from the first one."""
     start = np.array(cell.arm.posture) + TURN * turns * turns_on
     counts = counted if how == "counted" else wrapped(turns_on)
     frames = session(cell, skill, counts, start).run(TICKS)
@@ -93,7 +93,7 @@ def test_any_turn_is_followed_alike(
 
 
 def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_on: Vector) -> None:
-    """After a silence an arm is commanded in the turn that it reports then."""
+    """After a silence, an arm is commanded in the turn that it then reports."""
     loop = session(cell, skill, counted, np.array(cell.arm.posture) + TURN * turns_on)
     loop.run(600)
     loop.run(201, {200: order("reset")}, every=0)
@@ -106,7 +106,7 @@ def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_
 
 
 def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
-    """A silence of just as long as is allowed turns nothing."""
+    """A silence of the longest accepted duration changes no turn."""
     loop = session(cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05)  # beyond the seam
     loop.joints[0] = math.pi + 0.01
     for k in range(1500):
@@ -116,7 +116,7 @@ def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: V
 
 
 def test_jump_of_a_turn_is_none(cell: Settings, skill: Skill, turns_on: Vector) -> None:
-    """A jump of a turn is none and one of half a turn is."""
+    """A jump by a whole turn is ignored, one by half a turn is rejected."""
     loop = session(cell, skill, counted, np.array(cell.arm.posture))
     loop.run(200)
     before = loop.controller.state["measured"].copy()

@@ -78,7 +78,7 @@ def test_demonstrated_relation_with_little_tremor() -> None:
 
 
 def test_state_continues_bit_for_bit(taught: Skill) -> None:
-    """It goes on from its state bit for bit."""
+    """A controller continues from its state bit for bit."""
     ticks = list(ticks_of(HandScript(Scene(), seed=7)))[:2500]
     whole = followed(taught, ticks)
     first = Controller(ASSUMED, taught, urdf=URDF)
@@ -113,7 +113,7 @@ def without(unseen_ms: float) -> Settings:
 
 @pytest.mark.parametrize(("side", "most"), [("left", 1.0), ("right", 0.6)], ids=["it conducts", "the other does"])
 def test_tool_moves_while_one_hand_is_unseen(taught: Skill, moving: Session, side: str, most: float) -> None:
-    """The tool goes on while one hand is out of sight for a moment."""
+    """The tool keeps moving while one hand is out of sight for a moment."""
     ticks, whole = moving
     away = range(3300, 3500)
     ticks = unseen(ticks[: away.stop + 500], away, f"hands/{side}")
@@ -127,7 +127,7 @@ def test_tool_moves_while_one_hand_is_unseen(taught: Skill, moving: Session, sid
 
 
 def test_waits_for_an_unseen_hand_that_matters(taught: Skill, moving: Session) -> None:
-    """It waits at once where the hand that is not seen matters much."""
+    """The arm waits at once if the target depends strongly on the unseen hand."""
     ticks = unseen(moving[0][:2400], range(1650, 2400), "hands/left")
     seen = followed(taught, ticks, without(1000.0))
     assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand")]
@@ -137,7 +137,7 @@ def test_waits_for_an_unseen_hand_that_matters(taught: Skill, moving: Session) -
 
 
 def test_unseen_hand_keeps_arm_farther_away(taught: Skill, moving: Session) -> None:
-    """Who is not seen keeps the arm farther away."""
+    """The arm keeps a larger distance from a hand that is out of sight."""
     away = range(3300, 3500)
     seen = followed(taught, unseen(moving[0][: away.stop], away, "hands/left"))
     limit = seen["hand_limit"][away.start :]
@@ -145,7 +145,7 @@ def test_unseen_hand_keeps_arm_farther_away(taught: Skill, moving: Session) -> N
 
 
 def test_silent_hands_hold_within_100_ms(taught: Skill, moving: Session) -> None:
-    """Hands that fall silent bring a hold within 100 ms until both are seen again."""
+    """Silent hands cause a hold within 100 ms, until both are seen again."""
     ticks = unseen(moving[0], range(1500, 1900), "hands/left", "hands/right")
     ticks = unseen(ticks, range(1900, 1920), "hands/left")
     seen = followed(taught, ticks)
@@ -177,7 +177,7 @@ def test_an_operator_holds_and_resumes(taught: Skill) -> None:
 
 
 def test_nothing_is_commanded_before_arm_is_heard(taught: Skill) -> None:
-    """Nothing is commanded before the arm has told where it is."""
+    """No command is published before the arm has reported its joints."""
     start = (0.1, 0.5, 0.0, 1.9, 0.0, -0.3, 0.2)
     controller = Controller(Settings(), taught, urdf=URDF)
     before = frames(controller, resting(0, 200))
@@ -271,7 +271,7 @@ def test_repeated_jumps_hold_once(taught: Skill, jump_m: float, wrong_s: float) 
 
 
 def test_unsure_flag_does_not_change_motion(taught: Skill) -> None:
-    """An unsure skill is told by a flag and moves the arm as a sure one does."""
+    """An uncertain skill raises a flag and moves the arm as a certain one does."""
     ticks = list(ticks_of(HandScript(Scene(), seed=5)))[:1500]
     skills = [replace(taught, regions=Regions(scale)) for scale in (1e-4, 1e4)]
     sure, unsure = (followed(skill, ticks) for skill in skills)
@@ -308,7 +308,7 @@ def test_every_event_has_a_case(taught: Skill) -> None:
 
 
 def test_twin_decides_the_same(taught: Skill) -> None:
-    """A twin decides the same and leaves the other alone."""
+    """A twin makes the same decisions and leaves its original unchanged."""
     ticks = resting(0, 300)
     controller, twin = (Controller(ASSUMED, taught, urdf=URDF) for _ in range(2))
     for tick in ticks[:-1]:

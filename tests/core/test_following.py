@@ -46,7 +46,7 @@ def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: 
 
 @pytest.mark.parametrize(("rate_hz", "max_jerk"), [(500, 5.0), (500, 2.0), (250, 1.0), (100, 50.0), (50, 20.0)])
 def test_comes_to_rest_at_any_rate_and_jerk(rate_hz: int, max_jerk: float) -> None:
-    """Whatever its jerk and the loops rate it comes to rest."""
+    """The setpoint comes to rest at any jerk limit and loop rate."""
     tool = msgspec.structs.replace(TOOL, max_jerk=max_jerk)
     for way in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
         u = np.minimum(1.0, np.arange(12 * rate_hz) / (0.4 * rate_hz))[:, None]

@@ -46,7 +46,7 @@ def event(key: str, payload: bytes) -> Event | None:
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.one_case
 def test_spoilt_bytes_replay_within_bounds(seed: int, skill: Skill, tmp_path: Path) -> None:
-    """A session of spoilt bytes replays within every bound."""
+    """A session with damaged bytes replays within every bound."""
     traffic, path = Traffic(seed), tmp_path / "fuzzed.mcap"
     traffic.joints = np.array(SETTINGS.arm.posture)
     controller = Controller(SETTINGS, skill, urdf=URDF)

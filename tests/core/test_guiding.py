@@ -66,7 +66,7 @@ def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, firs
 
 
 def test_led_arm_without_report_is_a_fault(taught: Skill) -> None:
-    """An arm that is led without a report is at fault."""
+    """An arm that is led by hand without reporting it is a fault."""
     loop = Loop(CELL, taught)
     loop.run(700, {500: order("hold")})
     assert lead(loop, 800, is_reported=False)["reason"][-1] == Reason.ARM_ERROR

@@ -46,7 +46,7 @@ def test_even_motion_survives_a_late_sample() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.0005, 0.002, 0.005])
 def test_noise_is_reduced_and_measured(noise_m: float) -> None:
-    """Noise is made smaller and its size is found."""
+    """Noise is reduced, and its size is estimated."""
     noise = np.random.default_rng(1).normal(0.0, noise_m, (600, 3))
     still = np.array([0.5, 0.0, 0.2])
     hands = Hands()
@@ -137,7 +137,7 @@ def test_tremor_hardly_ripples_velocity(hz: float, size_m: float, speed: float) 
 @pytest.mark.parametrize(("rate_hz", "noise_m"), [(30, 0.002), (100, 0.0005)])
 @pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
 def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_s: float) -> None:
-    """A hand at rest that is not seen for a moment does not dart."""
+    """A resting hand that is out of sight for a moment makes no jump."""
     hands, still, random = Hands(), np.array([0.5, 0.0, 0.2]), np.random.default_rng(9)
     follow(hands, lambda t: still, until_s=4.0, rate_hz=rate_hz, noise=random.normal(0.0, noise_m, (4 * rate_hz, 3)))
     hands.advance(round(unseen_s / PERIOD_S))
@@ -198,7 +198,7 @@ def test_a_hand_that_trembles_rests(tremor_m: float) -> None:
 
 @pytest.mark.parametrize("hz", [25, 125, 500])
 def test_rest_ends_at_once_and_begins_slowly(hz: int) -> None:
-    """Rest is left at once and comes slowly at any rate."""
+    """Rest ends at once and begins slowly, at any rate."""
     speed = np.concatenate([np.zeros(hz), np.full(hz, 0.3), np.zeros(hz)])
     found = rest_of(speed, hz)
     assert found[hz - 1] == 1.0

@@ -27,13 +27,13 @@ QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
 
 
 def test_tracker_is_scaled_turned_and_moved() -> None:
-    """A turned tracker is scaled then turned then moved."""
+    """A tracker's positions are scaled, then rotated, then translated."""
     hands = Hands(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
     np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
 
 
 def test_left_handed_axes_are_mirrored() -> None:
-    """Left handed axes become right handed by their z before all else."""
+    """Left-handed axes become right-handed by their z before all else."""
     mapping = (1.0, 2.0, 3.0, *QUARTER_TURN)
     hands = Hands(HandSettings(unit="mm", axes="left-handed", base_from_tracker=mapping))
     np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 - 0.003])
@@ -209,7 +209,7 @@ def test_a_stamp_from_the_future_is_refused_and_locks_no_source_out(ahead_ns: in
 
 
 def test_stamp_may_be_ahead_by_passed_time() -> None:
-    """A stamp may be ahead by the time that passed and the time to silence."""
+    """A stamp may be ahead by the elapsed time and the time-out."""
     hands = Hands()
     hands.hand(1)
     hands.advance(30)
@@ -275,7 +275,9 @@ def test_useless_arm_sample_is_only_counted(
 
 
 def test_arm_is_silent_after_configured_time() -> None:
-    """An arm is silent after exactly the configured time and heard again with any stamp."""
+    """An arm counts as silent after exactly the configured time, and is accepted again with any
+    stamp.
+    """
     hands = Hands()
     assert not hands.heard()
     hands.arm(1000)

@@ -37,7 +37,7 @@ def test_bounded_least_squares(seed: int) -> None:
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
-    """Tool speeds now, to come and in total, and the error of the measured joints."""
+    """Present, future and total tool speed, and the error of the measured joints."""
     random = np.random.default_rng(2)
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
@@ -57,7 +57,7 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
 
 @pytest.mark.parametrize("name", ["wam", "franka", "ur5"])
 def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
-    """The tool's speed after a way of the joints is that of pinocchio."""
+    """The tool's speed after a joint displacement is that of Pinocchio."""
     random, settings = np.random.default_rng(3), cell_of(name)
     arm, joints = Arm(settings, robot_description(settings)), len(settings.joints.names)
     for _ in range(20):

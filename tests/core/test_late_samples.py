@@ -48,7 +48,7 @@ def told(
 @example_settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.sampled_from([30, 60, 100, 240, 500]), st.floats(0.01, 0.098), st.integers(0, 10**6))
 def test_order_of_arrival_does_not_matter(rate_hz: int, latest_s: float, seed: int) -> None:
-    """Whatever order samples come in the estimate is that of their own."""
+    """The estimate does not depend on the order in which samples arrive."""
     latest_s = min(latest_s, 0.098 - 1.0 / rate_hz)  # none is silent for long enough to begin anew
     until_s = WARM_S + 0.6
     made_s = np.arange(0.0, until_s, 1.0 / rate_hz)
@@ -89,7 +89,7 @@ def test_samples_60_ms_late_are_nearly_as_good(rate_hz: int) -> None:
     ],
 )
 def test_bad_clock_is_ignored(rate_hz: int, stamps: Callable[[Vector], Vector]) -> None:
-    """By a clock that is none samples are taken when they come."""
+    """With a useless clock, samples are stamped at their arrival."""
     made_s = np.arange(0.0, 8.0, 1.0 / rate_hz)
     usual = told(made_s, 0.0 * made_s, until_s=8.0)
     other = told(made_s, 0.0 * made_s, stamps=stamps, until_s=8.0)
@@ -98,7 +98,7 @@ def test_bad_clock_is_ignored(rate_hz: int, stamps: Callable[[Vector], Vector]) 
 
 
 def test_late_sample_does_not_undo_a_jump() -> None:
-    """A late sample of before a jump does not bring the hand back."""
+    """A late sample from before a jump does not move the hand back."""
     hands = Hands()
     for k in range(400):
         hands.advance(5)
@@ -111,7 +111,7 @@ def test_late_sample_does_not_undo_a_jump() -> None:
 
 
 def test_restarted_tracker_is_believed_again() -> None:
-    """A tracker that starts anew with its clock set back is believed again."""
+    """A tracker that restarts with its clock set back is accepted again."""
     hands = Hands()
     for k in range(300):
         hands.advance(5)

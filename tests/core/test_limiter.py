@@ -118,7 +118,7 @@ def test_joints_outside_their_limits_come_back() -> None:
 
 
 def test_smooth_motion_passes_unchanged() -> None:
-    """What is smooth and within the limits passes unchanged."""
+    """Velocities that are smooth and within the limits pass unchanged."""
     times = PERIOD * np.arange(1, 4001)[:, None]
     start = 1.0 - np.exp(-(times**3))
     wanted = start * 0.4 * np.sin(1.3 * times + np.arange(7))
@@ -128,7 +128,7 @@ def test_smooth_motion_passes_unchanged() -> None:
 
 
 def test_announced_ramp_is_followed_without_lag() -> None:
-    """Velocities that begin to change at once are caught up with if it is said how."""
+    """Velocities with sudden changes are followed if their derivative is given."""
     rate = np.array([5.0, -5.0, 5.0, 4.0, -5.0, 5.0, -3.0])
     wanted = np.clip(PERIOD * np.arange(1, 201)[:, None], 0.0, 0.25) * rate
     changing = np.where(wanted == 0.25 * rate, 0.0, rate)
@@ -171,7 +171,7 @@ def test_stop_is_shortest_and_ends_together() -> None:
 
 
 def test_joints_together_stay_on_their_way() -> None:
-    """Joints that go together stay on the way between their velocities and those wanted."""
+    """Synchronised joints stay between their present velocities and the wanted ones."""
     limiter, wanted = Limiter(LIMITS, PERIOD), np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
     there = np.isclose(drive(LIMITS, START, np.tile(wanted, (300, 1))).velocity, wanted, rtol=1e-6, atol=0.0)
     alone = int(np.argmax(there.all(axis=1)))
@@ -201,7 +201,7 @@ def test_a_nan_stops_all_joints() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300, 1e9])
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_unusable_state_neither_raises_nor_moves(bad: float, which: int) -> None:
-    """A state that is no state neither raises nor moves the others."""
+    """An invalid joint state raises no error and does not move the other joints."""
     state = [REST.copy(), REST.copy(), REST.copy()]
     state[which][3] = bad
     q, dq, ddq = state

@@ -65,7 +65,7 @@ def both_remembered(
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
 def test_memory_is_that_of_learning(rate_hz: int) -> None:
-    """The service remembers what was learned at any rate."""
+    """The service's memory is the learned one, at any rate."""
     shown = features(motion(np.arange(0.0, 6.0, 0.02))[0], 0.02, ORDER)
     live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[:: rate_hz // 50]
     behind = shown[:, 6:].reshape(-1, ORDER, 6) + shown[:, None, :6]
@@ -74,7 +74,7 @@ def test_memory_is_that_of_learning(rate_hz: int) -> None:
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
 def test_turns_are_those_of_learning(rate_hz: int) -> None:
-    """Hands are turned live as they were learned at any rate."""
+    """The hands' turns are filtered live as in learning, at any rate."""
     turns = np.tile(motion(np.arange(0.0, 6.0, 0.02))[0], 3)
     shown = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
     told = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
@@ -137,7 +137,7 @@ def order(skill: StoredSkill) -> int:
 
 @pytest.mark.thorough
 def test_learn_takes_memory_where_needed() -> None:
-    """Learn remembers where hands alone tell too little and nowhere else."""
+    """`learn` uses memory only where the hands alone do not determine the tool."""
     skill = learn(takes(8, remembers=True))
     assert order(skill) == ORDER
     assert figures_of(skill).taken.startswith("memory")

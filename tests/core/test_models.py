@@ -57,7 +57,7 @@ def test_prediction_has_its_derivative(skill: Skill, hands: Vector) -> None:
 
 
 def test_covariance_and_gate_are_those_of_many_hands(skill: Skill, hands: Vector) -> None:
-    """How sure it is and what the gate sees are those of many hands."""
+    """Confidence and gate of one hand equal those of a batch."""
     found = predicted(skill, hands, np.zeros(6))
     np.testing.assert_allclose(found.covariance, skill.model.covariances(hands[None])[0], rtol=0, atol=0.6e-10)
     assert found.gate_m == pytest.approx(skill.model.gates_m(hands[None])[0], abs=1e-6)
@@ -80,7 +80,7 @@ def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
 
 
 def test_stored_model_says_the_same(skill: Skill) -> None:
-    """Stored and read back it says the same."""
+    """Stored and read again, the status is the same."""
     model = skill.model
     assert set(model.own_arrays()) - {"names", "task_clock"} == set(model.ranges) - LATER[type(model).__name__]
     back = decoded(skill.file, origin="a file")

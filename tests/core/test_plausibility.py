@@ -40,7 +40,7 @@ def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int)
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 250, 500])
 def test_jump_is_believed_after_three_samples(rate_hz: int) -> None:
-    """A jump is believed once three samples over 20 ms agree and not at all before."""
+    """A jump is accepted once three samples over 20 ms agree, and not before."""
     hands = Hands()
     tell(hands, [PLACE] * rate_hz, rate_hz)
     y = np.array(tell(hands, [ELSEWHERE] * 30, rate_hz))
@@ -56,7 +56,7 @@ def test_jump_is_believed_after_three_samples(rate_hz: int) -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("length", [1, 2])
 def test_momentary_jump_leaves_no_trace(rate_hz: int, length: int) -> None:
-    """What is off for a moment leaves no trace in the estimate."""
+    """Short outliers leave no trace in the estimate."""
     told, missing = Hands(), Hands()
     head, tail = [PLACE] * 40, [PLACE] * 20
     tell(told, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
@@ -101,7 +101,7 @@ def test_quick_motion_is_not_dropped(rate_hz: int) -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("apart_m", [0.09, 0.4])
 def test_first_of_two_sources_is_believed(rate_hz: int, apart_m: float) -> None:
-    """Of two sources that take turns the first is believed and the contest is noticed."""
+    """Of two alternating sources, the first is accepted, and the contest is detected."""
     hands = Hands()
     other = (PLACE[0], PLACE[1] + apart_m, PLACE[2])
     tell(hands, [PLACE] * 20, rate_hz)
@@ -171,7 +171,7 @@ class BothHands(Hands):
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("lasts_s", [0.3, 1.5])
 def test_swapped_hands_are_held_for(rate_hz: int, lasts_s: float) -> None:
-    """Hands that are taken for each other are not believed but held for."""
+    """Exchanged hands are rejected, and the arm holds."""
     hands = BothHands(rate_hz)
     assert hands.tell(1.0)[1][-1].all()
     off, fresh = hands.tell(lasts_s, swapped=True)
@@ -188,7 +188,7 @@ def test_swapped_hands_are_held_for(rate_hz: int, lasts_s: float) -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("hidden", [(0,), (1,), (0, 1)])
 def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]) -> None:
-    """Hands that come back from hiding under each others labels are not believed."""
+    """Hands that reappear with exchanged labels are rejected."""
     hands = BothHands(rate_hz)
     hands.tell(1.0)
     hands.tell(0.2, hidden=hidden)  # the hand is covered, then its label goes to the other
@@ -203,7 +203,7 @@ def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 def test_lasting_swap_is_believed_after_2_s(rate_hz: int) -> None:
-    """Labels that stay changed are believed after two seconds."""
+    """Labels that stay exchanged are accepted after two seconds."""
     hands = BothHands(rate_hz)
     hands.tell(1.0)
     off, fresh = hands.tell(3.0, swapped=True)
@@ -244,7 +244,7 @@ SAMPLES = st.tuples(
 def test_any_samples_leave_a_usable_state(
     samples: list[tuple[int, int, str, tuple[float, ...], tuple[float, ...]]],
 ) -> None:
-    """Any samples are taken or counted and leave a state that can be calculated with."""
+    """All samples are accepted or counted, and leave a finite state."""
     hands = Hands()
     for k, (ticks, stamp_ns, frame, position, turn) in enumerate(samples):
         if ticks:
@@ -274,7 +274,7 @@ def told(until: int, contest: range, *, swap: bool = False) -> Iterator[Tick]:
 
 @pytest.mark.parametrize("swap", [False, True])
 def test_two_sources_hold_then_go_on(skill: Skill, swap: bool) -> None:
-    """While two sources tell of a hand it holds and then goes on."""
+    """While two sources report a hand, the arm holds; afterwards it continues."""
     contest = range(1000, 2500)
     seen = followed(skill, told(4000, contest, swap=swap))
     assert (seen["mode"][50:1000] == Mode.FOLLOW).all()
@@ -363,7 +363,7 @@ def test_uneven_trackers_are_noticed(
 @pytest.mark.parametrize("noise_m", [(0.003,) * 3, (0.008,) * 3, (0.002, 0.002, 0.010)])
 @pytest.mark.parametrize("shaken", [False, True])
 def test_poor_tracker_is_no_contest(noise_m: tuple[float, ...], kind: str, shaken: bool) -> None:
-    """A poor tracker alone is no contest however its samples come."""
+    """A single poor tracker is not taken for two, whatever the order of its samples."""
     for seed, rate_hz in enumerate((30.0, 60.0, 120.0, 250.0)):
         times, random = uneven(rate_hz, 6.0, kind, seed), np.random.default_rng(seed)
         at = np.outer(0.015 * shaken * np.sin(2 * math.pi * 5 * times), (1.0, 0.0, 1.0))
@@ -390,6 +390,6 @@ def spoilt(kind: str, rate_hz: float, seed: int) -> tuple[Vector, Vector]:
 @pytest.mark.parametrize("rate_hz", [30.0, 60.0, 100.0])
 @pytest.mark.parametrize("kind", ["spikes", "bursts"])
 def test_outliers_of_one_tracker_are_no_contest(kind: str, rate_hz: float) -> None:
-    """One tracker that is often elsewhere for a moment is no contest."""
+    """A tracker with frequent short outliers is not taken for two."""
     for seed in range(6):
         assert first_contest_s(*spoilt(kind, rate_hz, seed)) is None

@@ -93,7 +93,7 @@ def test_learned_orientation_is_that_of_kmp() -> None:
 
 @pytest.mark.parametrize("about", [False, True])
 def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
-    """An orientation that jumps is turned to within speed and acceleration."""
+    """An orientation that jumps is approached within speed and acceleration limits."""
     settings = changed(Settings(), tool={"orientation": "full"}) if about else Settings()
     lead, state = OrientationSetpoint(settings), blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
@@ -113,7 +113,7 @@ def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
 
 
 def test_full_orientation_costs_no_position() -> None:
-    """The arm turns its tool all the way where it is told to."""
+    """The arm follows the full orientation if the settings require it."""
     settings = changed(Settings(), tool={"orientation": "full"})
     arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
     q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)

@@ -217,7 +217,7 @@ def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], se
 @pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10: once swung for ever
 @pytest.mark.one_case
 def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
-    """Whatever the cell the arm comes to rest."""
+    """The arm comes to rest in every cell."""
     random, cell = np.random.default_rng(number), cell_of(("wam", "panda", "ur5")[number % 3])
     rate_hz, slower = int(random.choice([250, 500, 1000])), float(random.choice([0.3, 1.0]))
     cell = changed(

@@ -81,7 +81,7 @@ def orientation_of(here: Kinematics) -> Vector:
 
 
 def test_capsules_cover_collision_shapes() -> None:
-    """Capsules lie around the collision shapes as pinocchio has them."""
+    """Capsules enclose the collision shapes as Pinocchio places them."""
     model = pin.buildModelFromXML(URDF)
     shapes = pin.buildGeomFromUrdfString(model, URDF, pin.GeometryType.COLLISION)
     data, there = model.createData(), pin.GeometryData(shapes)
@@ -118,7 +118,7 @@ def coal_capsule(segment: Vector) -> tuple[Any, Any]:
 
 
 def test_capsule_distances_are_those_of_coal() -> None:
-    """Distances of capsules are those of coal."""
+    """Distances of capsules are those of Coal."""
     random, near = np.random.default_rng(2), np.empty(9)
     for _ in range(300):
         one, other = random.uniform(-0.5, 0.5, (2, 2, 3))
@@ -136,7 +136,7 @@ def test_capsule_distances_are_those_of_coal() -> None:
 
 
 def test_distance_of_capsule_and_box() -> None:
-    """Distances of a capsule and a box are the least along it and negative inside."""
+    """The distance of a capsule and a box is the minimum along the capsule, and negative inside."""
     random, near = np.random.default_rng(3), np.empty(9)
     box = np.array([[-0.2, -0.3, -0.1], [0.2, 0.3, 0.1]])
     for _ in range(300):
@@ -152,7 +152,7 @@ def test_distance_of_capsule_and_box() -> None:
 
 @pytest.mark.parametrize("hand_speed", [0.0, 0.4, 1.6])
 def test_stop_from_allowed_speed_keeps_clear(hand_speed: float) -> None:
-    """A stop from the allowed speed ends the clearance away."""
+    """A stop from the allowed speed ends at the clearance."""
     for distance in (0.05, 0.2, 0.6):
         speed = allowed_speed(distance, hand_speed, 3.0, 0.13, 0.03)
         left = distance - (speed + hand_speed) * 0.13 - speed**2 / 6.0 - hand_speed * speed / 3.0
@@ -161,7 +161,7 @@ def test_stop_from_allowed_speed_keeps_clear(hand_speed: float) -> None:
 
 
 def test_constraints_are_derivatives_of_distance() -> None:
-    """Constraints are how fast distances shrink."""
+    """Constraints are the rates at which distances shrink."""
     settings = changed(ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),)))
     apart, table = Separation(settings, URDF), settings.table
     low, high = (

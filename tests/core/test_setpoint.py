@@ -172,7 +172,7 @@ def test_slow_joints_slow_it_on_its_way() -> None:
 
 
 def test_broken_bound_is_named() -> None:
-    """A setpoint that passed a bound is found."""
+    """A setpoint beyond a bound is detected."""
     generator, state = SetpointGenerator(Settings()), blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     before = state["setpoint"].copy()

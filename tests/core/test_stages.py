@@ -66,7 +66,7 @@ def beliefs(segments: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
-    """What was before tells visits of a place apart."""
+    """The past distinguishes repeated visits of a place."""
     found = beliefs(there_and_back, legs(0.5, 0.9, 0.5, 0.9, 0.5))
     assert np.abs(found.sum(axis=1) - 1.0).max() < 1e-6
     for leg in range(4):
@@ -78,7 +78,7 @@ def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
 
 
 def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
-    """A segment whose ways are elsewhere is told by where hands are; those before are forgotten."""
+    """Segments with other paths are distinguished by the hands' places; earlier ones are forgotten."""
     segments = there_and_back.copy()
     segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
     belief = np.zeros(MOST_SEGMENTS)
@@ -90,7 +90,7 @@ def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
 
 
 def test_resting_hand_near_an_end_is_there(there_and_back: np.ndarray) -> None:
-    """A hand that rests near an end is there and a moving one on its way."""
+    """A hand that rests near an end counts as there, a moving one as on its way."""
     segment = there_and_back[0]
     near, half = np.array([0.54, 0.02, 0.1]), np.array([0.7, 0.0, 0.1])
     assert along_way(near, 1.0, segment, 0) < 0.01

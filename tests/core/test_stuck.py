@@ -112,7 +112,7 @@ def stuck(taught: Skill) -> tuple[Settings, Vector, Vector]:
 def test_stuck_tool_is_reported_and_led_out(
     taught: Skill, stuck: tuple[Settings, Vector, Vector], tmp_path: Path
 ) -> None:
-    """Where it is stuck that is said within a second and a way out is gone."""
+    """A stuck tool is reported within a second, and a way out is followed."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands)
     frames = np.array([frame for _, frame in ran.steps])
@@ -132,7 +132,7 @@ def test_stuck_tool_is_reported_and_led_out(
 
 
 def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
-    """Where no way is found it holds until the target is another one."""
+    """Without a way out, the arm holds until the target changes."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands, seconds=12.0, finds=False)
     last = ran.steps[-1][1]
@@ -141,7 +141,7 @@ def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Ve
 
 
 def test_way_from_elsewhere_is_ignored(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
-    """A way that begins elsewhere is not gone."""
+    """A way out that begins elsewhere is not followed."""
     cell, start, hands = stuck
     state = start_state(cell, taught)
     state["joints"][0] = start

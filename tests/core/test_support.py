@@ -76,7 +76,9 @@ def segmented(**more: object) -> SegmentedKMP:
 
 
 def test_unshown_places_are_uncertain() -> None:
-    """Between via points what was not shown and places that are not given are uncertain."""
+    """Between via-points, the prediction is uncertain where nothing was demonstrated or no place is
+    given.
+    """
     known = segmented(unknown=None)
     count = len(known.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))

@@ -85,7 +85,7 @@ def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
 
 @pytest.mark.parametrize("rate_hz", [24, 100, 500])
 def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
-    """It is learned as it counts at any rate."""
+    """A clock is learned as it counts live, at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
     speeds, stillness = np.where(times > 1.0, 0.3, 0.0), np.where(times > 1.0, 0.0, 1.0)
     shown = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])

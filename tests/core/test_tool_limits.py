@@ -22,7 +22,7 @@ PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 
 @pytest.mark.parametrize("name", ARMS)
 def test_limit_uses_all_that_is_planned(name: str) -> None:
-    """At its limit the tool needs all that is planned of the joint that is named."""
+    """At the tool's limit, the named joint uses all of its planned speed."""
     settings = cell_of(name)
     arm, random = Arm(settings, robot_description(settings)), np.random.default_rng(0)
     never_binding = {"max_speed": 100.0, "max_acceleration": 1000.0, "fault_speed": 200.0}

@@ -24,7 +24,7 @@ def test_near_point_is_replaced_and_far_one_inserted():
 
 
 def test_tolerance_is_exclusive_and_takes_nearest():
-    """The tolerance itself is not near enough."""
+    """A distance equal to the tolerance does not replace."""
     primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
     point = Gaussians([[5.0]], [[[1e-6]]])
     assert len(primitive.adapt([[0.25]], point, tolerance=0.25).inner.changes.replaced) == 0
@@ -37,7 +37,7 @@ def test_tolerance_is_exclusive_and_takes_nearest():
 @properties
 @given(seeds, st.floats(0, 3), representations)
 def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
-    """The order of via points does not matter nor whether they come one by one."""
+    """The order of via-points does not matter, nor whether they are inserted one by one."""
     primitive = skill(seed, representation=representation)
     inputs, points = via(seed, 5, std=0.01)
     inputs[4] = inputs[3] + 0.05
@@ -72,7 +72,7 @@ def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_teaching_elsewhere_keeps_covariance(representation):
-    """Teaching elsewhere leaves the covariance here as it was."""
+    """A via-point elsewhere does not change the covariance here."""
     inputs, reference = database()
     primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
     points = Gaussians.of(np.zeros((80, 3)), deviation=0.01)
@@ -87,7 +87,7 @@ def test_teaching_elsewhere_keeps_covariance(representation):
 
 
 def test_missed_via_point_is_named():
-    """A via point that is missed is named with the numbers."""
+    """A via-point that is missed is named, with the numbers."""
     primitive = skill()
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
     points = Gaussians.of([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], deviation=0.01)
@@ -100,7 +100,7 @@ def test_missed_via_point_is_named():
 
 
 def test_small_miss_is_not_named():
-    """A via point that may be missed or is missed by less than a millimetre is not named."""
+    """A via-point that may be missed, or is missed by less than a millimetre, is not named."""
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
     for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
         points = Gaussians.of([[0.0, 0, 0], [apart, 0, 0]], deviation=std)

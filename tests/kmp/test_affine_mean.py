@@ -51,7 +51,7 @@ def both(kernel, representation, how):
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_equals_learning_the_remainder(kernel, representation, how):
-    """It is as if what is left had been learned."""
+    """The result equals learning from the remaining data."""
     prior, one, rest = both(kernel, representation, how)
     queries = np.random.default_rng(1).normal(size=(5, one.inputs.shape[1]))
     close = {"rtol": 0, "atol": 1e-8 * np.abs(one.weights).max()}
@@ -76,7 +76,7 @@ def test_equals_learning_the_remainder(kernel, representation, how):
 
 
 def test_via_points_and_constraints_hold():
-    """Via points and their velocities are met and constraints obeyed."""
+    """Via-points and their velocities are met, and constraints are satisfied."""
     _, one, _ = both("a length an input", "dense", "fitted")
     where, wanted = one.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
     exact = Gaussians.of(wanted, deviation=1e-4)
@@ -98,7 +98,7 @@ def test_via_points_and_constraints_hold():
     ],
 )
 def test_mismatch_with_kernel_is_refused(kernel, prior, says):
-    """One that does not go with the kernel is refused."""
+    """A constraint that the kernel does not support is refused."""
     reference = Gaussians(np.zeros((3, 4)), np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(ValueError, match=says):
         KMP.fit(np.arange(3.0)[:, None], reference, kernel=kernel, lambda_mean=1.0, prior_mean=prior)

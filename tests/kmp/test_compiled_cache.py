@@ -124,7 +124,7 @@ def checkout(tmp_path: Path) -> Checkout:
 
 
 def test_same_sources_elsewhere_are_served(checkout: Checkout, tmp_path: Path) -> None:
-    """It serves the same sources elsewhere."""
+    """A cache serves the same sources in another folder."""
     assert checkout.result() == [20.0, 2]
     checkout.change("apart.py", "", "# imported by nobody")
     assert checkout.result() == [20.0, 0]
@@ -137,7 +137,7 @@ def test_same_sources_elsewhere_are_served(checkout: Checkout, tmp_path: Path) -
     ids=["what it calls", "a constant of what it calls", "itself"],
 )
 def test_change_compiles_anew(checkout: Checkout, module: str, before: str, after: str, returned: float) -> None:
-    """A function is compiled anew after a change of."""
+    """A function is compiled anew after a change of what it calls."""
     assert checkout.result() == [20.0, 2]
     checkout.change(module, before, after)
     assert checkout.result() == [returned, 1 if module == "outer.py" else 2]

@@ -45,7 +45,7 @@ def test_constraints_are_obeyed():
 
 
 def test_mean_has_least_cost():
-    """The mean is the one of the least cost among those that obey."""
+    """The mean has the least cost among those that satisfy the constraints."""
     few = LinearConstraints(WHERE[::5], np.tile([0.0, 1.0], (9, 1)), np.full(9, -0.2))
     t, path = T[::4], PATH[::4]
     reference = Gaussians(path, np.tile(0.05 * np.eye(2), (len(t), 1, 1)))
@@ -82,7 +82,7 @@ def test_speed_and_rates_can_be_limited():
 
 
 def test_via_points_and_constraints_in_any_order():
-    """Via points and constraints hold together in any order."""
+    """Via-points and constraints are met together, in any order."""
     via = Gaussians.of([[0.5, 0.1]], deviation=1e-4)
     first = base().constrained(LOW).adapt([[1.3]], via, tolerance=0.03)
     then = base().adapt([[1.3]], via, tolerance=0.03).constrained(LOW)
@@ -96,7 +96,7 @@ def test_via_points_and_constraints_in_any_order():
 
 
 def test_low_rank_is_solved_anew():
-    """A low rank is solved anew for constraints."""
+    """A low-rank primitive is solved densely for constraints."""
     via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
     dense, low = (base(one).adapt(*via, tolerance=0) for one in ("dense", "low_rank"))
     assert low.representation == "low_rank"
@@ -120,6 +120,6 @@ CONTRADICTION = LinearConstraints([[1.0], [1.0]], [[0, 1], [0, -1]], [0.5, 0.5])
     ],
 )
 def test_impossible_constraints_are_refused(call, says):
-    """What cannot be obeyed is refused with what could."""
+    """Constraints that cannot be satisfied are refused, with a feasible alternative."""
     with pytest.raises(ValueError, match=says):
         call()

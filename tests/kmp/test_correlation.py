@@ -67,7 +67,7 @@ def test_negative_factor_flips_signs():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rewards_grow_and_via_point_is_met(seed):
-    """Rewards grow and the via point is still met."""
+    """Rewards grow and the via-point is still met."""
     primitive = letter()
     found = improve(primitive, roughness, T, correlation=basis(), exploration=0.3, updates=15, rollouts=8, seed=seed)
     assert found.rewards[-1] > 1.03 * found.rewards[0]

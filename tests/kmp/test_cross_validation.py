@@ -32,7 +32,7 @@ def test_residuals_are_those_without_the_group():
 
 
 def test_covariances_are_those_without_the_group():
-    """Covariances are those without the group and without a points own noise."""
+    """Covariances are those without the group and without a point's own noise."""
     roots = 0.3 * RANDOM.normal(size=(20, 3, 3)) + np.eye(3)
     scatter = roots @ roots.transpose(0, 2, 1)
     found = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)

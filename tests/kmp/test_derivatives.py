@@ -63,7 +63,7 @@ def test_kernel_of_derivatives(name):
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 @pytest.mark.parametrize("kernel", ["one length", "a length an input"])
 def test_taught_jacobian_is_met(representation, kernel):
-    """A taught jacobian is the jacobian there and the place is still met."""
+    """A taught Jacobian is the one at its input, and the via-point is still met."""
     one = taught(base(representation, kernel))
     np.testing.assert_allclose(one.jacobian(PLACE[0]), FOLLOW[0], atol=1e-5)
     np.testing.assert_allclose(one.mean(PLACE), TRUTH(S[:1]), atol=1e-5)

@@ -56,7 +56,7 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
 
 
 def test_requirements_agree_with_project():
-    """It needs what the project needs of the same."""
+    """Its requirements are those of the project."""
     whole, alone = (tomllib.loads((ROOT / path).read_text()) for path in ("pyproject.toml", "kmp/pyproject.toml"))
     extras, theirs = (project["project"]["optional-dependencies"] for project in (alone, whole))
     assert {*alone["project"]["dependencies"], *extras["fast"]} <= set(theirs["cell"])
@@ -65,7 +65,7 @@ def test_requirements_agree_with_project():
 
 
 def test_predicts_the_same_without_numba(wheel, tmp_path):
-    """Installed without numba it predicts the same."""
+    """Without Numba, kmp predicts the same."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
     code = WITHOUT_NUMBA.format(site=str(tmp_path), libraries=sysconfig.get_path("purelib"))

@@ -25,7 +25,7 @@ def test_scikit_learns_own_checks_pass(components):
 
 
 def test_learns_any_unit_with_deviation():
-    """It learns outputs of any unit and tells how sure it is."""
+    """The regressor learns outputs of any unit, with their uncertainty."""
     noisy = Y + [0.02, 1.0] * RANDOM.normal(size=Y.shape)
     one = KMPRegressor().fit(X[:120], noisy[:120])
     assert one.score(X[120:], Y[120:]) > 0.95

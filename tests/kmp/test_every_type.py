@@ -92,7 +92,7 @@ def same(a, b):
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
 def test_file_returns_same_bits(tmp_path, value):
-    """Each goes to a file and back bit for bit."""
+    """Each value is saved and loaded bit for bit."""
     kmp.save(tmp_path / "value", value, input_unit="m", output_unit="rad")
     stored = kmp.load(tmp_path / "value")
     assert same(value, stored.value)
@@ -115,7 +115,7 @@ IMMUTABLE = [value for value in VALUES if isinstance(value, Immutable)]
 
 @pytest.mark.parametrize("value", IMMUTABLE, ids=lambda value: type(value).__name__)
 def test_arrays_are_read_only_in_every_copy(value):
-    """Every array is read only before and after a pickle or a copy."""
+    """Every array is read-only, also after pickling and copying."""
     for one in (value, pickle.loads(pickle.dumps(value)), copy.copy(value), copy.deepcopy(value)):
         assert [array.shape for array in arrays(one) if array.flags.writeable] == []
 
@@ -132,14 +132,14 @@ def test_pickle_leaves_factors_out(representation):
 
 
 def test_every_public_type_is_tested():
-    """All types that the package offers are among them."""
+    """The cases contain all types of the package."""
     types = {name for name in kmp.__all__ if isinstance(getattr(kmp, name), type)}
     offered = {n for n in types if not issubclass(getattr(kmp, n), Warning)} - {"Stored"}
     assert offered == {type(value).__name__ for value in VALUES}
 
 
 def test_other_values_are_refused(tmp_path):
-    """What is no primitive says so and a file of nothing known is refused."""
+    """A stored value that is no primitive is reported as such, and unknown kinds are refused."""
     kmp.save(tmp_path / "value", R, input_unit="m", output_unit="m")
     with pytest.raises(ValueError, match="the stored value: Gaussians given, KMP needed: take `value`"):
         _ = kmp.load(tmp_path / "value").primitive

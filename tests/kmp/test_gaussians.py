@@ -54,7 +54,7 @@ def test_the_arrays_are_read_only_copies():
     ],
 )
 def test_invalid_covariance_is_refused(second, says):
-    """A covariance that is none is refused with its place and the remedy."""
+    """A matrix that is no covariance is refused with its index and the remedy."""
     with pytest.raises(ValueError, match=says):
         Gaussians(np.zeros((2, 2)), [np.eye(2), second])
 
@@ -74,7 +74,7 @@ def test_affine_map_and_inverse_cancel(seed):
 @properties
 @given(seeds)
 def test_product_is_commutative_and_surer(seed):
-    """A product does not depend on the order and is surer than its factors."""
+    """A product of Gaussians does not depend on the order, and has less variance than its factors."""
     a, b, c = some(3, 2, seed), some(3, 2, seed + 1), some(3, 2, seed + 2)
     product = a.product(b, c)
     other = c.product(a).product(b)

@@ -31,7 +31,7 @@ def demonstrations(seed=0):
 
 
 def test_em_finds_two_clusters():
-    """Em finds two clusters where they are."""
+    """EM finds two clusters."""
     random = np.random.default_rng(0)
     samples = np.concatenate([random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))])
     found = GaussianMixture.fit(samples, components=2, seed=0)
@@ -98,6 +98,6 @@ def test_sampled_inputs_have_marginal_moments():
     ],
 )
 def test_impossible_mixtures_are_refused(call, says):
-    """What cannot be done is refused with what could."""
+    """Impossible requests are refused, with what is possible."""
     with pytest.raises(ValueError, match=says):
         call()

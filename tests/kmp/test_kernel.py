@@ -14,7 +14,7 @@ ells = st.floats(0.05, 10)
 @properties
 @given(seeds, ells)
 def test_kernel_is_symmetric_and_semidefinite(seed, ell):
-    """The kernel is one at home symmetric and positive semidefinite."""
+    """The kernel is 1 at equal inputs, symmetric and positive semidefinite."""
     s = np.random.default_rng(seed).normal(size=(12, 3))
     k = GaussianKernel(ell)(s, s)
     assert (np.diagonal(k) == 1).all()
@@ -25,7 +25,7 @@ def test_kernel_is_symmetric_and_semidefinite(seed, ell):
 @properties
 @given(seeds)
 def test_ell_for_each_input(seed):
-    """An ell for each input is the formula and equal ones are the one."""
+    """One ell for each input gives the formula's kernel; equal ones give that of a single ell."""
     random, ell = np.random.default_rng(seed), np.array([0.5, 2.0, 0.1])
     a, b = random.normal(size=(3, 3)), random.normal(size=(4, 3))
     value = np.exp(-(ell * (a[:, None] - b[None]) ** 2).sum(axis=2))

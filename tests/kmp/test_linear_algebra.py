@@ -9,7 +9,7 @@ from kmp.arrays.linear_algebra import nearest_positive_semidefinite, symmetric
 
 @pytest.mark.parametrize("count", [1, 4])
 def test_nearest_positive_semidefinite(count):
-    """What is positive definite stays and what is not gets a cholesky factor."""
+    """A positive definite matrix is unchanged; any other one gets a Cholesky factor."""
     random = np.random.default_rng(0)
     root = random.normal(size=(count, 3, 3))
     good = symmetric(root @ root.swapaxes(1, 2) + np.eye(3))

@@ -79,7 +79,7 @@ def test_equals_dense_within_data(seed, lambda_covariance):
 @properties
 @given(seeds, st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 0.05, 1.0]), st.sampled_from([None, 5.0]))
 def test_adapted_equals_dense_adapted(seed, tolerance, spread, lambda_covariance):
-    """Adapted it is the dense solution adapted."""
+    """An adapted low-rank primitive equals the adapted dense one."""
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     inputs, desired = points(seed, 3, std=1e-3, spread=spread)
     dense, low = (one.adapt(inputs, desired, tolerance=tolerance) for one in (dense, low))
@@ -144,7 +144,7 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
 
 @pytest.mark.parametrize("one", [GaussianKernel(8.0), PeriodicKernel(8.0, 2.0), VelocityKernel(8.0)], ids=repr)
 def test_rank_decides_over_time(one):
-    """Over time the rank decides and not the number of points alone."""
+    """Over time, the rank decides on the representation, not the number of points alone."""
     t, reference = correlated(0, 240, 4, 3.0)
     found = KMP.fit(t, reference, kernel=one, lambda_mean=10.0)
     dense = KMP.fit(t, reference, kernel=one, lambda_mean=10.0, representation="dense")
@@ -157,7 +157,7 @@ def test_rank_decides_over_time(one):
 
 
 def test_dense_where_rounding_would_hide():
-    """What the low rank would lose in rounding is solved densely."""
+    """A problem in which the low rank would lose digits is solved densely."""
     t, reference = correlated(0, 240, 4, 3.0)
     exact = Gaussians(reference.mean, 1e-13 * reference.covariance)
     options = {"kernel": GaussianKernel(4000.0), "lambda_mean": 10.0, "lambda_covariance": 1e9}
@@ -168,7 +168,7 @@ def test_dense_where_rounding_would_hide():
 
 @pytest.mark.parametrize("rank", [10, 20, 40])
 def test_reached_rank_is_reported_with_error_bound(rank):
-    """A rank that is reached is said and the error is within the bound that is said."""
+    """A rank that is reached is reported, and the error is within the stated bound."""
     inputs, reference = tube(0, 300)
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
     says = rf"rank: {rank} features leave up to .* 4e-12 is required: .* Raise the rank"
@@ -217,7 +217,7 @@ def test_derivatives_are_features_too(count, ell):
 
 
 def test_many_via_points_are_solved_anew():
-    """As many via points with rates as features are solved anew."""
+    """With as many via-points as features, the problem is solved densely."""
     t = np.linspace(0, 2, 8)[:, None]
     mean = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t)])
     reference = Gaussians.of(mean, deviation=0.03)

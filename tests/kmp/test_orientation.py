@@ -51,7 +51,7 @@ def test_rotation_per_zeta_is_the_derivative(seed, size):
 
 
 def test_signs_are_continuous():
-    """Signs are chosen so that neighbours are near."""
+    """Signs of quaternions are chosen so that successive ones are near."""
     t = np.linspace(0, 4, 50)
     q = Rotation.from_rotvec(np.outer(t, [0.3, 0.9, 0.1])).as_quat()
     flipped = q * np.random.default_rng(0).choice([-1, 1], size=(50, 1))
@@ -93,7 +93,7 @@ def test_skill_has_orientation_and_angular_velocity(velocity):
 
 
 def test_via_points_of_either_sign_are_met():
-    """Via points in orientation are met whatever their sign."""
+    """Via-points of orientation are met, whatever the quaternion's sign."""
     one = skill(velocity=False)
     wanted = (Rotation.from_rotvec([0.3, -0.2, 0.1]) * path(np.array([0.7]))).as_quat()
     for sign in (1, -1):
@@ -103,7 +103,7 @@ def test_via_points_of_either_sign_are_met():
 
 
 def test_via_point_may_fix_angular_velocity():
-    """A via point can fix the angular velocity too or leave it free."""
+    """A via-point can fix the angular velocity or leave it free."""
     one, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
     wanted = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
     free = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02)
@@ -133,7 +133,7 @@ def test_covariance_is_of_world_rotations():
 
 
 def test_impossible_orientations_are_refused():
-    """What cannot be done is refused with what could."""
+    """Impossible requests are refused, with what is possible."""
     one = skill(velocity=False)
     q = drawn(0, 1)
     for call, says in (

@@ -50,7 +50,7 @@ def test_plot_over_input():
 
 
 def test_via_points_replace_references():
-    """Via points are drawn with two deviations and the points that they replace no more."""
+    """Via-points are drawn with two standard deviations, without the points that they replace."""
     axes = ADAPTED.plot()
     for i, one in enumerate(axes):
         [bars] = [bars for bars in one.containers if bars.get_label() == "via-point"]
@@ -84,7 +84,7 @@ def test_region_in_a_plane():
 
 
 def test_missing_matplotlib_is_named(monkeypatch):
-    """Without matplotlib the extra is named."""
+    """Without Matplotlib the extra is named."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'kmp\[plot\]'"):
         PLAIN.plot()

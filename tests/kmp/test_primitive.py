@@ -73,7 +73,7 @@ def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_far_away_is_the_prior(representation):
-    """Far away the mean is the prior and the covariance the whole."""
+    """Far from the data, mean and covariance are those of the prior."""
     far = np.full((1, 4), 50.0)
     one = skill(prior_mean=[1, 2, 3], representation=representation)
     for primitive in (one, one.adapt(*via(0, 1), tolerance=0.1)):
@@ -122,7 +122,7 @@ def test_other_units_change_nothing(seed, c, representation):
 @properties
 @given(seeds, representations)
 def test_uncertainty_has_two_parts(seed, representation):
-    """The uncertainty is the demonstrations variability and the distance from them."""
+    """The uncertainty is the demonstrations' variability plus the distance from them."""
     inputs, reference = database(seed)
     primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
     queries = np.concatenate([inputs[:3], np.random.default_rng(seed).normal(size=(3, 4)), np.full((1, 4), 50.0)])
@@ -170,7 +170,7 @@ def fit(inputs=INPUTS, reference=REFERENCE):
     ],
 )
 def test_impossible_calls_are_refused(call, says):
-    """What cannot be done is refused with what could."""
+    """Impossible requests are refused, with what is possible."""
     with pytest.raises(ValueError, match=says):
         call()
 

@@ -38,7 +38,7 @@ def moving(skill):
 
 
 def test_one_call_equals_the_others(skill, monkeypatch):
-    """One call gives what the others give bit for bit."""
+    """One call gives the results of the separate calls, bit for bit."""
     monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as where Numba is not installed
     s, v, a = moving(skill)
     found, one = skill.predict_motion(s, v, a), skill.predict(s[None])
@@ -67,7 +67,7 @@ def test_compiled_loops_equal_plain_ones(skill):
 
 
 def test_jacobian_and_curvature_are_derivatives(skill):
-    """The jacobian and the curvature agree with finite differences."""
+    """The Jacobian and the curvature agree with finite differences."""
     (s, v, _), h = moving(skill), 1e-5
     steps = h * np.eye(len(s))
     numeric = (skill.mean(s + steps) - skill.mean(s - steps)).T / (2 * h)

@@ -67,7 +67,7 @@ def test_frames_carry_skill_to_new_places():
 
 
 def test_via_points_are_met_in_other_frames():
-    """Via points of the world are met in frames elsewhere."""
+    """Via-points in world coordinates are met in moved frames."""
     skill, t = learned()
     desired = Gaussians.of([[0.4, 0.9]], deviation=1e-4)
     placed = skill.placed([CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])])
@@ -128,7 +128,7 @@ def judged(offset):
 
 
 def test_process_knows_common_offsets():
-    """Demonstrations that are off as a whole are known to be."""
+    """Demonstrations that are shifted as a whole are recognised."""
     errors, shares = judged(offset=0.15)
     assert np.exp(np.mean(np.log(errors[:, 0] / errors[:, 1]))) < 0.65
     assert 0.8 < shares[:, 0].mean() <= 1

@@ -103,7 +103,7 @@ def test_reference_over_time_is_even(velocity):
 
 
 def test_impossible_choices_are_refused():
-    """What cannot be done is refused with what could."""
+    """Impossible requests are refused, with what is possible."""
     one = driven_by_hands(count=1)
     says = r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"
     with pytest.raises(ValueError, match=says):
@@ -127,7 +127,7 @@ def test_impossible_choices_are_refused():
 
 
 def test_shown_points_where_they_predict_better():
-    """Points of many inputs are shown ones where these predict better."""
+    """With many inputs, demonstrated samples become reference points where they predict better."""
     *shown, (hands, tool) = two_hands(0, demonstrations=6)
     learned = {points: chosen(shown, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
     misses = {points: off(one.primitive.mean(hands), tool) for points, one in learned.items()}
@@ -181,7 +181,7 @@ def test_the_gradient_is_the_differences(points, kernel):
 
 
 def test_likelihood_is_that_of_scipy():
-    """It is the density of the normal that scipy gives."""
+    """It is the density of the normal that SciPy gives."""
     points, kernel = CASES[0]
     value, _, signal = negative_log_likelihood(points, np.zeros(2), kernel, 0.7)
     total = np.kron(kernel(points.inputs, points.inputs), np.eye(2))
@@ -195,7 +195,7 @@ def test_likelihood_is_that_of_scipy():
 
 
 def test_likelihood_finds_irrelevant_input():
-    """An input that says nothing is found and the prediction better."""
+    """An uninformative input is detected, and the prediction improves without it."""
     options = {"components": 16, "seed": 0, "count": 80, "criterion": "likelihood"}
     each, one = (kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one"))
     variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)

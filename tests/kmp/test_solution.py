@@ -53,7 +53,7 @@ def test_solution_is_stored_with_base(primitive):
 
 @pytest.mark.parametrize("name", ["information", "features"])
 def test_missing_array_is_named(name):
-    """An array of the low rank solution that lacks is named."""
+    """A missing array of the low-rank solution is named."""
     arrays = named_arrays.to_arrays(fitted("low_rank"))
     del arrays[name]
     with pytest.raises(ValueError, match=f"The primitive's arrays lack {name}. Needed are .*pivots"):
@@ -61,7 +61,7 @@ def test_missing_array_is_named(name):
 
 
 def test_equal_pivots_are_refused():
-    """Pivots that rounding does not tell apart are refused."""
+    """Pivots that rounding cannot distinguish are refused."""
     arrays = named_arrays.to_arrays(fitted("low_rank"))
     pivots = arrays["pivots"].copy()
     pivots[-1] = pivots[0]
@@ -99,7 +99,7 @@ def test_outputs_solved_as_one_change(first):
 
 
 def test_lost_point_is_refused_where_replaced():
-    """A point lost in rounding is refused in the place of an early one too."""
+    """A point that rounding hides is refused, also where it replaces an earlier one."""
     inputs = np.arange(40.0)[:, None]
     base = KMP.fit(inputs, REFERENCE, kernel=GaussianKernel(0.5), lambda_mean=1.0, representation="dense")
     twice = Gaussians(np.zeros((2, 2)), np.tile(1e-18 * np.eye(2), (2, 1, 1)))
@@ -145,7 +145,7 @@ def assert_same(one, other, queries):
 
 @pytest.mark.parametrize("case", CASES)
 def test_extended_is_fit_of_all_points(case):
-    """It is the fit of all points and keeps its via points."""
+    """It is the fit of all points and keeps its via-points."""
     (inputs, reference), options = CASES[case]
     options = {"lambda_mean": 0.7} | options
     whole = KMP.fit(inputs, reference, **options)
@@ -167,7 +167,7 @@ def test_extended_is_fit_of_all_points(case):
 
 
 def test_extended_keeps_constraints():
-    """Derivatives and constraints go with it."""
+    """Derivatives and constraints are moved too."""
     (inputs, reference), options = CASES["two inputs"]
     directions = np.zeros((60, 2))
     directions[[5, 50]] = [1.0, 0.5]

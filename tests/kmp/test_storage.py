@@ -15,7 +15,7 @@ def saved(folder):
 
 
 def test_foreign_file_is_refused(tmp_path):
-    """A file that is none is refused with its name."""
+    """A file of another kind is refused with its name."""
     (tmp_path / "text").write_text("no")
     with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):
         kmp.load(tmp_path / "text")

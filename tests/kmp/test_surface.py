@@ -97,7 +97,7 @@ def test_default_tolerance_replaces_nearest():
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 @pytest.mark.parametrize("changed", ["as fitted", "adapted", "constrained"])
 def test_other_lambda_keeps_the_mean(representation, changed):
-    """Another lambda of the covariance is as fitted with it and keeps the mean."""
+    """Changing lambda_covariance equals fitting with it, and keeps the mean."""
 
     def made(**options):
         one = fitted(representation, **options)

@@ -310,7 +310,7 @@ def fault(function, name, right, value, must_fail):
 
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_call_names_its_argument(tmp_path, monkeypatch):
-    """Every wrong call ends in a value error that names the argument."""
+    """Every wrong call raises a ValueError that names the argument."""
     monkeypatch.chdir(tmp_path)
     kmp.save("skill.npz", ONE, input_unit="m", output_unit="m")
     made = list(calls())

@@ -22,13 +22,13 @@ def judged(demonstrations: list[Demonstration]) -> Figures:
 @pytest.mark.parametrize("noise_m", [0.0, 0.0002, 0.001, 0.003])
 @pytest.mark.parametrize("every", [1, 2])
 def test_tracker_noise_is_found(noise_m: float, every: int) -> None:
-    """The noise of a tracker is found in takes however the hands move."""
+    """A tracker's noise is estimated from takes, however the hands move."""
     moving = [circling(seed, noise_m=noise_m).every(every) for seed in range(3)]
     assert tracker_noise_m(moving) == pytest.approx(noise_m, rel=0.15, abs=2e-4)
 
 
 def test_fine_motion_is_legal_if_tracked_well() -> None:
-    """Fine motion is legal where the tracker can tell it and only there."""
+    """Fine motion is accepted only where the tracker can resolve it."""
     found = judged([fine(seed, 0.0005) for seed in range(4)])
     assert (found.unsafe, found.ambiguous) == ((), 0.0)
     assert found.all.error_mm < 10
@@ -45,7 +45,7 @@ def test_opposite_ways_are_refused(noise_m: float) -> None:
 
 
 def test_turns_of_fine_motion() -> None:
-    """Turns that go with fine motion are legal and those that go both ways are not."""
+    """Turns along with fine motion are accepted, alternating ones are not."""
     assert judged([fine(seed, 0.0005, turned=True) for seed in range(4)]).unsafe == ()
     both = judged([fine(seed, 0.0005, way, turned=True) for seed, way in enumerate((1.0, -1.0, 1.0, -1.0))])
     assert any("contradicts itself" in text for text in both.unsafe)

@@ -34,7 +34,7 @@ def test_linear_function_is_found() -> None:
 
 
 def test_look_up_uses_nearest_hands() -> None:
-    """A look up answers with the nearest hands of another demonstration."""
+    """A look-up returns the tool at the nearest hands of another demonstration."""
     tools = [np.full((50, 3), float(number)) for number in range(3)]
     near = [HANDS[0], HANDS[0] + 1e-6, HANDS[2] + 100.0]
     errors = held_out_errors([take(*one) for one in zip(range(3), near, tools, strict=True)], look_up)
@@ -43,7 +43,7 @@ def test_look_up_uses_nearest_hands() -> None:
 
 
 def test_left_out_person_tells_nothing() -> None:
-    """What is left out together tells nothing of each other."""
+    """Samples that are held out together do not predict each other."""
     tools = [np.full((50, 3), float(number)) for number in range(3)]
     hands = [HANDS[0], HANDS[0], HANDS[0] + 1e-6]
     for persons, wanted in ((range(3), [-1.0, 1.0]), ((0, 0, 1), [-2.0, -1.0])):

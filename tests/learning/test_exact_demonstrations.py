@@ -42,7 +42,7 @@ def test_gate_is_above_noise() -> None:
 
 
 def test_covariance_is_above_noise() -> None:
-    """A covariance is never less than a trackers noise."""
+    """A covariance is never less than the tracker's noise."""
     made = [one._replace(tool=(one.left + one.right) / 2) for one in (circling(seed, noise_m=0.0) for seed in range(4))]
     figures = figures_of(learn(made, points=80))
     assert figures.all.error_mm < 1.0 < figures.all.predicted_mm

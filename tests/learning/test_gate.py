@@ -55,7 +55,7 @@ def test_unseen_people_pass_and_nonsense_is_held(
 
 
 def test_gate_is_near_demonstrations(skill_of_five: Skill, unseen: list[Demonstration]) -> None:
-    """The gate is near what demonstrations reach."""
+    """The gate is near the largest distance of the demonstrations."""
     reached = max(deviations(skill_of_five, one.hands).max() for one in unseen)
     assert reached < skill_of_five.threshold < 1.5 * HELD_OUT_TIMES * reached
 

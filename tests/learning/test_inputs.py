@@ -56,7 +56,7 @@ def carried() -> StoredSkill:
 
 
 def test_both_hands_where_both_tell() -> None:
-    """Where both hands tell it is a function of both."""
+    """If both hands are informative, the tool depends on both."""
     skill = learn([shown(seed, "both") for seed in range(5)], points=120)
     found = figures_of(skill)
     assert skill.conductor is None
@@ -72,7 +72,7 @@ def test_both_hands_where_both_tell() -> None:
 
 
 def test_one_hand_where_it_tells_as_much() -> None:
-    """Where one hand tells as much the other makes no difference and that is said."""
+    """If one hand suffices, the other has no effect, and that is reported."""
     skill = learn([shown(seed, "left") for seed in range(5)], points=120)
     found = figures_of(skill)
     assert skill.conductor == 0

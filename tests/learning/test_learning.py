@@ -31,7 +31,7 @@ def test_gate_passes_demonstrations_only(aimed: Skill, taught: list[Demonstratio
 
 
 def test_mean_orientation_ignores_signs() -> None:
-    """A mean orientation does not mind signs."""
+    """A mean orientation does not depend on the quaternions' signs."""
     random = np.random.default_rng(0)
     near = np.array([0.0, 0.9, 0.0, 0.44]) + 0.01 * random.normal(size=(50, 4))
     flipped = near * random.choice([-1.0, 1.0], size=(50, 1))

@@ -74,7 +74,7 @@ def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Eviden
 
 
 def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
-    """It moves the tool no farther than between via points whatever was shown."""
+    """It moves the tool no farther than between via-points whatever was shown."""
     assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
     random = np.random.default_rng(0)
     hands = random.normal(scale=0.1, size=(200, 6))

@@ -71,7 +71,7 @@ def test_correction_moves_tool_in_its_segment(segmented: StoredSkill, segment: i
     ("segment", "share", "name"), [(0, 0.97, "handover"), (1, 0.02, "handover"), (1, 1.0, "glass")]
 )
 def test_correction_at_an_end_teaches_via_point(segmented: StoredSkill, segment: int, share: float, name: str) -> None:
-    """A correction at an end of a segment teaches that via point anew."""
+    """A correction at an end of a segment teaches that via-point anew."""
     hands = hands_in(segmented, segment, share)
     made = correction_at(segmented, hands, segment, tool_in(segmented, hands, segment) + UP)
     (before,) = made.replaced

@@ -167,7 +167,7 @@ def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 12
 def test_served_without_absent_hand(
     skill: StoredSkill,
 ) -> None:
-    """It is served without a hand that was never seen or has gone but waits for one that
+    """A skill runs without a hand that was never seen or has disappeared, but waits for one that
     vanishes.
     """
     follow = (Mode.FOLLOW, Reason.NONE)
@@ -183,7 +183,7 @@ def test_served_without_absent_hand(
 
 
 def test_arm_keeps_away_from_vanished_hand(skill: StoredSkill) -> None:
-    """The arm keeps away from where a hand that has gone was seen last."""
+    """The arm keeps its distance from where a lost hand was last seen."""
     there = (0.5, 0.21, 0.4)  # where the tool is to go
     seen = served(skill, 0, 50, count=3500, at=there)
     assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}

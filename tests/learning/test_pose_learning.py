@@ -73,7 +73,7 @@ def test_pose_comes_back_from_file(posed: Skill) -> None:
 
 
 def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) -> None:
-    """Places teach orientation and gripper and give them back."""
+    """Via-points store orientation and gripper, and return them."""
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
     told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
     hands = with_hands(told)
@@ -101,7 +101,7 @@ def test_contradicting_via_points_are_refused(skill: Skill) -> None:
 
 
 def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
-    """A gripper that tells millimetres is refused."""
+    """A gripper that reports millimetres is refused."""
     spoilt = [one._replace(gripper=80.0 * np.asarray(one.gripper)) for one in shown]
     with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
         learn(spoilt, components=5, points=60)

@@ -26,7 +26,7 @@ def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
 
 @pytest.mark.parametrize("arm", [*ARMS, "sliding"])
 def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
-    """No place where the tool can be is out of reach also at the joints limits."""
+    """No reachable place counts as out of reach, also at the joints' limits."""
     cell = cell_with(arm, WIDE, tmp_path)
     lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
     random, forward = np.random.default_rng(7), Arm(cell, robot_description(cell))
@@ -40,7 +40,7 @@ def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_unreachable_place_has_its_distance(arm: str, tmp_path: Path) -> None:
-    """A place that no posture comes near is out of reach by its distance."""
+    """A place that no posture reaches is out of reach by its distance."""
     cell = cell_with(arm, WIDE, tmp_path)
     shoulder, length = np.array(cell_of(arm).reach.centre), 1.0  # no shipped arm is longer
     random = np.random.default_rng(3)

@@ -40,7 +40,7 @@ def others() -> StoredSkill:
 
 
 def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
-    """Takes of whoever works with a skill refine it."""
+    """Takes of the skill's user refine it."""
     mine = [circling(seed).every(4) for seed in range(10, 14)]
     mine = [one._replace(tool=one.tool + np.concatenate([HABIT_M, np.zeros(4)])) for one in mine]
     refined = learn(mine[:3], name="mine", names=["a", "b", "c"], points=80, refined=others)
@@ -57,7 +57,7 @@ def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
 
 @pytest.mark.thorough
 def test_earlier_takes_of_a_person_count() -> None:
-    """Takes of a task refine it and earlier ones of the same person are theirs."""
+    """Takes of a task refine it; earlier ones of the same person count as that person's."""
     shown = [one.every(3) for one in made("three", range(3))]
     shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]
     skill = learn(shown, name="others")
@@ -75,7 +75,7 @@ def test_earlier_takes_of_a_person_count() -> None:
 
 
 def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
-    """What cannot be refined is refused with the remedy."""
+    """Skills that cannot be refined are refused with the remedy."""
     mine = [circling(seed).every(4) for seed in (30, 31)]
     with pytest.raises(SkillError, match=r"does not hold the demonstrations .*learn it anew"):
         learn(mine, refined=replace(others, demonstrations=b""))

@@ -51,7 +51,7 @@ def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) 
 
 @pytest.mark.parametrize("count", [6, 12, 40])
 def test_regions_hold_on_other_people(count: int) -> None:
-    """Regions hold on other people what they say at every level."""
+    """Regions contain the stated share on other people, at every level."""
     held = []
     for seed in range(20):
         rng = np.random.default_rng([seed, count])
@@ -113,7 +113,7 @@ def test_covariance_is_scaled_along_motion() -> None:
 
 
 def test_unsure_flag_does_not_flicker() -> None:
-    """Unsure is told from where the region reaches too far and does not flicker."""
+    """The flag for uncertainty is raised where the region is too large, and does not flicker."""
     settings, skill = Settings(), shipped_skill()
     state, frame = start_state(settings, skill), blank(frame_layout(len(settings.joints.names)))
     state["hands"][:, 0] = skill.hands[0].reshape(2, 3)
@@ -139,7 +139,7 @@ def learned() -> StoredSkill:
 
 
 def test_learned_regions_hold(learned: StoredSkill) -> None:
-    """What is learned says how sure it is with its lag left in."""
+    """The learned uncertainty includes the lag."""
     figures = figures_of(learned)
     assert learned.regions.std_s > 0.0
     assert figures.all.within_50 == pytest.approx(50, abs=10)
@@ -151,7 +151,9 @@ def test_learned_regions_hold(learned: StoredSkill) -> None:
 
 
 def test_wrong_regions_in_file_are_refused(learned: StoredSkill) -> None:
-    """A file without regions has those of a normal and one with others is refused."""
+    """Without regions in its file, a skill has those of a normal distribution; invalid ones are
+    refused.
+    """
     without = with_file(replace(learned, regions=NORMAL))
     assert decoded(without.file, origin="memory").regions == NORMAL
     for spoilt in (

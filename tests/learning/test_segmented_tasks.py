@@ -60,7 +60,7 @@ def moved(places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]
 
 @pytest.mark.thorough
 def test_common_places_of_a_hand_are_found(between: Skill) -> None:
-    """Places of a hand that are one are found."""
+    """Equal places of a hand are recognised."""
     assert isinstance(between.model, SegmentedKMP)
     task = between.model.task
     assert task.names == ("start", "handover", "glass", "soldering")
@@ -69,7 +69,7 @@ def test_common_places_of_a_hand_are_found(between: Skill) -> None:
 
 
 def test_tool_goes_to_told_places(between: Skill, shown: list[Demonstration]) -> None:
-    """The tool goes to the places that are told and with the hand where it follows."""
+    """The tool reaches its via-points, and moves with the hand that it follows."""
     for places in (shown[1].places, moved(shown[3].places, {"glass": (0.0, 0.1, 0.05)})):
         aimed = adapted(between, places, tolerance=0.05)
         assert max(point.missed_by_m for point in in_force(aimed)) < 0.008
@@ -81,7 +81,7 @@ def test_tool_goes_to_told_places(between: Skill, shown: list[Demonstration]) ->
 
 
 def test_unusable_places_are_explained(shown: list[Demonstration]) -> None:
-    """What cannot be learned between places says why."""
+    """Takes that cannot be learned between via-points are refused with a reason."""
     assert task_of([one._replace(places=()) for one in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
@@ -89,7 +89,7 @@ def test_unusable_places_are_explained(shown: list[Demonstration]) -> None:
 
 
 def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
-    """A place that the tool never came near is named."""
+    """A via-point that the tool never came near is named."""
     names = [f"take-{i}" for i in range(len(shown))]
     task, _ = task_of(shown)
     assert task is not None
@@ -154,7 +154,7 @@ def test_place_is_visited_twice(cyclic: Skill) -> None:
 
 
 def test_delay_of_teacher_is_learned(cyclic: Skill) -> None:
-    """The teachers delay is learned and the tool led by less."""
+    """The teacher's delay is learned, and the tool lags by less."""
     figures = figures_of(cyclic)
     late_s, std_s = figures.delay_s, figures.delay_std_s
     assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)  # the mean of 0.09 to 0.34 s

@@ -29,7 +29,7 @@ def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:
 
 @pytest.mark.parametrize("places", [(), PLACES])
 def test_file_returns_same_bits(learned: Skill, places: tuple[ViaPoint, ...], taught: list[Demonstration]) -> None:
-    """A trip through a file changes no bit."""
+    """Saving and loading changes no bit."""
     sent = adapted(learned, places, tolerance=0.04)
     back = with_file(replace(decoded(sent.file, origin="a file"), file=b""))
     assert back.file == sent.file
@@ -103,7 +103,7 @@ def test_foreign_file_is_refused(garbage: bytes) -> None:
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
 def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message: str) -> None:
-    """What no skill has is refused with what is accepted."""
+    """Values outside those of a skill are refused, with the accepted ones."""
     with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
         decoded(file_with(skill, **arrays), origin="x.npz")
     assert message in str(caught.value)
@@ -126,7 +126,7 @@ def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, 
 
 
 def test_large_archive_is_not_unpacked(skill: Skill) -> None:
-    """A file that unpacks to much is not unpacked."""
+    """A file that would unpack to too many bytes is not unpacked."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("format.npy", "w") as file:
         file.write(b"\x93NUMPY\x01\x00")
@@ -137,7 +137,7 @@ def test_large_archive_is_not_unpacked(skill: Skill) -> None:
 
 
 def test_damaged_archive_is_told_apart(skill: Skill) -> None:
-    """A damaged archive is told from what never was one."""
+    """A damaged archive is distinguished from a file that never was one."""
     random = Random(5)
     for _ in range(30):
         cut = skill.file[: random.randrange(4, len(skill.file))]

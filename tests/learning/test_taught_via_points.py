@@ -31,7 +31,7 @@ def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float
 
 
 def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
-    """Places are taught to the base and not on top of each other."""
+    """Via-points are inserted into the base primitive, not into an adapted one."""
     anew = adapted(aimed, PLACES[1:], tolerance=0.05)
     assert anew.file == adapted(learned, PLACES[1:], tolerance=0.05).file
     assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
@@ -70,7 +70,7 @@ def test_loose_via_points_contradict_less(skill: Skill) -> None:
 
 
 def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
-    """A place that is missed and one that is moved are told of by name."""
+    """Via-points that are missed or moved are reported by name."""
     loose = moved(HANDOVER, "loose", hands=0.06, tool=0.2, radius=0.0, std=0.05)
     after = adapted(aimed, (*PLACES, loose), tolerance=0.05)
     missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")

@@ -39,7 +39,7 @@ def found(frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float =
 
 
 def test_good_figures_have_no_remarks() -> None:
-    """Good figures are remarked on by nobody."""
+    """Good figures cause no remark."""
     assert found() == {}
 
 
@@ -68,7 +68,7 @@ def test_good_figures_have_no_remarks() -> None:
     ],
 )
 def test_verdict_of_each_figure(change: dict[str, Any], severity: str, says: str) -> None:
-    """A figure is warned of accepted by somebody or refused."""
+    """A poor figure is warned of, accepted by a person, or refused."""
     texts = {text: kind for text, kind in found(**change).items() if says in text} if says else found(**change)
     assert list(texts.values()) == [severity] * bool(says)
 

@@ -161,7 +161,7 @@ UR5_MESHES = {f"{one}_link": f"ur5/collision/{one.replace('_', '')}.stl" for one
     [("franka", FR3_MESHES | {"fr3_hand": "panda_description/meshes/collision/hand.stl"}), ("ur5", UR5_MESHES)],
 )
 def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> None:
-    """A shipped arms capsules cover the meshes that others publish."""
+    """A shipped arm's capsules cover the meshes that others publish."""
     cell = cell_of(arm)
     text = robot_description(cell)
     urdf = Urdf(text)
@@ -183,7 +183,7 @@ def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> No
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_described_cell_is_read_back(arm: str) -> None:
-    """What is told of a cell is read as it was."""
+    """A cell's status is read as it was published."""
     boxes = (Box(centre=(0.5, 0.6, 0.1), half_size=(0.1, 0.1, 0.1)),)
     cell = msgspec.structs.replace(cell_of(arm), obstacles=Obstacles(boxes=boxes))
     assert parse(described(cell), origin="cell.toml") == cell
@@ -191,7 +191,7 @@ def test_described_cell_is_read_back(arm: str) -> None:
 
 
 def test_places_are_moved_into_reach() -> None:
-    """Places out of reach are moved into it and said."""
+    """Via-points out of reach are moved into it and reported."""
     for arm in ARMS:
         assert SCENE.in_reach(cell_of(arm).reach) == (SCENE, ())
     short = Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.6)

@@ -172,7 +172,7 @@ def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
 
 
 def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
-    """What a mended network sends late does not move the arm."""
+    """Late messages of a restored network do not move the arm."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
@@ -401,7 +401,7 @@ class _Sample:
     ],
 )
 def test_invalid_command_is_never_followed(payload: bytes) -> None:
-    """A command that is none is counted and never followed."""
+    """Bytes that are no command are counted and never followed."""
     commands = Commands(JOINT_NAMES)
     commands.receive(_Sample(payload))  # type: ignore[arg-type]
     assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))
@@ -409,7 +409,7 @@ def test_invalid_command_is_never_followed(payload: bytes) -> None:
 
 
 def test_first_answer_counts_for_latency() -> None:
-    """Only the first answer to each hand sample tells of latency."""
+    """Only the first command after each hand sample counts for the latency."""
     commands = Commands(JOINT_NAMES)
     payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
     now = time.time_ns()

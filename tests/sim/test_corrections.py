@@ -55,7 +55,7 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 @pytest.mark.timeout(900)
 @pytest.mark.thorough
 def test_correction_from_end_to_end(tmp_path: Path) -> None:
-    """A tool that was led goes there from then on and back when it is undone."""
+    """A correction moves the tool to where it was led, and undoing it moves it back."""
     settings, records = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), tmp_path / "records"
     with (
         serving(tmp_path, "--rate", str(RATE_HZ), "--record", str(records)) as daemon,

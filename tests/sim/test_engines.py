@@ -72,7 +72,7 @@ def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
 
 
 def test_motors_are_no_stronger_than_described(bench: Bench) -> None:
-    """Motors are no stronger than the description says."""
+    """The motors' efforts are those of the description."""
     start = np.array(bench.observe().joints)
     for _ in range(20):  # no motor of 60 N m turns the stretched arm so fast within 40 ms
         bench.world.follow(tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5))

@@ -201,7 +201,7 @@ def test_missing_letters_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_missing_matplotlib_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without matplotlib the command names the extra."""
+    """Without Matplotlib the command names the extra."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["letters", "--output", str(tmp_path)]) == 1
     assert "thirdhand[experiments]" in capsys.readouterr().err

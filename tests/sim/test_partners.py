@@ -151,7 +151,7 @@ def test_judged_and_refused_as_the_command_does(
 
 
 def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut]) -> None:
-    """A refused fold enters no mean and its error is given apart."""
+    """A refused fold is left out of the means, and its error is listed separately."""
 
     def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
         said = left_out_by(RIVALS["mean"], takes_, tested, told=True)

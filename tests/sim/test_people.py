@@ -135,7 +135,7 @@ class TestJudging:
 def test_skills_go_to_told_places(
     method: NoDemonstrations | LookUp | GaussianProcess | Service, run_of_tuning: Session
 ) -> None:
-    """Skills go to the places they are told."""
+    """Skills reach their via-points."""
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
     hands = frames(places)[1:, :6]

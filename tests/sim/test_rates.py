@@ -60,7 +60,7 @@ def test_demo_succeeds_with_every_arm(rate_hz: int, engine: str, arm: str) -> No
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_loop_at_50_hz_does_the_task(arm: str) -> None:
-    """At 50 hz the loop does the task and a follower says why it cannot."""
+    """At 50 Hz the loop does the task, and a follower says why it cannot."""
     cell = cell_of(arm, rate_hz=50)
     run = rehearse(HandScript(SCENE, seed=1), lambda _: taught(), settings=cell)
     assert run.events.success

@@ -20,7 +20,7 @@ def test_an_empty_file_is_the_nominal_scene(tmp_path: Path) -> None:
 
 
 def test_file_moves_what_it_names(tmp_path: Path) -> None:
-    """A file moves what it names and what hangs on it."""
+    """A scene file moves the places that it names and those that depend on them."""
     scene = load(tmp_path, "soldering = [0.70, 0.10, 0.08]\nseed = 7\n")
     assert scene.seed == 7
     assert scene.carry == pytest.approx((0.57, 0.10, 0.28))

@@ -35,7 +35,7 @@ def test_motion_has_its_derivatives(options: dict[str, object]) -> None:
 
 
 def test_places_are_passed_without_scatter() -> None:
-    """Hands and tool pass the scenes places when nothing scatters."""
+    """Hands and tool pass the scene's places when nothing scatters."""
     script, teacher = HandScript(SCENE, seed=1, offset_std=0.0), Teacher(SCENE, seed=1, offset_std=0.0)
     ends = [0.0, *(end for end, _ in SCENE.dwells)]
     np.testing.assert_allclose(
@@ -76,7 +76,7 @@ def test_tremor_has_size_and_band() -> None:
 
 
 def test_hands_go_back_in_a_deep_pause() -> None:
-    """In a deep pause the hands go back the way they came and come again."""
+    """In a long pause, the hands return along their path and come again."""
     clock = HandScript(SCENE, seed=1, pauses=(ScriptPause(4.0, 1.5, depth=2.0),)).clock
     before, turned, after = clock.at(3.9), clock.at(4.8), clock.at(6.0)
     assert (before[1], turned[1], after[1]) == pytest.approx((1.0, -1.0, 1.0))

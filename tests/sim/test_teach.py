@@ -60,7 +60,7 @@ def test_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
-    """The tutorials task visits the tray twice in one scene and its places are written."""
+    """The tutorial's task visits the tray twice, and its via-points are stored."""
     file = tmp_path / "places.json"
     assert teach.main(["--visits", "--places", str(file)]) == 0
     told = places_in(file)
