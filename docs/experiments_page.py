@@ -19,12 +19,7 @@ from typing import Any
 import jinja2
 
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
-from thirdhand_sim.lab.evidence import (
-    RESULTS,
-    result_of,
-    staleness,
-    tree,
-)
+from thirdhand_sim.lab.evidence import RESULTS, result_of, staleness, tree
 from thirdhand_sim.lab.partners import verdict
 from thirdhand_sim.lab.people.moving_hands import MOST_LATE_S, PRECISE_M, UNSEEN_S
 

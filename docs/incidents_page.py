@@ -9,13 +9,7 @@ from pathlib import Path
 
 import jinja2
 
-from thirdhand.contract.incidents import (
-    INCIDENTS,
-    Condition,
-    Incident,
-    filled,
-    word,
-)
+from thirdhand.contract.incidents import INCIDENTS, Condition, Incident, filled, word
 from thirdhand.contract.records import Mode
 from thirdhand.settings.config import Settings
 

@@ -20,12 +20,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.settings.palette import TOOL
 from thirdhand.skills.skill_file import StoredSkill
 from thirdhand.workbench.learning.learn import learn
-from thirdhand_sim.lab.people.left_out import (
-    JUDGED_HZ,
-    LeftOut,
-    left_out,
-    predicted,
-)
+from thirdhand_sim.lab.people.left_out import JUDGED_HZ, LeftOut, left_out, predicted
 from thirdhand_sim.lab.reached import taught
 from thirdhand_sim.made_tasks import takes
 

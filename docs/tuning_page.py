@@ -12,12 +12,7 @@ from typing import Any, NamedTuple
 
 from thirdhand.core.skill import tuning as skill_tuning
 from thirdhand.core.tuning import TUNING
-from thirdhand_sim.lab.evidence import (
-    RESULTS,
-    result_of,
-    staleness,
-    tree,
-)
+from thirdhand_sim.lab.evidence import RESULTS, result_of, staleness, tree
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"

@@ -25,20 +25,10 @@ from typing import Any
 
 from thirdhand.client import endpoints, open_session, publisher
 from thirdhand.contract import cdr
-from thirdhand.contract.messages import (
-    BASE,
-    Attachment,
-    JointState,
-    PoseStamped,
-)
+from thirdhand.contract.messages import BASE, Attachment, JointState, PoseStamped
 from thirdhand.contract.records import SIDES, SOURCES, Mode
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    Vector,
-)
+from thirdhand.core.frame import Event, Frame, Tick, Vector
 from thirdhand.daemon import daemon
 from thirdhand.daemon.cell_streams import Arrivals, CellStreams
 from thirdhand.daemon.input_monitor import KEY_OF_SOURCE

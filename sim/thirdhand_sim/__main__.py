@@ -14,12 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from thirdhand.cli.usage import (
-    UsageError,
-    add_end_with,
-    end_with,
-    option,
-)
+from thirdhand.cli.usage import UsageError, add_end_with, end_with, option
 from thirdhand.client import client_settings, endpoints, open_session
 from thirdhand.contract import requests
 from thirdhand.contract.channels import ENDPOINT
@@ -117,13 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(str(error))
     from thirdhand_sim.bench import Bench, BenchHands
     from thirdhand_sim.engines import world_of
-    from thirdhand_sim.network import (
-        BenchError,
-        Dropout,
-        Live,
-        RunReport,
-        run,
-    )
+    from thirdhand_sim.network import BenchError, Dropout, Live, RunReport, run
     from thirdhand_sim.observed_world import ObservedWorld
     from thirdhand_sim.parts import before_others
     from thirdhand_sim.tracked_hands import TrackedHands

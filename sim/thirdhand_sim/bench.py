@@ -24,29 +24,9 @@ from thirdhand.client import BRAKE_AFTER_S
 from thirdhand.contract.messages import BASE, SceneObject
 from thirdhand.settings.config import Settings
 from thirdhand_sim.engines import world_of
-from thirdhand_sim.scene import (
-    ARRIVED_M,
-    GRASP_DISTANCE,
-    HAND_ORIENTATION,
-    TOOL_FROM_HAND,
-    Scene,
-)
-from thirdhand_sim.script import (
-    GRIP_S,
-    Array,
-    HandMotions,
-    TaskProgress,
-)
-from thirdhand_sim.world import (
-    BOARD_IN_TOOL,
-    LEVEL,
-    POSITION_GAIN,
-    Floats,
-    Pose,
-    World,
-    carried_by,
-    seen_from,
-)
+from thirdhand_sim.scene import ARRIVED_M, GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND, Scene
+from thirdhand_sim.script import GRIP_S, Array, HandMotions, TaskProgress
+from thirdhand_sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
 
 SETTLE_RANGE_S = (0.5, 2.5)  # shortest and longest time for the arm to settle before the script begins
 SETTLED_STILL_S = 0.25  # the arm has settled after resting for this time

@@ -11,13 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from thirdhand.contract import cdr
-from thirdhand.contract.messages import (
-    BASE,
-    JointState,
-    PoseStamped,
-    Quaternion,
-    Vector3,
-)
+from thirdhand.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3
 from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Event, Frame, Tick
 from thirdhand.core.skill.pose import CLOSED, UNKNOWN

@@ -25,13 +25,7 @@ from thirdhand.daemon.launch import Launched, launched
 from thirdhand.settings.config import Settings
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.network import Bridge, Live
-from thirdhand_sim.parts import (
-    CELL,
-    CellPart,
-    Link,
-    as_usual_afterwards,
-    before_others,
-)
+from thirdhand_sim.parts import CELL, CellPart, Link, as_usual_afterwards, before_others
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 

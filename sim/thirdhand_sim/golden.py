@@ -23,19 +23,8 @@ from thirdhand.cli.usage import option
 from thirdhand.contract import cdr
 from thirdhand.contract.explain import in_words
 from thirdhand.contract.requests import TOLERANCE_M
-from thirdhand.core.controller import (
-    Controller,
-    Tap,
-    outgoing,
-    run,
-)
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    differences,
-    order,
-)
+from thirdhand.core.controller import Controller, Tap, outgoing, run
+from thirdhand.core.frame import Event, Frame, Tick, differences, order
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks
@@ -45,12 +34,7 @@ from thirdhand.settings.whole_file import whole
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench
-from thirdhand_sim.closed_loop import (
-    START_NS,
-    ClosedLoop,
-    hand_event,
-    joints_event,
-)
+from thirdhand_sim.closed_loop import START_NS, ClosedLoop, hand_event, joints_event
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 

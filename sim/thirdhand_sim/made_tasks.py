@@ -21,21 +21,10 @@ from scipy.spatial.transform import Rotation
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.settings.config import Reach
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand_sim.people import (
-    GROUP_SEEDS,
-    PROJECT_SEED,
-    Person,
-    person,
-)
+from thirdhand_sim.people import GROUP_SEEDS, PROJECT_SEED, Person, person
 from thirdhand_sim.scene import TOOL_ORIENTATION
 from thirdhand_sim.script import Array
-from thirdhand_sim.sessions import (
-    SHAPE_STEPS,
-    Leg,
-    along,
-    restless,
-    shape,
-)
+from thirdhand_sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
 TASK_KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
 TAUGHT = "visits"  # the task of the tutorial, which no experiment uses

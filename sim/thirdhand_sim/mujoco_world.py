@@ -10,15 +10,7 @@ import numpy as np
 
 from thirdhand.settings.config import Settings
 from thirdhand_sim.description import simulated
-from thirdhand_sim.world import (
-    FIELD_OF_VIEW,
-    POSITION_GAIN,
-    UNLIMITED,
-    Floats,
-    Pose,
-    World,
-    WorldBody,
-)
+from thirdhand_sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen

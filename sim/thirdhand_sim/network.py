@@ -19,20 +19,10 @@ import zenoh
 
 from thirdhand.arms.playback import Playback
 from thirdhand.client import Command
-from thirdhand.contract import (
-    cdr,
-    channels,
-    messages,
-    requests,
-)
+from thirdhand.contract import cdr, channels, messages, requests
 from thirdhand.contract.records import SIDES
 from thirdhand.daemon.clock import Deadlines
-from thirdhand_sim.bench import (
-    Bench,
-    Observation,
-    TaskEvent,
-    TaskEvents,
-)
+from thirdhand_sim.bench import Bench, Observation, TaskEvent, TaskEvents
 from thirdhand_sim.observed_world import ObservedWorld
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import Array

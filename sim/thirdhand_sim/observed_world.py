@@ -16,14 +16,7 @@ from thirdhand.core.arm.stage import Arm
 from thirdhand.core.geometry import between_segments, place, quaternion_of
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand_sim.world import (
-    LEVEL,
-    Floats,
-    Pose,
-    World,
-    WorldBody,
-    carried_by,
-)
+from thirdhand_sim.world import LEVEL, Floats, Pose, World, WorldBody, carried_by
 
 
 class ObservedWorld(World):

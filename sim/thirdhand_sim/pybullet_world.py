@@ -10,15 +10,7 @@ import numpy as np
 from thirdhand.settings.config import Settings
 from thirdhand_sim.description import simulated
 from thirdhand_sim.quiet import pybullet
-from thirdhand_sim.world import (
-    POSITION_GAIN,
-    UNLIMITED,
-    Floats,
-    Pose,
-    World,
-    WorldBody,
-    camera,
-)
+from thirdhand_sim.world import POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody, camera
 
 
 class PyBulletWorld(World):

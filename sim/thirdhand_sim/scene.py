@@ -22,12 +22,7 @@ from thirdhand.contract import requests
 from thirdhand.contract.explain import in_words, validated
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Reach
-from thirdhand.settings.file_content import (
-    SettingsError,
-    UnusableError,
-    text_in,
-    toml_in,
-)
+from thirdhand.settings.file_content import SettingsError, UnusableError, text_in, toml_in
 
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]

@@ -10,16 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thirdhand_sim.people import (
-    GROUP_SEEDS,
-    LONGEST_LEAD_S,
-    PLAIN_PERSON,
-    PROJECT_SEED,
-    Group,
-    Person,
-    Places,
-    person,
-)
+from thirdhand_sim.people import GROUP_SEEDS, LONGEST_LEAD_S, PLAIN_PERSON, PROJECT_SEED, Group, Person, Places, person
 from thirdhand_sim.scene import MOST_MOVED, TOOL_FROM_HAND, Scene
 from thirdhand_sim.script import TOOL_ARCS, Array
 

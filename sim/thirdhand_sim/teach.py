@@ -29,18 +29,8 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 from thirdhand_sim import made_tasks, sessions
 from thirdhand_sim.people import Places
-from thirdhand_sim.scene import (
-    TOOL_FROM_HAND,
-    TOOL_ORIENTATION,
-    Scene,
-    SceneError,
-)
-from thirdhand_sim.script import (
-    Array,
-    Clock,
-    HandScript,
-    Teacher,
-)
+from thirdhand_sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneError
+from thirdhand_sim.script import Array, Clock, HandScript, Teacher
 
 RADIUS_M = 0.03  # radius of via-points
 MIN_PLACE_STD_M = 0.001  # least standard deviation of via-points

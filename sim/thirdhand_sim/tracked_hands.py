@@ -12,18 +12,8 @@ from thirdhand.contract.records import SIDES
 from thirdhand.settings import palette
 from thirdhand.settings.config import Settings
 from thirdhand.workbench.takes.demonstration_reader import from_tracker, is_by_tracker
-from thirdhand_sim.scene import (
-    ARRIVED_M,
-    HAND_ORIENTATION,
-    Point,
-    Scene,
-)
-from thirdhand_sim.script import (
-    Array,
-    HandMotions,
-    PointMotion,
-    TaskProgress,
-)
+from thirdhand_sim.scene import ARRIVED_M, HAND_ORIENTATION, Point, Scene
+from thirdhand_sim.script import Array, HandMotions, PointMotion, TaskProgress
 from thirdhand_sim.world import LEVEL
 
 OBSERVED_S = 0.8  # an event is observed for this time after it was reached, as it is in the scripted scene

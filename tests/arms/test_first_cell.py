@@ -19,11 +19,7 @@ from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import load, robot_description
 from thirdhand.settings.urdf import Urdf
 from thirdhand.skills.via_points import adapted
-from thirdhand.workbench.first_cell.first_cell import (
-    Proposal,
-    proposed,
-    written,
-)
+from thirdhand.workbench.first_cell.first_cell import Proposal, proposed, written
 from thirdhand.workbench.first_cell.rates import rates
 from thirdhand_sim.lab.rehearsal import rehearse
 from thirdhand_sim.scene import Scene

@@ -24,11 +24,7 @@ from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
-from thirdhand.client import (
-    UnreachableError,
-    endpoints,
-    open_session,
-)
+from thirdhand.client import UnreachableError, endpoints, open_session
 from thirdhand.contract import cdr
 from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings

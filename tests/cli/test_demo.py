@@ -19,25 +19,13 @@ from support.cell import thirdhand
 from support.cell_commands import succeeded
 from support.paths import ROOT
 from support.recorded import drawn_ticks
-from thirdhand.client import (
-    Client,
-    Tracker,
-    UnreachableError,
-    open_session,
-)
+from thirdhand.client import Client, Tracker, UnreachableError, open_session
 from thirdhand.command_line import main
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.daemon.launch import launched, played
 from thirdhand.recordings.recording import Recording
 from thirdhand.settings.config import WAM, Settings
-from thirdhand.workbench.cli.demo import (
-    DEMO_ATTEMPTS,
-    EVENT_TITLES,
-    SLOW_RATE_HZ,
-    TOO_BUSY,
-    exit_code,
-    text,
-)
+from thirdhand.workbench.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, SLOW_RATE_HZ, TOO_BUSY, exit_code, text
 from thirdhand.workbench.report.columns import read
 from thirdhand_sim.scene import Scene
 

@@ -15,11 +15,7 @@ import pytest
 from thirdhand.cli.diagnosis import Y_UP, Finding, findings
 from thirdhand.cli.status import rows
 from thirdhand.contract.incidents import what_to_do
-from thirdhand.contract.requests import (
-    Percentiles,
-    Source,
-    Status,
-)
+from thirdhand.contract.requests import Percentiles, Source, Status
 from thirdhand.core.geometry import rotation
 from thirdhand.settings.config import converted
 

@@ -14,15 +14,7 @@ import pytest
 import zenoh
 
 from support.cell import until
-from thirdhand.client import (
-    Client,
-    RefusedError,
-    UncertainError,
-    UnreachableError,
-    endpoints,
-    living,
-    open_session,
-)
+from thirdhand.client import Client, RefusedError, UncertainError, UnreachableError, endpoints, living, open_session
 from thirdhand.client.presence import is_connected
 from thirdhand.contract import channels, requests
 from thirdhand.contract.requests import ViaPoint

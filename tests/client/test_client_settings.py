@@ -6,11 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from thirdhand.client import (
-    UnreachableError,
-    client_settings,
-    open_session,
-)
+from thirdhand.client import UnreachableError, client_settings, open_session
 from thirdhand.command_line import main
 from thirdhand.settings.config import Settings
 from thirdhand.settings.file_content import SettingsError

@@ -17,12 +17,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from support.wam import JOINT_NAMES
-from thirdhand.contract import (
-    cdr,
-    channels,
-    messages,
-    requests,
-)
+from thirdhand.contract import cdr, channels, messages, requests
 from thirdhand.contract.channels import EVENT_NUMBERS
 from thirdhand.contract.ros2msg import schema
 from thirdhand.core.frame import definitions

@@ -7,13 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from support.pictures import grey
-from thirdhand.contract.images import (
-    COMPRESSED_IMAGE,
-    CompressedImage,
-    decode_image,
-    encode_image,
-    image_in,
-)
+from thirdhand.contract.images import COMPRESSED_IMAGE, CompressedImage, decode_image, encode_image, image_in
 from thirdhand.contract.messages import WireError
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)

@@ -7,29 +7,12 @@ from __future__ import annotations
 import pytest
 
 from thirdhand.contract.evidence import Evidence, explained
-from thirdhand.contract.incidents import (
-    BY_WORD,
-    INCIDENTS,
-    Condition,
-    what_happened,
-    word,
-)
-from thirdhand.contract.records import (
-    GONE_S,
-    Cause,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.incidents import BY_WORD, INCIDENTS, Condition, what_happened, word
+from thirdhand.contract.records import GONE_S, Cause, Flag, Mode, Reason
 from thirdhand.contract.requests import Source
 from thirdhand.core.intake import CONFIRMED_SAMPLES
 from thirdhand.core.tuning import TUNING
-from thirdhand.settings.config import (
-    ArmSettings,
-    HandSettings,
-    Settings,
-    ToolSettings,
-)
+from thirdhand.settings.config import ArmSettings, HandSettings, Settings, ToolSettings
 
 STUCK_S = TUNING.decision.stuck_s
 TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s

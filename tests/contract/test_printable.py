@@ -16,10 +16,7 @@ from support.wicked import WICKED
 from thirdhand.cli.serve import PrintableFormatter
 from thirdhand.client import RefusedError, decoded
 from thirdhand.command_line import main
-from thirdhand.contract.printable import (
-    printable,
-    printable_lines,
-)
+from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.contract.requests import Status
 from thirdhand.skills.skill_file import SkillError
 

@@ -35,7 +35,7 @@ def rejected(loop: Loop) -> dict[Cause, int]:
 @pytest.mark.parametrize("ahead_ns", [10**9, HOUR_NS])
 @pytest.mark.parametrize("posture", [POSTURE, ELSEWHERE])
 def test_one_state_ahead_changes_nothing(skill: Skill, ahead_ns: int, posture: tuple[float, ...]) -> None:
-    """A single state with a stamp ahead causes no fault, no motion and no rejection of later ones."""
+    """A single state with a stamp ahead causes no fault, no motion and no later rejection."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     seen = loop.run(1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5)

@@ -30,12 +30,7 @@ from support.wam import URDF
 from thirdhand.contract import channels
 from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import (
-    Event,
-    Tick,
-    definitions,
-    order,
-)
+from thirdhand.core.frame import Event, Tick, definitions, order
 from thirdhand.core.skill.model import Regions
 from thirdhand.core.skill.skill import Skill
 from thirdhand.settings.config import Settings

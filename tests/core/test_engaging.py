@@ -16,21 +16,10 @@ from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, Loop, assert_limits_hold, clutch, led, ticks_of
 from support.setpoints import MIDDLE, PERIOD_S, at_rest, driven
 from thirdhand.contract.records import Flag, Mode, Reason
-from thirdhand.core.frame import (
-    Event,
-    Tick,
-    Vector,
-    order,
-)
+from thirdhand.core.frame import Event, Tick, Vector, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
-from thirdhand.settings.config import (
-    Settings,
-    SettingsError,
-    ToolSettings,
-    parse,
-    robot_description,
-)
+from thirdhand.settings.config import Settings, SettingsError, ToolSettings, parse, robot_description
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 

@@ -16,12 +16,7 @@ from thirdhand.contract.messages import WireError
 from thirdhand.contract.records import Mode
 from thirdhand.contract.requests import RequestError
 from thirdhand.core.controller import Controller, run
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    order,
-)
+from thirdhand.core.frame import Event, Frame, Tick, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import Recorder
 from thirdhand.settings.config import Settings

@@ -11,12 +11,7 @@ from support.skills import at_rest, figures_of
 from thirdhand.contract.records import Field
 from thirdhand.core.skill import ORDER, TURNS
 from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.memory import (
-    features,
-    moving_features,
-    remember,
-    turning,
-)
+from thirdhand.core.skill.memory import features, moving_features, remember, turning
 from thirdhand.core.skill.tuning import MEMORY_LAG_S, TURN_LAG_S, TURN_WEIGHT_M
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import StoredSkill, decoded

@@ -19,23 +19,10 @@ from thirdhand.contract import cdr
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import outgoing
 from thirdhand.core.frame import blank, state_layout
-from thirdhand.core.geometry import (
-    axis_of,
-    quaternion_of,
-    swing,
-    turn_between,
-    turn_on,
-)
+from thirdhand.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.core.setpoint.orientation import OrientationSetpoint
-from thirdhand.core.skill.pose import (
-    CLOSED,
-    NO_GRIPPER,
-    OPEN,
-    UNKNOWN,
-    LearnedOrientation,
-    decided,
-)
+from thirdhand.core.skill.pose import CLOSED, NO_GRIPPER, OPEN, UNKNOWN, LearnedOrientation, decided
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.tuning import GRIPPER_MOVES_S
 from thirdhand.core.tuning import TUNING

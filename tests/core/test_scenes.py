@@ -22,17 +22,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from support.arms import MODELS, cell_of
-from support.in_process import (
-    ASSUMED,
-    LEFT,
-    RIGHT,
-    assert_limits_hold,
-    assert_replays,
-    frames,
-    led,
-    seen,
-    ticks_of,
-)
+from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, assert_replays, frames, led, seen, ticks_of
 from support.paths import RECORDINGS
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.controller import Controller, start_state

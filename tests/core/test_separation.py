@@ -22,20 +22,8 @@ from support.wam import STATE, URDF
 from thirdhand.contract.records import Flag, Mode
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import start_state
-from thirdhand.core.frame import (
-    Record,
-    Tick,
-    Vector,
-    blank,
-    frame_layout,
-)
-from thirdhand.core.geometry import (
-    between_segments,
-    nearest_to_box,
-    place,
-    quaternion_of,
-    to_box,
-)
+from thirdhand.core.frame import Record, Tick, Vector, blank, frame_layout
+from thirdhand.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
 from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.limiter.stage import LimiterStage
 from thirdhand.core.separation import TABLE_DEPTH_M
@@ -46,13 +34,7 @@ from thirdhand.core.separation.step import allowed_speed
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings.shipped import shipped_skill
-from thirdhand.settings.config import (
-    Box,
-    Obstacles,
-    Settings,
-    TableTop,
-    robot_description,
-)
+from thirdhand.settings.config import Box, Obstacles, Settings, TableTop, robot_description
 from thirdhand_sim.lab.separation import nearest as measured
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript

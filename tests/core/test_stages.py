@@ -11,12 +11,7 @@ from support.paths import RECORDINGS
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import structured
 from thirdhand.core.skill.memory import along, delayed
-from thirdhand.core.skill.segments import (
-    MOST_SEGMENTS,
-    SEGMENT,
-    along_way,
-    recognise,
-)
+from thirdhand.core.skill.segments import MOST_SEGMENTS, SEGMENT, along_way, recognise
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.skill.tuning import FIRST_SEGMENT_ODDS
@@ -78,7 +73,7 @@ def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
 
 
 def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
-    """Segments with other paths are distinguished by the hands' places; earlier ones are forgotten."""
+    """The hands' places distinguish segments with other paths; earlier ones are forgotten."""
     segments = there_and_back.copy()
     segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
     belief = np.zeros(MOST_SEGMENTS)

@@ -23,13 +23,7 @@ from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import Controller, start_state
 from thirdhand.core.decision import WAY
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    Vector,
-    order,
-)
+from thirdhand.core.frame import Event, Frame, Tick, Vector, order
 from thirdhand.core.separation.stage import Separation
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.way_out import WayOut

@@ -9,10 +9,7 @@ from support.followed import changed
 from thirdhand.contract.records import Flag, Mode
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.frame import blank, frame_layout
-from thirdhand.core.tool_limits import (
-    binding,
-    tool_limits,
-)
+from thirdhand.core.tool_limits import binding, tool_limits
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Settings, robot_description

@@ -20,21 +20,9 @@ from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
-from thirdhand.client import (
-    Client,
-    Tracker,
-    UnreachableError,
-    cells,
-    endpoints,
-    open_session,
-    publisher,
-)
+from thirdhand.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
 from thirdhand.command_line import main
-from thirdhand.contract import (
-    cdr,
-    channels,
-    requests,
-)
+from thirdhand.contract import cdr, channels, requests
 from thirdhand.contract.messages import PoseStamped
 
 NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))

@@ -31,12 +31,7 @@ from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.settings.config import Files, Reach, Settings
 from thirdhand.skills.reach import beyond_m
-from thirdhand.skills.skill_file import (
-    SkillError,
-    StoredSkill,
-    decoded,
-    with_file,
-)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.skills.via_points import adapted
 
 HANDOVER = PLACES[0]

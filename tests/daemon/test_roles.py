@@ -17,22 +17,11 @@ import zenoh
 from support.cell import LEFT, Tracker, thirdhand, until
 from support.cell_commands import assert_refused, succeeded
 from support.certificates import make_certificates
-from thirdhand.client import (
-    Client,
-    endpoints,
-    living,
-    open_session,
-)
+from thirdhand.client import Client, endpoints, living, open_session
 from thirdhand.client.session import CertificateError
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.messages import PoseStamped
-from thirdhand.contract.roles import (
-    ROLES,
-    ROUTER,
-    TOPICS,
-    access_control,
-    names,
-)
+from thirdhand.contract.roles import ROLES, ROUTER, TOPICS, access_control, names
 from thirdhand.daemon.launch import launched
 from thirdhand.daemon.single_instance import NETWORK_BOUNDS
 

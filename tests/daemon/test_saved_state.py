@@ -24,12 +24,7 @@ from thirdhand.daemon.saved_state import MAX_STATE_BYTES, NOT_OURS
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.single_instance import state_folder
 from thirdhand.settings import mesh_cover
-from thirdhand.settings.config import (
-    WAM,
-    Files,
-    Settings,
-    converted,
-)
+from thirdhand.settings.config import WAM, Files, Settings, converted
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.scene import Scene

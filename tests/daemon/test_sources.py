@@ -18,22 +18,11 @@ from thirdhand.contract.messages import JointState, PoseStamped, WireError
 from thirdhand.contract.records import Cause
 from thirdhand.contract.requests import Percentiles, Status
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    blank,
-    frame_layout,
-)
+from thirdhand.core.frame import Event, Frame, Tick, blank, frame_layout
 from thirdhand.core.intake import KEPT
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.skill.skill import Skill
-from thirdhand.daemon.input_monitor import (
-    KEY_OF_SOURCE,
-    InputMonitor,
-    apart_m,
-    evidence,
-)
+from thirdhand.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, apart_m, evidence
 from thirdhand.daemon.status import CellStatus
 from thirdhand.settings.config import HandSettings, Settings
 

@@ -14,14 +14,7 @@ import pytest
 
 from support.cell import serving
 from support.cell_commands import python
-from thirdhand.client import (
-    Client,
-    StartingError,
-    UnreachableError,
-    cells,
-    endpoints,
-    open_session,
-)
+from thirdhand.client import Client, StartingError, UnreachableError, cells, endpoints, open_session
 from thirdhand.command_line import main
 from thirdhand.contract.channels import CHANNELS
 from thirdhand.daemon import launch

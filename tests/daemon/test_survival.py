@@ -20,12 +20,7 @@ import pytest
 from support.cell import Daemon, Tracker, serving, thirdhand, until
 from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
-from thirdhand.client import (
-    Client,
-    RefusedError,
-    UnreachableError,
-    open_session,
-)
+from thirdhand.client import Client, RefusedError, UnreachableError, open_session
 from thirdhand.daemon.launch import free_port
 from thirdhand.daemon.single_instance import Lock
 from thirdhand.recordings.replay import replay

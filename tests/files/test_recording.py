@@ -18,10 +18,7 @@ from support.recorded import CELL, SKILL, at_ns, state_after, ticks, write
 from support.wam import FRAME
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.channels import EVENT_NUMBERS
-from thirdhand.core.frame import (
-    blank,
-    encode,
-)
+from thirdhand.core.frame import blank, encode
 from thirdhand.recordings.mcap_file import McapFile, RecordingError
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.skills.demonstration import Demonstration

@@ -18,11 +18,7 @@ from support.paths import RECORDINGS
 from support.recorded import thin
 from support.wam import URDF
 from thirdhand.core.controller import Controller, run
-from thirdhand.core.frame import (
-    STAGES,
-    Frame,
-    Tick,
-)
+from thirdhand.core.frame import STAGES, Frame, Tick
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings import replay as replay_module

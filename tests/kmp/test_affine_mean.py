@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from kmp import (
-    KMP,
-    AffineMean,
-    GaussianKernel,
-    Gaussians,
-    LinearConstraints,
-    PeriodicKernel,
-    VelocityKernel,
-)
+from kmp import KMP, AffineMean, GaussianKernel, Gaussians, LinearConstraints, PeriodicKernel, VelocityKernel
 from kmp.functionals import Functionals
 from kmp.solution import mean_of
 from support.primitives import KERNELS, curve

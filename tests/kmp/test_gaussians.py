@@ -74,7 +74,7 @@ def test_affine_map_and_inverse_cancel(seed):
 @properties
 @given(seeds)
 def test_product_is_commutative_and_surer(seed):
-    """A product of Gaussians does not depend on the order, and has less variance than its factors."""
+    """A product does not depend on the order, and has less variance than its factors."""
     a, b, c = some(3, 2, seed), some(3, 2, seed + 1), some(3, 2, seed + 2)
     product = a.product(b, c)
     other = c.product(a).product(b)

@@ -7,15 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kmp import (
-    KMP,
-    GaussianKernel,
-    Gaussians,
-    PeriodicKernel,
-    RankReached,
-    VelocityKernel,
-    named_arrays,
-)
+from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, RankReached, VelocityKernel, named_arrays
 
 properties = settings(max_examples=10, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)

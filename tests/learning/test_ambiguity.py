@@ -8,9 +8,7 @@ from support.circling import circling
 from support.fine_motion import fine
 from support.skills import figures_of
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.ambiguity import (
-    tracker_noise_m,
-)
+from thirdhand.workbench.learning.ambiguity import tracker_noise_m
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import Figures
 

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.baselines import (
-    held_out_errors,
-    linear,
-    look_up,
-)
+from thirdhand.workbench.learning.baselines import held_out_errors, linear, look_up
 from thirdhand.workbench.learning.records import Take
 
 RANDOM = np.random.default_rng(0)

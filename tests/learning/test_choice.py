@@ -10,12 +10,7 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.criteria.cross_validation import rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
-from thirdhand.workbench.learning.choice import (
-    MAX_GAIN,
-    POSITION_SCALES,
-    RIDGE_M,
-    selection_of,
-)
+from thirdhand.workbench.learning.choice import MAX_GAIN, POSITION_SCALES, RIDGE_M, selection_of
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript, Teacher
 

@@ -12,12 +12,7 @@ from kmp.criteria.cross_validation import rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
 from support.circling import circling
 from support.paths import RECORDINGS
-from thirdhand.skills.skill_file import (
-    SkillError,
-    StoredSkill,
-    decoded,
-    with_file,
-)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.workbench.learning.baselines import held_out_errors, linear
 from thirdhand.workbench.learning.choice import MAX_GAIN, RIDGE_M, selection_of
 from thirdhand.workbench.learning.learn import learn

@@ -10,31 +10,16 @@ import pytest
 from support.skills import figures_of, made
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import blank, frame_layout
-from thirdhand.core.skill.model import (
-    LEVELS,
-    NORMAL,
-    REGION_95,
-    Regions,
-)
+from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Regions
 from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.skill.step import calibrate
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
-from thirdhand.skills.skill_file import (
-    SkillError,
-    StoredSkill,
-    decoded,
-    with_file,
-)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import TimedErrors
-from thirdhand.workbench.learning.regions import (
-    BLOCKS,
-    blocks_of,
-    calibrated,
-    calibrated_without,
-)
+from thirdhand.workbench.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
 
 
 def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> TimedErrors:

@@ -21,12 +21,7 @@ from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.core.skill.segments import LEFT, NONE
 from thirdhand.core.skill.skill import Skill
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.skills.skill_file import (
-    SkillError,
-    StoredSkill,
-    decoded,
-    with_file,
-)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.skills.via_points import adapted, in_force
 from thirdhand.workbench.learning.division import task_of, via_points_never_reached
 from thirdhand.workbench.learning.learn import learn

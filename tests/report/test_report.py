@@ -17,21 +17,10 @@ from support.wam import URDF
 from support.wicked import wicked_skill
 from thirdhand.command_line import main
 from thirdhand.contract.records import Flag, Mode, Reason
-from thirdhand.contract.requests import (
-    Percentiles,
-    Status,
-    ViaPoint,
-    encode_json,
-)
+from thirdhand.contract.requests import Percentiles, Status, ViaPoint, encode_json
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import (
-    STAGES,
-    Event,
-    Tick,
-    order,
-    timed,
-)
+from thirdhand.core.frame import STAGES, Event, Tick, order, timed
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.daemon.input_monitor import InputMonitor
@@ -41,22 +30,9 @@ from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.report.columns import read, runs
-from thirdhand.workbench.report.report import (
-    Report,
-    Span,
-    reported,
-    why_missed,
-)
+from thirdhand.workbench.report.report import Report, Span, reported, why_missed
 from thirdhand.workbench.report.tables import tables, verdict
-from thirdhand_sim.golden import (
-    AWAY_S,
-    BAD_S,
-    DROPOUT_S,
-    HOLD_S,
-    RETEACH_S,
-    SESSION_S,
-    TEACH_S,
-)
+from thirdhand_sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 
 SETTINGS = Settings()
 PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)

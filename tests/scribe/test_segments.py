@@ -22,12 +22,7 @@ from support.recorded import SKILL, state_after, ticks, write
 from support.wam import URDF
 from thirdhand.command_line import main
 from thirdhand.core.controller import Controller, run
-from thirdhand.core.frame import (
-    TIMING,
-    Frame,
-    Tick,
-    blank,
-)
+from thirdhand.core.frame import TIMING, Frame, Tick, blank
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay

@@ -21,16 +21,7 @@ from thirdhand.client.client_settings import client_settings
 from thirdhand.contract.requests import List, ViaPointsRequest, decode_request
 from thirdhand.daemon.launch import described
 from thirdhand.recordings.shipped import cell_of
-from thirdhand.settings.config import (
-    FOLLOWING,
-    WAM,
-    Files,
-    Settings,
-    converted,
-    load,
-    parse,
-    robot_description,
-)
+from thirdhand.settings.config import FOLLOWING, WAM, Files, Settings, converted, load, parse, robot_description
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.network import Network, is_local
 from thirdhand_sim.scene import Scene, SceneError

@@ -20,13 +20,7 @@ from support.paths import ROOT
 from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.arm_description import description
-from thirdhand.settings.config import (
-    Settings,
-    converted,
-    parse,
-    robot_description,
-    urdf_path,
-)
+from thirdhand.settings.config import Settings, converted, parse, robot_description, urdf_path
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.mesh_cover import capsule_around, covered
 from thirdhand.settings.urdf import Shape, Urdf, UrdfError

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from thirdhand.contract.records import Mode
 from thirdhand.settings import palette
-from thirdhand.settings.palette import (
-    BY_MODE,
-    LEAST_CONTRAST,
-    PAPER,
-    contrast,
-)
+from thirdhand.settings.palette import BY_MODE, LEAST_CONTRAST, PAPER, contrast
 from thirdhand.workbench.report.page import MODE_COLOURS, TINT
 
 

@@ -19,14 +19,7 @@ from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.daemon.launch import described
 from thirdhand.recordings.shipped import ARMS, cell_of, shipped_skill
-from thirdhand.settings.config import (
-    Box,
-    Obstacles,
-    Reach,
-    Settings,
-    parse,
-    robot_description,
-)
+from thirdhand.settings.config import Box, Obstacles, Reach, Settings, parse, robot_description
 from thirdhand.settings.urdf import Urdf
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench

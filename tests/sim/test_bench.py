@@ -29,14 +29,7 @@ from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.learning.learn import learn
 from thirdhand_sim.bench import Bench, Observation
 from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.network import (
-    BenchError,
-    Commands,
-    Dropout,
-    Live,
-    RunReport,
-    run,
-)
+from thirdhand_sim.network import BenchError, Commands, Dropout, Live, RunReport, run
 from thirdhand_sim.observed_world import ObservedWorld
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import GRIP_S, HandScript, Teacher

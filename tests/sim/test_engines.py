@@ -16,11 +16,7 @@ from thirdhand_sim.engines import world_of
 from thirdhand_sim.lab.rehearsal import Rehearsed, rehearse
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
-from thirdhand_sim.world import (
-    LEVEL,
-    Pose,
-    pixels,
-)
+from thirdhand_sim.world import LEVEL, Pose, pixels
 
 SCENE = Scene()
 EYE, TARGET, SIZE = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31), (160, 120)

@@ -27,14 +27,7 @@ from thirdhand_sim.golden import record
 from thirdhand_sim.lab import evidence
 from thirdhand_sim.lab.__main__ import main
 from thirdhand_sim.lab.catalogue import EXPERIMENTS, Stream
-from thirdhand_sim.lab.evidence import (
-    core_digest,
-    kmp_digest,
-    options_of,
-    origin,
-    staleness,
-    tree,
-)
+from thirdhand_sim.lab.evidence import core_digest, kmp_digest, options_of, origin, staleness, tree
 from thirdhand_sim.lab.results import ExperimentError, Options
 
 NAMED = {"commit", "date", "machine", "seeds", "options", "depends_on"}

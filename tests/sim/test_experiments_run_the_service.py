@@ -25,12 +25,7 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.lab import rehearsal
 from thirdhand_sim.lab.people.moving_hands import stops
-from thirdhand_sim.lab.people.trials import (
-    RATE_HZ,
-    Seen,
-    seen,
-    served,
-)
+from thirdhand_sim.lab.people.trials import RATE_HZ, Seen, seen, served
 from thirdhand_sim.lab.reached import ours
 from thirdhand_sim.lab.rivals import followers
 from thirdhand_sim.lab.rivals.service import LearnedByService

@@ -7,12 +7,7 @@ import pytest
 
 from thirdhand.settings.config import Reach
 from thirdhand.workbench.learning.division import FOLLOW, off_via_point
-from thirdhand_sim.made_tasks import (
-    TAKE_HZ,
-    TASK_KINDS,
-    run,
-    takes,
-)
+from thirdhand_sim.made_tasks import TAKE_HZ, TASK_KINDS, run, takes
 
 pytestmark = pytest.mark.thorough
 

@@ -14,25 +14,11 @@ from thirdhand.core.skill.model import LEVELS
 from thirdhand.skills.skill_file import decoded
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
-from thirdhand_sim.lab.partners import (
-    Fold,
-    Found,
-    as_command,
-    numbers_of,
-    served,
-)
-from thirdhand_sim.lab.people.left_out import (
-    LeftOut,
-    judged,
-    left_out,
-    predicted,
-)
+from thirdhand_sim.lab.partners import Fold, Found, as_command, numbers_of, served
+from thirdhand_sim.lab.people.left_out import LeftOut, judged, left_out, predicted
 from thirdhand_sim.lab.results import Options, Results
 from thirdhand_sim.lab.rivals.method import Predicted
-from thirdhand_sim.lab.rivals.partners import (
-    RIVALS,
-    left_out_by,
-)
+from thirdhand_sim.lab.rivals.partners import RIVALS, left_out_by
 from thirdhand_sim.made_tasks import takes
 
 pytestmark = pytest.mark.thorough

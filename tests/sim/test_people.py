@@ -12,15 +12,8 @@ import numpy as np
 import pytest
 
 from thirdhand.core.skill.skill import Skill
-from thirdhand_sim.lab.people.comparison import (
-    METHODS,
-    run,
-)
-from thirdhand_sim.lab.people.trials import (
-    Seen,
-    judge,
-    seen,
-)
+from thirdhand_sim.lab.people.comparison import METHODS, run
+from thirdhand_sim.lab.people.trials import Seen, judge, seen
 from thirdhand_sim.lab.results import Options, Results
 from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
 from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
@@ -28,14 +21,7 @@ from thirdhand_sim.lab.rivals.mixtures import frames
 from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
 from thirdhand_sim.lab.rivals.service import Service
 from thirdhand_sim.people import Group, person
-from thirdhand_sim.sessions import (
-    BREAKING,
-    MISTAKES,
-    Session,
-    demonstrations,
-    played,
-    session,
-)
+from thirdhand_sim.sessions import BREAKING, MISTAKES, Session, demonstrations, played, session
 
 pytestmark = pytest.mark.thorough
 

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from thirdhand_sim.scene import Scene
-from thirdhand_sim.script import (
-    HandScript,
-    PointMotion,
-    ScriptPause,
-    Teacher,
-)
+from thirdhand_sim.script import HandScript, PointMotion, ScriptPause, Teacher
 
 SCENE = Scene()
 

@@ -20,13 +20,7 @@ from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench, TaskEvents
-from thirdhand_sim.closed_loop import (
-    HANDS_HZ,
-    START_NS,
-    begin_when_settled,
-    hand_event,
-    joints_event,
-)
+from thirdhand_sim.closed_loop import HANDS_HZ, START_NS, begin_when_settled, hand_event, joints_event
 from thirdhand_sim.engines import world_of
 from thirdhand_sim.network import Commands, Gripper, Led
 from thirdhand_sim.scene import Scene

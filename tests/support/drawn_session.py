@@ -26,14 +26,7 @@ from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.records import SIDES, Flag, Reason
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Record,
-    Tick,
-    Vector,
-    order,
-)
+from thirdhand.core.frame import Event, Frame, Record, Tick, Vector, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.way_out import WayOut
 from thirdhand.recordings.shipped import shipped_skill

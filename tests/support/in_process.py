@@ -15,13 +15,7 @@ from thirdhand.contract import cdr
 from thirdhand.contract.messages import GRIPPER, JointState
 from thirdhand.contract.records import SIDES
 from thirdhand.core.controller import Controller, run, start_state
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Record,
-    Tick,
-    Vector,
-)
+from thirdhand.core.frame import Event, Frame, Record, Tick, Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import Recorder
 from thirdhand.recordings.replay import replay

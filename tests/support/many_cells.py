@@ -22,12 +22,7 @@ from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.daemon.start import starting
 from thirdhand.recordings.shipped import recordings, shipped_skill
 from thirdhand.scribe.scribe import Scribe
-from thirdhand.settings.config import (
-    ArmSettings,
-    Files,
-    Settings,
-    robot_description,
-)
+from thirdhand.settings.config import ArmSettings, Files, Settings, robot_description
 from thirdhand.settings.network import Network
 
 RATE_HZ, ROS2_DOMAIN = 50, 7

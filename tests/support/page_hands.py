@@ -12,12 +12,7 @@ from typing import Any
 
 import zenoh
 
-from thirdhand.client import (
-    Client,
-    Tracker,
-    endpoints,
-    open_session,
-)
+from thirdhand.client import Client, Tracker, endpoints, open_session
 from thirdhand.contract.cdr import decode_pose
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.workbench.trackers.cell_view import Latest

@@ -12,13 +12,7 @@ import rerun as rr
 from support.wam import FRAME, JOINT_NAMES, STATE
 from thirdhand.contract import cdr, messages
 from thirdhand.core.controller import outgoing
-from thirdhand.core.frame import (
-    TIMING,
-    Event,
-    Record,
-    Tick,
-    blank,
-)
+from thirdhand.core.frame import TIMING, Event, Record, Tick, blank
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks as ticks_in
 from thirdhand.scribe.scribe import Scribe

@@ -10,13 +10,7 @@ from support.wam import FRAME, JOINT_NAMES, STATE
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import Cause
 from thirdhand.core.codes import ARM_HEARD
-from thirdhand.core.frame import (
-    Record,
-    Vector,
-    as_array,
-    blank,
-    copied,
-)
+from thirdhand.core.frame import Record, Vector, as_array, blank, copied
 from thirdhand.core.intake.hand_estimator import is_fresh
 from thirdhand.core.intake.stage import Intake
 from thirdhand.core.intake.step import is_contested

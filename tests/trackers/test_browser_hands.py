@@ -22,16 +22,8 @@ import pytest
 from support.page_hands import PALM, hands_message, page_of_hands, serving_page
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.workbench.trackers import browser_hands
-from thirdhand.workbench.trackers.browser_hands import (
-    FULL,
-    MAX_PAGES,
-    NO_TOKEN,
-    TAKEN,
-)
-from thirdhand.workbench.trackers.hand_message import (
-    PING,
-    PING_MAGIC,
-)
+from thirdhand.workbench.trackers.browser_hands import FULL, MAX_PAGES, NO_TOKEN, TAKEN
+from thirdhand.workbench.trackers.hand_message import PING, PING_MAGIC
 from thirdhand.workbench.trackers.hands_page import WORKER, HeadsetPage
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 

@@ -30,11 +30,7 @@ from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.daemon.launch import free_port
 from thirdhand.recordings.mcap_file import whole_file
 from thirdhand.recordings.shipped import cell_of
-from thirdhand.settings.config import (
-    HandSettings,
-    Settings,
-    load,
-)
+from thirdhand.settings.config import HandSettings, Settings, load
 from thirdhand.workbench.takes.track import Track
 from thirdhand.workbench.trackers.calibration import cell_file
 from thirdhand.workbench.trackers.calibration.cell_file import (
@@ -45,11 +41,7 @@ from thirdhand.workbench.trackers.calibration.cell_file import (
     recorded,
     write,
 )
-from thirdhand.workbench.trackers.calibration.collecting import (
-    LedTracks,
-    held_tool,
-    solved,
-)
+from thirdhand.workbench.trackers.calibration.collecting import LedTracks, held_tool, solved
 from thirdhand.workbench.trackers.calibration.solver import (
     Calibration,
     CalibrationError,
@@ -58,17 +50,7 @@ from thirdhand.workbench.trackers.calibration.solver import (
     solve_held,
     solve_points,
 )
-from thirdhand_sim.calibration import (
-    GRIP,
-    KINDS,
-    ORIGIN,
-    TURN,
-    LedArm,
-    error_m,
-    held,
-    led,
-    touched,
-)
+from thirdhand_sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
 
 SECONDS, SEEDS = 40.0, range(8)
 CORNERS = bench_corners(Settings())

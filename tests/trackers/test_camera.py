@@ -11,14 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from thirdhand.workbench.trackers.camera import CameraError, HandCamera, pictures
-from thirdhand.workbench.trackers.palm import (
-    AVERAGE_PALM,
-    PALM,
-    PALM_CORNERS,
-    Array,
-    Lens,
-    palm_pose,
-)
+from thirdhand.workbench.trackers.palm import AVERAGE_PALM, PALM, PALM_CORNERS, Array, Lens, palm_pose
 
 LENS, LENGTH_M = Lens(600.0, 640, 480), 0.18
 HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None

@@ -24,27 +24,11 @@ from thirdhand.contract.requests import Add, encode_json
 from thirdhand.core.arm.stage import Arm
 from thirdhand.daemon.launch import free_port
 from thirdhand.recordings.mcap_file import RecordingError
-from thirdhand.settings.config import (
-    HandSettings,
-    Settings,
-    ToolSettings,
-    robot_description,
-)
-from thirdhand.workbench.takes.demonstration_files import (
-    demonstration_paths,
-    summary,
-    table,
-    uncut,
-)
+from thirdhand.settings.config import HandSettings, Settings, ToolSettings, robot_description
+from thirdhand.workbench.takes.demonstration_files import demonstration_paths, summary, table, uncut
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
 from thirdhand.workbench.takes.pose_streams import PoseRecording, PoseTopic
-from thirdhand.workbench.trackers.capture import (
-    JOINT_STATES,
-    Capture,
-    CaptureError,
-    Sample,
-    capture,
-)
+from thirdhand.workbench.trackers.capture import JOINT_STATES, Capture, CaptureError, Sample, capture
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import perform
 

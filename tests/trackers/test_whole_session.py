@@ -26,14 +26,7 @@ from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings, load
-from thirdhand_sim.calibration import (
-    BENCH,
-    GRIP,
-    ORIGIN,
-    TURN,
-    LedArm,
-    led,
-)
+from thirdhand_sim.calibration import BENCH, GRIP, ORIGIN, TURN, LedArm, led
 from thirdhand_sim.scene import Scene
 
 pytestmark = [

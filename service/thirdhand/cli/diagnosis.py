@@ -13,21 +13,8 @@ import msgspec
 
 from thirdhand.cli.status import AHEAD_MS, disk, hours_until_full
 from thirdhand.contract.channels import BY_KEY, key
-from thirdhand.contract.evidence import (
-    Evidence,
-    explained,
-    lasting,
-    two_places,
-    unit_advice,
-)
-from thirdhand.contract.incidents import (
-    SOURCE_NAMES,
-    Condition,
-    in_brief,
-    input_name,
-    what_to_do,
-    word,
-)
+from thirdhand.contract.evidence import Evidence, explained, lasting, two_places, unit_advice
+from thirdhand.contract.incidents import SOURCE_NAMES, Condition, in_brief, input_name, what_to_do, word
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.records import SIDES, Cause, Reason
 from thirdhand.contract.requests import Source, Status

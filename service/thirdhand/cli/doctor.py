@@ -19,12 +19,7 @@ import zenoh
 from thirdhand.cli.diagnosis import Finding, findings, wrong
 from thirdhand.cli.status import statuses
 from thirdhand.cli.usage import CONNECT_TIMEOUT_S, reached, reaching
-from thirdhand.client import (
-    Overheard,
-    RefusedError,
-    StartingError,
-    UnreachableError,
-)
+from thirdhand.client import Overheard, RefusedError, StartingError, UnreachableError
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import ENDPOINT, key, tcp_address
 from thirdhand.contract.explain import in_words

@@ -22,12 +22,7 @@ from thirdhand.contract.printable import printable
 from thirdhand.daemon.single_instance import allow_descriptors, holder_of, state_folder
 from thirdhand.process import bytecode, foreign_modules
 from thirdhand.scribe.paths import MB, existing_folder
-from thirdhand.settings.config import (
-    Files,
-    Settings,
-    robot_description,
-    urdf_path,
-)
+from thirdhand.settings.config import Files, Settings, robot_description, urdf_path
 from thirdhand.settings.network import Network, is_local
 
 ROUTER_TIMEOUT_S = 2.0

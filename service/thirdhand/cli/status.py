@@ -15,22 +15,10 @@ from zenoh.handlers import RingChannel
 
 from thirdhand.cli.clients import ask
 from thirdhand.cli.usage import reached
-from thirdhand.client import (
-    Client,
-    UnreachableError,
-    decoded,
-    why_silent,
-)
+from thirdhand.client import Client, UnreachableError, decoded, why_silent
 from thirdhand.contract import channels
 from thirdhand.contract.evidence import lasting
-from thirdhand.contract.incidents import (
-    SOURCE_NAMES,
-    in_brief,
-    input_name,
-    what_happened,
-    what_to_do,
-    word,
-)
+from thirdhand.contract.incidents import SOURCE_NAMES, in_brief, input_name, what_happened, what_to_do, word
 from thirdhand.contract.records import SIDES, Flag
 from thirdhand.contract.requests import Source, Status
 from thirdhand.process import interrupt

@@ -17,21 +17,10 @@ from typing import Any, NoReturn
 import msgspec
 import zenoh
 
-from thirdhand.client import (
-    CLIENT_FILE,
-    ClientSettings,
-    UnreachableError,
-    client_settings,
-    open_session,
-)
+from thirdhand.client import CLIENT_FILE, ClientSettings, UnreachableError, client_settings, open_session
 from thirdhand.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from thirdhand.contract.explain import did_you_mean, in_file, in_words
-from thirdhand.contract.requests import (
-    Add,
-    RequestError,
-    ViaPoint,
-    decode_request,
-)
+from thirdhand.contract.requests import Add, RequestError, ViaPoint, decode_request
 from thirdhand.settings.config import RATES_HZ, Settings
 from thirdhand.settings.file_content import UnusableError, content
 

@@ -22,13 +22,7 @@ from thirdhand.client.session import (
 from thirdhand.contract import channels, requests
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.printable import printable_lines
-from thirdhand.contract.requests import (
-    ANSWER_TIMEOUT_S,
-    Reply,
-    Status,
-    ViaPoint,
-    ViaPointInForce,
-)
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S, Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
 QUERIES = 2  # queries within the time of one request, if it may be repeated

@@ -15,13 +15,7 @@ import zenoh
 from thirdhand.client.session import open_session
 from thirdhand.contract.channels import ENDPOINT, CellName, lacking
 from thirdhand.contract.explain import InvalidError, in_words, validated
-from thirdhand.settings.file_content import (
-    SettingsError,
-    UnreadableError,
-    UnusableError,
-    text_in,
-    toml_in,
-)
+from thirdhand.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
 from thirdhand.settings.user_folder import HomelessError, user_folder
 
 CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"

@@ -26,22 +26,8 @@ from thirdhand.client.streams import (
     wait_until_heard,
 )
 from thirdhand.contract import cdr, markers
-from thirdhand.contract.messages import (
-    BASE,
-    GRIPPER,
-    JointState,
-    PoseStamped,
-    Quaternion,
-    SceneObject,
-    Vector3,
-    finite,
-)
-from thirdhand.contract.requests import (
-    ANSWER_TIMEOUT_S,
-    NORM_TOLERANCE,
-    Reply,
-    ViaPoint,
-)
+from thirdhand.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S, NORM_TOLERANCE, Reply, ViaPoint
 
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
 FORMS = {  # by the largest count of numbers

@@ -20,23 +20,9 @@ from typing import Any, NamedTuple
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import (
-    UnreachableError,
-    check_open,
-    put,
-    tried,
-)
+from thirdhand.client.session import UnreachableError, check_open, put, tried
 from thirdhand.contract import cdr, channels
-from thirdhand.contract.messages import (
-    BASE,
-    JointState,
-    PoseStamped,
-    Quaternion,
-    Vector3,
-    WireError,
-    finite,
-    in_order,
-)
+from thirdhand.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from thirdhand.contract.printable import printable
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Status

@@ -10,22 +10,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
-from thirdhand.contract.incidents import (
-    SOURCE_NAMES,
-    THEN_RESET,
-    Condition,
-    Member,
-    what_happened,
-    what_to_do,
-    word,
-)
+from thirdhand.contract.incidents import SOURCE_NAMES, THEN_RESET, Condition, Member, what_happened, what_to_do, word
 from thirdhand.contract.messages import JointState, PoseStamped
-from thirdhand.contract.records import (
-    SIDES,
-    Cause,
-    Flag,
-    Reason,
-)
+from thirdhand.contract.records import SIDES, Cause, Flag, Reason
 from thirdhand.contract.requests import Source
 
 LONGEST_NAME = 64  # characters of a frame's name

@@ -12,12 +12,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-from thirdhand.contract.records import (
-    Cause,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.records import Cause, Flag, Mode, Reason
 
 SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
 ORDERS = {

@@ -16,12 +16,7 @@ import numpy as np
 
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import CHANNELS, STREAMS
-from thirdhand.contract.messages import (
-    BASE,
-    GRIPPER,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-)
+from thirdhand.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from thirdhand.contract.records import GONE_S, Flag, Reason
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import (

@@ -18,21 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kmp.compiled import PLAIN
 from thirdhand.contract import cdr
-from thirdhand.contract.records import (
-    Field,
-    Layout,
-    assembled,
-    definition,
-)
-from thirdhand.core import (
-    arm,
-    decision,
-    intake,
-    limiter,
-    separation,
-    setpoint,
-    skill,
-)
+from thirdhand.contract.records import Field, Layout, assembled, definition
+from thirdhand.core import arm, decision, intake, limiter, separation, setpoint, skill
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void

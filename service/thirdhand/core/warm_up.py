@@ -14,16 +14,7 @@ from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import SIDES
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import (
-    Event,
-    Tick,
-    Vector,
-    as_array,
-    blank,
-    frame_layout,
-    order,
-    state_layout,
-)
+from thirdhand.core.frame import Event, Tick, Vector, as_array, blank, frame_layout, order, state_layout
 from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import STILL
 from thirdhand.core.intake.stage import Intake

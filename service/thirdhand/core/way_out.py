@@ -18,12 +18,7 @@ import numpy as np
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.decision import WAY
 from thirdhand.core.frame import Vector
-from thirdhand.core.geometry import (
-    axis_of,
-    quaternion_of,
-    swing,
-    turn_between,
-)
+from thirdhand.core.geometry import axis_of, quaternion_of, swing, turn_between
 from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.separation.stage import Separation
 from thirdhand.settings.config import Settings

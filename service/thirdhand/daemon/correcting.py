@@ -7,12 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thirdhand.contract.requests import (
-    Correct,
-    Orientation,
-    RequestError,
-    ViaPoint,
-)
+from thirdhand.contract.requests import Correct, Orientation, RequestError, ViaPoint
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import FAULT, HELD_SEEN, HOLD
 from thirdhand.core.frame import Frame, Record, Vector

@@ -17,28 +17,12 @@ from typing import Any
 from thirdhand.client import endpoints
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.explain import ExplainedError, in_words
-from thirdhand.contract.incidents import (
-    Condition,
-    in_brief,
-    in_full,
-    what_to_do,
-)
+from thirdhand.contract.incidents import Condition, in_brief, in_full, what_to_do
 from thirdhand.contract.messages import Attachment
 from thirdhand.contract.records import Reason
 from thirdhand.contract.requests import Status, ViaPoint, encode_json
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import (
-    STAGES,
-    Event,
-    Frame,
-    Outputs,
-    Record,
-    Tick,
-    blank,
-    frame_layout,
-    order,
-    timed,
-)
+from thirdhand.core.frame import STAGES, Event, Frame, Outputs, Record, Tick, blank, frame_layout, order, timed
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.warm_up import warm_up
 from thirdhand.daemon import supervised_thread

@@ -14,24 +14,8 @@ from statistics import median
 import msgspec
 import numpy as np
 
-from thirdhand.contract.evidence import (
-    LONGEST_NAME,
-    Evidence,
-    Explanation,
-    Jump,
-    Outside,
-    explained,
-    two_places,
-)
-from thirdhand.contract.incidents import (
-    FROZEN,
-    MALFORMED,
-    Condition,
-    in_full,
-    input_name,
-    what_to_do,
-    word,
-)
+from thirdhand.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
+from thirdhand.contract.incidents import FROZEN, MALFORMED, Condition, in_full, input_name, what_to_do, word
 from thirdhand.contract.joint_states import measured
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
 from thirdhand.contract.records import SOURCES, Cause

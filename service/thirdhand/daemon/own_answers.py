@@ -7,12 +7,7 @@ import logging
 import threading
 import time
 
-from thirdhand.client import (
-    Client,
-    RefusedError,
-    UnreachableError,
-    open_session,
-)
+from thirdhand.client import Client, RefusedError, UnreachableError, open_session
 from thirdhand.settings.config import Settings
 
 log = logging.getLogger("thirdhand")

@@ -39,18 +39,8 @@ from thirdhand.contract.requests import (
 from thirdhand.core.frame import Event, Frame, order
 from thirdhand.daemon import supervised_thread
 from thirdhand.daemon.clock import run_beside_real_time
-from thirdhand.daemon.correcting import (
-    Corrections,
-    Moment,
-    check_same_hold,
-    held_since,
-)
-from thirdhand.daemon.request_inbox import (
-    ADOPTION_TIMEOUT_S,
-    Check,
-    RequestInbox,
-    accept,
-)
+from thirdhand.daemon.correcting import Corrections, Moment, check_same_hold, held_since
+from thirdhand.daemon.request_inbox import ADOPTION_TIMEOUT_S, Check, RequestInbox, accept
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.skill_worker import SkillWorker, has_posture_of
 from thirdhand.daemon.status import outcome

@@ -9,12 +9,7 @@ from concurrent.futures import Future
 
 from thirdhand.contract.records import Mode
 from thirdhand.contract.requests import RequestError
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Record,
-    order,
-)
+from thirdhand.core.frame import Event, Frame, Record, order
 
 ADOPTION_TIMEOUT_S = 2.0  # the loop must take a request within this time
 MAX_HOLDERS = 64  # names that hold the arm at once

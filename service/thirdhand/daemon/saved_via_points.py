@@ -15,12 +15,7 @@ import msgspec
 import numpy as np
 
 from thirdhand.contract.explain import in_words
-from thirdhand.contract.requests import (
-    Add,
-    ViaPoint,
-    decode_request,
-    encode_json,
-)
+from thirdhand.contract.requests import Add, ViaPoint, decode_request, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.daemon.saved_state import restored

@@ -27,12 +27,7 @@ from thirdhand.core.way_out import WayOut
 from thirdhand.process import child
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.corrections import Effect, corrected
-from thirdhand.skills.skill_file import (
-    SkillError,
-    StoredSkill,
-    decoded,
-    skill_in,
-)
+from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, skill_in
 from thirdhand.skills.via_points import adapted
 
 MODULE = "thirdhand.daemon.skill_worker"

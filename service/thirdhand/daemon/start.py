@@ -22,13 +22,7 @@ from thirdhand.contract import channels, ros2
 from thirdhand.contract.printable import CLEAR
 from thirdhand.contract.requests import STARTING
 from thirdhand.contract.roles import access_control
-from thirdhand.daemon.single_instance import (
-    NETWORK_BOUNDS,
-    Lock,
-    allow_descriptors,
-    occupy,
-    state_folder,
-)
+from thirdhand.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
 from thirdhand.daemon.systemd import Systemd
 from thirdhand.process.priority import ahead_of_others
 from thirdhand.process.progress import say

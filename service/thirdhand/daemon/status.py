@@ -9,22 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thirdhand.contract.evidence import (
-    Evidence,
-    Inside,
-    Outside,
-    Stuck,
-    explained,
-)
+from thirdhand.contract.evidence import Evidence, Inside, Outside, Stuck, explained
 from thirdhand.contract.incidents import MALFORMED, word
 from thirdhand.contract.messages import Vector3
-from thirdhand.contract.records import (
-    GONE_S,
-    SIDES,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.records import GONE_S, SIDES, Flag, Mode, Reason
 from thirdhand.contract.requests import Source, Status
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import READY, RETURNING

@@ -9,12 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Record,
-    order,
-)
+from thirdhand.core.frame import Event, Frame, Record, order
 from thirdhand.daemon.skill_worker import SkillWorker, way_out_of
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import SkillError

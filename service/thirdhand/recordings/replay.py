@@ -14,13 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from thirdhand.contract import channels
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import (
-    Event,
-    Frame,
-    Tick,
-    differences,
-    encode,
-)
+from thirdhand.core.frame import Event, Frame, Tick, differences, encode
 from thirdhand.recordings.mcap_file import RecordingError, machine
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.steps import Gap, Step, checksum

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from thirdhand.settings.config import (
-    WAM,
-    Settings,
-    converted,
-    load,
-)
+from thirdhand.settings.config import WAM, Settings, converted, load
 from thirdhand.settings.file_content import UnreadableError
 
 if TYPE_CHECKING:

@@ -11,16 +11,7 @@ from typing import Any, NamedTuple
 
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import WireError
-from thirdhand.core.frame import (
-    TIMING,
-    Frame,
-    Outputs,
-    Record,
-    decode,
-    encode,
-    frame_layout,
-    state_layout,
-)
+from thirdhand.core.frame import TIMING, Frame, Outputs, Record, decode, encode, frame_layout, state_layout
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.recordings.mcap_reader import Messages
 from thirdhand.settings.config import Settings

@@ -7,15 +7,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from thirdhand.core.frame import (
-    TIMING,
-    Event,
-    Outputs,
-    Record,
-    Tick,
-    frame_layout,
-    state_layout,
-)
+from thirdhand.core.frame import TIMING, Event, Outputs, Record, Tick, frame_layout, state_layout
 from thirdhand.settings.config import Settings
 
 MAX_NOTE_LENGTH = 16_384  # [characters]

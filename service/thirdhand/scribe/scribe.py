@@ -24,14 +24,7 @@ import msgspec
 
 from thirdhand.core.frame import Outputs, Record, Tick
 from thirdhand.process import child
-from thirdhand.scribe.protocol import (
-    MAX_PACKET_BYTES,
-    ScribeReport,
-    ScribeSetup,
-    pack,
-    pack_image,
-    pack_note,
-)
+from thirdhand.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, pack_image, pack_note
 from thirdhand.settings.config import Settings
 
 BUFFER_BYTES = 4 * 1024 * 1024  # the socket holds some seconds of ticks

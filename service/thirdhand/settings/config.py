@@ -18,13 +18,7 @@ from thirdhand.contract.channels import CellName
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.messages import BASE
 from thirdhand.settings.arm_description import check, completed, description
-from thirdhand.settings.file_content import (
-    SettingsError,
-    UnreadableError,
-    UnusableError,
-    text_in,
-    toml_in,
-)
+from thirdhand.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
 from thirdhand.settings.network import Network, Ros2
 from thirdhand.settings.urdf import Urdf, UrdfError
 

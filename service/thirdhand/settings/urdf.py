@@ -9,15 +9,7 @@ from typing import NamedTuple
 from thirdhand.contract.explain import ExplainedError, did_you_mean
 from thirdhand.contract.messages import Quaternion, Transform, Vector3
 from thirdhand.settings.link_tree import root_of
-from thirdhand.settings.robot_xml import (
-    Element,
-    check_numbers,
-    element_of,
-    kinematics,
-    numbers,
-    three,
-    unread,
-)
+from thirdhand.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three, unread
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic")  # an arm's chain may have these
 CONTINUOUS_RAD = 6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise

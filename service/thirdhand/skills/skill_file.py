@@ -28,13 +28,7 @@ from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
 from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.model import (
-    LEVELS,
-    NORMAL,
-    REGION_95,
-    Model,
-    Regions,
-)
+from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
 from thirdhand.core.skill.skill import MODELS, Skill
 from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT

@@ -16,13 +16,7 @@ from thirdhand.contract.requests import ViaPoint, ViaPointInForce
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.via_points import NEIGHBOURS, neighbourhoods, rest_of
-from thirdhand.skills.pose_via_points import (
-    NOTED_RAD,
-    check_turns,
-    gripper_through,
-    missed_by_rad,
-    turn_through,
-)
+from thirdhand.skills.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
 from thirdhand.skills.skill_file import SkillError, StoredSkill, with_file
 
 MAX_GAIN = 4.0  # [m/m] largest ratio of the tool's motion to the hands', of an affine mean and between via-points

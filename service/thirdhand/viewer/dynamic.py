@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thirdhand.contract.incidents import word
-from thirdhand.contract.records import (
-    SIDES,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.records import SIDES, Flag, Mode, Reason
 from thirdhand.core.frame import STAGES, TIMING, Record
 from thirdhand.core.geometry import between_segments, off_target, place
 from thirdhand.core.separation import FARTHEST_REPORTED_M

@@ -24,12 +24,7 @@ from thirdhand.contract.records import SIDES, Mode, Reason
 from thirdhand.core.frame import STAGES
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings import palette
-from thirdhand.settings.config import (
-    Reach,
-    Settings,
-    robot_description,
-    urdf_path,
-)
+from thirdhand.settings.config import Reach, Settings, robot_description, urdf_path
 from thirdhand.settings.file_content import UnusableError, begin_of
 from thirdhand.settings.mesh_cover import found_meshes, unfound
 from thirdhand.settings.robot_xml import element_of

@@ -21,20 +21,8 @@ from thirdhand.cli.usage import workers as workers_of
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand_sim.faulty_cell import FaultError
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
-from thirdhand_sim.lab.evidence import (
-    RESULTS,
-    commit,
-    origin,
-    result_of,
-    staleness,
-    tree,
-)
-from thirdhand_sim.lab.results import (
-    ExperimentError,
-    Options,
-    Results,
-    pyplot,
-)
+from thirdhand_sim.lab.evidence import RESULTS, commit, origin, result_of, staleness, tree
+from thirdhand_sim.lab.results import ExperimentError, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
 
 OF_OTHERS = "-of-others"  # ends the name of a result on recorded hands

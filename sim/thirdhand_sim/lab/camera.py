@@ -25,29 +25,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from thirdhand.contract.records import SIDES
-from thirdhand.workbench.trackers.camera import (
-    CameraError,
-    HandCamera,
-    HandPoints,
-    mediapipe,
-)
+from thirdhand.workbench.trackers.camera import CameraError, HandCamera, HandPoints, mediapipe
 from thirdhand.workbench.trackers.hand_model import HandModelError, hand_model
-from thirdhand.workbench.trackers.palm import (
-    INDEX,
-    LITTLE,
-    WRIST,
-    Lens,
-    palm_pose,
-    where_seen,
-)
+from thirdhand.workbench.trackers.palm import INDEX, LITTLE, WRIST, Lens, palm_pose, where_seen
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
-from thirdhand_sim.lab.results import (
-    Array,
-    ExperimentError,
-    Options,
-    Results,
-    brief,
-)
+from thirdhand_sim.lab.results import Array, ExperimentError, Options, Results, brief
 
 PACKAGES = {"three": "three@0.187.0", "hands": "@webxr-input-profiles/assets@1.0.20"}
 HANDS_IN_PACKAGE = "package/dist/profiles/generic-hand/"

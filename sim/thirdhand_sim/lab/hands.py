@@ -20,16 +20,7 @@ from thirdhand_sim.lab.load.live import SKIPPED, is_evidence, steady_run
 from thirdhand_sim.lab.reached import EVENTS, ours
 from thirdhand_sim.lab.rehearsal import demonstrated, rehearse
 from thirdhand_sim.lab.reproduction.beside_the_paper import differences
-from thirdhand_sim.lab.results import (
-    LEFT,
-    RIGHT,
-    TOOL,
-    Array,
-    Options,
-    Results,
-    equal_box,
-    pyplot,
-)
+from thirdhand_sim.lab.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
 from thirdhand_sim.lab.scenes import Drawn
 from thirdhand_sim.network import RunReport
 from thirdhand_sim.scene import Scene

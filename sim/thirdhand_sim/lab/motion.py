@@ -51,15 +51,7 @@ from thirdhand_sim.lab.results import (
     pyplot,
     rgb,
 )
-from thirdhand_sim.lab.rivals.followers import (
-    Followed,
-    Follower,
-    chase,
-    ours,
-    servo,
-    truth,
-    unsmoothed,
-)
+from thirdhand_sim.lab.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
 from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
 from thirdhand_sim.lab.workers import shared_out
 

@@ -37,17 +37,7 @@ from thirdhand_sim.lab.people.left_out import (
     read,
 )
 from thirdhand_sim.lab.reached import taught
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    OTHER,
-    REFERENCE,
-    TOOL,
-    ExperimentError,
-    Options,
-    Results,
-    brief,
-    pyplot,
-)
+from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
 from thirdhand_sim.lab.rivals.partners import RIVALS, left_out_by
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.made_tasks import TASK_KINDS, takes

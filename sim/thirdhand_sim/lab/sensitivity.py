@@ -16,23 +16,13 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 import numpy as np
 
-from thirdhand.contract.records import (
-    SIDES,
-    Cause,
-    Flag,
-    Mode,
-)
+from thirdhand.contract.records import SIDES, Cause, Flag, Mode
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Tick, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.recordings.shipped import recordings, shipped_skill
-from thirdhand.settings.config import (
-    Box,
-    Obstacles,
-    Settings,
-    robot_description,
-)
+from thirdhand.settings.config import Box, Obstacles, Settings, robot_description
 from thirdhand.skills.skill_file import decoded
 from thirdhand_sim.closed_loop import START_NS, hand_event, joints_event
 from thirdhand_sim.lab import motion, reached

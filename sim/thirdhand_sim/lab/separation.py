@@ -27,32 +27,11 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.reached import EVENTS, ours
-from thirdhand_sim.lab.rehearsal import (
-    NOISE_M,
-    TREMOR_M,
-    Rehearsed,
-    rehearse,
-)
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    OTHER,
-    Array,
-    Options,
-    Results,
-    brief,
-    pyplot,
-)
+from thirdhand_sim.lab.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
+from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.scenes import OFFSET_M, Drawn, draw
 from thirdhand_sim.lab.workers import shared_out
-from thirdhand_sim.script import (
-    PAUSE_RAMP_S,
-    Clock,
-    HandMotions,
-    HandScript,
-    PointMotion,
-    ScriptPause,
-    Teacher,
-)
+from thirdhand_sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, PointMotion, ScriptPause, Teacher
 
 SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
 KINDS = ("random", "thrust", "unheeded")

@@ -10,15 +10,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    OTHER,
-    REFERENCE,
-    TOOL,
-    Array,
-    Results,
-    pyplot,
-)
+from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)
 PARTS = 3  # bands within RIPPLE_HZ

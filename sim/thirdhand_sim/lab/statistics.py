@@ -16,15 +16,7 @@ from thirdhand_sim.lab.catalogue import DRAWING, EXPERIMENTS
 from thirdhand_sim.lab.load.live import is_evidence, steady_run
 from thirdhand_sim.lab.reached import EVENTS, places_in, shown
 from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    OTHER,
-    Options,
-    Results,
-    brief,
-    pyplot,
-    rgb,
-)
+from thirdhand_sim.lab.results import ADAPTED, OTHER, Options, Results, brief, pyplot, rgb
 from thirdhand_sim.lab.rivals.as_skill import in_bench
 from thirdhand_sim.lab.rivals.gaussian_process import SampleProcess
 from thirdhand_sim.lab.rivals.method import Learn, Model

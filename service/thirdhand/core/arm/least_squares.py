@@ -17,13 +17,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Vector
-from thirdhand.core.numerics import (
-    BOUND_ROUNDS,
-    CONSTRAINT_ROUNDS,
-    LEAST_SLOPE,
-    ROUNDING,
-    TOLERANCE,
-)
+from thirdhand.core.numerics import BOUND_ROUNDS, CONSTRAINT_ROUNDS, LEAST_SLOPE, ROUNDING, TOLERANCE
 
 
 @compiled

@@ -9,23 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from kmp.elementary import exp, log
-from thirdhand.core.arm.step import (
-    NEAR,
-    SEPARATED,
-    SPEED,
-    describe,
-    follow,
-    joint_step,
-    stand,
-)
-from thirdhand.core.frame import (
-    RECORDS,
-    Record,
-    Vector,
-    as_array,
-    parameters,
-    shared_dtype,
-)
+from thirdhand.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, joint_step, stand
+from thirdhand.core.frame import RECORDS, Record, Vector, as_array, parameters, shared_dtype
 from thirdhand.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from thirdhand.core.kinematics import Kinematics, joint_costs
 from thirdhand.core.kinematics import tool_speeds as _tool_speeds

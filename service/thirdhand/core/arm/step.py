@@ -16,12 +16,7 @@ from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import solve
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import (
-    ROUND_TO,
-    quaternion_of,
-    swing,
-    turn_between,
-)
+from thirdhand.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
 from thirdhand.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
 from thirdhand.core.vectors import dot, norm, square
 

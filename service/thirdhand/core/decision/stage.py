@@ -7,26 +7,10 @@ from __future__ import annotations
 import numpy as np
 
 from thirdhand.contract.records import Reason
-from thirdhand.core.codes import (
-    AMBIGUOUS,
-    BLOCKED,
-    FAR,
-    FAULT,
-    HOLD,
-    NOT_READY,
-    RETURNING,
-    STALE_HAND,
-)
+from thirdhand.core.codes import AMBIGUOUS, BLOCKED, FAR, FAULT, HOLD, NOT_READY, RETURNING, STALE_HAND
 from thirdhand.core.decision.leave import WayOut, speeds_of_ways
 from thirdhand.core.decision.step import step
-from thirdhand.core.frame import (
-    Event,
-    Record,
-    Records,
-    Vector,
-    as_array,
-    parameters,
-)
+from thirdhand.core.frame import Event, Record, Records, Vector, as_array, parameters
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings
 

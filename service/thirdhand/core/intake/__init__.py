@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from thirdhand.contract.records import (
-    PER_JOINT,
-    SOURCES,
-    Cause,
-    Field,
-)
+from thirdhand.contract.records import PER_JOINT, SOURCES, Cause, Field
 
 MODES = 3  # modes of the hand filter: rest, reach, change
 STATES = 5  # states of each mode and axis: position, velocity, acceleration, tremor and its velocity

@@ -20,13 +20,7 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import exp
 from thirdhand.core.codes import DOUBTED, LEARNING, TRUSTED
-from thirdhand.core.frame import (
-    Record,
-    Records,
-    Vector,
-    as_array,
-    parameters,
-)
+from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
 from thirdhand.core.geometry import ROUND_TO
 from thirdhand.core.intake import KEPT, MODES, SETTLED_SAMPLES
 from thirdhand.core.intake.mode_filter import advance, start, update

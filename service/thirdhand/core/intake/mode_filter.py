@@ -27,12 +27,7 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.intake import MODES, STATES
-from thirdhand.core.intake.motion_model import (
-    CHANGE,
-    REACH,
-    REST,
-    STEADY,
-)
+from thirdhand.core.intake.motion_model import CHANGE, REACH, REST, STEADY
 from thirdhand.core.vectors import square
 
 

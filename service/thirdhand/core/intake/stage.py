@@ -14,29 +14,14 @@ from numpy.typing import NDArray
 
 from thirdhand.contract.channels import BY_KEY
 from thirdhand.contract.joint_states import measured
-from thirdhand.contract.messages import (
-    BASE,
-    JointState,
-    PoseStamped,
-    WireError,
-)
+from thirdhand.contract.messages import BASE, JointState, PoseStamped, WireError
 from thirdhand.contract.records import SIDES, SOURCES, Cause
-from thirdhand.core.frame import (
-    Event,
-    Record,
-    as_array,
-    parameters,
-)
+from thirdhand.core.frame import Event, Record, as_array, parameters
 from thirdhand.core.geometry import rotation
 from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import HandEstimator
 from thirdhand.core.intake.motion_model import models
-from thirdhand.core.intake.step import (
-    ARM,
-    report,
-    take_arm,
-    take_hand,
-)
+from thirdhand.core.intake.step import ARM, report, take_arm, take_hand
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import HandSettings, Settings
 

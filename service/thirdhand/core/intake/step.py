@@ -24,27 +24,9 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.geometry import ROUND_TO
 from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
 from thirdhand.core.intake.arm_samples import compared, unwrap
-from thirdhand.core.intake.hand_estimator import (
-    goes_on,
-    note_clock,
-    order_of,
-    take,
-    ticks_late,
-    turn_to,
-)
-from thirdhand.core.intake.late_samples import (
-    drop,
-    expected,
-    take_late,
-    tick_made,
-    wrong_samples,
-)
-from thirdhand.core.intake.plausibility import (
-    is_confirmed,
-    is_of_another,
-    is_swapped,
-    is_to_and_fro,
-)
+from thirdhand.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
+from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
+from thirdhand.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
 from thirdhand.core.vectors import distance, squared_distance
 
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)

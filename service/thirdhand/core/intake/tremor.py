@@ -17,12 +17,7 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.geometry import ROUND_TO
-from thirdhand.core.intake import (
-    BANK,
-    MODES,
-    NO_TREMOR,
-    USUAL_RATE,
-)
+from thirdhand.core.intake import BANK, MODES, NO_TREMOR, USUAL_RATE
 from thirdhand.core.intake.mode_filter import measure, move_on
 from thirdhand.core.intake.motion_model import CHANGE, REST, STEADY
 

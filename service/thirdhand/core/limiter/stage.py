@@ -18,12 +18,7 @@ import numpy as np
 import ruckig
 
 from thirdhand.core.arm.stage import Arm
-from thirdhand.core.frame import (
-    Record,
-    Vector,
-    as_array,
-    parameters,
-)
+from thirdhand.core.frame import Record, Vector, as_array, parameters
 from thirdhand.core.joint_limits import LIMIT_MARGIN_RAD, approach_gain
 from thirdhand.core.kinematics import Kinematics, tool_speeds
 from thirdhand.core.limiter.step import (

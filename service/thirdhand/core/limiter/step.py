@@ -11,12 +11,7 @@ from thirdhand.core.codes import FAULT
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.geometry import ROUND_TO, quaternion_of
 from thirdhand.core.kinematics import tool_speed_after
-from thirdhand.core.numerics import (
-    INSIDE_LIMIT_SHARE,
-    LARGEST_USABLE,
-    ROUNDING,
-    STOP_SAMPLES,
-)
+from thirdhand.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING, STOP_SAMPLES
 from thirdhand.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited

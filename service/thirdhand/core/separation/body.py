@@ -14,12 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thirdhand.core.frame import Records, Vector, structured
-from thirdhand.core.geometry import (
-    CAPSULE,
-    between_segments,
-    place,
-    rotation,
-)
+from thirdhand.core.geometry import CAPSULE, between_segments, place, rotation
 from thirdhand.core.numerics import CAPSULE_FITS, TOLERANCE
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings

@@ -6,12 +6,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import (
-    between_segments,
-    nearest_to_box,
-    place,
-    to_box,
-)
+from thirdhand.core.geometry import between_segments, nearest_to_box, place, to_box
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 
 PEOPLE, THINGS, ITSELF = 0, 1, 2  # index of a rule in `brake`, `reaction_s` and `clearance`

@@ -19,14 +19,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from thirdhand.contract.requests import ViaPoint
-from thirdhand.core.frame import (
-    Record,
-    Records,
-    Vector,
-    as_array,
-    parameters,
-    structured,
-)
+from thirdhand.core.frame import Record, Records, Vector, as_array, parameters, structured
 from thirdhand.core.separation import FARTHEST_REPORTED_M, TABLE_DEPTH_M
 from thirdhand.core.separation.body import body_of, own_clearance
 from thirdhand.core.separation.clearance import NOBODY, clearance

@@ -9,13 +9,7 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import exp
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import (
-    between_segments,
-    carry_back,
-    nearest_to_box,
-    place,
-    to_box,
-)
+from thirdhand.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from thirdhand.core.vectors import norm

@@ -25,29 +25,12 @@ from typing import TypeAlias
 import numpy as np
 
 from kmp.compiled import compiled
-from thirdhand.core.codes import (
-    ACCELERATION_BOUND,
-    FINITE_BOUND,
-    JERK_BOUND,
-    NO_BOUND,
-    POSITION_BOUND,
-    SPEED_BOUND,
-)
+from thirdhand.core.codes import ACCELERATION_BOUND, FINITE_BOUND, JERK_BOUND, NO_BOUND, POSITION_BOUND, SPEED_BOUND
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.numerics import (
-    ROUNDING,
-    STOP_SECANT_TOLERANCE_M,
-    STOP_SECANTS,
-    TOLERANCE,
-)
+from thirdhand.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from thirdhand.core.setpoint import HULL_SPANS
 from thirdhand.core.stops import fastest_stop
-from thirdhand.core.vectors import (
-    distance,
-    norm,
-    square,
-    squared_distance,
-)
+from thirdhand.core.vectors import distance, norm, square, squared_distance
 
 Pair: TypeAlias = tuple[float, float]
 

@@ -7,21 +7,8 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from thirdhand.core.frame import (
-    Record,
-    Records,
-    Vector,
-    as_array,
-    parameters,
-)
-from thirdhand.core.geometry import (
-    ROUND_TO,
-    axis_of,
-    quaternion_of,
-    swing,
-    turn_between,
-    turn_on,
-)
+from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
+from thirdhand.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
 from thirdhand.core.numerics import ROUNDING
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.vectors import dot, norm

@@ -28,23 +28,12 @@ import numpy as np
 
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import SetpointBound
-from thirdhand.core.frame import (
-    Record,
-    Records,
-    Vector,
-    as_array,
-    parameters,
-)
+from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
 from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.setpoint import HULL_SPANS
 from thirdhand.core.setpoint.bounds import broken_bound, farthest
 from thirdhand.core.setpoint.orientation import OrientationSetpoint
-from thirdhand.core.setpoint.step import (
-    finish,
-    lead,
-    ready,
-    write,
-)
+from thirdhand.core.setpoint.step import finish, lead, ready, write
 from thirdhand.core.setpoint.tracker import gains_for, waiting
 from thirdhand.core.skill.model import Target, Wanted
 from thirdhand.core.skill.pose import NO_GRIPPER, decided

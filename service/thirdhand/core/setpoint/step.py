@@ -11,13 +11,7 @@ from thirdhand.core.codes import BROKEN, PLANNED, STOPPED
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.kinematics import joint_costs
 from thirdhand.core.numerics import LEAST_SPEED_MPS
-from thirdhand.core.setpoint.bounds import (
-    between,
-    bounds_around,
-    broken_bound,
-    stopping,
-    take_safe,
-)
+from thirdhand.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
 from thirdhand.core.setpoint.orientation import turn_orientation
 from thirdhand.core.vectors import distance, norm
 

@@ -21,12 +21,7 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.numerics import MEMORY_STEP_S
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.model import Seen
-from thirdhand.core.skill.tuning import (
-    MEMORY_LAG_S,
-    MEMORY_LONGEST_STEP_S,
-    TURN_LAG_S,
-    TURN_WEIGHT_M,
-)
+from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
 
 
 @compiled

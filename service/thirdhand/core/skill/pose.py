@@ -14,12 +14,7 @@ from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import turn_on
-from thirdhand.core.skill.tuning import (
-    GRIPPER_CLOSE_ABOVE,
-    GRIPPER_MOVES_S,
-    GRIPPER_OPEN_BELOW,
-    GRIPPER_THERE_M,
-)
+from thirdhand.core.skill.tuning import GRIPPER_CLOSE_ABOVE, GRIPPER_MOVES_S, GRIPPER_OPEN_BELOW, GRIPPER_THERE_M
 
 if TYPE_CHECKING:
     from kmp import KMP

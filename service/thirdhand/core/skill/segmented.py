@@ -20,12 +20,7 @@ from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Records, Vector, structured
 from thirdhand.core.intake.hand_estimator import STILL
 from thirdhand.core.numerics import BELIEF_PERIODS, MOTION_STEP_S
-from thirdhand.core.skill.model import (
-    COVARIANCE_ROUND_TO,
-    Arrays,
-    Motion,
-    Seen,
-)
+from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, Arrays, Motion, Seen
 from thirdhand.core.skill.segments import (
     MOST_SEGMENTS,
     OUTPUTS,
@@ -40,13 +35,7 @@ from thirdhand.core.skill.segments import (
     tools_at,
 )
 from thirdhand.core.skill.support import error_table
-from thirdhand.core.skill.task import (
-    TASK_RANGES,
-    TASK_UNITS,
-    NamedViaPoints,
-    Task,
-    check_shapes,
-)
+from thirdhand.core.skill.task import TASK_RANGES, TASK_UNITS, NamedViaPoints, Task, check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import (
     ERROR_SEGMENT_DISTANCE,

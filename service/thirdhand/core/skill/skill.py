@@ -22,20 +22,8 @@ from thirdhand.core.numerics import MAX_TARGET_M
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import delayed, turn_lag_s
-from thirdhand.core.skill.model import (
-    NO_CLOCK,
-    NORMAL,
-    Model,
-    Regions,
-    Seen,
-    Target,
-)
-from thirdhand.core.skill.pose import (
-    NO_GRIPPER,
-    LearnedGripper,
-    LearnedOrientation,
-    Turn,
-)
+from thirdhand.core.skill.model import NO_CLOCK, NORMAL, Model, Regions, Seen, Target
+from thirdhand.core.skill.pose import NO_GRIPPER, LearnedGripper, LearnedOrientation, Turn
 from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.settings.config import Reach
 

@@ -10,18 +10,8 @@ from thirdhand.core.skill import ORDER, TURNS
 from thirdhand.core.skill.memory import recall, turn_lag_s
 from thirdhand.core.skill.model import Seen, Target, Wanted
 from thirdhand.core.skill.pose import NO_GRIPPER
-from thirdhand.core.skill.skill import (
-    NEVER,
-    Skill,
-    clamp,
-    reach_of,
-)
-from thirdhand.core.skill.step import (
-    IS_AMBIGUOUS,
-    IS_OUTSIDE,
-    conclude,
-    tell_segment,
-)
+from thirdhand.core.skill.skill import NEVER, Skill, clamp, reach_of
+from thirdhand.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_segment
 from thirdhand.core.skill.task_clock import move
 from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
 from thirdhand.core.skill.unseen import deviation_m, off_m

@@ -15,12 +15,7 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, REGION_95
 from thirdhand.core.skill.skill import is_inside
 from thirdhand.core.skill.support import error_probability
-from thirdhand.core.skill.tuning import (
-    AMBIGUOUS_PROBABILITY,
-    AMBIGUOUS_S,
-    TRAIL_S,
-    UNSURE_M,
-)
+from thirdhand.core.skill.tuning import AMBIGUOUS_PROBABILITY, AMBIGUOUS_S, TRAIL_S, UNSURE_M
 
 NO_SEGMENT = -1  # segment in a frame while it is not known
 IS_AMBIGUOUS, IS_OUTSIDE = 1, 2  # what `conclude` returns, added

@@ -19,12 +19,7 @@ from kmp.loops.mean import add_table, table_of
 from thirdhand.core.frame import Vector
 from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.model import LEVELS
-from thirdhand.core.skill.tuning import (
-    LEAST_STD_M,
-    SUPPORT_MASS,
-    SUPPORT_SHARPNESS,
-    UNSURE_M,
-)
+from thirdhand.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
 
 SURVIVAL = np.round(-np.log1p(-np.array(LEVELS)), 12)  # -log of the share of errors beyond each level
 

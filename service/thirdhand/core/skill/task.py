@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 from thirdhand.contract.requests import Name, ViaPoint
 from thirdhand.core.frame import Records, Vector, structured
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
-from thirdhand.core.skill.segments import (
-    MOST_SEGMENTS,
-    NONE,
-    RIGHT,
-    SEGMENT,
-    STAYS,
-)
+from thirdhand.core.skill.segments import MOST_SEGMENTS, NONE, RIGHT, SEGMENT, STAYS
 from thirdhand.core.skill.tuning import LEAST_PATH_M
 
 MOST_NAMES = MOST_SEGMENTS + 1  # largest number of via-points of a task

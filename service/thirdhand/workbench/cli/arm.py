@@ -15,12 +15,7 @@ from thirdhand.settings.config import load
 from thirdhand.settings.mesh_cover import unfound
 from thirdhand.settings.whole_file import whole
 from thirdhand.workbench.first_cell.arm_picture import draw
-from thirdhand.workbench.first_cell.first_cell import (
-    DEMO_TOOL_M,
-    Proposal,
-    proposed,
-    written,
-)
+from thirdhand.workbench.first_cell.first_cell import DEMO_TOOL_M, Proposal, proposed, written
 from thirdhand.workbench.first_cell.rates import JERK_RATE, RISE_S, TORQUE_SHARE
 
 DEGREES = 7.0  # [rad] larger limits of a revolute joint are probably in degrees

@@ -18,13 +18,7 @@ from typing import Any
 
 import zenoh
 
-from thirdhand.client import (
-    Client,
-    Tracker,
-    UnreachableError,
-    no_room_to_brake,
-    open_session,
-)
+from thirdhand.client import Client, Tracker, UnreachableError, no_room_to_brake, open_session
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.contract.requests import Add, Status, decode_request
 from thirdhand.daemon.launch import engine_of, launched, played

@@ -29,14 +29,7 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.process.progress import progress
 from thirdhand.viewer.stream import ViewerError, rerun_program
 from thirdhand.workbench.trackers.cell_view import Latest, carried_out
-from thirdhand.workbench.trackers.web_server import (
-    HTML,
-    INLINE,
-    JSON,
-    WebServer,
-    answer,
-    filled,
-)
+from thirdhand.workbench.trackers.web_server import HTML, INLINE, JSON, WebServer, answer, filled
 
 STARTING_POLL_S = 0.2
 START_S = 15.0  # the viewer's server starts within this time

@@ -6,13 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from thirdhand.cli.usage import (
-    CONNECT_TIMEOUT_S,
-    UsageError,
-    check_writable,
-    inputs_session,
-    places_in,
-)
+from thirdhand.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, inputs_session, places_in
 from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.process.progress import say
 from thirdhand.recordings.mcap_file import RecordingError

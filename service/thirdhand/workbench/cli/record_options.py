@@ -5,12 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from thirdhand.cli.usage import (
-    ARM_HELP,
-    flag,
-    option,
-    within,
-)
+from thirdhand.cli.usage import ARM_HELP, flag, option, within
 
 ABOUT_RECORD = (
     "Records a demonstration of hands and tool from a running cell, called a take, and summarizes it. Also lists, "

@@ -12,12 +12,7 @@ from collections.abc import Mapping
 import msgspec
 
 from kmp import AffineMean
-from thirdhand.cli.usage import (
-    UsageError,
-    check_writable,
-    places_in,
-    reached,
-)
+from thirdhand.cli.usage import UsageError, check_writable, places_in, reached
 from thirdhand.client import Client, Tracker
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.printable import printable, printable_lines

@@ -24,15 +24,7 @@ from thirdhand.settings.whole_file import whole
 from thirdhand.workbench.cli.many_files import of_each
 from thirdhand.workbench.report.columns import KEPT
 from thirdhand.workbench.report.report import Report, overview, reported
-from thirdhand.workbench.report.tables import (
-    Table,
-    comparison,
-    every_figure,
-    names_of,
-    overviews,
-    summary,
-    tables,
-)
+from thirdhand.workbench.report.tables import Table, comparison, every_figure, names_of, overviews, summary, tables
 
 BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}

@@ -24,12 +24,7 @@ from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.memory import along as filtered
 from thirdhand.core.skill.memory import turn_lag_s
-from thirdhand.core.skill.segments import (
-    LEFT,
-    MOST_SEGMENTS,
-    NONE,
-    RIGHT,
-)
+from thirdhand.core.skill.segments import LEFT, MOST_SEGMENTS, NONE, RIGHT
 from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
 from thirdhand.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
 from thirdhand.skills.demonstration import Demonstration

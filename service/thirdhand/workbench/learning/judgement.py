@@ -17,21 +17,8 @@ from thirdhand.core.skill.skill import is_reachable
 from thirdhand.settings.config import Reach
 from thirdhand.workbench.learning.ambiguity import COMPARED, contradictions, lengths
 from thirdhand.workbench.learning.baselines import baselines, constant_errors
-from thirdhand.workbench.learning.records import (
-    Figures,
-    Fitted,
-    HeldOut,
-    Pose,
-    Row,
-    TimedErrors,
-    persons_of,
-)
-from thirdhand.workbench.learning.regions import (
-    calibrated,
-    calibrated_without,
-    timed_errors,
-    unknown_std,
-)
+from thirdhand.workbench.learning.records import Figures, Fitted, HeldOut, Pose, Row, TimedErrors, persons_of
+from thirdhand.workbench.learning.regions import calibrated, calibrated_without, timed_errors, unknown_std
 from thirdhand.workbench.learning.takes import Division, conductor_of
 from thirdhand.workbench.learning.verdicts import Subject, verdicts
 

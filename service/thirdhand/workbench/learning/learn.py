@@ -15,14 +15,7 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill
 from thirdhand.skills.stored_demonstrations import stored_demonstrations
 from thirdhand.workbench.learning.judgement import judged
 from thirdhand.workbench.learning.pose import learned_pose
-from thirdhand.workbench.learning.records import (
-    Evidence,
-    Fitted,
-    Options,
-    Pose,
-    Progress,
-    Taught,
-)
+from thirdhand.workbench.learning.records import Evidence, Fitted, Options, Pose, Progress, Taught
 from thirdhand.workbench.learning.store import stored
 from thirdhand.workbench.learning.takes import Division, divided, standing_out
 

@@ -19,22 +19,11 @@ from kmp.criteria.direct import DirectSelection, Parameters
 from kmp.orientation import continuous, log
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import angles
-from thirdhand.core.skill.pose import (
-    CLOSED,
-    UNKNOWN,
-    LearnedGripper,
-    LearnedOrientation,
-    decided,
-)
+from thirdhand.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOrientation, decided
 from thirdhand.skills.flat import UNDECIDED, even
 from thirdhand.workbench.learning.ambiguity import contradictions
 from thirdhand.workbench.learning.choice import selection_of
-from thirdhand.workbench.learning.records import (
-    HeldOut,
-    Pose,
-    Verdict,
-    persons_of,
-)
+from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, persons_of
 
 CONSTANT_RAD = math.radians(5.0)  # an orientation that stays this near to its mean counts as constant
 DIFFERENT_RAD = math.radians(30.0)  # orientations this far from each other contradict each other at the same hands

@@ -33,23 +33,13 @@ from kmp import KMP, ViaPointMissed
 from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.model import (
-    LEVELS,
-    NORMAL,
-    REGION_95,
-    Regions,
-)
+from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Regions
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.support import LocalErrors
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import check_agreement
-from thirdhand.workbench.learning.records import (
-    HeldOut,
-    Take,
-    TimedErrors,
-    persons_of,
-)
+from thirdhand.workbench.learning.records import HeldOut, Take, TimedErrors, persons_of
 
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
 BLOCKS = 6  # takes that follow each other, often of one person or hour, are held out in so many blocks at most

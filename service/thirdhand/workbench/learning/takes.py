@@ -12,25 +12,13 @@ from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Hands
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.tuning import UNSURE_M
-from thirdhand.skills.demonstration import (
-    LEAST_M,
-    Demonstration,
-    NamedDemonstration,
-    check,
-    moved_m,
-    persons,
-)
+from thirdhand.skills.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, moved_m, persons
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import of_one
 from thirdhand.workbench.learning.ambiguity import same_hands_m
 from thirdhand.workbench.learning.methods import Method, method_of
 from thirdhand.workbench.learning.methods.segmented import Segmented
-from thirdhand.workbench.learning.records import (
-    Fitted,
-    HeldOut,
-    Options,
-    Take,
-)
+from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Take
 from thirdhand.workbench.learning.regions import BLOCKS
 
 LEAST_COMPARED = 4  # takes: among fewer, none counts as standing out

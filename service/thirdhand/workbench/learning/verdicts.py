@@ -15,12 +15,7 @@ from thirdhand.contract.messages import BASE
 from thirdhand.workbench.learning.baselines import SAME_TIME
 from thirdhand.workbench.learning.choice import NOISE_M
 from thirdhand.workbench.learning.gate import Gate
-from thirdhand.workbench.learning.records import (
-    Figures,
-    Row,
-    Severity,
-    Verdict,
-)
+from thirdhand.workbench.learning.records import Figures, Row, Severity, Verdict
 
 ADVISED = 5  # demonstrations
 OUTLIER_TIMES, OUTLIER_MM = 2.5, 25.0  # an outlier's error is above this multiple of the median, and above this error

@@ -10,13 +10,7 @@ import numpy as np
 
 from thirdhand.contract.evidence import Evidence, Explanation, explained
 from thirdhand.contract.incidents import ORDERS, input_name, word
-from thirdhand.contract.records import (
-    SIDES,
-    Cause,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.records import SIDES, Cause, Flag, Mode, Reason
 from thirdhand.contract.requests import Source
 from thirdhand.workbench.report.columns import Columns
 

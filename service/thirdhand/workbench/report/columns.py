@@ -21,13 +21,7 @@ from thirdhand.contract.messages import WireError
 from thirdhand.contract.printable import printable, printable_values
 from thirdhand.contract.records import Mode
 from thirdhand.contract.requests import Source
-from thirdhand.core.frame import (
-    TIMING,
-    Record,
-    Records,
-    Vector,
-    frame_layout,
-)
+from thirdhand.core.frame import TIMING, Record, Records, Vector, frame_layout
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import DECISIONS, Recording
 from thirdhand.recordings.steps import Gap, Step

@@ -16,13 +16,7 @@ from thirdhand.contract.records import SIDES, Mode
 from thirdhand.core.frame import Vector
 from thirdhand.settings import palette
 from thirdhand.workbench.report.report import Report
-from thirdhand.workbench.report.tables import (
-    Table,
-    comparison,
-    names_of,
-    summary,
-    tables,
-)
+from thirdhand.workbench.report.tables import Table, comparison, names_of, summary, tables
 
 LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))

@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thirdhand.contract.incidents import word
-from thirdhand.contract.records import (
-    SIDES,
-    Cause,
-    Flag,
-    Mode,
-    Reason,
-)
+from thirdhand.contract.records import SIDES, Cause, Flag, Mode, Reason
 from thirdhand.contract.requests import ALONG_TASK, ANY_DIRECTION, ToolLimits
 from thirdhand.core.frame import Records, Vector
 from thirdhand.recordings.recording import Recording

@@ -11,15 +11,7 @@ from typing import NamedTuple
 from thirdhand.contract.incidents import what_happened, what_to_do, word
 from thirdhand.contract.printable import printable
 from thirdhand.contract.records import Mode
-from thirdhand.workbench.report.report import (
-    Figure,
-    Joint,
-    Overview,
-    Percentiles,
-    Report,
-    Span,
-    differing_settings,
-)
+from thirdhand.workbench.report.report import Figure, Joint, Overview, Percentiles, Report, Span, differing_settings
 
 NONE = "-"
 IN_A_ROW = {  # figures of a recording among many, with the heads of their columns

@@ -11,32 +11,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thirdhand.contract import cdr
-from thirdhand.contract.channels import (
-    JOINTS,
-    POSE,
-    STRING,
-    TAKE_KEYS,
-    topic,
-)
-from thirdhand.contract.messages import (
-    BASE,
-    GRIPPER,
-    JointState,
-    PoseStamped,
-    WireError,
-)
+from thirdhand.contract.channels import JOINTS, POSE, STRING, TAKE_KEYS, topic
+from thirdhand.contract.messages import BASE, GRIPPER, JointState, PoseStamped, WireError
 from thirdhand.contract.requests import Hands, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import rotation
 from thirdhand.core.intake.far_away import too_far
 from thirdhand.core.intake.stage import UNIT_M, base_from
 from thirdhand.core.tuning import TUNING
-from thirdhand.recordings.mcap_file import (
-    McapFile,
-    RecordingError,
-    ends_early,
-    existing,
-)
+from thirdhand.recordings.mcap_file import McapFile, RecordingError, ends_early, existing
 from thirdhand.recordings.mcap_reader import Messages
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.skills.demonstration import Demonstration
@@ -50,12 +33,7 @@ from thirdhand.workbench.takes.pose_streams import (
     with_types,
 )
 from thirdhand.workbench.takes.track import Track
-from thirdhand.workbench.takes.track_check import (
-    LEAST_PIECE_S,
-    Checked,
-    checked,
-    sound,
-)
+from thirdhand.workbench.takes.track_check import LEAST_PIECE_S, Checked, checked, sound
 from thirdhand.workbench.takes.track_clocks import by_one_clock
 
 _STREAMS = tuple(TAKE_KEYS.values())

@@ -19,40 +19,18 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from thirdhand.contract import cdr
-from thirdhand.contract.channels import (
-    JOINTS,
-    POSE,
-    POSE_WITH_COVARIANCE,
-    STRING,
-    TAKE_KEYS,
-    TRANSFORMS,
-)
+from thirdhand.contract.channels import JOINTS, POSE, POSE_WITH_COVARIANCE, STRING, TAKE_KEYS, TRANSFORMS
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.joint_states import JointStates, measured
-from thirdhand.contract.messages import (
-    BASE,
-    JointState,
-    PoseStamped,
-    WireError,
-)
+from thirdhand.contract.messages import BASE, JointState, PoseStamped, WireError
 from thirdhand.contract.printable import printable
-from thirdhand.contract.requests import (
-    Add,
-    Hands,
-    ViaPoint,
-    decode_request,
-)
+from thirdhand.contract.requests import Add, Hands, ViaPoint, decode_request
 from thirdhand.core.frame import Vector
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.recordings.mcap_file import RecordingError, begin_of, existing
 from thirdhand.recordings.mcap_reader import FileFault, Messages, full_name
 from thirdhand.settings.config import Settings
-from thirdhand.workbench.takes.motion_capture import (
-    CAPTURE_FRAME,
-    Captured,
-    read_c3d,
-    read_motive,
-)
+from thirdhand.workbench.takes.motion_capture import CAPTURE_FRAME, Captured, read_c3d, read_motive
 from thirdhand.workbench.takes.tool_poses import tool_poses
 from thirdhand.workbench.takes.track import Track, clock_parts
 

@@ -29,12 +29,7 @@ from numpy.typing import NDArray
 
 from thirdhand.contract.messages import BASE, PoseStamped
 from thirdhand.contract.records import Cause, Reason
-from thirdhand.core.frame import (
-    Vector,
-    as_array,
-    blank,
-    state_layout,
-)
+from thirdhand.core.frame import Vector, as_array, blank, state_layout
 from thirdhand.core.intake.stage import Intake
 from thirdhand.core.intake.step import is_contested
 from thirdhand.core.tuning import TUNING

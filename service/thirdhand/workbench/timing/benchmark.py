@@ -22,12 +22,7 @@ from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.shipped import SHIPPED_SKILL, cell_of, recordings
 from thirdhand.settings.config import RecordingSettings
 from thirdhand.workbench.timing.probe import EDGES_US, figures, percentiles
-from thirdhand.workbench.timing.probe_processes import (
-    ProbeError,
-    echo,
-    family,
-    probe,
-)
+from thirdhand.workbench.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "thirdhand")
 DURATION_PARTS = 6  # the duration is divided into two parts each for the empty loop, the core and the whole

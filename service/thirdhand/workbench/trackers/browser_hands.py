@@ -28,12 +28,7 @@ from thirdhand.contract.incidents import ORDERS
 from thirdhand.contract.messages import WireError
 from thirdhand.workbench.trackers import web_server
 from thirdhand.workbench.trackers.cell_view import Latest, carried_out, corrected
-from thirdhand.workbench.trackers.hand_message import (
-    PageHands,
-    decode_hands,
-    is_ping,
-    pong,
-)
+from thirdhand.workbench.trackers.hand_message import PageHands, decode_hands, is_ping, pong
 from thirdhand.workbench.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench

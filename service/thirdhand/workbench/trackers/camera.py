@@ -19,12 +19,7 @@ import numpy as np
 from thirdhand.client import Tracker
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.records import SIDES
-from thirdhand.workbench.trackers.palm import (
-    Array,
-    Lens,
-    PalmPose,
-    palm_pose,
-)
+from thirdhand.workbench.trackers.palm import Array, Lens, PalmPose, palm_pose
 
 CAMERA_FRAME = "camera"  # x to the right in the picture, y down, z away from the camera
 REPORT_S = 2.0

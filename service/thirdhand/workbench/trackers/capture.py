@@ -19,12 +19,7 @@ from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.channels import TAKE_KEYS
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.joint_states import JointStates, measured
-from thirdhand.contract.messages import (
-    BASE,
-    PoseStamped,
-    WireError,
-    finite,
-)
+from thirdhand.contract.messages import BASE, PoseStamped, WireError, finite
 from thirdhand.contract.requests import Hands, ViaPoint, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.intake.arm_samples import in_turn
@@ -32,18 +27,9 @@ from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings.mcap_file import machine, whole_file
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.workbench.takes.demonstration_reader import (
-    far_away,
-    from_tracker,
-    is_by_tracker,
-    unknown_frame,
-)
+from thirdhand.workbench.takes.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
 from thirdhand.workbench.takes.dwells import REST_M
-from thirdhand.workbench.takes.pose_streams import (
-    GRIPPER_STATE,
-    JOINT_STATES,
-    PLACES_TOPIC,
-)
+from thirdhand.workbench.takes.pose_streams import GRIPPER_STATE, JOINT_STATES, PLACES_TOPIC
 from thirdhand.workbench.takes.tool_poses import tool_poses
 from thirdhand.workbench.takes.track import Track
 

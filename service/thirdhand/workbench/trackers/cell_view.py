@@ -9,12 +9,7 @@ from typing import Any
 
 import zenoh
 
-from thirdhand.client import (
-    Client,
-    RefusedError,
-    UncertainError,
-    decoded,
-)
+from thirdhand.client import Client, RefusedError, UncertainError, decoded
 from thirdhand.contract import channels
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.incidents import ORDERS, in_brief, title

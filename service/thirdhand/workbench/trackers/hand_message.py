@@ -22,12 +22,7 @@ import math
 import struct
 from typing import NamedTuple
 
-from thirdhand.contract.messages import (
-    Quaternion,
-    Vector3,
-    WireError,
-    finite,
-)
+from thirdhand.contract.messages import Quaternion, Vector3, WireError, finite
 from thirdhand.contract.records import SIDES
 
 HANDS_MAGIC, PING_MAGIC = 0x53444E48, 0x474E4950

@@ -31,21 +31,8 @@ from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.workbench.report.columns import read
-from thirdhand_sim.faulty_cell import (
-    Command,
-    Fault,
-    FaultTimes,
-    FaultyCell,
-    Network,
-)
-from thirdhand_sim.lab.results import (
-    DESIRED,
-    REFERENCE,
-    TOOL,
-    Options,
-    Results,
-    pyplot,
-)
+from thirdhand_sim.faulty_cell import Command, Fault, FaultTimes, FaultyCell, Network
+from thirdhand_sim.lab.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
 from thirdhand_sim.script import Array
 

@@ -30,15 +30,7 @@ from thirdhand_sim.lab.people.trials import (
     judge,
     seen,
 )
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    OTHER,
-    Array,
-    Options,
-    Results,
-    brief,
-    pyplot,
-)
+from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
 from thirdhand_sim.lab.rivals.method import Method, Model
 from thirdhand_sim.lab.rivals.mixtures import MixtureRegression, TaskParameterised
@@ -47,13 +39,7 @@ from thirdhand_sim.lab.rivals.promp import InteractionProMP
 from thirdhand_sim.lab.rivals.service import Service, ServiceAsPaper
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.people import Group, Places, person
-from thirdhand_sim.sessions import (
-    BREAKING,
-    SessionDemonstration,
-    breaking,
-    demonstrations,
-    session,
-)
+from thirdhand_sim.sessions import BREAKING, SessionDemonstration, breaking, demonstrations, session
 
 SEEDS = EXPERIMENTS["people"].seeds
 PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}

@@ -25,13 +25,7 @@ from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.open_loop import controller, frames
 from thirdhand_sim.lab.results import Array
 from thirdhand_sim.lab.rivals.as_skill import Said, along_hands, rival
-from thirdhand_sim.lab.rivals.method import (
-    DependsOn,
-    Mask,
-    Observed,
-    Placed,
-    Predicted,
-)
+from thirdhand_sim.lab.rivals.method import DependsOn, Mask, Observed, Placed, Predicted
 from thirdhand_sim.scene import TOOL_FROM_HAND
 from thirdhand_sim.sessions import Session
 from thirdhand_sim.teach import places_of

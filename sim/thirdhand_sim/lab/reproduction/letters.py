@@ -10,24 +10,8 @@ import rerun as rr
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
-from thirdhand_sim.lab.reproduction.writing import (
-    DURATION_S,
-    TARGETS,
-    TIMES,
-    recorded,
-    write,
-)
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    DESIRED,
-    REFERENCE,
-    Array,
-    Options,
-    Results,
-    ellipse,
-    pyplot,
-    rgb,
-)
+from thirdhand_sim.lab.reproduction.writing import DURATION_S, TARGETS, TIMES, recorded, write
+from thirdhand_sim.lab.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
 
 ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
 SEEDS = EXPERIMENTS["letters"].seeds

@@ -12,27 +12,9 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
-from thirdhand_sim.lab.reproduction.letters import (
-    SETS,
-    Case,
-    Letter,
-    Line,
-    by_kmp,
-    cases,
-    draw_lines,
-    gathered,
-    record,
-)
+from thirdhand_sim.lab.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered, record
 from thirdhand_sim.lab.reproduction.writing import DURATION_S, TIMES
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    DESIRED,
-    OTHER,
-    Array,
-    Options,
-    Results,
-    pyplot,
-)
+from thirdhand_sim.lab.results import ADAPTED, DESIRED, OTHER, Array, Options, Results, pyplot
 from thirdhand_sim.lab.rivals.promp import BASES, RIDGE, learned_promp
 
 COLUMNS = 5  # letters in a row of the figure

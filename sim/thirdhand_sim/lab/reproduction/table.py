@@ -13,28 +13,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kmp import Gaussians
-from thirdhand_sim.lab.reproduction.letters import (
-    SETS,
-    Case,
-    Letter,
-    Line,
-    by_kmp,
-    cases,
-    draw_lines,
-    gathered,
-)
+from thirdhand_sim.lab.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered
 from thirdhand_sim.lab.reproduction.promp import conditioned
 from thirdhand_sim.lab.reproduction.writing import DURATION_S, TIMES
-from thirdhand_sim.lab.results import (
-    ADAPTED,
-    DESIRED,
-    OTHER,
-    Array,
-    ExperimentError,
-    Options,
-    Results,
-    pyplot,
-)
+from thirdhand_sim.lab.results import ADAPTED, DESIRED, OTHER, Array, ExperimentError, Options, Results, pyplot
 
 WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
 METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}

@@ -21,13 +21,7 @@ from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.skill.via_points import neighbourhoods
 from thirdhand_sim.lab.people.left_out import LeftOut
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.method import (
-    DependsOn,
-    Law,
-    Learn,
-    Observed,
-    Predicted,
-)
+from thirdhand_sim.lab.rivals.method import DependsOn, Law, Learn, Observed, Predicted
 from thirdhand_sim.lab.rivals.service import SEED, joined
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration

@@ -19,12 +19,7 @@ from thirdhand.workbench.learning.baselines import linear
 from thirdhand_sim.lab.people.left_out import JUDGED_HZ, LeftOut
 from thirdhand_sim.lab.results import Array
 from thirdhand_sim.lab.rivals.gaussian_process import by_folds
-from thirdhand_sim.lab.rivals.method import (
-    Law,
-    Learn,
-    Observed,
-    Predicted,
-)
+from thirdhand_sim.lab.rivals.method import Law, Learn, Observed, Predicted
 
 MOVES_MPS = 0.08  # a hand that moves faster begins the task
 MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now

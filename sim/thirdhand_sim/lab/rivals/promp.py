@@ -10,19 +10,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from thirdhand_sim.lab.results import Array, ExperimentError
-from thirdhand_sim.lab.rivals.method import (
-    DependsOn,
-    Law,
-    Observed,
-    Predicted,
-)
-from thirdhand_sim.lab.rivals.mixtures import (
-    frames,
-    joined,
-    log_normal,
-    path_share,
-    threshold,
-)
+from thirdhand_sim.lab.rivals.method import DependsOn, Law, Observed, Predicted
+from thirdhand_sim.lab.rivals.mixtures import frames, joined, log_normal, path_share, threshold
 from thirdhand_sim.people import Places
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.sessions import SessionDemonstration

@@ -16,12 +16,7 @@ from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.learning.learn import learn
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.method import (
-    DependsOn,
-    Law,
-    Observed,
-    Predicted,
-)
+from thirdhand_sim.lab.rivals.method import DependsOn, Law, Observed, Predicted
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import places_of, recorded

@@ -12,12 +12,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.methods.inputs import HandInputs
 from thirdhand.workbench.learning.methods.mixture import Mixture
 from thirdhand.workbench.learning.methods.segmented import Segmented
-from thirdhand.workbench.learning.records import (
-    Fitted,
-    Options,
-    Progress,
-    Taught,
-)
+from thirdhand.workbench.learning.records import Fitted, Options, Progress, Taught
 
 
 class Method(Protocol):

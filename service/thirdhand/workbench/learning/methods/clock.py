@@ -10,12 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thirdhand.contract.messages import BASE, PoseStamped
-from thirdhand.core.frame import (
-    Records,
-    Vector,
-    blank,
-    state_layout,
-)
+from thirdhand.core.frame import Records, Vector, blank, state_layout
 from thirdhand.core.intake.stage import Intake
 from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
 from thirdhand.core.skill.tuning import CLOCK_START_MPS, LEAST_PATH_M, OWN_NEAR_M

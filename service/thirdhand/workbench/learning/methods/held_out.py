@@ -11,18 +11,8 @@ from thirdhand.core.frame import Vector
 from thirdhand.core.skill.hands_kmp import TURN_INPUTS
 from thirdhand.core.skill.model import standard_deviations
 from thirdhand.skills.skill_file import HIGHEST_GATE_M
-from thirdhand.workbench.learning.gate import (
-    Gate,
-    every_few,
-    gate_between,
-    nonsense,
-)
-from thirdhand.workbench.learning.records import (
-    HeldOut,
-    Progress,
-    Take,
-    persons_of,
-)
+from thirdhand.workbench.learning.gate import Gate, every_few, gate_between, nonsense
+from thirdhand.workbench.learning.records import HeldOut, Progress, Take, persons_of
 
 Fit = Callable[[int | None], KMP]  # the primitive without a person's takes, or of all
 ROWS = 500  # inputs that are predicted at once, which bounds the memory

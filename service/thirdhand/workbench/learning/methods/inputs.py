@@ -27,22 +27,10 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.choice import selection_of
 from thirdhand.workbench.learning.division import task_of
 from thirdhand.workbench.learning.gate import CEILING_M
-from thirdhand.workbench.learning.methods.clock import (
-    Tempo,
-    clock_of,
-    paired,
-    remark_on,
-)
+from thirdhand.workbench.learning.methods.clock import Tempo, clock_of, paired, remark_on
 from thirdhand.workbench.learning.methods.held_out import Fit, gate_of, held_out_takes
 from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
-from thirdhand.workbench.learning.records import (
-    Fitted,
-    Options,
-    Progress,
-    Take,
-    Taught,
-    persons_of,
-)
+from thirdhand.workbench.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
 from thirdhand.workbench.learning.regions import local_errors, refitted_errors
 
 AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good

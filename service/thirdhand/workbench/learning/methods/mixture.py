@@ -17,14 +17,7 @@ from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.held_out import gate_of, held_out_takes
-from thirdhand.workbench.learning.records import (
-    Fitted,
-    HeldOut,
-    Options,
-    Progress,
-    Take,
-    Taught,
-)
+from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Progress, Take, Taught
 
 ELL_PER_M2, PENALTY = 5.0, 2.0  # the kernel's ell and lambda, unless they are given
 

@@ -27,20 +27,8 @@ from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.memory import along
-from thirdhand.core.skill.segmented import (
-    NO_ERRORS,
-    Placed,
-    SegmentedKMP,
-    Unknown,
-)
-from thirdhand.core.skill.segments import (
-    LEFT,
-    MOST_SEGMENTS,
-    NONE,
-    OUTPUTS,
-    RIGHT,
-    STAYS,
-)
+from thirdhand.core.skill.segmented import NO_ERRORS, Placed, SegmentedKMP, Unknown
+from thirdhand.core.skill.segments import LEFT, MOST_SEGMENTS, NONE, OUTPUTS, RIGHT, STAYS
 from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import SEGMENT_DISTANCE, SEGMENT_DISTANCE_BESIDE, TURN_WEIGHT_M
@@ -56,20 +44,8 @@ from thirdhand.workbench.learning.division import (
     task_of,
     via_points_never_reached,
 )
-from thirdhand.workbench.learning.gate import (
-    CEILING_M,
-    FLOOR_M,
-    every_few,
-    gate_between,
-    nonsense,
-)
-from thirdhand.workbench.learning.methods.clock import (
-    Tempo,
-    begins_of,
-    paired,
-    remark_on,
-    segment_clock_of,
-)
+from thirdhand.workbench.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
+from thirdhand.workbench.learning.methods.clock import Tempo, begins_of, paired, remark_on, segment_clock_of
 from thirdhand.workbench.learning.methods.held_out import held_out_takes
 from thirdhand.workbench.learning.methods.inputs import (
     AS_GOOD,

@@ -18,12 +18,7 @@ import tomlkit.exceptions
 
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.settings.config import Settings, load, parse
-from thirdhand.settings.file_content import (
-    LARGEST_CONFIGURATION,
-    UnusableError,
-    content,
-    text_in,
-)
+from thirdhand.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content, text_in
 from thirdhand.settings.whole_file import whole
 from thirdhand.workbench.trackers.calibration.solver import Calibration, CalibrationError
 

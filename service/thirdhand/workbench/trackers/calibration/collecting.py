@@ -20,11 +20,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.settings.config import HandSettings, Settings, robot_description
 from thirdhand.workbench.takes.demonstration_reader import in_metres, is_by_tracker
 from thirdhand.workbench.takes.hands_and_tool import by_ending
-from thirdhand.workbench.takes.pose_streams import (
-    JOINT_STATES,
-    PoseRecording,
-    with_types,
-)
+from thirdhand.workbench.takes.pose_streams import JOINT_STATES, PoseRecording, with_types
 from thirdhand.workbench.takes.track import Track
 from thirdhand.workbench.trackers.calibration.solver import (
     LEAD_APART,
