@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Iterator
 
-from thirdhand.client import client_settings, publisher
+from thirdhand.client import Publisher, client_settings
 from thirdhand.contract.cdr import encode_pose
 from thirdhand.contract.messages import PoseStamped
 
@@ -49,7 +49,7 @@ def main() -> None:
     args = p.parse_args()
     settings = client_settings(connect=args.connect, cell=args.cell)
     with settings.session(timeout_s=None) as session, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream:
-        publishers = {key: publisher(session, settings.cell, key, express=True) for key in KEYS.values()}
+        publishers = {key: Publisher(session, settings.cell, key) for key in KEYS.values()}
         stream.bind(("", args.port))
         said = ""
         while True:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from thirdhand.client import client_settings
+from thirdhand.client import Publisher, client_settings
 from thirdhand.contract.cdr import encode_pose
 from thirdhand.contract.messages import PoseStamped
 
@@ -47,7 +47,7 @@ def main() -> None:
     settings = client_settings(connect=args.connect, cell=args.cell)
     keys = {args.left: "hands/left", args.right: "hands/right", args.tool: "tool/pose"}
     with settings.session(timeout_s=None) as session:
-        publishers = {key: session.declare_publisher(f"{settings.cell}/{key}") for key in keys.values()}
+        publishers = {key: Publisher(session, settings.cell, key) for key in keys.values()}
 
         def publish(frame: DataFrame) -> None:
             for key, pose in poses(frame.rigid_bodies, keys, time.time_ns()):

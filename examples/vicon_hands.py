@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterator, Mapping
 from math import cos, sin
 
-from thirdhand.client import client_settings, publisher
+from thirdhand.client import Publisher, client_settings
 from thirdhand.contract.cdr import encode_pose
 from thirdhand.contract.messages import PoseStamped, Quaternion
 
@@ -68,7 +68,7 @@ def main() -> None:
     settings = client_settings(connect=args.connect, cell=args.cell)
     keys = {args.left: "hands/left", args.right: "hands/right"} | ({args.tool: "tool/pose"} if args.tool else {})
     with settings.session(timeout_s=None) as session, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream:
-        publishers = {key: publisher(session, settings.cell, key, express=True) for key in keys.values()}
+        publishers = {key: Publisher(session, settings.cell, key) for key in keys.values()}
         stream.bind(("", args.port))
         said = ""
         while True:

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from thirdhand.client import endpoints, open_session, publisher
+from thirdhand.client import Publisher, endpoints, open_session
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import BASE, Attachment, JointState, PoseStamped
 from thirdhand.contract.records import SIDES, SOURCES, Mode
@@ -95,7 +95,7 @@ def walk() -> Walk:
     arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES}
     streams = CellStreams(listening, settings, arrivals=arrivals, failed=print)
     with open_session(connect=list(endpoints(listening))) as session:
-        trackers = [publisher(session, settings.cell, f"hands/{side}") for side in SIDES]
+        trackers = [Publisher(session, settings.cell, f"hands/{side}") for side in SIDES]
 
         def sample(hand: Vector, index: int) -> bytes:
             x, y, z = hand.tolist()

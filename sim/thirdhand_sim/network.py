@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 
 from thirdhand.arms.playback import Playback
-from thirdhand.client import Command
+from thirdhand.client import Command, Publisher
 from thirdhand.contract import cdr, channels, messages, requests
 from thirdhand.contract.records import SIDES
 from thirdhand.daemon.clock import Deadlines
@@ -201,12 +201,7 @@ class Bridge:
         self.hands_sent = 0  # samples of both hands, published or received
         hands, arm = tuple(f"hands/{side}" for side in SIDES), ("joints/state", "gripper/state")
         own = ("objects", *(() if tracked else hands), *(() if observed else arm))
-        self._publishers = {
-            suffix: session.declare_publisher(
-                channels.key(live.cell, suffix), congestion_control=zenoh.CongestionControl.DROP
-            )
-            for suffix in own
-        }
+        self._publishers = {suffix: Publisher(session, live.cell, suffix) for suffix in own}
         # Callbacks run on another thread for 20 µs and note the time of arrival of each command.
         self._subscribers = [
             session.declare_subscriber(channels.key(live.cell, suffix), receive)
@@ -262,7 +257,7 @@ class Bridge:
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         for publisher in self._publishers.values():
-            publisher.undeclare()  # type: ignore[no-untyped-call]
+            publisher.close()
 
 
 def run(

@@ -28,8 +28,8 @@ import threading
 import time
 from collections.abc import Iterator
 
-from thirdhand.client import endpoints, open_session
-from thirdhand.contract import cdr, channels, messages
+from thirdhand.client import Publisher, endpoints, open_session
+from thirdhand.contract import cdr, messages
 from thirdhand.contract.explain import in_words
 from thirdhand.daemon.clock import Deadlines
 from thirdhand.process import child
@@ -89,7 +89,7 @@ def track(endpoint: str) -> None:
     signal.signal(signal.SIGUSR2, set_the_clock)
     script, sides = HandScript(Scene(), seed=Scene().seed), ("left", "right")
     with open_session(connect=[endpoint]) as session:
-        publishers = [session.declare_publisher(channels.key(CELL, f"hands/{side}")) for side in sides]
+        publishers = [Publisher(session, CELL, f"hands/{side}") for side in sides]
         clock, payloads = Deadlines(PART_HANDS_HZ), [b"", b""]
         print("begun", flush=True)
         while True:

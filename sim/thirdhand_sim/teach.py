@@ -15,12 +15,11 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
-import zenoh
 
 from thirdhand.cli.usage import option
-from thirdhand.client import ClientSettings, client_settings
+from thirdhand.client import ClientSettings, Publisher, client_settings
 from thirdhand.contract import cdr
-from thirdhand.contract.channels import ENDPOINT, key
+from thirdhand.contract.channels import ENDPOINT
 from thirdhand.contract.explain import in_words
 from thirdhand.contract.messages import BASE, PoseStamped
 from thirdhand.contract.requests import ViaPoint
@@ -172,7 +171,7 @@ def publish(
     """
     with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
-        publishers = [session.declare_publisher(key(cell, name)) for name in names]
+        publishers = [Publisher(session, cell, name) for name in names]
         until, of_hands = time.monotonic() + wait_s, publishers[:2]
         while not _are_heard(of_hands):
             if time.monotonic() > until:
@@ -192,9 +191,9 @@ def publish(
         return t >= lasts_s
 
 
-def _are_heard(publishers: list[zenoh.Publisher]) -> bool:
+def _are_heard(publishers: list[Publisher]) -> bool:
     """True if each publisher has a subscriber."""
-    return all(publisher.matching_status.matching for publisher in publishers)  # type: ignore[attr-defined]
+    return all(publisher.is_heard for publisher in publishers)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -131,14 +131,19 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
         ),
         ({"sources": source("arm", rate_hz=0.0, age_ms=None, fresh=False)}, "arm", ("joints a, b", "the driver")),
         (
-            {"sources": source("left", rejected={"older": 90})},
+            {"sources": source("arm", rejected={"older": 90})},
+            "arm",
+            ("45% of the states contradict", "one publisher of lab/joints/state", "stop one"),
+        ),
+        (
+            {"sources": source("left", rejected={"other_publisher": 200})},
             "left hand",
-            ("45% of the samples contradict", "one publisher of lab/hands/left", "stop one"),
+            ("100 messages/s rejected as other_publisher", "stop one of the two trackers"),
         ),
         (
             {"sources": source("left", scatter_mm=9.0)},
             "left hand",
-            ("scatter by 9 mm on each axis, 8 accepted", "stop one"),
+            ("scatter by 9 mm on each axis", "at most 8 mm", "look at what the tracker sees"),
         ),
         ({"sources": source("left", clock_ms=-4000.0)}, "left hand's clock", ("4 s after it arrives", "chrony")),
         ({"command_heard": False}, "arm's driver", ("nobody listens to lab/joints/command",)),

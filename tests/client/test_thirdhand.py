@@ -29,9 +29,8 @@ from thirdhand.client import (
     connect,
     endpoints,
     open_session,
-    publisher,
 )
-from thirdhand.client.streams import wait_until_heard
+from thirdhand.client.streams import Publisher, wait_until_heard
 from thirdhand.contract import channels
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.process.foreign_modules import EXTRAS
@@ -265,7 +264,7 @@ def test_a_watch_yields_in_order_none_in_silence_and_skips_what_is_not_readable(
     poses = [PoseStamped(n, "base", (0.0, 0.0, float(n)), (0.0, 0.0, 0.0, 1.0)) for n in range(3)]
     with cell.watch("tool/setpoint", timeout_s=0.2) as watch:
         assert next(watch) is None
-        daemon = publisher(listener, "bench", "tool/setpoint")
+        daemon = Publisher(listener, "bench", "tool/setpoint")
         wait_until_heard(daemon, timeout_s=10)
         daemon.put(b"nonsense")
         for pose in poses:

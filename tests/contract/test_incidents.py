@@ -52,7 +52,6 @@ def test_what_happened_names_the_settings_of_the_cell() -> None:
 def test_numbers_in_the_table_are_those_that_decide() -> None:
     for member, words in (
         (Reason.STALE_HAND, f"only {GONE_S:g} s"),
-        (Reason.TWO_SOURCES, f"more than {1e3 * TUNING.intake.scatter_on_m:g} mm"),
         (Reason.TOOL_SPEED, f"for {1e3 * TOO_FAST_S:g} ms"),
         (Flag.STUCK, f"for {STUCK_S:g} s"),
         (Cause.OLDER, f"more than {TUNING.intake.max_late_s:g} s"),

@@ -6,7 +6,7 @@ Each was an attack once: on hands here, on the arm in `test_arm_sources`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +20,8 @@ from support.in_process import LEFT, RIGHT, led
 from support.tracked import LEFT as LEFT_SIDE
 from support.tracked import PERIOD_S, STRAIGHT, Hands
 from thirdhand.contract.messages import PoseStamped
-from thirdhand.contract.records import Cause, Mode, Reason
-from thirdhand.core.frame import Tick, Vector
+from thirdhand.contract.records import Cause, Reason
+from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 
 PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
@@ -80,7 +80,6 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
             assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05  # separation counts with both places
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
     assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
-    assert not hands.contested()
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100])
@@ -101,29 +100,14 @@ def test_quick_motion_is_not_dropped(rate_hz: int) -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 @pytest.mark.parametrize("apart_m", [0.09, 0.4])
 def test_first_of_two_sources_is_believed(rate_hz: int, apart_m: float) -> None:
-    """Of two alternating sources, the first is accepted, and the contest is detected."""
+    """Of two publishers without a name that take turns, the first is accepted."""
     hands = Hands()
     other = (PLACE[0], PLACE[1] + apart_m, PLACE[2])
     tell(hands, [PLACE] * 20, rate_hz)
     y = tell(hands, [other, PLACE] * (3 * rate_hz // 2), rate_hz)
     assert np.abs(np.array(y) - PLACE[1]).max() < 0.001
-    assert hands.contested()
     assert hands.fresh()
-    tell(hands, [PLACE] * (3 * rate_hz), rate_hz)
-    assert not hands.contested(already=True)
-
-
-@pytest.mark.parametrize("offset_ns", [-5_000_000, 3600 * 10**9])
-def test_second_clock_is_noticed(offset_ns: int) -> None:
-    """A second source with a clock of its own is noticed too."""
-    hands = Hands()
-    for _ in range(500):
-        hands.advance(5)
-        stamp_ns = 10**15 + int(hands.state["tick"]) * 2_000_000
-        hands.hand(stamp_ns, PLACE)
-        hands.hand(stamp_ns + offset_ns, ELSEWHERE)
-    assert hands.contested()
-    assert abs(hands.state["hands"][LEFT_SIDE, 0, 1] - 0.1) < 0.001
+    assert hands.rejected() == {Cause.JUMPED: 3 * rate_hz // 2}
 
 
 def test_flood_of_samples_is_taken() -> None:
@@ -182,7 +166,6 @@ def test_swapped_hands_are_held_for(rate_hz: int, lasts_s: float) -> None:
     off, fresh = hands.tell(1.0)
     assert fresh[2 * hands.every :].all()
     assert off.max() < 0.02
-    assert not hands.contested(already=True)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -255,36 +238,12 @@ def test_any_samples_leave_a_usable_state(
         late = taken and int(hands.state["hand_stamps_ns"][LEFT_SIDE]) == newest_ns != stamp_ns
         assert not late or 0 < newest_ns - stamp_ns <= 100_000_000
         assert taken <= (late or int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])), k
-        for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "mode_probabilities", "contested"):
+        for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "mode_probabilities"):
             assert np.isfinite(hands.state[name]).all(), name
         assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 0]) < 10.0
 
 
 # --- in the core ---
-
-
-def told(until: int, contest: range, *, swap: bool = False) -> Iterator[Tick]:
-    """Ticks with hands at rest; between two sources take turns, or the hands' labels are mixed
-    up in every other sample.
-    """
-    rest = np.array((LEFT, RIGHT))
-    other = rest[::-1] if swap else np.add(rest, [(0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
-    return led(other if k in contest and k // 5 % 2 else rest for k in range(until))
-
-
-@pytest.mark.parametrize("swap", [False, True])
-def test_two_sources_hold_then_go_on(skill: Skill, swap: bool) -> None:
-    """While two sources report a hand, the arm holds; afterwards it continues."""
-    contest = range(1000, 2500)
-    seen = followed(skill, told(4000, contest, swap=swap))
-    assert (seen["mode"][50:1000] == Mode.FOLLOW).all()
-    held = np.flatnonzero(seen["mode"] == Mode.HOLD)
-    assert set(seen["reason"][held[held > 50]].tolist()) == {Reason.TWO_SOURCES}
-    assert held[held > 50][0] < contest.start + 500
-    assert contest.stop < held[-1] < contest.stop + 1000
-    assert seen["mode"][-1] == Mode.FOLLOW
-    still = seen["hands"][1000:, 0] - np.array(LEFT)
-    assert np.abs(still).max() < 0.002
 
 
 def test_sudden_move_of_both_hands_is_followed(skill: Skill) -> None:
@@ -293,103 +252,3 @@ def test_sudden_move_of_both_hands_is_followed(skill: Skill) -> None:
     hands[1000:, :, 1] += 0.09
     seen = followed(replace(skill, threshold=math.inf), led(hands, every=16))
     assert set(seen["reason"][50:].tolist()) == {Reason.NONE}
-
-
-# --- plain and compiled ---
-
-
-# --- two trackers of one hand, and one alone, at uneven intervals ---
-
-
-def uneven(rate_hz: float, seconds: float, kind: str, seed: int) -> Vector:
-    """Times [s] of samples that come evenly, early or late, at random, or three at once."""
-    random, count = np.random.default_rng(seed), int(rate_hz * seconds)
-    if kind == "random":
-        return np.cumsum(random.exponential(1 / rate_hz, count))
-    at = np.arange(count) / rate_hz
-    if kind == "evenly":
-        return at
-    return (
-        np.sort(at + random.uniform(0.0, 0.8 / rate_hz, count)) if kind == "early or late" else at - at % (3 / rate_hz)
-    )
-
-
-def first_contest_s(times: Vector, places: Vector) -> float | None:
-    """When samples (T, 3) [m] are found to be of two sources [s], or None: never."""
-    hands = Hands()
-    for at_s, place in zip(times, places, strict=True):
-        hands.advance(max(0, round(500 * at_s) - int(hands.state["tick"])))
-        hands.hand(10**12 + round(1e9 * at_s), tuple(place.tolist()))
-        if hands.contested():
-            return float(at_s)
-    return None
-
-
-SLOW, FAST = (0.05, 2.0), (0.1, 4.0)  # amplitude [m] and rate [rad/s] of a hand that goes to and fro
-TWO_TRACKERS = [
-    *(
-        (apart_m, (97.0, 100.0), kind, SLOW)
-        for apart_m in (0.02, 0.03, 0.04, 0.055)
-        for kind in ("early or late", "random")
-    ),
-    *(
-        (apart_m, rates_hz, "early or late", FAST)
-        for apart_m in (0.02, 0.1, 0.3)
-        for rates_hz in ((30.0, 30.0), (100.0, 100.0), (100.0, 60.0), (60.0, 30.0))
-    ),
-]
-
-
-@pytest.mark.parametrize(("apart_m", "rates_hz", "kind", "motion"), TWO_TRACKERS)
-def test_uneven_trackers_are_noticed(
-    apart_m: float, rates_hz: tuple[float, float], kind: str, motion: tuple[float, float]
-) -> None:
-    """Two trackers whose samples come unevenly are noticed."""
-    size_m, rate = motion
-    for seed, way in enumerate(np.eye(3)):
-        one, other = (uneven(rate_hz, 4.0, kind, seed + round(rate_hz)) for rate_hz in rates_hz)
-        both = np.concatenate((one, other + 0.003))
-        order = np.argsort(both)
-        times = both[order]
-        of_other = order >= len(one)
-        moved = np.outer(size_m * np.sin(rate * times), (0.0, 1.0, 0.0))
-        noise = 0.001 * np.random.default_rng(seed).standard_normal((len(times), 3))
-        found = first_contest_s(times, PLACE + moved + noise + apart_m * np.outer(of_other, way))
-        assert found is not None
-        assert found < 2.5
-
-
-@pytest.mark.parametrize("kind", ["evenly", "early or late", "random", "three at once"])
-@pytest.mark.parametrize("noise_m", [(0.003,) * 3, (0.008,) * 3, (0.002, 0.002, 0.010)])
-@pytest.mark.parametrize("shaken", [False, True])
-def test_poor_tracker_is_no_contest(noise_m: tuple[float, ...], kind: str, shaken: bool) -> None:
-    """A single poor tracker is not taken for two, whatever the order of its samples."""
-    for seed, rate_hz in enumerate((30.0, 60.0, 120.0, 250.0)):
-        times, random = uneven(rate_hz, 6.0, kind, seed), np.random.default_rng(seed)
-        at = np.outer(0.015 * shaken * np.sin(2 * math.pi * 5 * times), (1.0, 0.0, 1.0))
-        assert first_contest_s(times, PLACE + at + np.array(noise_m) * random.standard_normal(at.shape)) is None
-
-
-def spoilt(kind: str, rate_hz: float, seed: int) -> tuple[Vector, Vector]:
-    """Times [s] and places (T, 3) [m] as one tracker tells them that takes a hand for elsewhere,
-    each time another way: at once for some samples, or a little for one.
-    """
-    random, times = np.random.default_rng(seed), np.arange(0.0, 8.0, 1.0 / rate_hz)
-    places = (
-        PLACE + np.outer(0.1 * np.sin(2 * times), (0.0, 1.0, 0.0)) + 0.002 * random.standard_normal((len(times), 3))
-    )
-    at = 3
-    while at < len(times):
-        way, lasts = random.standard_normal(3), 1 if kind == "spikes" else int(random.integers(3, 9))
-        far_m = random.uniform(0.02, 0.04) if kind == "spikes" else random.uniform(0.1, 0.2)
-        places[at : at + lasts] += far_m * way / np.linalg.norm(way)
-        at += lasts + int(random.integers(5, 9))
-    return times, places
-
-
-@pytest.mark.parametrize("rate_hz", [30.0, 60.0, 100.0])
-@pytest.mark.parametrize("kind", ["spikes", "bursts"])
-def test_outliers_of_one_tracker_are_no_contest(kind: str, rate_hz: float) -> None:
-    """A tracker with frequent short outliers is not taken for two."""
-    for seed in range(6):
-        assert first_contest_s(*spoilt(kind, rate_hz, seed)) is None

@@ -20,7 +20,7 @@ from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
-from thirdhand.client import Client, Tracker, UnreachableError, cells, endpoints, open_session, publisher
+from thirdhand.client import Client, Publisher, Tracker, UnreachableError, cells, endpoints, open_session
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, channels, requests
 from thirdhand.contract.messages import PoseStamped
@@ -125,7 +125,7 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
     assert len(commands[-1].position) == len(commands[-1].velocity) == 7
     own = Client(lab.session, cell).status()
     assert own.received.keys() == {"hands/left", "hands/right", "objects"}
-    assert own.rejected.keys() <= {"two_sources", "repeated", "older", "ahead"}
+    assert own.rejected.keys() <= {"repeated", "older", "ahead"}
 
 
 def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
@@ -159,7 +159,7 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
     with open_session(connect=[lab.endpoint], zenoh_config=file) as session:
         assert list(session.info.routers_zid())
         assert endpoints(session) == ()
-        one, came = publisher(session, "cell", "hands/left"), []
+        one, came = Publisher(session, "cell", "hands/left"), []
         with lab.session.declare_subscriber("cell/hands/left", lambda sample: came.append(str(sample.key_expr))):
             until(lambda: one.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0)))) or came)
     assert set(came) == {"cell/hands/left"}  # and not elsewhere

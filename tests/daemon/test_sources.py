@@ -7,7 +7,6 @@ import math
 import re
 from typing import Any
 
-import numpy as np
 import pytest
 
 from support.in_process import LEFT, RIGHT
@@ -19,10 +18,9 @@ from thirdhand.contract.records import Cause
 from thirdhand.contract.requests import Percentiles, Status
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Frame, Tick, blank, frame_layout
-from thirdhand.core.intake import KEPT
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.skill.skill import Skill
-from thirdhand.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, apart_m, evidence
+from thirdhand.daemon.input_monitor import KEY_OF_SOURCE, InputMonitor, evidence
 from thirdhand.daemon.status import CellStatus
 from thirdhand.settings.config import HandSettings, Settings
 
@@ -321,58 +319,6 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     for _ in range(60):
         cell.tell()
     assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 120 ms")
-
-
-def two_trackers(
-    apart_m: float, *, noise_m: float, rates_hz: tuple[float, float] = (100.0, 100.0), seed: int = 0
-) -> Any:
-    """Positions (T, 3) [m] of a resting hand for 8 s, and when they are published [s], in order."""
-    random = np.random.default_rng(seed)
-    when = sorted((k / hz + 0.003 * one, one) for one, hz in enumerate(rates_hz) for k in range(int(8 * hz)))
-    places = np.add(LEFT, [(0.6 * apart_m * one, 0.8 * apart_m * one, 0.0) for _, one in when])
-    return places + noise_m * random.standard_normal(places.shape), [at_s for at_s, _ in when]
-
-
-@pytest.mark.parametrize("rates_hz", [(100.0, 100.0), (97.0, 100.0), (100.0, 60.0), (30.0, 30.0)])
-def test_two_trackers_a_few_millimetres_apart_are_detected_while_the_hand_rests(
-    rates_hz: tuple[float, float], skill: Skill
-) -> None:
-    cell, now_s, apart_mm = Cell(skill), 0.0, 0.0
-    for position, at_s in zip(*two_trackers(0.005, noise_m=0.0007, rates_hz=rates_hz), strict=True):
-        while now_s + cell.settings.period_s < at_s:
-            cell.tell()
-            now_s += cell.settings.period_s
-            if round(now_s / cell.settings.period_s) % 50 == 0:
-                apart_mm = cell.status(now_s).sources["left"].apart_mm
-                assert not apart_mm or now_s > 2.5
-        cell.tell(("left", pose(S + round(S * at_s), tuple(position.tolist()))))
-        now_s += cell.settings.period_s
-    assert apart_mm == pytest.approx(5.0, abs=0.5)
-    (line,) = (line for line in cell.log if "alternate" in line)
-    assert line.startswith("left hand: at rest, its samples alternate between two places ")
-    assert "stop one" in line
-
-
-LONE = {
-    "outliers": lambda t, random: 1e-3 * random.standard_t(2, size=(len(t), 3)),
-    "tremor": lambda t, random: along_x(random.uniform(1e-3, 6e-3) * np.sin(2 * np.pi * random.uniform(3, 5) * t)),
-    "reaches": lambda t, random: along_x(0.15 * np.sin(2 * np.pi * random.uniform(0.2, 2) * t)),
-    "moved once": lambda t, random: along_x(random.uniform(2e-3, 0.02) * (t > t.mean())),
-}
-
-
-def along_x(values: Any) -> Any:
-    return np.column_stack([values, np.zeros((len(values), 2))])
-
-
-@pytest.mark.parametrize("kind", LONE)
-def test_a_tracker_alone_is_not_taken_for_two(kind: str) -> None:
-    random = np.random.default_rng(5)
-    for _ in range(500):
-        times = np.arange(KEPT) / random.choice([30.0, 60.0, 100.0])
-        alone = LONE[kind](times, random) + random.uniform(1e-4, 1e-3) * random.standard_normal((KEPT, 3))
-        assert apart_m(alone) == 0.0
-    assert apart_m(np.zeros((KEPT, 3))) == 0.0
 
 
 def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:

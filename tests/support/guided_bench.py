@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from thirdhand.client import publisher
+from thirdhand.client import Publisher
 from thirdhand.contract import cdr
 from thirdhand.core.frame import Vector
 from thirdhand.daemon.clock import Deadlines
@@ -49,7 +49,7 @@ class GuidedBench:
         self._goal = None
 
     def _run(self) -> None:
-        said = publisher(self._session, self._settings.cell, "joints/guided")
+        said = Publisher(self._session, self._settings.cell, "joints/guided")
         with Bench(HandScript(Scene(), seed=1), settings=self._settings) as bench:
             bridge = Bridge(self._session, Live(cell=self._settings.cell), bench.joint_names)
             drive, deadlines, before = (

@@ -13,7 +13,6 @@ from thirdhand.core.codes import ARM_HEARD
 from thirdhand.core.frame import Record, Vector, as_array, blank, copied
 from thirdhand.core.intake.hand_estimator import is_fresh
 from thirdhand.core.intake.stage import Intake
-from thirdhand.core.intake.step import is_contested
 from thirdhand.settings.config import HandSettings, Settings, TrackerSettings
 
 PERIOD_S = 0.002
@@ -67,9 +66,6 @@ class Hands:
     def heard(self) -> bool:
         """Whether the arm has reported its joints lately enough."""
         return bool(self.intake.step(copied(self.state), blank(FRAME), 0, []) & ARM_HEARD)
-
-    def contested(self, *, already: bool = False) -> bool:
-        return bool(is_contested(as_array(self.state), self.intake.parameters, already))
 
     def rejected(self) -> dict[Cause, int]:
         return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}

@@ -13,7 +13,7 @@ import msgspec
 
 from thirdhand.cli.status import AHEAD_MS, disk, hours_until_full
 from thirdhand.contract.channels import BY_KEY, key
-from thirdhand.contract.evidence import Evidence, explained, lasting, two_places, unit_advice
+from thirdhand.contract.evidence import Evidence, explained, lasting, unit_advice
 from thirdhand.contract.incidents import SOURCE_NAMES, Condition, in_brief, input_name, what_to_do, word
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.records import SIDES, Cause, Reason
@@ -234,20 +234,19 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
     rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
     share = max(source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz)
     for cause, rate in rates.items():
-        if rate and not (share > REJECTED_SHARE and cause in ("older", "jumped")):  # these are found below
+        if rate and not (name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")):  # found below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
             advice = (_unit_advice(source) or source.advice if cause == source.cause else "") or what_to_do(cause)
             yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
-    if source.apart_mm:
-        wanted = f"one publisher of {key(now.cell, KEYS[name])}"
-        yield wrong(what, two_places(source), wanted, what_to_do(Condition.TWO_PLACES))
-    is_noisy = source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM
-    if share > REJECTED_SHARE or is_noisy:
-        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE, SCATTER_MM)
+    if share > REJECTED_SHARE and name == "arm":
+        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE)
         found = explained(Reason.TWO_SOURCES, seen)
-        wanted = f"one publisher of {key(now.cell, KEYS[name])}, and a tracker that sees well"
+        wanted = f"one publisher of {key(now.cell, KEYS[name])}"
         yield wrong(what, found.why.removeprefix(f"{what}, "), wanted, found.what_to_do)
+    if source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM:
+        found_mm = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis"
+        yield wrong(what, found_mm, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
 
 
 def _unit_advice(source: Source) -> str:

@@ -23,10 +23,10 @@ from thirdhand.client.streams import (
     ENCODINGS,
     Command,
     Follower,
+    Publisher,
     Tracker,
     Watch,
     no_room_to_brake,
-    publisher,
 )
 from thirdhand.contract.messages import SceneObject
 from thirdhand.contract.requests import ViaPoint
@@ -46,6 +46,7 @@ __all__ = [
     "Connection",
     "Follower",
     "Overheard",
+    "Publisher",
     "RefusedError",
     "SceneObject",
     "SettingsError",
@@ -63,6 +64,5 @@ __all__ = [
     "living",
     "no_room_to_brake",
     "open_session",
-    "publisher",
     "why_silent",
 ]

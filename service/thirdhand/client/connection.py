@@ -15,14 +15,14 @@ import zenoh
 
 from thirdhand.client.calls import Client
 from thirdhand.client.client_settings import client_settings
-from thirdhand.client.session import check_open, put
+from thirdhand.client.session import check_open
 from thirdhand.client.streams import (
     UNTURNED,
+    Publisher,
     Watch,
     checked_frame,
     checked_stamp,
     encoded_joints,
-    publisher,
     wait_until_heard,
 )
 from thirdhand.contract import cdr, markers
@@ -70,7 +70,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
         super().__init__(session, cell, timeout_s=timeout_s)
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._publishers: dict[str, Publisher] = {}
 
     @property
     def session(self) -> zenoh.Session:
@@ -193,20 +193,20 @@ class Connection(Client, AbstractContextManager["Connection"]):
         check_open(self._session)
         publishers = [self._heard(suffix) for suffix in messages]
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        for one, encode in zip(publishers, messages.values(), strict=True):
-            put(self._session, one, encode(stamp_ns))
+        for publisher, encode in zip(publishers, messages.values(), strict=True):
+            publisher.put(encode(stamp_ns))
 
-    def _heard(self, suffix: str) -> zenoh.Publisher:
+    def _heard(self, suffix: str) -> Publisher:
         """The publisher on a channel, once somebody listens. Raises UnreachableError."""
         if (known := self._publishers.get(suffix)) is not None:
             return known
-        one = publisher(self._session, self._cell, suffix, express=True)
+        publisher = Publisher(self._session, self._cell, suffix)
         try:
-            wait_until_heard(one, timeout_s=LISTENER_TIMEOUT_S)
+            wait_until_heard(publisher, timeout_s=LISTENER_TIMEOUT_S)
         except BaseException:
-            one.undeclare()  # type: ignore[no-untyped-call]
+            publisher.close()
             raise
-        return self._publishers.setdefault(suffix, one)
+        return self._publishers.setdefault(suffix, publisher)
 
 
 def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:

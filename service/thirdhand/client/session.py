@@ -145,15 +145,6 @@ def check_open(session: zenoh.Session) -> None:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
-def put(session: zenoh.Session, publisher: zenoh.Publisher, message: bytes) -> None:
-    """Publish a message. Raises UnreachableError if another thread closes the session meanwhile."""
-    try:
-        publisher.put(message)
-    except (zenoh.ZError, RuntimeError):
-        check_open(session)
-        raise
-
-
 def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
     """By endpoint, why the system connects to none of them; empty where one accepts or hangs."""
     failed: dict[str, OSError] = {}

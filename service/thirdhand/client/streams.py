@@ -13,14 +13,14 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import UnreachableError, check_open, put, tried
+from thirdhand.client.session import UnreachableError, check_open, tried
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
 from thirdhand.contract.printable import printable
@@ -64,36 +64,59 @@ def encoded_joints(stamp_ns: int, names: Sequence[str], position: Sequence[float
         ) from None
 
 
-def publisher(session: zenoh.Session, cell: str, suffix: str, **more: Any) -> zenoh.Publisher:
+class Publisher:
     """A publisher on one channel of a cell; messages that cannot be sent at once are dropped.
-    Raises UnreachableError if the session was closed.
+
+    Each message carries its publisher's identity and its number (Zenoh's SourceInfo). Raises
+    UnreachableError if the session is closed.
     """
-    check_open(session)
-    return session.declare_publisher(
-        channels.key(cell, suffix),
-        encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
-        congestion_control=zenoh.CongestionControl.DROP,
-        **more,
-    )
+
+    def __init__(self, session: zenoh.Session, cell: str, suffix: str, **more: Any) -> None:
+        check_open(session)
+        self._session = session
+        self._number = 0
+        self._zenoh = session.declare_publisher(
+            channels.key(cell, suffix),
+            encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+            **more,
+        )
+        self.key = str(self._zenoh.key_expr)
+
+    def put(self, message: bytes, attachment: bytes | None = None) -> None:
+        """Publish a message. Raises UnreachableError if another thread closes the session."""
+        source = zenoh.SourceInfo(self._zenoh.id, self._number % channels.MESSAGE_NUMBERS)
+        self._number += 1
+        try:
+            self._zenoh.put(message, attachment=attachment, source_info=source)
+        except (zenoh.ZError, RuntimeError):
+            check_open(self._session)
+            raise
+
+    @property
+    def is_heard(self) -> bool:
+        """True if it has a subscriber."""
+        return bool(self._zenoh.matching_status.matching)  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        """End the publisher."""
+        self._zenoh.undeclare()  # type: ignore[no-untyped-call]
 
 
-def wait_until_heard(*publishers: zenoh.Publisher, timeout_s: float | None) -> None:
+def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     """Wait up to `timeout_s` [s] until each publisher has a subscriber; None: until Ctrl-C. Raises
     UnreachableError.
     """
 
     def check() -> None:
-        if unheard := _unheard(publishers):
-            raise UnreachableError(
-                f"nobody listens to {unheard[0]}: is a daemon or `thirdhand record` running in this cell?"
-            )
+        for publisher in publishers:
+            if not publisher.is_heard:
+                raise UnreachableError(
+                    f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running in this cell?"
+                )
 
     tried(check, timeout_s)
-
-
-def _unheard(publishers: Iterable[zenoh.Publisher]) -> list[str]:
-    """The keys of the publishers without a subscriber."""
-    return [str(one.key_expr) for one in publishers if not one.matching_status.matching]  # type: ignore[attr-defined]
 
 
 def checked_stamp(stamp_ns: Any) -> int:
@@ -124,7 +147,7 @@ class Tracker(AbstractContextManager["Tracker"]):
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
         self._session = session
-        self._publishers = {side: publisher(session, cell, f"hands/{side}", express=True) for side in SIDES}
+        self._publishers = {side: Publisher(session, cell, f"hands/{side}") for side in SIDES}
         try:
             wait_until_heard(*self._publishers.values(), timeout_s=timeout_s)
         except BaseException:
@@ -160,16 +183,16 @@ class Tracker(AbstractContextManager["Tracker"]):
                 f"{side} hand: {reprlib.repr(position)} and {reprlib.repr(orientation)} given; a position x y z [m] "
                 "and a quaternion x y z w needed"
             ) from None
-        put(self._session, self._publishers[side], message)
+        self._publishers[side].put(message)
 
     def heard(self) -> bool:
         """True if both hands have a subscriber."""
-        return not _unheard(self._publishers.values())
+        return all(publisher.is_heard for publisher in self._publishers.values())
 
     def close(self) -> None:
         """End the publishers."""
-        for one in self._publishers.values():
-            one.undeclare()  # type: ignore[no-untyped-call]
+        for publisher in self._publishers.values():
+            publisher.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -289,7 +312,7 @@ class Follower(_Received):
 
     def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
         self._names = tuple(names)
-        self._state = publisher(session, cell, "joints/state", express=True)
+        self._state = Publisher(session, cell, "joints/state")
         super().__init__(session, cell, "joints/command")
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
@@ -314,12 +337,12 @@ class Follower(_Received):
         """
         check_open(self._session)
         now_ns = time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns)
-        put(self._session, self._state, encoded_joints(now_ns, self._names, position, velocity))
+        self._state.put(encoded_joints(now_ns, self._names, position, velocity))
 
     def close(self) -> None:
         """End the subscription and the publisher."""
         super().close()
-        self._state.undeclare()  # type: ignore[no-untyped-call]
+        self._state.close()
 
     def _decoded(self, sample: zenoh.Sample) -> Command:
         message = cdr.decode_joints(sample.payload.to_bytes())

@@ -73,8 +73,7 @@ class Evidence(NamedTuple):
     """Figures at the time of an incident; unknown ones are left out."""
 
     sources: Mapping[str, Source] = MappingProxyType({})
-    contested: float = 0.0  # accepted share of samples that contradict the rest
-    scatter_mm: float = 0.0  # accepted scatter of a hand's samples
+    contested: float = 0.0  # accepted share of the arm's states that contradict the rest
     settings: Any = None  # of the cell
     gate_m: Exceeded | None = None  # deviation from what the skill knows
     measure: str = ""  # the skill's name for that deviation
@@ -240,27 +239,16 @@ def _jumps(seen: Evidence, side: str) -> bool:
 
 
 def _contest(seen: Evidence) -> str:
-    """The source whose samples contradict each other, or scatter, most."""
-    if not seen.sources:
+    """How many of the arm's states contradict each other."""
+    if (arm := seen.sources.get("arm")) is None:
         return ""
-    name, source = max(seen.sources.items(), key=lambda item: item[1].contested)
-    what = f"{source.contested:.0%} of the samples contradict the rest"
-    if source.contested <= seen.contested:
-        name, source = max(seen.sources.items(), key=lambda item: item[1].scatter_mm or 0.0)
-        if source.scatter_mm is None:
-            return ""
-        what = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis, {seen.scatter_mm:.0f} accepted"
-    return f"{SOURCE_NAMES[name]}, {'in the last second' if source.rate_hz else 'before it ended'}: {what}"
+    when = "in the last second" if arm.rate_hz else "before it ended"
+    return f"{SOURCE_NAMES['arm']}, {when}: {arm.contested:.0%} of the states contradict the rest"
 
 
 def unit_advice(unit: str) -> str:
     """The remedy for positions that seem to be in another unit than that of the settings."""
     return f'{what_to_do(Condition.WRONG_UNIT)}: unit = "{unit}"'
-
-
-def two_places(source: Source) -> str:
-    """The sign, in words, that two trackers publish the same hand; it appears while that rests."""
-    return f"at rest, its samples alternate between two places {source.apart_mm:g} mm apart"
 
 
 def _joint_error(seen: Evidence) -> str:

@@ -27,11 +27,11 @@ _SETTING = re.compile(r"\{(\w+)\.(\w+) (\S+)\}")
 # Incidents that are no reason, flag or cause: findings of `doctor`, and closer causes of others.
 Condition = enum.StrEnum(
     "Condition",
-    "MALFORMED FROZEN CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE TWO_DRIVERS "
-    "MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
+    "MALFORMED FROZEN OTHER_PUBLISHER CLOCK_STEPPED DELAYED HANDS_TOO_RARE JOINTS_TOO_RARE ARM_UNSETTLED ARM_INSIDE "
+    "TWO_DRIVERS MACHINE_BUSY HAND_SILENT JOINTS_SILENT KEY_MISSPELT RATE_LOW WRONG_UNIT DEGREES Y_UP HANDS_EXCHANGED "
     "HAND_ELSEWHERE ARM_LATE NO_DRIVER DRIVES_OFF OFF_TARGET CLOCKS_DIFFER NO_REAL_TIME NOT_LOCKED NOT_RECORDED "
     "TICKS_LOST DISK_SHORT STARTING VERSIONS_DIFFER NO_DAEMON NO_ANSWER OTHER_CELL PORT_CLOSED NO_WAY "
-    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE TWO_PLACES "
+    "PORT_FOREIGN NO_ARM CALIBRATION_OFF LIMIT_BINDS HUMBLE NOISY "
     "CLOCK_SET",
 )
 
@@ -117,10 +117,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
             "the hands are farther from the demonstrations than the skill accepts",
             "move the hands back to where the task was demonstrated, or demonstrate this too"),
         Incident(Reason.TWO_SOURCES, Mode.HOLD, "two sources contradict each other",
-            "a quarter of the last second's samples report a hand, or the arm, at another position; or the samples "
-            "of a hand scatter by more than 12 mm",
-            "two trackers or drivers may publish under one key: stop one; if there is only one, look at what the "
-            "tracker sees; `rejected` counts `older` and `jumped` meanwhile"),
+            "a quarter of the last second's joint states report the arm in another posture",
+            "two drivers may publish under one key: stop one; `rejected` counts `older` and `jumped` meanwhile"),
         Incident(Reason.BLOCKED, Mode.HOLD, "tool blocked",
             "joint limits or things around the arm keep the tool from its target",
             "wait while the arm looks for a way out and takes it; if it finds none, move the hands: it tries again "
@@ -185,11 +183,10 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.OFF_TARGET, None, "tool off its target",
             "the tool has been more than 5 cm from its target for some time",
             "check that the arm's driver follows commands, and as fast"),
-        Incident(Condition.TWO_PLACES, None, "hand at two places",
-            "the samples of a hand that rests alternate between two places, some millimetres apart, and the tool errs "
-            "by as much",
-            "two trackers may publish this hand: stop one; if there is only one, see whether it alternates between two "
-            "views"),
+        Incident(Condition.NOISY, None, "hand noisy",
+            "the samples of a hand scatter by more than those of a tracker that sees it well",
+            "look at what the tracker sees: light, reflections, distance; a second tracker that does not name itself "
+            "may publish this hand, too"),
         Incident(Condition.Y_UP, None, "tracker's axes",
             "y of the tracker seems to point up; in frame `base`, z does",
             "turn the tracker's frame by `base_from_tracker` under [hands]"),
@@ -232,7 +229,7 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Cause.JUMPED, None, "jumped",
             "a hand or a joint that is suddenly elsewhere; a hand is accepted there after three samples over 20 ms "
             "that agree",
-            "look for reflections, and for a second source"),
+            "look for reflections, and for a second tracker that does not name itself"),
         Incident(Cause.SWAPPED, None, "hands swapped",
             "a hand where the other hand was, and the other where it was; accepted after 2 s",
             "let the tracker see both hands apart for a moment: it takes left for right"),
@@ -243,6 +240,9 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {  # by what a person notices, i
         Incident(Condition.MALFORMED, None, "malformed",
             "bytes that are not the message of their key; they are counted by key",
             "publish the type and encoding that docs/wire.md lists for the key"),
+        Incident(Condition.OTHER_PUBLISHER, None, "other publisher",
+            "samples of a second publisher of this hand; those of the first one count, until it is silent for 0.5 s",
+            "stop one of the two trackers: both publish under this key"),
         Incident(Condition.FROZEN, None, "hand frozen",
             "the pose of a hand was the same, bit for bit, for 0.5 s while its stamps went on: its tracker has lost it",
             "bring the hand into the tracker's view; it is accepted again as soon as its pose changes"),
@@ -321,6 +321,7 @@ def word(member: Member) -> str:
 
 MALFORMED = word(Condition.MALFORMED)
 FROZEN = word(Condition.FROZEN)
+OTHER_PUBLISHER = word(Condition.OTHER_PUBLISHER)
 BY_WORD = {word(row.member): row for rows in INCIDENTS.values() for row in rows}
 if missing := {word(member) for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind} - {"", *BY_WORD}:
     raise NotImplementedError(f"no incident is described for {', '.join(sorted(missing))}")

@@ -246,9 +246,8 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     cause: str = ""  # cause of the newest rejection in the last second
     refused: str = ""  # that rejection in words: what arrived, and what is accepted
     advice: str = ""  # what to do about that rejection
-    contested: float = 0.0  # share of the last second's samples that contradict the rest
+    contested: float = 0.0  # share of the arm's states in the last second that contradict the rest
     scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
-    apart_mm: float = 0.0  # distance of two places between which a resting hand's samples alternate; 0: they do not
     unit: str = ""  # the unit in which a hand's positions seem to be, if it is not that of the settings
     batches_ms: float = 0.0  # interval of the batches in which a hand's samples arrive, if it is too long; 0: none
 

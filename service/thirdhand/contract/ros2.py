@@ -137,6 +137,11 @@ def encode_attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
     return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
 
 
+def publisher_of(attachment: bytes) -> str:
+    """The publisher that an attachment of rmw_zenoh names, in hexadecimal; empty for others."""
+    return attachment[-16:].hex() if len(attachment) == _ATTACHMENT.size else ""
+
+
 def _typed(topic: Topic) -> str:
     package, _, name = topic.type.split("/")
     return f"{package}::msg::dds_::{name}_/RIHS01_{TYPE_HASHES[topic.type]}"

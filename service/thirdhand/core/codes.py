@@ -13,7 +13,7 @@ class Condition(enum.IntFlag):
     HANDS = 1  # both hands are seen
     ARM_HEARD = 2  # the arm has reported its joints recently
     ARM_STILL = 4  # the arm has reported the same posture for a while
-    CONTESTED = 8  # two sources report a hand or the arm
+    CONTESTED = 8  # two sources report the arm
     LEFT_UNSEEN = 16  # the left hand is out of sight for a moment; the right hand is seen
     RIGHT_UNSEEN = 32  # the right hand is out of sight for a moment; the left hand is seen
     ARM_INSIDE = 64  # a part of the arm is inside of a thing, or of another part
@@ -22,17 +22,6 @@ class Condition(enum.IntFlag):
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
     CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
     ARM_GUIDED = 2048  # the arm's driver reports that the arm is led by hand
-
-
-class Alternation(enum.IntEnum):
-    """Orders in which two sources may report one hand, over four samples. Bit i is the source of
-    sample i, counted from the newest.
-    """
-
-    SECOND_NEWEST = 0b0010  # the second-newest sample is of the other source
-    THIRD_NEWEST = 0b0100  # the third-newest sample is of the other source
-    INNER_PAIR = 0b0110  # two of the other source, between two of the first one
-    EVERY_OTHER = 0b0101  # the sources take turns
 
 
 class Start(enum.IntEnum):
@@ -97,8 +86,6 @@ CONTESTED, UNSEEN = int(Condition.CONTESTED), (int(Condition.LEFT_UNSEEN), int(C
 ARM_INSIDE, ONE_HAND = int(Condition.ARM_INSIDE), int(Condition.ONE_HAND)
 SEGMENT_AMBIGUOUS, UNSEEN_HAND_NEEDED = int(Condition.SEGMENT_AMBIGUOUS), int(Condition.UNSEEN_HAND_NEEDED)
 CLUTCH_RELEASED, ARM_GUIDED = int(Condition.CLUTCH_RELEASED), int(Condition.ARM_GUIDED)
-SECOND_NEWEST, THIRD_NEWEST = int(Alternation.SECOND_NEWEST), int(Alternation.THIRD_NEWEST)
-ALTERNATIONS = tuple(int(order) for order in Alternation)
 STARTS_ASSUMED, STARTS_MEASURED = int(Start.ASSUMED), int(Start.MEASURED)
 READY, RETURNING = int(ArmReady.READY), int(ArmReady.RETURNING)
 HELD_UNSEEN, HELD_SEEN = int(Held.HANDS_UNSEEN), int(Held.HANDS_SEEN)

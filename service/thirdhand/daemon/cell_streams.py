@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from statistics import median
 from typing import Any
@@ -13,7 +13,8 @@ import numpy as np
 import zenoh
 from zenoh.handlers import RingChannel
 
-from thirdhand.client import publisher
+from thirdhand.client import Publisher
+from thirdhand.client.publisher_identity import SolePublisher, identity
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
@@ -47,11 +48,11 @@ MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all n
 class Arrivals:
     """Statistics of the messages received on one channel. The loop writes, other threads read."""
 
-    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "why")
+    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "others", "why")
 
     def __init__(self) -> None:
         self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, arrival - stamp [ns]
-        self.count = self.malformed = self.frozen = self.at_ns = 0
+        self.count = self.malformed = self.frozen = self.others = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
 
@@ -168,6 +169,7 @@ class CellStreams:
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
+        self._sole = {key: SolePublisher() for key in self._frozen}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [channel.key for channel in heard(settings)]
         keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
@@ -187,11 +189,10 @@ class CellStreams:
             for key, by_frame in frames.items()
         ]
         self._publishers = {
-            channel.key: publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME, express=True)
+            channel.key: Publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME)
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
-        self._sent = Counter[str]()  # messages by channel
         self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
@@ -200,61 +201,75 @@ class CellStreams:
         """
         events: list[Event] = []
         for suffix, source in self._subscribers:
-            waiting = _waiting(source, _most(suffix))
-            arrived = [event for sample in waiting if (event := self._decoded(suffix, sample.payload))]
+            arrived: list[Event] = []
+            for sample in _waiting(source, _most(suffix)):
+                if (event := self._decoded(suffix, sample.payload, identity(sample))) is not None:
+                    arrived.append(event)
             events += arrived[-1:] if suffix == ARM_STATE else arrived
         for by_frame, source in self._transforms:
-            for suffix, poses in self._poses(by_frame, source).items():
-                encoded = map(cdr.encode_pose, poses[-MAX_ARRIVALS:])
-                events += [event for payload in encoded if (event := self._decoded(suffix, payload))]
+            for suffix, payload, publisher in self._poses(by_frame, source):
+                if (event := self._decoded(suffix, payload, publisher)) is not None:
+                    events.append(event)
         return events
 
-    def _poses(self, by_frame: Mapping[str, str], source: Any) -> dict[str, list[PoseStamped]]:
-        """The poses by channel in the messages of a topic of transforms. Only the newest messages
-        with a frame of `by_frame` are decoded: most are of other nodes.
+    def _poses(self, by_frame: Mapping[str, str], source: Any) -> list[tuple[str, bytes, str]]:
+        """The poses in the messages of a topic of transforms: channel, message and publisher. Only
+        the newest messages with a frame of `by_frame` are decoded: most are of other nodes.
         """
-        payloads = [sample.payload.to_bytes() for sample in _waiting(source, MAX_TRANSFORM_MESSAGES)]
-        named = [(one, [frame for frame in by_frame if cdr.bytes_of_frame(frame) in one]) for one in payloads]
-        found: dict[str, list[PoseStamped]] = {}
-        for payload, frames in [one for one in named if one[1]][-MAX_ARRIVALS:]:
+        named: list[tuple[bytes, list[str], str]] = []
+        for sample in _waiting(source, MAX_TRANSFORM_MESSAGES):
+            payload = sample.payload.to_bytes()
+            if frames := [frame for frame in by_frame if cdr.bytes_of_frame(frame) in payload]:
+                named.append((payload, frames, identity(sample)))
+
+        poses: dict[str, deque[tuple[str, bytes, str]]] = {}
+        for payload, frames, publisher in named[-MAX_ARRIVALS:]:
             try:
-                for frame, pose in cdr.decode_transforms(payload, tuple(by_frame)):
-                    found.setdefault(by_frame[frame], []).append(pose)
+                for frame, pose in cdr.decode_transforms(payload, tuple(frames)):
+                    newest = poses.setdefault(frame, deque(maxlen=MAX_ARRIVALS))
+                    newest.append((by_frame[frame], cdr.encode_pose(pose), publisher))
             except WireError as error:
                 for frame in frames:
                     self._arrivals[by_frame[frame]].refuse(str(error))
-        return found
+        return [pose for newest in poses.values() for pose in newest]
 
-    def _decoded(self, suffix: str, raw: Any) -> Event | None:
+    def _decoded(self, suffix: str, raw: Any, publisher: str) -> Event | None:
+        """The event of a message; None if it is refused, or completes no state of the arm."""
         channel, arrivals = channels.BY_KEY[suffix], self._arrivals[suffix]
         try:
             if len(raw) > cdr.MAX_BYTES:
                 raise WireError(f"{len(raw)} bytes, at most {cdr.MAX_BYTES} accepted")
-            payload, at_ns = bytes(raw), time.time_ns()
+            payload = bytes(raw)
             message = channel.codec.decode(payload)
+            now_s = time.monotonic()
             if suffix == ARM_STATE:
-                now_s = time.monotonic()
                 state = self._joints.take(message, now_s) or self._joints.incomplete(message, now_s)
                 if state is None:
                     return None
                 if state is not message:
-                    message, payload = state, cdr.encode_joints(state)
-            arrivals.take(message, at_ns)
-            hand = self._frozen.get(suffix)
-            if hand and hand.is_frozen(message):
-                arrivals.frozen += 1
-                return None
-            event = self.newest[suffix] = Event(suffix, payload, message)
-            return event
+                    message = state
+                    payload = cdr.encode_joints(state)
         except WireError as error:
             arrivals.refuse(str(error))
             return None
 
+        # Of two publishers of a hand, the samples of one count; a lost hand is not seen.
+        sole = self._sole.get(suffix)
+        if sole is not None and sole.is_other(publisher, now_s):
+            arrivals.others += 1
+            arrivals.count += 1
+            return None
+        arrivals.take(message, time.time_ns())
+        hand = self._frozen.get(suffix)
+        if hand is not None and hand.is_frozen(message):
+            arrivals.frozen += 1
+            return None
+        event = self.newest[suffix] = Event(suffix, payload, message)
+        return event
+
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""
-        one, number = self._publishers[suffix], self._sent[suffix]
-        self._sent[suffix] += 1
-        one.put(payload, attachment=attachment, source_info=zenoh.SourceInfo(one.id, number % channels.MESSAGE_NUMBERS))
+        self._publishers[suffix].put(payload, attachment)
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
 
@@ -268,7 +283,7 @@ class CellStreams:
     @property
     def is_followed(self) -> bool:
         """True if the commands have a subscriber."""
-        return bool(self._publishers["joints/command"].matching_status.matching)  # type: ignore[attr-defined]
+        return self._publishers["joints/command"].is_heard
 
     def close(self) -> None:
         """End the threads beside the loop."""

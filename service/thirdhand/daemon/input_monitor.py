@@ -12,17 +12,15 @@ from collections.abc import Iterator
 from statistics import median
 
 import msgspec
-import numpy as np
 
-from thirdhand.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained, two_places
-from thirdhand.contract.incidents import FROZEN, MALFORMED, Condition, in_full, input_name, what_to_do, word
+from thirdhand.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
+from thirdhand.contract.incidents import FROZEN, MALFORMED, OTHER_PUBLISHER, Condition, in_full, input_name, word
 from thirdhand.contract.joint_states import measured
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
 from thirdhand.contract.records import SOURCES, Cause
 from thirdhand.contract.requests import Source
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import Record, Vector
-from thirdhand.core.intake import KEPT
+from thirdhand.core.frame import Record
 from thirdhand.core.intake.far_away import too_far, unit_meant
 from thirdhand.core.intake.late_samples import lateness_ms
 from thirdhand.core.intake.stage import Intake, Refused
@@ -33,13 +31,6 @@ from thirdhand.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
 COUNTS_EVERY_S = 10.0  # interval of the log lines that count further rejections
-# Two trackers of a hand that rests: its samples alternate between two places. The distance between
-# the two halves of a normal distribution is 2.7 times their standard deviation, of an even one 3.5
-# times, and of a tremor 4.1 times; a tremor, or a hand that has moved, changes sides more rarely.
-LEAST_APART_M = 0.003  # smaller distances are the steps of a coarse tracker
-APART_STDS = 4.5  # least distance of the places / standard deviation at one of them
-ALTERNATING_SHARE = 0.35  # least share of the samples that follow one at the other place
-APART_FOR_S = 3.0  # for so long, several times as long as the retained samples, chance does not last
 KEY_OF_SOURCE = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
 
 
@@ -53,8 +44,6 @@ class _History:
         self.logged: dict[str, int] = {}
         self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
         self.cause, self.refused_s = "", -math.inf
-        self.apart: deque[tuple[float, float]] = deque()
-        self.is_apart_logged = False
 
 
 class InputMonitor:
@@ -92,14 +81,14 @@ class InputMonitor:
         while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
             history.clocks.popleft()
         since_s, before = history.counts[0]
-        counted = {MALFORMED: arrivals.malformed, FROZEN: arrivals.frozen}
+        counted = {MALFORMED: arrivals.malformed, FROZEN: arrivals.frozen, OTHER_PUBLISHER: arrivals.others}
         rejected = {cause: count for cause, count in counted.items() if count}
         if intake is not None:
             counts = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
             rejected = {word(cause): int(n) for cause, n in counts if n} | rejected
         for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
-            if cause == FROZEN:
-                history.found[cause] = explained(Condition.FROZEN)
+            if cause in (FROZEN, OTHER_PUBLISHER):
+                history.found[cause] = explained(Condition[cause.upper()])
             elif cause == MALFORMED or intake is None:
                 history.found[cause] = explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
             else:
@@ -133,8 +122,7 @@ class InputMonitor:
             fresh=age_ms is not None and age_ms < silent_ms,
             late_ms=None if late is None else round(late[0], 1),
             late_95_ms=None if late is None else round(late[1], 1),
-            contested=round(float(state["contested"][index]), 3),
-            apart_mm=self._apart_mm(source, state, now_s),
+            contested=round(float(state["arm_contested"]), 3) if source == "arm" else 0.0,
             scatter_mm=None
             if source == "arm" or seen < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
@@ -147,17 +135,6 @@ class InputMonitor:
         if not isinstance(newest, PoseStamped):
             return ""
         return unit_meant(newest.position, self._settings.hands_in(newest.frame_id).unit)
-
-    def _apart_mm(self, source: str, state: Record, now_s: float) -> float:
-        """Distance [mm] of two places between which a hand mostly alternated lately; 0: none."""
-        if source == "arm":
-            return 0.0
-        side, apart = SOURCES.index(source), self._histories[source].apart
-        kept = (int(state["kept_newest"][side]) - np.arange(int(state["kept"][side]))) % KEPT
-        apart.append((now_s, apart_m(state["kept_positions"][side][kept])))
-        while apart[0][0] < now_s - APART_FOR_S:
-            apart.popleft()
-        return round(1e3 * median(m for _, m in apart), 1) if now_s - apart[0][0] > 0.9 * APART_FOR_S else 0.0
 
     def clutch(self, state: Record) -> str:
         """The problem with the clutch's messages; empty if there is none, or no clutch."""
@@ -176,9 +153,6 @@ class InputMonitor:
         for source, now in sources.items():
             history, name = self._histories[source], input_name(source)
             logged, found = history.logged, history.found
-            if now.apart_mm and not history.is_apart_logged:
-                history.is_apart_logged = True
-                yield name + in_full(two_places(now), what_to_do(Condition.TWO_PLACES))
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
                 yield f"{name}: rejected as {cause}{in_full(*found[cause])}"
@@ -189,25 +163,6 @@ class InputMonitor:
                 yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {which}"
         if counts:
             self._counted_s = now_s
-
-
-def apart_m(positions: Vector) -> float:
-    """Distance [m] of two places between which successive positions (M, 3) [m] alternate; 0 if they
-    do not.
-
-    The places are the means of the positions on each side of the mean along their principal axis.
-    """
-    if len(positions) < KEPT // 2:
-        return 0.0
-    off = positions - positions.mean(axis=0)
-    along = off @ np.linalg.svd(off, full_matrices=False)[2][0]
-    there = along > 0.0
-    if there.all() or not there.any():
-        return 0.0
-    apart = float(along[there].mean() - along[~there].mean())
-    spread = math.sqrt((along[there].var() * there.sum() + along[~there].var() * (~there).sum()) / len(along))
-    alternate = np.count_nonzero(there[1:] != there[:-1]) >= ALTERNATING_SHARE * len(along)
-    return apart if alternate and apart > max(LEAST_APART_M, APART_STDS * spread) else 0.0
 
 
 def _too_far(sample: PoseStamped, settings: Settings) -> str:

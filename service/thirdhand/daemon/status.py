@@ -136,7 +136,6 @@ class CellStatus(NamedTuple):
             sources={name: source for name, source in self.sources.items() if not self._is_unneeded(name, source)},
             settings=settings,
             contested=TUNING.intake.contested_off_share,
-            scatter_mm=1e3 * TUNING.intake.scatter_on_m,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
             measure=skill.model.measure,
             outside=self._outside(),

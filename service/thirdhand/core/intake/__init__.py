@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thirdhand.contract.records import PER_JOINT, SOURCES, Cause, Field
+from thirdhand.contract.records import PER_JOINT, Cause, Field
 
 MODES = 3  # modes of the hand filter: rest, reach, change
 STATES = 5  # states of each mode and axis: position, velocity, acceleration, tremor and its velocity
@@ -18,7 +18,7 @@ STATE = (
     Field("arm_stamp_ns", "int64"),
     Field("arm_tick", "int64"),
     Field("arm_still_tick", "int64"),  # tick since which the arm has reported `arm_still_posture`
-    Field("sample_ticks", "int64", (len(SOURCES), 2)),  # the last two ticks with a plausible sample
+    Field("arm_sample_ticks", "int64", (2,)),  # the last two ticks with a plausible state of the arm
     Field("jump_first_tick", "int64", (2,)),  # tick of the first one of the successive samples that jumped
     Field("jump_newest_tick", "int64", (2,)),  # tick of the newest one of the successive samples that jumped
     Field("jump_count", "int64", (2,)),  # number of successive samples that jumped
@@ -31,8 +31,6 @@ STATE = (
     Field("kept_newest", "int64", (2,)),  # index of the newest sample in all rings `kept_*`
     Field("kept_stamps_ns", "int64", (2, KEPT)),
     Field("kept_ticks", "int64", (2, KEPT)),  # ticks in which the samples were made
-    Field("other_tick", "int64", (2,)),  # tick of the newest sample that jumped, accepted or not
-    Field("other_after_ns", "int64", (2,)),  # stamp of the newest accepted sample at that time
     Field("tremor_rate", "int64", (2,)),  # index of the rate of a hand's tremor
     Field("bank_stamps_ns", "int64", (2,)),  # stamp of the newest sample in the bank of tremor filters
     Field("bank_ticks", "int64", (2,)),  # tick in which that sample was made
@@ -66,8 +64,7 @@ STATE = (
     Field("kept_past", "float64", (2, KEPT, 3, 3)),  # `past_samples` after each retained sample
     Field("kept_noise", "float64", (2, KEPT, 4)),  # noise_variance, noise_samples, even_samples, sample_interval_s
     Field("jumped_to", "float64", (2, 3)),  # position of the newest sample that jumped [m]
-    Field("other_offset", "float64", (2, 3)),  # from the expected position to that of the newest sample that jumped [m]
-    Field("contested", "float64", (len(SOURCES),)),  # share of recent samples that contradict the others
+    Field("arm_contested", "float64"),  # share of the arm's recent states that contradict the others
     Field("arm_still_posture", "float64", (PER_JOINT,)),  # posture in which the arm is at rest
     Field("measured", "float64", (PER_JOINT,)),
     Field("measured_velocities", "float64", (PER_JOINT,)),
@@ -76,7 +73,6 @@ STATE = (
     Field("trembles", "uint8", (2,)),  # 1: the hand's tremor is evident
     Field("clock", "uint8", (2,)),  # `codes.ClockTrust`: trust in a tracker's clock
     Field("kept_restarts", "uint8", (2, KEPT)),  # 1: the filter started anew with this sample
-    Field("other_returns", "uint8", (2,)),  # 1: the newest sample that jumped is of a second source
     Field("jump_is_swap", "uint8", (2,)),  # 1: the hand jumped to where the other one had been
 )
 FRAME = (

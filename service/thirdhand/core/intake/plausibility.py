@@ -1,5 +1,5 @@
 """Plausibility of samples, compared with earlier ones: stamps, jumps, swapped hands, and a second
-source that contradicts the first. The rules are the same for both hands and for the arm:
+arm. The rules are the same for both hands and for the arm:
 
 * A stamp differs from the newest one. It is at most MAX_LATE_S older than the newest one (the arm's
   stamps must increase), and is ahead of it by at most the time since the newest sample arrived plus
@@ -11,43 +11,17 @@ source that contradicts the first. The rules are the same for both hands and for
 * A hand that appears where the other hand was, while that one is no longer seen there, is taken for
   the other one: the tracker has swapped them. The new position is accepted after `swapped_s`,
   within which the tracker may correct itself.
-* A source is contested when more than CONTESTED_ON_SHARE of its samples within about
-  TRACKER_MEMORY_S contradict the others, until the share is below CONTESTED_OFF_SHARE. For the
-  arm, these are samples that jumped. For a hand, they alternate between two positions, or they
-  jumped by the same offset as the last one that jumped, with accepted samples between them; the
-  jumps of a single tracker do not repeat an offset. A hand is also contested while its samples
-  scatter more than those of any tracker, as do samples of two trackers whose positions differ by
-  some centimetres.
+* The arm is contested when more than CONTESTED_ON_SHARE of its states within about
+  TRACKER_MEMORY_S jumped, until the share is below CONTESTED_OFF_SHARE: two drivers report it. Of
+  two trackers of one hand, the daemon takes the samples of one only.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
 from kmp.compiled import compiled
-from thirdhand.core.codes import ALTERNATIONS, SECOND_NEWEST, THIRD_NEWEST
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.intake import CONFIRMED_SAMPLES
-from thirdhand.core.intake.hand_estimator import slot
-from thirdhand.core.vectors import distance, squared_distance
-
-
-@compiled
-def is_of_another(states: Records, parameters: Records, side: int, position: Vector, expected: Vector) -> bool:
-    """True if a hand's sample (3,) [m] that jumped comes from a second source; records the jump.
-
-    Its offset from the `expected` position (3,) must equal that of the last sample that jumped,
-    within `jump`, and that sample must be less than `stale_ticks` old. Between the two, a sample
-    was accepted; in a row of successive jumps, the decision about the first one holds for all.
-    """
-    state, config, offset = states[0], parameters[0], position - expected
-    passed = state.tick - state.other_tick[side]
-    far = distance(offset, state.other_offset[side]) > config.jump_m
-    in_row = state.other_after_ns[side] == state.hand_stamps_ns[side]
-    returns = passed < config.stale_ticks and not far and (not in_row or state.other_returns[side] > 0)
-    state.other_tick[side], state.other_after_ns[side] = state.tick, state.hand_stamps_ns[side]
-    state.other_offset[side, :], state.other_returns[side] = offset, returns
-    return bool(returns)
+from thirdhand.core.vectors import distance
 
 
 @compiled
@@ -115,50 +89,3 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
     passed = state.tick - state.jump_newest_tick[side]
     near = distance(position, state.jumped_to[side]) <= config.jump_m + config.jump_speed_mps * passed * config.period_s
     return bool(passed < config.stale_ticks and near)
-
-
-@compiled
-def _returns(states: Records, parameters: Records, side: int, order: int, offset: Vector) -> bool:
-    """True if an earlier sample deviated by about the same `offset` (3,) [m] from its neighbours.
-
-    The retained samples from number `order` + 2 on are checked; the one before is a neighbour of
-    the new deviation. The deviation of a sample is x_k - (x_(k-1) + x_(k+1)) / 2; it may differ
-    from the offset by source_spread_share |offset|. A second source repeats its offset, the
-    outliers of one tracker do not.
-    """
-    state, around = states[0], np.empty((3, 3))
-    for before in range(order + 2, state.kept[side] - 1):
-        for k in range(3):
-            around[k] = state.kept_positions[side, slot(states, side, before - 1 + k)]
-        off = around[1] - 0.5 * (around[0] + around[2])
-        if distance(off, offset) <= parameters[0].source_spread_share * distance(offset, np.zeros(3)):
-            return True
-    return False
-
-
-@compiled
-def is_to_and_fro(states: Records, parameters: Records, side: int, order: int, position: Vector) -> bool:
-    """True if four samples alternate between two positions: a new one (3,) [m], and the three
-    before it, whose newest has number `order`. Their intervals may be uneven.
-
-    For one of the ALTERNATIONS, which assign the samples to two sources, samples of different
-    sources are at least sources_apart_m apart, and those of one source differ by at most
-    source_spread_share of the smallest distance between the sources. A pattern with one sample of
-    the second source also requires that this source was seen before (`_returns`).
-    """
-    config, samples = parameters[0], np.empty((4, 3))
-    samples[0], samples[1:] = position, states[0].kept_past[side, slot(states, side, order)]
-    for sources in ALTERNATIONS:
-        within, apart = 0.0, np.inf
-        for i in range(4):
-            for j in range(i):
-                between = squared_distance(samples[i], samples[j])
-                if (sources >> i) & 1 == (sources >> j) & 1:
-                    within = max(within, between)
-                else:
-                    apart = min(apart, between)
-        if apart >= config.sources_apart_m**2 and within <= config.source_spread_share**2 * apart:
-            # index of the second source's only sample; 0 if it has two
-            odd = 1 if sources == SECOND_NEWEST else 2 if sources == THIRD_NEWEST else 0
-            return odd == 0 or _returns(states, parameters, side, order + odd - 1, samples[odd] - samples[0])
-    return False

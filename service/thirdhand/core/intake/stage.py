@@ -21,10 +21,11 @@ from thirdhand.core.geometry import rotation
 from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import HandEstimator
 from thirdhand.core.intake.motion_model import models
-from thirdhand.core.intake.step import ARM, report, take_arm, take_hand
+from thirdhand.core.intake.step import report, take_arm, take_hand
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import HandSettings, Settings
 
+ARM = SOURCES.index("arm")
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
 
@@ -106,16 +107,7 @@ class Intake:
             least_mode_probability=round(math.exp(-(numbers.outlier_stds**2)), 9),
             tremor_rates_per_s=numbers.tremor_rates_per_s,
             jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
-            sources_apart_m=numbers.scatter_on_m,
-            # Below twice the acceleration of the strongest tremor, a hand may move to and fro.
-            to_and_fro_mps2=2.0 * numbers.max_tremor_m * numbers.tremor_rate_per_s**2,
-            # Alternating samples raise the contested share up to this limit.
-            to_and_fro_max_share=2.0 * numbers.contested_on_share,
             contested_off_share=numbers.contested_off_share,
-            scatter_on_m=numbers.scatter_on_m,
-            scatter_off_m=numbers.scatter_off_m,
-            # With fewer, one outlier in four differences looks like scatter.
-            scatter_least_samples=numbers.noise_samples // 2,
             max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
@@ -132,7 +124,9 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""
-        for field in ("tick", "hand_ticks", "memory_ticks", "arm_tick", "arm_still_tick", "sample_ticks", "clock_tick"):
+        for field in ("tick", "hand_ticks", "clock_tick", "memory_ticks"):
+            state[field] = -1
+        for field in ("arm_tick", "arm_still_tick", "arm_sample_ticks"):
             state[field] = -1
         state["stale_ticks"] = self._stale_ticks
         self._estimator.begin(state)

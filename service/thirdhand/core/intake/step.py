@@ -8,7 +8,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.contract.records import SOURCES, Cause
+from thirdhand.contract.records import Cause
 from thirdhand.core.codes import (
     ARM_GUIDED,
     ARM_HEARD,
@@ -26,31 +26,23 @@ from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
 from thirdhand.core.intake.arm_samples import compared, unwrap
 from thirdhand.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
 from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
-from thirdhand.core.intake.plausibility import is_confirmed, is_of_another, is_swapped, is_to_and_fro
+from thirdhand.core.intake.plausibility import is_confirmed, is_swapped
 from thirdhand.core.vectors import distance, squared_distance
 
 NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
 REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
-JUMPED, SWAPPED, ARM = int(Cause.JUMPED), int(Cause.SWAPPED), SOURCES.index("arm")
+JUMPED, SWAPPED = int(Cause.JUMPED), int(Cause.SWAPPED)
 
 
 @compiled
-def is_contested(states: Records, parameters: Records, already: bool) -> bool:
-    """True if a hand or the arm is contested: two sources report it.
-
-    A source is contested if its `contested` share is above contested_on_share, or if the noise of a
-    hand's samples is above scatter_on_m. If it was contested `already`, the lower limits
-    contested_off_share and scatter_off_m apply.
+def is_contested(states: Records, parameters: Records) -> bool:
+    """True if two sources report the arm: its share of contradicting states is above
+    contested_on_share, or above contested_off_share if it was contested at the last tick.
     """
     state, config = states[0], parameters[0]
-    share, scatter_m = config.contested_on_share, config.scatter_on_m
-    if already:
-        share, scatter_m = config.contested_off_share, config.scatter_off_m
-    for side in range(2):
-        known = already or state.noise_samples[side] >= config.scatter_least_samples
-        if known and state.noise_variance[side] > scatter_m**2:
-            return True
-    return bool(state.contested.max() > share)
+    was_contested = state.reason == TWO_SOURCES
+    limit = config.contested_off_share if was_contested else config.contested_on_share
+    return bool(state.arm_contested > limit)
 
 
 @compiled
@@ -72,25 +64,27 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
 
 
 @compiled
-def note(states: Records, parameters: Records, source: int, jumped: bool, most_s: float) -> None:
-    """Update the share c of a source's recent samples that contradict the others:
+def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
+    """Update the share c of the arm's recent states that contradict the others:
 
         c = c + (1 - exp(-Δ / tracker_memory_s)) (jumped - c)
 
-    Δ is half the time since the tick with a sample before the last one; for a further sample in the
-    same tick, it is the time since the last tick with one. Δ is at most `most_s`, after which the
-    source is silent. So the samples of two trackers that take turns have the same weight, however
-    soon one follows the other.
+    Δ is half the time since the tick with a state before the last one; for a further state in the
+    same tick, it is the time since the last tick with one. Δ is at most the time after which the
+    arm is silent. So the states of two drivers that take turns have the same weight, however soon
+    one follows the other.
     """
-    state = states[0]
-    ticks, share = state.sample_ticks[source], state.contested[source]
+    state, config = states[0], parameters[0]
+    ticks = state.arm_sample_ticks
     passed = float(state.tick - ticks[0])
     if ticks[1] < state.tick:
-        passed *= 0.5  # half the time since the sample before the last one
-        ticks[0], ticks[1] = ticks[1], state.tick
-    passed_s = min(passed * parameters[0].period_s, most_s)
-    share += (1.0 - exp(-passed_s / parameters[0].tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
-    state.contested[source] = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
+        passed *= 0.5  # half the time since the state before the last one
+        ticks[0] = ticks[1]
+        ticks[1] = state.tick
+    passed_s = min(passed * config.period_s, config.silent_ticks * config.period_s)
+    share = state.arm_contested
+    share += (1.0 - exp(-passed_s / config.tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
+    state.arm_contested = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
 
 
 @compiled
@@ -110,23 +104,6 @@ def has_jumped(
         config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
     )
     return bool(squared_distance(position, expected) > gate * gate)
-
-
-@compiled
-def _turns_hard(states: Records, parameters: Records, side: int, at: int, position: Vector, after_s: float) -> bool:
-    """True if a hand at x_0 (3,) [m], h_0 after the retained sample x_1 at ring index `at`, which
-    followed x_2 after h_1, would have accelerated by at least to_and_fro_mps2:
-
-        |(x_0 - x_1) / h_0 - (x_1 - x_2) / h_1| / ((h_0 + h_1) / 2) >= to_and_fro_mps2
-
-    Intervals h are at least a period, also those within a tick.
-    """
-    past, wanted, period_s = states[0].kept_past[side, at], 0.0, parameters[0].period_s
-    after_s, before_s = max(after_s, period_s), max(states[0].kept_noise[side, at, 3], period_s)
-    for axis in range(3):
-        turned = (position[axis] - past[0, axis]) / after_s - (past[0, axis] - past[1, axis]) / before_s
-        wanted += (2.0 * turned / (after_s + before_s)) ** 2
-    return bool(wanted >= parameters[0].to_and_fro_mps2 ** 2)
 
 
 @compiled
@@ -151,7 +128,7 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
         jumped = fresh and off > config.joint_jump_rad + config.joint_jump_speed * passed_s
-        note(states, parameters, ARM, jumped, silent_s)
+        note_arm(states, parameters, jumped)
         if jumped and cause < 0:
             cause = JUMPED
     if near and (moved > config.arm_still_rad or not fresh):
@@ -219,6 +196,53 @@ def _in_time(
 
 
 @compiled
+def _in_base(position: tuple[float, float, float], frame: Vector) -> Vector:
+    """Position (3,) [m] in frame base of a tracker's position, by its axes times its unit, and its
+    origin: `frame` (3, 4).
+    """
+    in_base = np.empty(3)
+    for i in range(3):
+        in_base[i] = frame[i, 3]
+        for k in range(3):
+            in_base[i] += frame[i, k] * position[k]
+    return in_base
+
+
+@compiled
+def _jump(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    order: int,
+    made: int,
+    position: Vector,
+    fresh: bool,
+) -> tuple[bool, int]:
+    """Whether a hand's sample (3,) [m], number `order` among the retained ones and made in tick
+    `made`, has jumped; and the number of samples before it that were wrong, if it continues the
+    ones before those.
+    """
+    state, config = states[0], parameters[0]
+    jumped, wrong = False, 0
+    if fresh:
+        prediction = state.hands[side, 0].copy()
+        if order > 0 or made != state.tick:
+            expected(states, models, side, order, made, prediction)
+        neighbour = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
+        interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
+        jumped = has_jumped(states, parameters, side, position, prediction, interval_s)
+        if jumped and order == 0:
+            wrong = wrong_samples(states, parameters, models, side, made, position)
+            jumped = wrong == 0
+
+    # A hand may also reappear where the other hand was.
+    if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
+        jumped = is_swapped(states, parameters, side, position)
+    return jumped, wrong
+
+
+@compiled
 def take_hand(
     states: Records,
     parameters: Records,
@@ -235,42 +259,24 @@ def take_hand(
     `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
     `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
-    state, config, in_base = states[0], parameters[0], np.empty(3)
-    period_s = config.period_s
-    for i in range(3):
-        in_base[i] = frame[i, 3]
-        for k in range(3):
-            in_base[i] += frame[i, k] * position[k]
+    state = states[0]
+    in_base = _in_base(position, frame)
     fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
-    jumped, order, made, wrong = False, 0, state.tick, 0
+
+    # Is the sample accepted?
+    order, made, jumped, wrong = 0, state.tick, False, 0
     cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
         cause, order, made = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
-        another = False
-        if fresh and cause != REPEATED:
-            there = state.hands[side, 0].copy()
-            if order > 0 or made != state.tick:
-                expected(states, models, side, order, made, there)
-            at = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
-            passed_s = abs(made - state.kept_ticks[side, at]) * period_s
-            jumped = has_jumped(states, parameters, side, in_base, there, passed_s)
-            another = jumped and is_of_another(states, parameters, side, in_base, there)
-            if jumped and not another and cause < 0 and order == 0:
-                wrong = wrong_samples(states, parameters, models, side, made, in_base)
-            if not another and order < state.kept[side] and state.contested[side] < config.to_and_fro_max_share:
-                # a higher share would only decay later
-                another = _turns_hard(states, parameters, side, at, in_base, passed_s)
-                another = another and is_to_and_fro(states, parameters, side, order, in_base)
-            jumped = jumped and wrong == 0
-        if cause != REPEATED:
-            note(states, parameters, side, another, state.stale_ticks[side] * period_s)
-            if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
-                jumped = is_swapped(states, parameters, side, in_base)
-        if cause < 0 and jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
+    if cause < 0:
+        jumped, wrong = _jump(states, parameters, models, side, order, made, in_base, fresh)
+        if jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
+
+    # It is filtered after the samples made before it, without the wrong ones.
     before = state.hands[side, 0].copy()
     if wrong > 0:
         drop(states, side, wrong)
@@ -279,10 +285,12 @@ def take_hand(
     else:
         note_clock(states, parameters, side, stamp_ns, fresh)
         take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
+
+    # The newest sample is what later ones are compared with.
     if order == 0:
         _note_correction(states, parameters, side, wrong, before)
-        state.jump_count[side] = state.jump_is_swap[side] = 0
-        state.jump_is_swap[1 - side] = 0  # this hand is seen, so the other one is not taken for it
+        state.jump_count[side] = 0
+        state.jump_is_swap[:] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, frame)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
@@ -342,5 +350,4 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
             known |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
         known |= CLUTCH_RELEASED
-    contested = is_contested(states, parameters, state.reason == TWO_SOURCES)
-    return known | CONTESTED if contested else known
+    return known | CONTESTED if is_contested(states, parameters) else known

@@ -61,20 +61,18 @@ class IntakeTuning(NamedTuple):
     # Late samples.
     # 0.03 to 0.3. More: later samples are used. Less: late samples are rejected sooner.
     max_late_s: float = 0.1  # samples older than the newest one by more are rejected; longer delays count as this
-    # 0.3 to 5. More: judgements are steadier. Less: drift and second sources are seen sooner.
-    tracker_memory_s: float = 1.0  # time over which a tracker's minimum delay and its contradictions are judged
+    # 0.3 to 5. More: judgements are steadier. Less: drift and a second arm are seen sooner.
+    tracker_memory_s: float = 1.0  # time over which a tracker's minimum delay and the arm's contradictions are judged
     # 2e-3 to 0.05. More: worse clocks are trusted. Less: good clocks are doubted.
     delay_tolerance_s: float = 0.01  # minimum delays of two windows agree within this: 1 % of drift between two clocks
 
-    # Jumps, and two sources that contradict each other.
+    # Jumps, and two sources of the arm.
     # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
     max_hand_distance_m: float = 5.0  # samples farther from the base plate are rejected; their unit is probably wrong
     # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
     confirmed_s: float = 0.02  # successive samples that confirm a jump span at least this time
-    # 0.1 to 0.8. More: noise looks like two sources. Less: noisy sources are mixed.
-    source_spread_share: float = 0.4  # largest scatter of one source's samples / distance between the sources
-    # 0.1 to 0.5. More: two sources are tolerated longer. Less: outliers hold the arm.
-    contested_on_share: float = 0.25  # a source is contested above this share of contradicting samples
+    # 0.1 to 0.5. More: two arms are tolerated longer. Less: outliers hold the arm.
+    contested_on_share: float = 0.25  # the arm is contested above this share of contradicting states
 
     # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
     # 0.05 to 1. More: jumps of the arm pass. Less: coarse joint states are rejected.
@@ -120,20 +118,8 @@ class IntakeTuning(NamedTuple):
 
     @property
     def contested_off_share(self) -> float:
-        """A contested source remains so until its share of contradicting samples is below this."""
+        """A contested arm remains so until its share of contradicting states is below this."""
         return self.end_share * self.contested_on_share
-
-    @property
-    def scatter_on_m(self) -> float:
-        """A hand is contested above this standard deviation of its samples on each axis. The
-        positions of two sources are also at least this far apart, as tremor spans as much.
-        """
-        return 2.0 * self.max_tremor_m
-
-    @property
-    def scatter_off_m(self) -> float:
-        """A contested hand remains so until the standard deviation is below this."""
-        return self.end_share * self.scatter_on_m
 
     @property
     def max_joint_radps(self) -> float:

@@ -122,6 +122,10 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     captured.write(path, places)
     for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
+    for key, count in captured.of_others.items():
+        print(
+            f"{count} messages on {key} are left out: a second tracker publishes this hand; stop one", file=sys.stderr
+        )
 
 
 def _say_over_progress(line: str) -> None:

@@ -28,10 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thirdhand.contract.messages import BASE, PoseStamped
-from thirdhand.contract.records import Cause, Reason
-from thirdhand.core.frame import Vector, as_array, blank, state_layout
+from thirdhand.contract.records import Cause
+from thirdhand.core.frame import Vector, blank, state_layout
 from thirdhand.core.intake.stage import Intake
-from thirdhand.core.intake.step import is_contested
 from thirdhand.core.tuning import TUNING
 from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.workbench.takes.track import Track
@@ -60,7 +59,6 @@ class Distrust(StrEnum):
     JUMPED = "a motion that no hand can make"
     SWAPPED = "at the position of the other hand"
     LOST = "one pose repeated bit by bit, by a tracker that has lost the hand"
-    CONTESTED = "reported by two sources"
     UNSEEN = "not seen"
     REPEATED = "repeated stamps"
     OLDER = "stamps older than those before"
@@ -174,7 +172,6 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
         (int(ns) - start_ns, side, i) for side, track in enumerate(tracks) for i, ns in enumerate(track.stamps_ns)
     )
     rows = [track.poses.tolist() for track in tracks]
-    disputed_ns: tuple[list[int], ...] = tuple([] for _ in tracks)
     ticked, period_ns = 0, 1e9 * settings.period_s
     for stamp_ns, side, i in merged:
         tick = round(stamp_ns / period_ns)
@@ -186,29 +183,7 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
             out[side].why[i] = Distrust.__members__.get(Cause(causes[0]).name, Distrust.UNSEEN)
         else:
             out[side].restarts[i] = bool(state["kept_restarts"][side, state["kept_newest"][side]])
-        is_disputed = bool(
-            is_contested(as_array(state), intake.parameters, bool(state["reason"] == Reason.TWO_SOURCES))
-        )
-        state["reason"] = Reason.TWO_SOURCES if is_disputed else Reason.NONE
-        for one in range(len(tracks)) if is_disputed else ():
-            if (
-                state["contested"][one] > TUNING.intake.contested_off_share
-                or state["noise_variance"][one] > TUNING.intake.scatter_off_m**2
-            ):
-                disputed_ns[one].append(stamp_ns + start_ns)
-    for track, verdict, times in zip(tracks, out, disputed_ns, strict=True):
-        mask = _is_before(track.stamps_ns, np.array(times, np.int64), round(1e9 * TUNING.intake.tracker_memory_s))
-        for i in np.flatnonzero(mask).tolist():
-            verdict.why[i] = Distrust.CONTESTED
     return out
-
-
-def _is_before(stamps: NDArray[np.int64], times: NDArray[np.int64], most_ns: int) -> Mask:
-    """A mask (N,) of the stamps that one of the times follows within `most_ns` [ns]."""
-    if not len(times):
-        return np.zeros(len(stamps), bool)
-    following = np.searchsorted(times, stamps)
-    return np.asarray((following < len(times)) & (times[np.minimum(following, len(times) - 1)] - stamps <= most_ns))
 
 
 def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[Distrust]:

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import zenoh
 
-from thirdhand.client import endpoints, open_session
+from thirdhand.client import Publisher, endpoints, open_session
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.records import SIDES
@@ -109,7 +109,7 @@ def swaying(skill: Skill, t: float) -> list[tuple[float, float, float]]:
 def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], None]:
     """A function that publishes both swaying hands of a time [s] with a stamp [ns]."""
     cell = Settings().cell
-    publishers = [session.declare_publisher(channels.key(cell, f"hands/{side}"), express=True) for side in SIDES]
+    publishers = [Publisher(session, cell, f"hands/{side}") for side in SIDES]
 
     def publish(t: float, stamp_ns: int) -> None:
         for publisher, place in zip(publishers, swaying(skill, t), strict=True):

@@ -15,6 +15,7 @@ import numpy as np
 import zenoh
 
 from thirdhand.client import Overheard
+from thirdhand.client.publisher_identity import SolePublisher, identity
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.channels import TAKE_KEYS
 from thirdhand.contract.explain import ExplainedError
@@ -77,7 +78,9 @@ class Capture:
             key: [] for key in CAPTURED_KEYS if key not in HAND_KEYS or key in self.hands
         }
         self.malformed: dict[str, int] = {}
-        self._waiting: dict[str, list[tuple[int, bytes]]] = {key: [] for key in self.samples}
+        self.of_others: dict[str, int] = {}  # messages of a hand's second publisher, which are left out
+        self._sole = {key: SolePublisher() for key in self.hands}
+        self._waiting: dict[str, list[tuple[int, bytes, str]]] = {key: [] for key in self.samples}
         self._heard_s, self._moved = time.monotonic(), False
         self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         heard = [(channels.key(cell, key), self._listener(key)) for key in self.samples]
@@ -94,12 +97,13 @@ class Capture:
 
         def take(sample: zenoh.Sample) -> None:
             arrived_ns, payload = time.time_ns(), sample.payload.to_bytes()
+            publisher = identity(sample)
             if not frame:
-                waiting.append((arrived_ns, payload))
+                waiting.append((arrived_ns, payload, publisher))
             elif name in payload:
                 try:
                     poses = cdr.decode_transforms(payload, (frame,))
-                    waiting.extend((arrived_ns, cdr.encode_pose(pose)) for _, pose in poses)
+                    waiting.extend((arrived_ns, cdr.encode_pose(pose), publisher) for _, pose in poses)
                 except WireError:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
 
@@ -115,13 +119,18 @@ class Capture:
         """Decode the messages since the last call; unreadable ones are counted."""
         for key, waiting in self._waiting.items():
             while waiting:
-                arrived_ns, payload = waiting.pop(0)
+                arrived_ns, payload, publisher = waiting.pop(0)
                 self._heard_s = time.monotonic()
                 try:
                     sample = (self._state if key == JOINT_STATES else self._sample)(key, arrived_ns, payload)
-                    self.samples[key] += [] if sample is None else [sample]
                 except WireError:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
+                    continue
+                sole = self._sole.get(key)
+                if sole is not None and sole.is_other(publisher, arrived_ns / 1e9):
+                    self.of_others[key] = self.of_others.get(key, 0) + 1
+                elif sample is not None:
+                    self.samples[key].append(sample)
 
     def _state(self, key: str, arrived_ns: int, payload: bytes) -> Sample | None:
         """The state of all joints that a message completes; None if it completes none."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import zenoh
 
-from thirdhand.client import publisher
+from thirdhand.client import Publisher
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import GRIPPER, JointState
 
@@ -25,7 +25,7 @@ class Pinches:
     ) -> None:
         self._clutch, self._gripper, self._is_pressed = clutch, gripper, False
         self._publishers = {
-            key: publisher(session, cell, key, express=True)
+            key: Publisher(session, cell, key)
             for key, side in (("clutch", clutch), ("gripper/wish", gripper))
             if side is not None
         }
