@@ -1,10 +1,10 @@
 """`python docs/experiments_page.py` writes the figures of the experiments from
 recordings/experiments: experiments.md from its template, experiments.md.jinja; in the README,
-camera.md, tune.md and faults.md what stands between `<!-- evidence -->` marks, and the last cells
-of the table of faults.
+tune.md and faults.md what stands between `<!-- evidence -->` marks, and the last cells of the table
+of faults.
 
-A number of a template is an expression of a result, as `{{ camera.pictures | fixed(1) }}`; without
-that result it is an error. What was measured with another version is marked as stale.
+A number of a template is an expression of a result, as `{{ people.people }}`; without that result
+it is an error. What was measured with another version is marked as stale.
 """
 
 from __future__ import annotations
@@ -38,14 +38,6 @@ teacher would take. A mere look-up of the taught places succeeds in
 {{ people.methods.look_up.success.mean | percent }} %, but its tool takes that path in
 {{ people.methods.look_up.success_on_the_way.mean | percent }} %.
 [docs/experiments.md](docs/experiments.md) has all results, and how they were measured.""",
-    "docs/camera.md": """{{ stale("camera") }}
-| method | error, median | 95 % | of depth | about its mean, median | 95 % |
-|---|---|---|---|---|---|
-{% for name, one in camera.methods.items() -%}
-| {{ name }} | {{ one.median_mm | fixed }} mm | {{ one.p95_mm | fixed }} mm | \
-{{ one.depth_mm | fixed }} mm | {{ one.about_own_mean_median_mm | fixed }} mm | \
-{{ one.about_own_mean_p95_mm | fixed }} mm |
-{% endfor %}""",
     "docs/tune.md": """{{ stale("motion") }}
 {% if "ours, calmly" in motion.by_follower -%}
 | `follow` | error, rms | lag | jerk, multiple of the hands' | overshoot of sudden stops, mean | worst |

@@ -127,7 +127,7 @@ CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's nu
     "hands": lambda found: is_evidence(found["evidence_is_periods_skipped_at_most"]),
     "statistics": is_stable_only_with_places,
 }
-ELSEWHERE = {"motion-of-others", "sensitivity", "camera", "people", "partners", "faults"}  # or hours long
+ELSEWHERE = {"motion-of-others", "sensitivity", "people", "partners", "faults"}  # or hours long
 
 
 @pytest.mark.usefixtures("close_figures")

@@ -150,5 +150,4 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     ),
     "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
     "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
-    "camera": Experiment("camera", (), Seeds({"hands": Stream("rendered hands", 0, range(12))})),
 }
