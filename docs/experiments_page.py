@@ -87,11 +87,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     )
     stale = {name for name, result in results.items() if staleness(name, result, here)}
 
-    def at_six(method: str) -> dict[str, Any]:
-        """The row of a method with six inputs."""
-        rows = results["promp"]["dimensions"]
-        return next(row for row in rows if (row["method"], row["inputs"]) == (method, 6))
-
     def table_miss(who: str) -> float:
         """The largest miss of a point [cm] by a method of Table I."""
         rows = [results["table"][letters][who] for letters in ("modelled", "recorded")]
@@ -119,7 +114,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
 
     found.globals |= {name.replace("-", "_"): result for name, result in results.items()}
     found.globals |= {
-        "at_six": at_six,
         "table_miss": table_miss,
         "share": share,
         "version": version,
@@ -133,7 +127,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
         "percent": lambda value, digits=0: f"{100 * value:.{digits}f}",
         "up": lambda value, digits: f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.{digits}f}",
         "significant": significant,
-        "thousands": lambda value: f"{value:,}".replace(",", " "),
         "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
         "word": lambda value: WORDS.get(value, str(value)),
         "judged": verdict,

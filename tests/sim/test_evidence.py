@@ -124,12 +124,12 @@ class TestAll:
     @pytest.fixture(autouse=True)
     def runs(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         """How often each was run, and the error of the one that fails."""
-        seen: dict[str, Any] = {"letters": 0, "promp": 0, "table": 0, "error": ExperimentError("no letters")}
+        seen: dict[str, Any] = {"letters": 0, "statistics": 0, "table": 0, "error": ExperimentError("no letters")}
 
         def module(name: str) -> ModuleType:
             def run(results: Any, options: Options) -> dict[str, Any]:
                 seen[name] += 1
-                if name == "promp" and seen["error"]:
+                if name == "statistics" and seen["error"]:
                     raise seen["error"]
                 return {"found": 1}
 
@@ -137,7 +137,7 @@ class TestAll:
             one.run = run  # type: ignore[attr-defined]
             return one
 
-        few = {name: EXPERIMENTS[name] for name in ("letters", "promp", "table")}
+        few = {name: EXPERIMENTS[name] for name in ("letters", "statistics", "table")}
         for name in few:
             monkeypatch.setitem(sys.modules, f"thirdhand_sim.lab.{EXPERIMENTS[name].module}", module(name))
         monkeypatch.setattr(
@@ -152,12 +152,14 @@ class TestAll:
         """Goes on after a failure and makes only what is missing the next time."""
         runs["error"] = error
         assert main(["all", "--output", str(tmp_path), "--quiet"]) == 1
-        assert f"promp: {error}" in capsys.readouterr().err.replace("Traceback", "").replace("ValueError: ", "promp: ")
+        assert f"statistics: {error}" in capsys.readouterr().err.replace("Traceback", "").replace(
+            "ValueError: ", "statistics: "
+        )
         runs["error"] = None
         assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "promp", "table")] == [1, 2, 1]
+        assert [runs[name] for name in ("letters", "statistics", "table")] == [1, 2, 1]
         assert main(["all", "--output", str(tmp_path), "--anew", "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "promp", "table")] == [2, 3, 2]
+        assert [runs[name] for name in ("letters", "statistics", "table")] == [2, 3, 2]
         assert set(json.loads((tmp_path / "table.json").read_text())) > NAMED
 
     def test_makes_what_is_stale_and_lists_it(
@@ -173,7 +175,7 @@ class TestAll:
         assert [line.split()[0] for line in listed] == ["letters", "motion-of-others", "2"]
         assert "kmp changed since" in listed[0]
         assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "promp", "table")] == [2, 1, 1]
+        assert [runs[name] for name in ("letters", "statistics", "table")] == [2, 1, 1]
 
     def test_file_that_is_no_result_is_named(
         self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -184,4 +186,4 @@ class TestAll:
         for command in ("stale", "all"):
             assert main([command, "--output", str(tmp_path), "--quiet"]) == 1
             assert f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
-        assert [runs[name] for name in ("letters", "promp", "table")] == [0, 1, 1]
+        assert [runs[name] for name in ("letters", "statistics", "table")] == [0, 1, 1]

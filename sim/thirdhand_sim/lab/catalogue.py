@@ -95,7 +95,6 @@ def _letters(seed: int) -> dict[str, Stream]:
 TUNED_SCENES = {"scenes": Stream("random scene", 2019, range(100))}
 SHIPPED = Stream("demonstration", 1, range(1, 6))
 _SHIPPED = {"demonstrations": SHIPPED}
-_IN_SPACE = {"letters": Stream("letter in space", 3, range(4))}
 # The ridge of ProMP was chosen on the letters of seed 0.
 _WRITTEN = Seeds(_letters(1), tuning=_letters(0))
 _TUNED_HANDS = {"people": Stream("moving hands", 0, range(3)), "stops": Stream("sudden stop", 0, range(24))}
@@ -119,7 +118,6 @@ _FOLLOWED = {
     "small": Stream("small motion", 0, range(200, 202)),
 }
 _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
-_FUNCTIONS = {"functions": Stream("random function", 0, range(5))}
 _SENSITIVITY = Seeds(  # one of each for each seed of a session
     {},
     tuning={
@@ -142,12 +140,6 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "separation": Experiment("separation", CORE, Seeds(_scenes(100), tuning=TUNED_SCENES)),
     "faults": Experiment("load.faults", CORE, Seeds(_hands(Scene().seed)), ("arm",)),
     "letters": Experiment("reproduction.letters", KMP, _WRITTEN, ("letters",)),
-    "promp": Experiment(
-        "reproduction.promp", KMP, Seeds(_letters(1) | _FUNCTIONS, tuning=_WRITTEN.tuning), ("letters",)
-    ),
-    "correlation": Experiment(
-        "reproduction.correlation", KMP, Seeds(_IN_SPACE | {"points": Stream("via-point", 0, range(2))})
-    ),
     "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
     "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
 }

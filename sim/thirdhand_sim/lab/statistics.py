@@ -1,5 +1,5 @@
 """Success rate of the task with taught places: 100 random scenes in closed loop, our skill beside
-rivals, some of which need no demonstration; and a few scenes in real time over Zenoh.
+rivals, some of which need no demonstration.
 """
 
 from __future__ import annotations
@@ -13,24 +13,22 @@ import rerun as rr
 
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand_sim.lab.catalogue import DRAWING, EXPERIMENTS
-from thirdhand_sim.lab.load.live import is_evidence, steady_run
 from thirdhand_sim.lab.reached import EVENTS, places_in, shown
 from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.lab.results import ADAPTED, OTHER, Options, Results, brief, pyplot, rgb
+from thirdhand_sim.lab.results import ADAPTED, OTHER, Options, Results, pyplot, rgb
 from thirdhand_sim.lab.rivals.as_skill import in_bench
 from thirdhand_sim.lab.rivals.gaussian_process import SampleProcess
 from thirdhand_sim.lab.rivals.method import Learn, Model
 from thirdhand_sim.lab.rivals.mixtures import MixtureRegression
 from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
-from thirdhand_sim.lab.rivals.promp import ProMPOverTime
-from thirdhand_sim.lab.rivals.service import COMPONENTS, LearnedByService, Paper
+from thirdhand_sim.lab.rivals.service import COMPONENTS, LearnedByService
 from thirdhand_sim.lab.scenes import draw
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.people import Places
 from thirdhand_sim.scene import GRASP_DISTANCE
 
 SEEDS = EXPERIMENTS["statistics"].seeds
-SCENES, LIVE_SCENES = SEEDS.evaluation["scenes"], 3
+SCENES = SEEDS.evaluation["scenes"]
 ELL = 5.0  # [1/m²] as the shipped skill
 OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
 METHODS: dict[str, tuple[str, Learn]] = {
@@ -39,8 +37,6 @@ METHODS: dict[str, tuple[str, Learn]] = {
     "look_up": ("look-up of these,\nweighted by distance", LookUp().learn),
     "gaussian_process_5": ("Gaussian process,\nour ell, same places", SampleProcess(ell=ELL).learn),
     "gaussian_process": ("Gaussian process,\nsame places", SampleProcess().learn),
-    "paper": ("KMP, the paper's\nell, lambda, points", Paper().learn),
-    "promp": ("ProMP over time,\nnominal speed", ProMPOverTime().learn),
     "gmr": ("GMR alone", MixtureRegression(COMPONENTS).learn),
 }
 LEAST_MM = 1e-3  # errors are rounded to it; a logarithmic axis shows nothing smaller
@@ -82,7 +78,6 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     scenes = SCENES.share(options.share)
     count = len(scenes)
-    live_count = LIVE_SCENES if options.share == 1 else 0
     tasks = [(method, number) for method in METHODS for number in scenes]
     found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
     for one in shared_out(outcome, tasks, options.workers):
@@ -92,7 +87,6 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"scene {one.number} missed: {one.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
             results.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
-    in_real_time = [_in_real_time(results, inside) for inside in found["ours"][:live_count]]
     paths = {f"/{name}/{method}": (method, i) for method in found for i, name in enumerate(EVENTS)}
     styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(who))], names=[who]) for path, (who, _) in paths.items()}
     values = {path: [one.errors_mm[i] for one in found[who]] for path, (who, i) in paths.items()}
@@ -104,26 +98,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "methods": {method: _summary(rows) for method, rows in found.items()},
         "failed_scenes_of_ours": [one.number for one in found["ours"] if not one.success],
         "held_s_of_ours": max(one.held_s for one in found["ours"]),
-        "in_real_time": in_real_time,
         "errors_mm_by_scene": {method: [one.errors_mm for one in rows] for method, rows in found.items()},
     }
     draw_numbers(results, numbers)
     return numbers
-
-
-def _in_real_time(results: Results, inside: Outcome) -> dict[str, Any]:
-    """The scene of an outcome again, over Zenoh in real time, and whether both agree."""
-    live, _ = steady_run(draw(inside.number, seed=SCENES.seed), results.folder)
-    found = {
-        "scene": inside.number,
-        "success": live.success,
-        "errors_mm": [getattr(live.events, name).error_mm for name in EVENTS],
-        "errors_in_process_mm": inside.errors_mm,
-        "agrees": live.success == inside.success,
-        "evidence": is_evidence(live.skipped),
-    }
-    results.say(f"scene {inside.number} over Zenoh in real time: {brief(found)}")
-    return found
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from thirdhand_sim.lab.people.trials import (
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
 from thirdhand_sim.lab.rivals.method import Method, Model
-from thirdhand_sim.lab.rivals.mixtures import MixtureRegression, TaskParameterised
+from thirdhand_sim.lab.rivals.mixtures import MixtureRegression
 from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
 from thirdhand_sim.lab.rivals.promp import InteractionProMP
 from thirdhand_sim.lab.rivals.service import Service, ServiceAsPaper
@@ -83,13 +83,6 @@ METHODS = {
             InteractionProMP(by_length=by_length, hands_m=hands_m)
             for by_length in (True, False)
             for hands_m in (0.01, 0.02, 0.03)
-        ),
-    ),
-    "tp_gmm": Entry(
-        "TP-GMM",
-        tuple(
-            TaskParameterised(components, 0.01, iterations)
-            for components, iterations in ((6, 40), (10, 1), (20, 3), (10, 3), (10, 40), (20, 1))
         ),
     ),
 }
@@ -189,11 +182,6 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             method: {
                 **({} if method == TEACHER else {"parameters": repr(METHODS[method].candidates[0])}),
                 **summary(rows),
-                "success_by_sigma_mm": {
-                    f"{1000 * sigma:g}": float(np.mean([o.success for o in rows if o.number % 2 == i]))
-                    for i, sigma in enumerate(SIGMAS_M)
-                },
-                "success_more_than_ours": _more(rows, main["ours"]),
             }
             for method, rows in main.items()
         },
@@ -248,13 +236,6 @@ def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
     success = [float(np.mean([one.success for one in rows])) for rows in tried]
     path = [float(np.mean([one.path_mm for one in rows])) for rows in tried]
     return min((p, i) for i, p in enumerate(path) if success[i] >= max(success) - SAME)[1]
-
-
-def _more(rows: Sequence[Outcome], ours: Sequence[Outcome]) -> dict[str, float]:
-    """Difference of its success rate to ours, scene by scene."""
-    difference = np.array([float(a.success) - float(b.success) for a, b in zip(rows, ours, strict=True)])
-    mean, low, high = _resampled(rows, difference)
-    return {"mean": mean, "low": low, "high": high}
 
 
 def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, float]:

@@ -95,16 +95,11 @@ class Line(NamedTuple):
         at = [int(np.argmin(np.abs(TIMES - t))) for t in self.case.times]
         return np.asarray(np.linalg.norm(self.points[at] - self.case.points, axis=1))
 
-    def measured(self) -> dict[str, float]:
-        """Largest miss, and distances from the demonstrations' mean, by name."""
+    @property
+    def rms_deviation_elsewhere_cm(self) -> float:
+        """Distance from the demonstrations' mean, far from every desired point."""
         off = np.linalg.norm(self.points - self.letter.demonstrations.mean(axis=0), axis=1)
-        away = off[elsewhere(self.case)]
-        return {
-            "miss_cm": float(self.misses.max()),
-            "rms_deviation_elsewhere_cm": _rms(away),
-            "largest_deviation_elsewhere_cm": float(away.max()),
-            "rms_deviation_cm": _rms(off),
-        }
+        return _rms(off[elsewhere(self.case)])
 
 
 def _rms(x: Array) -> float:

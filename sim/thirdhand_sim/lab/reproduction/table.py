@@ -1,8 +1,7 @@
 """The paper's Table I in numbers: DMP, ProMP, mixture regression and KMP on the same letters.
 
 Each letter is adapted as in `letters`. A DMP can be given another start and another end, so its
-via-points are those of the mean that it imitates; mixture regression cannot be given any point. The
-row of inputs of many dimensions is in `promp`, with six of them.
+via-points are those of the mean that it imitates; mixture regression cannot be given any point.
 """
 
 from __future__ import annotations
@@ -12,12 +11,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from kmp import Gaussians
 from thirdhand_sim.lab.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered
-from thirdhand_sim.lab.reproduction.promp import conditioned
 from thirdhand_sim.lab.reproduction.writing import DURATION_S, TIMES
 from thirdhand_sim.lab.results import ADAPTED, DESIRED, OTHER, Array, ExperimentError, Options, Results, pyplot
+from thirdhand_sim.lab.rivals.promp import BASES, learned_promp
 
+VIA_VARIANCE = 1e-6  # [cm²] as for KMP
 WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
 METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}
 SHOWN = ("B", "G")
@@ -43,11 +42,18 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             for case in cases(row)
         ]
         numbers[SETS[name]] = {who: _summary([one[who] for one in found]) for who in methods}
-        numbers[SETS[name]]["inside_95_percent"] = _coverage(rows)
         last = [one for one in found if len(one["kmp"].case.times) == 3]
         shown += [one for one in last if one["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
     _draw(results, shown)
     return numbers
+
+
+def conditioned(letter: Letter, case: Case) -> Array:
+    """The trajectory (200, 2) [cm] of the letter's ProMP through the desired points."""
+    primitive = learned_promp([TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES)
+    for t, point in zip(case.times, case.points, strict=True):
+        primitive = primitive.condition_position(point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S)
+    return np.asarray(primitive.mean_trajectory(TIMES.copy()))
 
 
 def configured(letter: Letter, case: Case) -> Array:
@@ -75,32 +81,8 @@ def _summary(lines: list[Line]) -> dict[str, float]:
             misses[{TIMES[0]: "start", TIMES[-1]: "end"}.get(t, "via")].append(float(miss))
     return {
         **{f"largest_miss_of_{kind}_cm": max(values) for kind, values in misses.items()},
-        "mean_rms_deviation_elsewhere_cm": float(
-            np.mean([line.measured()["rms_deviation_elsewhere_cm"] for line in lines])
-        ),
+        "mean_rms_deviation_elsewhere_cm": float(np.mean([line.rms_deviation_elsewhere_cm for line in lines])),
     }
-
-
-def _coverage(rows: list[Letter]) -> dict[str, float]:
-    """Share of the demonstrations' samples within the predicted 95 % regions [%].
-
-    Of KMP with the scale of its covariance as the paper has it, and of the mixture. A DMP predicts
-    no covariance.
-    """
-    found = {
-        "kmp": [row.primitive.predict(TIMES[:, None]) for row in rows],
-        "gmm": [row.primitive.reference for row in rows],
-    }
-    return {
-        who: 100 * float(np.mean([_inside(row, one) for row, one in zip(rows, each, strict=True)]))
-        for who, each in found.items()
-    }
-
-
-def _inside(row: Letter, predicted: Gaussians) -> float:
-    off = row.demonstrations - predicted.mean
-    squares = np.einsum("hti,tij,htj->ht", off, np.linalg.inv(predicted.covariance), off)
-    return float(np.mean(squares < 5.991))  # chi-square of two degrees of freedom
 
 
 def _draw(results: Results, shown: list[dict[str, Line]]) -> None:

@@ -19,7 +19,7 @@ from thirdhand.core.skill.skill import Earlier, Prediction, Skill
 from thirdhand.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Placed
+from thirdhand_sim.lab.rivals.method import Observed, Placed
 
 HandsToTool: TypeAlias = Callable[[Array], Array]
 """From hands (M, 6) [m] to tool (M, 3) [m]."""
@@ -77,19 +77,9 @@ def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: 
 
 
 def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
-    """A placed model as a skill in a bench, made from `skill`; a rival is never far from its data.
-
-    A rival over time starts with the hands, and its motion is that of its means in time.
-    """
+    """A placed model as a bench's skill, made from `skill`. A rival is never far from its data."""
     if isinstance(placed, Skill):
         return lambda bench: placed
-    if placed.depends_on is DependsOn.TIME:
-
-        def over_time(bench: Bench) -> Said:
-            rows = placed.mean(Observed.resting(np.zeros((3, 6)), bench.time_s + STEPS * MOTION_STEP_S))
-            return Said(differences(*rows))
-
-        return lambda bench: rival(skill, lambda *moving: over_time(bench))
 
     def of_hands(*moving: Array) -> Said:
         return Said(along_hands(lambda at: placed.mean(Observed.resting(at)), *(x[None] for x in moving))[0])

@@ -27,7 +27,6 @@ class DependsOn(Enum):
 
     HANDS = "the hands now"
     PAST = "the hands until now"
-    TIME = "the time since the hands began"
 
 
 class Observed(NamedTuple):

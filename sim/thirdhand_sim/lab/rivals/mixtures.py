@@ -1,9 +1,9 @@
-"""Gaussian mixtures of hands and tool: mixture regression, and its task-parameterised form."""
+"""Gaussian mixtures of hands and tool: mixture regression."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -91,10 +91,6 @@ def log_density(mixture: GaussianMixture, hands: Array) -> Array:
         ],
         axis=1,
     )
-    return _log_sum(logs)
-
-
-def _log_sum(logs: Array) -> Array:
     top = logs.max(axis=1)
     return np.asarray(top + np.log(np.exp(logs - top[:, None]).sum(axis=1)))
 
@@ -109,58 +105,3 @@ def log_normal(x: Array, mean: Array, covariance: Array) -> Array:
 def threshold(densities: Sequence[Array]) -> float:
     """The log density [nat] below which hands are far from the demonstrations."""
     return float(np.quantile(np.concatenate(densities), UNUSUAL)) - SLACK
-
-
-@dataclass(frozen=True)
-class TaskParameterised:
-    """TP-GMM (Calinon 2016): one mixture seen from frames at the start and at each place, whose
-    normals are multiplied where the frames are now, and then conditioned on the hands.
-
-    A frame moves hands and tool each by where they are at its place.
-    """
-
-    components: int = 10
-    regularization_m: float = 0.02
-    iterations: int = 40
-
-    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedFrames:
-        """The mixture, by EM from equal spans of the way; the frames share responsibilities."""
-        local = np.concatenate([joined(one)[:, None] - frames(one.places) for one in demonstrations])  # (M, 4, 9)
-        phase = 0.999 * np.concatenate([path_share(one) for one in demonstrations])
-        count = self.components
-        share = np.eye(count)[(phase * count).astype(int)]
-        weights, means, covariances = np.empty(0), np.empty(0), np.empty(0)
-        for _ in range(self.iterations):
-            total = share.sum(axis=0) + 1e-9
-            weights = total / total.sum()
-            means = np.einsum("mk,mfi->kfi", share, local) / total[:, None, None]
-            off = local[:, None] - means
-            covariances = np.einsum("mk,mkfi,mkfj->kfij", share, off, off, optimize=True) / total[:, None, None, None]
-            covariances += self.regularization_m**2 * np.eye(9)
-            logs = np.log(weights) + np.stack(
-                [sum(log_normal(local[:, f], means[k, f], covariances[k, f]) for f in range(4)) for k in range(count)],
-                axis=1,
-            )
-            share = np.exp(logs - _log_sum(logs)[:, None])
-        learned = LearnedFrames(weights, means, covariances, -np.inf)
-        placed = [log_density(learned.place(one.places).mixture, one.hands) for one in demonstrations]
-        return replace(learned, threshold=threshold(placed))
-
-
-@dataclass(frozen=True, eq=False)
-class LearnedFrames:
-    """A mixture in four frames: weights (K,), means (K, 4, 9), covariances (K, 4, 9, 9) [m]."""
-
-    weights: Array
-    means: Array
-    covariances: Array
-    threshold: float
-
-    def place(self, places: Places) -> LearnedMixture:
-        """The mixture where the frames are now."""
-        precisions = np.linalg.inv(self.covariances)
-        covariances = np.linalg.inv(precisions.sum(axis=1))
-        moved = self.means + frames(places)
-        means = np.einsum("kij,kj->ki", covariances, np.einsum("kfij,kfj->ki", precisions, moved))
-        covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-        return LearnedMixture(GaussianMixture(self.weights, means, covariances), self.threshold)

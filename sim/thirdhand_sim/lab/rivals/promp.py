@@ -1,4 +1,4 @@
-"""ProMPs: over time, and of hands and tool together (interaction ProMP)."""
+"""ProMPs: of a trajectory, and of hands and tool together (interaction ProMP)."""
 
 from __future__ import annotations
 
@@ -7,54 +7,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from thirdhand_sim.lab.results import Array, ExperimentError
-from thirdhand_sim.lab.rivals.method import DependsOn, Law, Observed, Predicted
+from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
 from thirdhand_sim.lab.rivals.mixtures import frames, joined, log_normal, path_share, threshold
 from thirdhand_sim.people import Places
-from thirdhand_sim.scene import Scene
 from thirdhand_sim.sessions import SessionDemonstration
-from thirdhand_sim.teach import places_of
 
-BASES, EXACT_STD_M = 20, 0.0001  # basis functions of each axis over time; deviation of a via-point
+BASES = 20  # basis functions of each axis over time
 # Multiple of the mean variance of the weights: of 0 to 100, about where ProMP changes the rest of a
 # letter as little as KMP does.
 RIDGE = 10.0
 LEAST_STD_M = 0.001
-
-
-@dataclass(frozen=True)
-class ProMPOverTime:
-    """A ProMP over time, conditioned on the places at their nominal times, replayed at nominal
-    speed.
-    """
-
-    def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedOverTime:
-        """From demonstrations with even and equal periods."""
-        length = min(len(one.tool) for one in demonstrations)
-        times = np.linspace(0.0, (length - 1) * float(demonstrations[0].times[1]), length)
-        tools = [one.tool[:length:4] for one in demonstrations]
-        return LearnedOverTime(learned_promp([times[::4]] * len(tools), tools, bases=BASES), float(times[-1]))
-
-
-@dataclass(frozen=True, eq=False)
-class LearnedOverTime:
-    """The primitive of movement_primitives, and its duration [s]."""
-
-    primitive: Any
-    lasts_s: float
-
-    def place(self, places: Places) -> Law:
-        """Conditioned on the places."""
-        conditioned = self.primitive
-        for (begin, end), point in zip(Scene().dwells, places_of(places)[1:], strict=True):
-            conditioned = conditioned.condition_position(
-                np.array(point.tool), EXACT_STD_M**2 * np.eye(3), t=(begin + end) / 2, t_max=self.lasts_s
-            )
-        grid = np.linspace(0.0, self.lasts_s, 1001)
-        spline = CubicSpline(grid, conditioned.mean_trajectory(grid.copy()))
-        return Law(lambda seen: Predicted(spline(np.clip(seen.times, 0.0, self.lasts_s))), DependsOn.TIME)
 
 
 def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, bases: int, ridge: float = RIDGE) -> Any:
