@@ -69,7 +69,7 @@ KMP_GROUPS = {
 CLIENT_GROUPS = {
     "Connect": ("connect", "Connection", "Watch", "SceneObject"),
     "Requests": ("Client",),
-    "Hands and joints": ("Tracker", "Follower", "Command"),
+    "Hands and joints": ("Tracker", "Follower", "Command", "Publisher"),
     "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
     "Errors": ("UnreachableError", "StartingError", "UncertainError", "RefusedError", "SettingsError"),

@@ -133,7 +133,7 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
         (
             {"sources": source("arm", rejected={"older": 90})},
             "arm",
-            ("45% of the states contradict", "one publisher of lab/joints/state", "stop one"),
+            ("9% of the states contradict", "one publisher of lab/joints/state", "stop one"),
         ),
         (
             {"sources": source("left", rejected={"other_publisher": 200})},

@@ -11,10 +11,9 @@ import zenoh
 
 from support.cell import until
 from thirdhand.client import Publisher, endpoints, open_session
-from thirdhand.client.publisher_identity import TAKEOVER_S, SolePublisher
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.messages import BASE, PoseStamped
-from thirdhand.daemon.cell_streams import Arrivals, CellStreams, heard
+from thirdhand.daemon.cell_streams import TAKEOVER_S, Arrivals, CellStreams, SolePublisher, heard
 from thirdhand.settings.config import Settings
 
 KEY = "thirdhand/hands/left"

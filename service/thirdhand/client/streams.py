@@ -75,21 +75,21 @@ class Publisher:
         check_open(session)
         self._session = session
         self._number = 0
-        self._zenoh = session.declare_publisher(
+        self.zenoh = session.declare_publisher(
             channels.key(cell, suffix),
             encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
             congestion_control=zenoh.CongestionControl.DROP,
             express=True,
             **more,
         )
-        self.key = str(self._zenoh.key_expr)
+        self.key = str(self.zenoh.key_expr)
 
-    def put(self, message: bytes, attachment: bytes | None = None) -> None:
+    def put(self, message: bytes) -> None:
         """Publish a message. Raises UnreachableError if another thread closes the session."""
-        source = zenoh.SourceInfo(self._zenoh.id, self._number % channels.MESSAGE_NUMBERS)
+        source = zenoh.SourceInfo(self.zenoh.id, self._number % channels.MESSAGE_NUMBERS)
         self._number += 1
         try:
-            self._zenoh.put(message, attachment=attachment, source_info=source)
+            self.zenoh.put(message, source_info=source)
         except (zenoh.ZError, RuntimeError):
             check_open(self._session)
             raise
@@ -97,11 +97,11 @@ class Publisher:
     @property
     def is_heard(self) -> bool:
         """True if it has a subscriber."""
-        return bool(self._zenoh.matching_status.matching)  # type: ignore[attr-defined]
+        return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
 
     def close(self) -> None:
         """End the publisher."""
-        self._zenoh.undeclare()  # type: ignore[no-untyped-call]
+        self.zenoh.undeclare()  # type: ignore[no-untyped-call]
 
 
 def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:

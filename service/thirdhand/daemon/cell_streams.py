@@ -1,10 +1,15 @@
-"""The daemon's subscribers and publishers of its cell's streams."""
+"""The daemon's subscribers and publishers of its cell's streams.
+
+If two publishers report one hand, the samples of one count. Each message of this library's trackers
+names its publisher, and so does each of a ROS 2 node behind rmw_zenoh. All messages without a name
+count as one publisher's.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from statistics import median
 from typing import Any
@@ -14,7 +19,6 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from thirdhand.client import Publisher
-from thirdhand.client.publisher_identity import SolePublisher, identity
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
@@ -26,6 +30,7 @@ from thirdhand.settings.config import Settings
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+TAKEOVER_S = 0.5  # another publisher of a hand is heard after a silence of this time
 FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
 TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
 EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
@@ -105,6 +110,31 @@ class Arrivals:
         self.why = why
         self.count += 1
         self.malformed += 1
+
+
+def identity(sample: zenoh.Sample) -> str:
+    """The name of a message's publisher on the network; empty if the message has none."""
+    if (source := sample.source_info) is not None:
+        return str(source.source_id)
+    if sample.attachment is not None:
+        return ros2.publisher_of(sample.attachment.to_bytes())
+    return ""
+
+
+class SolePublisher:
+    """The one publisher of a stream that is heard: the first one, until it is silent."""
+
+    def __init__(self) -> None:
+        self._name: str | None = None
+        self._heard_s = 0.0
+
+    def is_other(self, name: str, now_s: float) -> bool:
+        """True if a message that came at `now_s` [s] is of another publisher than the one heard."""
+        if self._name is not None and name != self._name and now_s - self._heard_s < TAKEOVER_S:
+            return True
+        self._name = name
+        self._heard_s = now_s
+        return False
 
 
 class FrozenHand:
@@ -189,10 +219,11 @@ class CellStreams:
             for key, by_frame in frames.items()
         ]
         self._publishers = {
-            channel.key: Publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME)
+            channel.key: Publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME).zenoh
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
+        self._sent = Counter[str]()  # messages by channel
         self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
 
     def receive(self) -> list[Event]:
@@ -269,7 +300,10 @@ class CellStreams:
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""
-        self._publishers[suffix].put(payload, attachment)
+        publisher = self._publishers[suffix]
+        source = zenoh.SourceInfo(publisher.id, self._sent[suffix] % channels.MESSAGE_NUMBERS)
+        self._sent[suffix] += 1
+        publisher.put(payload, attachment=attachment, source_info=source)
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
 
@@ -283,7 +317,7 @@ class CellStreams:
     @property
     def is_followed(self) -> bool:
         """True if the commands have a subscriber."""
-        return self._publishers["joints/command"].is_heard
+        return bool(self._publishers["joints/command"].matching_status.matching)  # type: ignore[attr-defined]
 
     def close(self) -> None:
         """End the threads beside the loop."""

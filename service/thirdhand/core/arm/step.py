@@ -152,75 +152,127 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     |T y - (goal acceleration)|² + damping |y|², in the first three rows, within the acceleration
     limits.
     """
-    arm, here, goal = arms[0], heres[0], goals[0]
-    tasks, scale, damping = here.tasks, arm.scale, here.damping
-    count_of_tasks, joints = tasks.shape
-    wanted, error, linear, turn = np.empty(count_of_tasks), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
-        error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M) - arm.period_s * linear[i]
-    distance = norm(error)
-    # rate is constant for small errors; large errors are closed at constant deceleration
-    near = arm.closing_braking / arm.position_gain**2
-    rate = arm.position_gain
-    if distance > near:
-        rate = min(math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near)), arm.closing_speed) / distance
-    excess = max(rate * distance - arm.far_speed, 0.0)
-    damping += arm.far_damping * excess * excess
-    for i in range(3):  # implicit step: in proportion to the error at the end of the period
-        error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)
-    _add_closing(linear, error, arm.max_tool_speed)
-    _turn(arms, here.rotation, goal.orientation, goal.turning, count_of_tasks == 6, turn)
-    wanted[:3], wanted[3:] = linear, 0.0
-    for i in range(count_of_tasks - 3):
-        for k in range(3):
-            wanted[3 + i] += arm.turn_lever * here.rotation[k, i] * turn[k]
-    flags, scaled, home, bounds = 0, np.empty((count_of_tasks, joints)), np.empty(joints), np.empty((2, joints))
-    for j in range(joints):
-        low, high = here.joints[j] - arm.lower[j], arm.upper[j] - here.joints[j]
-        if min(low, high) < arm.near_limit_rad * arm.per_rad[j]:
-            flags |= NEAR
-        bounds[0, j] = -arm.approach_gain[j] * max(low, 0.0) / scale[j]
-        bounds[1, j] = arm.approach_gain[j] * max(high, 0.0) / scale[j]
-        off, most = arm.posture[j] - here.joints[j], arm.posture_speed * arm.per_rad[j]
-        if arm.is_continuous[j]:  # any number of turns away; 0 at half a turn, where no direction is shorter
-            off, _ = sin_cos(off)
-        home[j] = min(max(arm.posture_gain * off, -most), most) / scale[j]
-        for i in range(count_of_tasks):
-            scaled[i, j] = tasks[i, j] * scale[j]
-    rows, limits = np.empty((count, joints)), np.empty(count)
+    arm = arms[0]
+    here = heres[0]
+    goal = goals[0]
+    task_count, joints = here.tasks.shape
+
+    # The programme: what the tool shall do, what the joints can do, and what separation allows.
+    wish = np.empty(task_count)
+    damping = here.damping + _wish(arms, heres, goals, wish)
+    scaled = np.empty((task_count, joints))
+    home = np.empty(joints)
+    bounds = np.empty((2, joints))
+    flags = _bound_joints(arms, heres, scaled, home, bounds)
+    rows = np.empty((count, joints))
+    limits = np.empty(count)
     for k in range(count):
         limits[k] = constraints[k].planned
         for j in range(joints):
-            rows[k, j] = constraints[k].row[j] * scale[j]
+            rows[k, j] = constraints[k].row[j] * arm.scale[j]
+
     velocity = out[0]
-    is_constrained = solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
+    is_constrained = solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
     if is_constrained:
         flags |= SEPARATED
-        missing = _missing(scaled, wanted, velocity)
+        missing = _missing(scaled, wish, velocity)
         damping += arm.singular_damping * missing / (missing + arm.constrained_speed * arm.constrained_speed)
-        solve(scaled, wanted, home, damping, bounds, rows, limits, velocity)
-    near = _can_have(arms, goals, velocity)
-    scaled[3:], wanted[3:] = 0.0, 0.0
-    if not near:  # the turn is reduced, so that the position is kept
-        free = np.empty(joints)
+        solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
+
+    # If the joints cannot reach it soon, the turn is reduced, so that the position is kept. A
+    # mixture of two solutions need not keep the rows as well as the first one.
+    is_reachable = _can_have(arms, goals, velocity)
+    scaled[3:] = 0.0
+    wish[3:] = 0.0
+    if not is_reachable:
+        without_turn = np.empty(joints)
         for j in range(joints):
             brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
-            home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / scale[j]
-        solve(scaled, wanted, home, damping, bounds, rows, limits, free)
-        if not is_constrained:  # a mixture of two solutions need not keep the rows as well as the first one
-            _turn_less(arms, goals, velocity, free)
+            home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
+        solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
+        if not is_constrained:
+            _turn_less(arms, goals, velocity, without_turn)
     excess = _excess(arms, velocity)
-    wanted[:3], home[:] = goal.acceleration, 0.0
+
+    # The accelerations, within their own limits.
+    wish[:3] = goal.acceleration
+    home[:] = 0.0
     for j in range(joints):
-        bounds[1, j] = arm.acceleration[j] / scale[j]
+        bounds[1, j] = arm.acceleration[j] / arm.scale[j]
         bounds[0, j] = -bounds[1, j]
-    solve(scaled, wanted, home, damping, bounds, rows[:0], limits[:0], out[1])
+    solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
+
     for j in range(joints):
-        velocity[j] = 0.0 if math.isnan(excess) else velocity[j] * scale[j] / max(excess, 1.0)
-        for order in range(2):
-            out[order, j] = np.rint(out[order, j] * (1.0 if order == 0 else scale[j]) * ROUND_TO) / ROUND_TO
+        speed = 0.0 if math.isnan(excess) else velocity[j] * arm.scale[j] / max(excess, 1.0)
+        velocity[j] = np.rint(speed * ROUND_TO) / ROUND_TO
+        out[1, j] = np.rint(out[1, j] * arm.scale[j] * ROUND_TO) / ROUND_TO
     return flags | SPEED if excess > 1.0 + ROUNDING else flags
+
+
+@compiled
+def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
+    """Write the target velocities (v; l R^T w) of `joint_step`; return the damping far from the
+    goal.
+    """
+    arm = arms[0]
+    here = heres[0]
+    goal = goals[0]
+    linear = np.empty(3)
+    error = np.empty(3)
+    for i in range(3):
+        linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
+        error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M)
+        error[i] -= arm.period_s * linear[i]
+
+    # The rate is constant for small errors; large ones are closed at constant deceleration.
+    distance = norm(error)
+    near_m = arm.closing_braking / arm.position_gain**2
+    rate = arm.position_gain
+    if distance > near_m:
+        speed = math.sqrt(2.0 * arm.closing_braking * (distance - 0.5 * near_m))
+        rate = min(speed, arm.closing_speed) / distance
+    for i in range(3):  # implicit step: in proportion to the error at the end of the period
+        error[i] *= rate / (1.0 + arm.position_gain * arm.period_s)
+    _add_closing(linear, error, arm.max_tool_speed)
+
+    turn = np.empty(3)
+    turn_rows = len(wish) - 3
+    _turn(arms, here.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
+    wish[:3] = linear
+    wish[3:] = 0.0
+    for i in range(turn_rows):
+        for k in range(3):
+            wish[3 + i] += arm.turn_lever * here.rotation[k, i] * turn[k]
+    excess = max(rate * distance - arm.far_speed, 0.0)
+    far_damping: float = arm.far_damping * excess * excess
+    return far_damping
+
+
+@compiled
+def _bound_joints(arms: Records, heres: Records, scaled: Vector, home: Vector, bounds: Vector) -> int:
+    """Write T (N, J), h (J,) and the bounds (2, J) on x of `joint_step`; return NEAR if a joint is
+    near its limit, else 0.
+    """
+    arm = arms[0]
+    here = heres[0]
+    flags = 0
+    for j in range(len(home)):
+        below = here.joints[j] - arm.lower[j]
+        above = arm.upper[j] - here.joints[j]
+        if min(below, above) < arm.near_limit_rad * arm.per_rad[j]:
+            flags = NEAR
+        bounds[0, j] = -arm.approach_gain[j] * max(below, 0.0) / arm.scale[j]
+        bounds[1, j] = arm.approach_gain[j] * max(above, 0.0) / arm.scale[j]
+
+        # Any number of turns away; 0 at half a turn, where no direction is shorter.
+        error = arm.posture[j] - here.joints[j]
+        if arm.is_continuous[j]:
+            error, _ = sin_cos(error)
+        max_speed = arm.posture_speed * arm.per_rad[j]
+        home[j] = min(max(arm.posture_gain * error, -max_speed), max_speed) / arm.scale[j]
+        for i in range(len(scaled)):
+            scaled[i, j] = here.tasks[i, j] * arm.scale[j]
+    return flags
 
 
 @compiled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,6 +14,14 @@ from thirdhand.core.geometry import between_segments, carry_back, nearest_to_box
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from thirdhand.core.vectors import norm
+
+NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)  # figures of a step: nearest_m, speed_limit, setpoint_share
+
+Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records]
+"""States, heres, parameters, capsules, contacts and constraints of a step."""
+
+Approach: TypeAlias = tuple[bool, Vector, float, float, float, float]
+"""A hand: is its velocity known; velocity; faster_by, nearer_by, contact_speed, braked."""
 
 
 @compiled
@@ -73,98 +82,211 @@ def step(
 
     Only constraints that the joints can violate are kept.
     """
-    state, here, config = states[0], heres[0], parameters[0]
-    joints, near, forearm, count = len(here.joints), np.empty(9), np.empty((2, 3)), 0
-    later, velocity, placed = np.empty(joints), np.empty(3), np.empty((2, len(capsules), 2, 3))
-    now, then = placed[0], placed[1]
-    place(here.joints, config.frames, config.axes, capsules, now)
-    nearest_m, setpoint_share = FARTHEST_REPORTED_M, 1.0
-    speed_limit = capsules[0].max_speed
-    for capsule in range(len(capsules)):
-        speed_limit = max(speed_limit, capsules[capsule].max_speed)
+    scene = (states, heres, parameters, capsules, contacts, constraints)
+    config = parameters[0]
+    placed = np.empty((2, len(capsules), 2, 3))  # ends of the capsules: now, and at a later time
+    place(heres[0].joints, config.frames, config.axes, capsules, placed[0])
+    figures = np.array([FARTHEST_REPORTED_M, _fastest(capsules), 1.0])
+
+    count = 0
     for side in range(2):
-        if state.hand_ticks[side] < 0:
-            continue
-        variance = 0.0
-        for mode in range(state.mode_probabilities.shape[1]):
-            variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
-        doubt = state.hand_doubt_m[side]
-        known, receives = (
-            variance <= config.unknown_velocity_std_mps * config.unknown_velocity_std_mps and doubt == 0.0,
-            _receives(contacts, state.hands, side, config.contact_margin_m),
-        )
-        age_s = (state.tick - state.hand_ticks[side]) * config.period_s
-        # a hand out of sight may be faster by `speed_up` [m/s] and closer by `nearer` [m]
-        unseen_s = age_s - config.unseen_s[0] if config.unseen_s[0] < age_s < config.unseen_s[1] else 0.0
-        speed_up = min(config.unseen_acceleration_mps2 * unseen_s, config.unknown_speed)
-        nearer = doubt + speed_up * (unseen_s - 0.5 * speed_up / config.unseen_acceleration_mps2)
-        moment = _swiftness(state.hands[side, 1], config.tremor_speed) if known else 0.0
-        for k in range(len(config.lookahead_s) if moment > 0.0 else 1):
-            ahead = moment * config.lookahead_s[k]
-            parts = now if k == 0 else then
-            if k > 0:
-                for j in range(joints):
-                    later[j] = here.joints[j] + ahead * state.joints[1, j]
-                place(later, config.frames, config.axes, capsules, then)
-            faster = config.brake_ramp_s * (1.0 - exp(-ahead / config.brake_ramp_s))
-            for i in range(3):
-                v, a = state.hands[side, 1, i], state.hands[side, 2, i]
-                velocity[i] = v + faster * a
-                moved = ahead * v + config.brake_ramp_s * (ahead - faster) * a
-                forearm[0, i] = state.hands[side, 0, i] + moved
-                forearm[1, i] = forearm[0, i] + config.forearm[i]
-            braked = config.brake[PEOPLE] * max(ahead - config.brake_ramp_s, 0.0)
-            for capsule in range(config.first, len(capsules)):
-                part, constraint = capsules[capsule], constraints[count]
-                distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
-                if k == 0:
-                    nearest_m = min(nearest_m, distance)
-                distance -= nearer
-                coming = 0.0
-                for i in range(3):
-                    coming -= near[6 + i] * velocity[i]
-                coming = max(coming, 0.0) + speed_up if known else config.unknown_speed
-                least = config.contact_speed if receives and part.link == joints else 0.0
-                if k == 0:
-                    most = max(least, _allowed(parameters, PEOPLE, distance, coming))
-                    speed_limit = min(speed_limit, most)
-                planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
-                if planned < part.max_speed:
-                    constraint.planned = planned
-                    constraint.allowed = (
-                        max(least, _allowed(parameters, PEOPLE, distance, coming)) + braked + config.slip_speed_mps
-                    )
-                    if k > 0:
-                        carry_back(near, then[capsule], now[capsule])
-                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-                    if part.link == joints:
-                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += _may_pass(constraints, count, planned, config.max_velocity)
+        if states[0].hand_ticks[side] >= 0:
+            count = _keep_from_hand(scene, side, count, placed, figures)
+    count = _keep_from_boxes(scene, boxes, count, placed[0], figures)
+    count = _keep_from_itself(scene, pairs, count, placed[0])
+    return count, figures[NEAREST], figures[SPEED_LIMIT], figures[SETPOINT_SHARE]
+
+
+@compiled
+def _fastest(capsules: Records) -> float:
+    """Largest speed [m/s] of any part."""
+    speed: float = capsules[0].max_speed
+    for capsule in range(len(capsules)):
+        speed = max(speed, capsules[capsule].max_speed)
+    return speed
+
+
+@compiled
+def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures: Vector) -> int:
+    """Write the constraints of one hand, after the first `count`; return the number of all.
+
+    `placed` (2, C, 2, 3) [m] has the capsules' ends now, and is filled for a later time.
+    """
+    states, heres, parameters, capsules, contacts, _ = scene
+    state = states[0]
+    config = parameters[0]
+    here = heres[0]
+
+    # What is known of the hand: its velocity, and how much faster and nearer it may be.
+    is_known = _is_velocity_known(states, parameters, side)
+    is_touched = _receives(contacts, state.hands, side, config.contact_margin_m)
+    contact_speed = config.contact_speed if is_touched else 0.0
+    faster_by, nearer_by = _while_unseen(states, parameters, side)
+    moving = _swiftness(state.hands[side, 1], config.tremor_speed) if is_known else 0.0
+
+    later = np.empty(len(here.joints))
+    forearm = np.empty((2, 3))
+    velocity = np.empty(3)
+    for k in range(len(config.lookahead_s) if moving > 0.0 else 1):
+        ahead_s = moving * config.lookahead_s[k]
+        if k > 0:
+            for j in range(len(later)):
+                later[j] = here.joints[j] + ahead_s * state.joints[1, j]
+            place(later, config.frames, config.axes, capsules, placed[1])
+        _move_hand(states, parameters, side, ahead_s, forearm, velocity)
+        braked = config.brake[PEOPLE] * max(ahead_s - config.brake_ramp_s, 0.0)
+        approach = (is_known, velocity, faster_by, nearer_by, contact_speed, braked)
+        for capsule in range(config.first, len(capsules)):
+            count = _keep_part(scene, capsule, k > 0, forearm, approach, count, placed, figures)
+    return count
+
+
+@compiled
+def _is_velocity_known(states: Records, parameters: Records, side: int) -> bool:
+    """True if a hand's velocity is certain enough, and the hand was not corrected lately."""
+    state = states[0]
+    variance = 0.0
+    for mode in range(state.mode_probabilities.shape[1]):
+        variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
+    limit = parameters[0].unknown_velocity_std_mps
+    return bool(variance <= limit * limit and state.hand_doubt_m[side] == 0.0)
+
+
+@compiled
+def _while_unseen(states: Records, parameters: Records, side: int) -> tuple[float, float]:
+    """How much faster [m/s] and nearer [m] a hand may be: w, and hand_doubt_m + w (t - w / 2g)."""
+    state = states[0]
+    config = parameters[0]
+    age_s = (state.tick - state.hand_ticks[side]) * config.period_s
+    is_unseen = config.unseen_s[0] < age_s < config.unseen_s[1]
+    unseen_s = age_s - config.unseen_s[0] if is_unseen else 0.0
+    faster_by = min(config.unseen_acceleration_mps2 * unseen_s, config.unknown_speed)
+    way_m = faster_by * (unseen_s - 0.5 * faster_by / config.unseen_acceleration_mps2)
+    return faster_by, state.hand_doubt_m[side] + way_m
+
+
+@compiled
+def _move_hand(
+    states: Records,
+    parameters: Records,
+    side: int,
+    ahead_s: float,
+    forearm: Vector,
+    velocity: Vector,
+) -> None:
+    """Set the ends (2, 3) [m] of a hand's forearm, and its velocity (3,) [m/s], at a time ahead."""
+    config = parameters[0]
+    hand = states[0].hands[side]
+    accelerated_s = config.brake_ramp_s * (1.0 - exp(-ahead_s / config.brake_ramp_s))
+    for i in range(3):
+        speed = hand[1, i]
+        acceleration = hand[2, i]
+        velocity[i] = speed + accelerated_s * acceleration
+        moved = ahead_s * speed + config.brake_ramp_s * (ahead_s - accelerated_s) * acceleration
+        forearm[0, i] = hand[0, i] + moved
+        forearm[1, i] = forearm[0, i] + config.forearm[i]
+
+
+@compiled
+def _keep_part(
+    scene: Scene,
+    capsule: int,
+    is_later: bool,
+    forearm: Vector,
+    approach: Approach,
+    count: int,
+    placed: Vector,
+    figures: Vector,
+) -> int:
+    """Write the constraint of one part near a hand; return the number of all constraints."""
+    states, heres, parameters, capsules, _, constraints = scene
+    is_known, velocity, faster_by, nearer_by, contact_speed, braked = approach
+    config = parameters[0]
+    part = capsules[capsule]
+    is_tool = part.link == len(heres[0].joints)
+    near = np.empty(9)
+    parts = placed[1] if is_later else placed[0]
+    distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
+    if not is_later:
+        figures[NEAREST] = min(figures[NEAREST], distance)
+    distance -= nearer_by
+
+    # The speed of the hand toward the part, and the speed that the rule allows the part.
+    coming = config.unknown_speed
+    if is_known:
+        coming = max(-_along(near, velocity), 0.0) + faster_by
+    least = contact_speed if is_tool else 0.0
+    allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
+    if not is_later:
+        figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
+    planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+    if planned >= part.max_speed:
+        return count
+
+    constraint = constraints[count]
+    constraint.planned = planned
+    constraint.allowed = allowed + braked + config.slip_speed_mps
+    if is_later:
+        carry_back(near, parts[capsule], placed[0, capsule])
+    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+    if is_tool:
+        figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1]))
+    return count + _may_pass(constraints, count, planned, config.max_velocity)
+
+
+@compiled
+def _keep_from_boxes(scene: Scene, boxes: Vector, count: int, placed: Vector, figures: Vector) -> int:
+    """Write the constraints of the boxes (B, ...), after the first `count`; return the number of
+    all. `placed` (C, 2, 3) [m] has the capsules' ends.
+    """
+    states, heres, parameters, capsules, _, constraints = scene
+    config = parameters[0]
+    near = np.empty(9)
     for capsule in range(config.first, len(capsules)):
         part = capsules[capsule]
         for box in range(len(boxes)):
-            inner = nearest_to_box(now[capsule], boxes[box])
-            for where in range(3):  # the ends have constraints too: a capsule along a face may tip
-                share = inner if where == 0 else where - 1.0
-                distance = to_box(now[capsule], share, boxes[box], near) - part.radius
+            inner = nearest_to_box(placed[capsule], boxes[box])
+            for point in range(3):  # the ends have constraints too: a capsule along a face may tip
+                share = inner if point == 0 else point - 1.0
+                distance = to_box(placed[capsule], share, boxes[box], near) - part.radius
                 planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
-                twice = where > 0 and share == inner
-                if not twice and planned < part.max_speed:
-                    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-                    planned = _limit(constraints, count, parameters, THINGS, distance, planned)
-                    if part.link == joints:
-                        setpoint_share = min(setpoint_share, _share(near, planned, state.setpoint[1]))
-                    count += _may_pass(constraints, count, planned, config.max_velocity)
+                is_repeated = point > 0 and share == inner
+                if is_repeated or planned >= part.max_speed:
+                    continue
+                _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+                planned = _limit(constraints, count, parameters, THINGS, distance, planned)
+                if part.link == len(heres[0].joints):
+                    figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1]))
+                count += _may_pass(constraints, count, planned, config.max_velocity)
+    return count
+
+
+@compiled
+def _keep_from_itself(scene: Scene, pairs: Vector, count: int, placed: Vector) -> int:
+    """Write the constraints of pairs (P, 2) of parts, after the first `count`; return the number of
+    all. `placed` (C, 2, 3) [m] has the capsules' ends.
+    """
+    _, heres, parameters, capsules, _, constraints = scene
+    near = np.empty(9)
     for pair in range(len(pairs)):
-        one, other = capsules[pairs[pair, 0]], capsules[pairs[pair, 1]]
-        distance = between_segments(now[pairs[pair, 0]], now[pairs[pair, 1]], near) - one.radius - other.radius
+        first = capsules[pairs[pair, 0]]
+        second = capsules[pairs[pair, 1]]
+        distance = between_segments(placed[pairs[pair, 0]], placed[pairs[pair, 1]], near)
+        distance = distance - first.radius - second.radius
         planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
-        if planned < one.max_speed + other.max_speed:
-            _bring_together(constraints, count, near, 0, heres, one.link, 1.0)
-            _bring_together(constraints, count, near, 3, heres, other.link, -1.0)
+        if planned < first.max_speed + second.max_speed:
+            _bring_together(constraints, count, near, 0, heres, first.link, 1.0)
+            _bring_together(constraints, count, near, 3, heres, second.link, -1.0)
             planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
-            count += _may_pass(constraints, count, planned, config.max_velocity)
-    return count, nearest_m, speed_limit, setpoint_share
+            count += _may_pass(constraints, count, planned, parameters[0].max_velocity)
+    return count
+
+
+@compiled
+def _along(near: Vector, velocity: Vector) -> float:
+    """Speed [m/s] of a velocity (3,) along the normal."""
+    speed: float = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    return speed
 
 
 @compiled
@@ -232,9 +354,9 @@ def _swiftness(velocity: Vector, tremor_speed: float) -> float:
 @compiled
 def _share(near: Vector, limit: float, velocity: Vector) -> float:
     """Largest share, at most 1, of a velocity (3,) that keeps a limit along the normal."""
-    along = near[6] * velocity[0] + near[7] * velocity[1] + near[8] * velocity[2]
+    speed = _along(near, velocity)
     limit = max(limit, 0.0)
-    return limit / along if along > limit else 1.0
+    return limit / speed if speed > limit else 1.0
 
 
 @compiled

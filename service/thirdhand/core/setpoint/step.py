@@ -115,59 +115,111 @@ def _track(
     Returns PLANNED if a barrier reduced the jerk, else 0.
     """
     config = parameters[0]
-    gains, dt = config.gains, config.period_s
-    max_speed = config.max_speed
-    speed, target_speed = norm(setpoint[1]), norm(target[1])
-    feasible = min(1.0, max_speed / target_speed) if target_speed > 0.0 else 1.0
+    speed = norm(setpoint[1])
+    feasible = _feasible_share(target[1], config.max_speed)
+    _tracking_jerk(setpoint, target, parameters, feasible, jerk)
+    _approach_sides(setpoint, parameters, box, jerk)
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    if speed <= LEAST_SPEED_MPS:
+        return 0
+
+    # Along the velocity: how setpoint and target move.
+    along = np.empty(3)
+    a = tracking = distance = target_speed = target_a = 0.0
+    for i in range(3):
+        along[i] = setpoint[1, i] / speed
+        a += along[i] * setpoint[2, i]
+        tracking += along[i] * jerk[i]
+        distance += along[i] * (target[0, i] - setpoint[0, i])
+        target_speed += along[i] * feasible * target[1, i]
+        target_a += along[i] * target[2, i]
+    motion = (speed, a, tracking)
+    target_motion = (distance, target_speed, target_a)
+    reduced = _barriers(motion, target_motion, along, parameters, costs, slow)
+    if reduced >= tracking:
+        return 0
+    for i in range(3):
+        jerk[i] += (reduced - tracking) * along[i]
+    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    return PLANNED
+
+
+@compiled
+def _feasible_share(velocity: Vector, max_speed: float) -> float:
+    """The share φ of a velocity (3,) [m/s] that is within the speed limit."""
+    speed = norm(velocity)
+    return min(1.0, max_speed / speed) if speed > 0.0 else 1.0
+
+
+@compiled
+def _tracking_jerk(setpoint: Vector, target: Vector, parameters: Records, feasible: float, jerk: Vector) -> None:
+    """Write the tracker's jerk (3,) [m/s³], see `_track`."""
+    gains = parameters[0].gains
     for i in range(3):
         jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
         if feasible == 1.0:  # accelerations of a target beyond the speed limit are not followed
             jerk[i] += gains[2] * target[2, i]
         jerk[i] += gains[3] * setpoint[1, i] + gains[4] * setpoint[2, i]
-    _approach_sides(setpoint, parameters, box, jerk)
-    _limit_jerk(jerk, setpoint[2], parameters, costs)
-    if speed <= LEAST_SPEED_MPS:
-        return 0
-    along = np.empty(3)
-    a = u = distance = v_target = a_target = 0.0
-    for i in range(3):
-        along[i] = setpoint[1, i] / speed
-        a += along[i] * setpoint[2, i]
-        u += along[i] * jerk[i]
-        distance += along[i] * (target[0, i] - setpoint[0, i])
-        v_target += along[i] * feasible * target[1, i]
-        a_target += along[i] * target[2, i]
-    brake = config.planned_brake_share * min(config.max_acceleration, 1.0 / max(_largest(costs[1], along), 1e-9))
-    change = config.planned_brake_share * min(config.stop_jerk, 1.0 / max(_largest(costs[2], along), 1e-9))
-    change = min(change, config.stop_jerk_error_m * gains[0])
-    top = slow * config.planned_speed_share * min(max_speed, 1.0 / max(_largest(costs[0], along), 1e-9))
-    predicted_speed = max(0.0, v_target + config.deceleration_lookahead_s * min(a_target, 0.0))
+
+
+@compiled
+def _barriers(
+    motion: tuple[float, float, float],
+    target_motion: tuple[float, float, float],
+    along: Vector,
+    parameters: Records,
+    costs: Vector,
+    slow: float,
+) -> float:
+    """The jerk [m/s³] along the velocity that the barriers of `_track` leave.
+
+    `motion` has speed, acceleration and tracking jerk of the setpoint along the unit vector `along`
+    (3,); `target_motion` has distance, speed and acceleration of the target.
+    """
+    config = parameters[0]
+    dt = config.period_s
+    speed, a, tracking = motion
+    distance, target_speed, target_a = target_motion
+
+    # What is planned with, within the limits of tool and joints.
+    share = config.planned_brake_share
+    brake = share * min(config.max_acceleration, _joint_limit(costs[1], along))
+    change = share * min(config.stop_jerk, _joint_limit(costs[2], along))
+    change = min(change, config.stop_jerk_error_m * config.gains[0])
+    top = slow * config.planned_speed_share * min(config.max_speed, _joint_limit(costs[0], along))
+
+    # Below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse.
+    coasting_now = _coasting(speed, a, 0.0, change, 0.0)
+    coasting_least = _coasting(speed, a, -change, change, dt)
+    lowest = between(tracking, -change, _coasting(speed, a, tracking, change, dt), coasting_least, 0.0)
+    retained = 1.0 - min(config.barrier_rate_per_s * dt, config.barrier_time_s / dt)
+
+    # Stop: the setpoint can stop where the target will.
+    predicted_speed = max(0.0, target_speed + config.deceleration_lookahead_s * min(target_a, 0.0))
     overshoot = config.stop_overshoot_m + config.stop_room * predicted_speed * predicted_speed / (
         2.0 * config.hand_brake_mps2
     )
-    # below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse
-    now, soon = _coasting(speed, a, 0.0, change, 0.0), _coasting(speed, a, u, change, dt)
-    lowest = between(u, -change, soon, _coasting(speed, a, -change, change, dt), 0.0)
-    # each barrier's distance shrinks at barrier_rate_per_s at most
-    retained = 1.0 - min(config.barrier_rate_per_s * dt, config.barrier_time_s / dt)
-    chosen = stopping(
-        distance + overshoot, min(predicted_speed, speed) * dt, speed, a, (brake, change), (u, lowest), retained, dt
-    )
-    faster, a_faster = speed - v_target, a - a_target
-    if faster > 0.0 and _coasting(faster, a_faster, 0.0, change, 0.0) > 0.0:
-        meeting = max(brake + min(a_target, 0.0), config.meeting_brake_least_share * brake)
-        chosen = stopping(
-            distance + config.stop_overshoot_m, 0.0, faster, a_faster, (meeting, change), (chosen, lowest), retained, dt
-        )
-    limit = top - retained * (top - now)
-    coasting = _coasting(speed, a, chosen, change, dt)
-    chosen = between(chosen, -change, coasting, _coasting(speed, a, -change, change, dt), limit)
-    if chosen >= u:
-        return 0
-    for i in range(3):
-        jerk[i] += (chosen - u) * along[i]
-    _limit_jerk(jerk, setpoint[2], parameters, costs)
-    return PLANNED
+    gap = distance + overshoot
+    closing = min(predicted_speed, speed) * dt
+    jerk = stopping(gap, closing, speed, a, (brake, change), (tracking, lowest), retained, dt)
+
+    # Meeting: a faster setpoint slows down to the speed of its target.
+    faster_by = speed - target_speed
+    a_faster_by = a - target_a
+    if faster_by > 0.0 and _coasting(faster_by, a_faster_by, 0.0, change, 0.0) > 0.0:
+        meeting = max(brake + min(target_a, 0.0), config.meeting_brake_least_share * brake)
+        gap = distance + config.stop_overshoot_m
+        jerk = stopping(gap, 0.0, faster_by, a_faster_by, (meeting, change), (jerk, lowest), retained, dt)
+
+    # Speed: the speed after the acceleration has ended stays below the limit.
+    limit = top - retained * (top - coasting_now)
+    return between(jerk, -change, _coasting(speed, a, jerk, change, dt), coasting_least, limit)
+
+
+@compiled
+def _joint_limit(costs: Vector, along: Vector) -> float:
+    """What the joints allow the tool along a direction (3,), by the costs of one derivative."""
+    return 1.0 / max(_largest(costs, along), 1e-9)
 
 
 @compiled

@@ -15,7 +15,6 @@ import numpy as np
 import zenoh
 
 from thirdhand.client import Overheard
-from thirdhand.client.publisher_identity import SolePublisher, identity
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.channels import TAKE_KEYS
 from thirdhand.contract.explain import ExplainedError
@@ -26,6 +25,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.core.intake.arm_samples import in_turn
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.tuning import TUNING
+from thirdhand.daemon.cell_streams import SolePublisher, identity
 from thirdhand.recordings.mcap_file import machine, whole_file
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.workbench.takes.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
