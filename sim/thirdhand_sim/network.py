@@ -276,143 +276,179 @@ def run(
     tracked = bench.script if isinstance(bench.script, TrackedHands) else None
     bridge = Bridge(session, live, bench.joint_names, observed=observed, tracked=tracked)
     try:
-        _play(bench, bridge, live, tracked, stop=stop, report=report, say=say)
+        _Run(bench, bridge, live, tracked, report=report, say=say).play(stop)
     finally:
         bridge.close()
 
 
-def _play(
-    bench: Bench,
-    bridge: Bridge,
-    live: Live,
-    tracked: TrackedHands | None,
-    *,
-    stop: threading.Event,
-    report: Callable[[RunReport], None],
-    say: Callable[[str], None],
-) -> None:
-    commands, key = bridge.commands, channels.key(live.cell, "joints/command")
-    rate_hz = round(1.0 / bench.period_s)
-    hands_every = max(1, round(rate_hz / live.hands_hz))
-    things_every = max(1, round(rate_hz / THINGS_HZ))
-    led = Led(bench, commands, bridge.gripper)
-    deadlines, before = Deadlines(rate_hz), -1
-    ready_s: float | None = None  # time from which commands arrive and the hands wait at their start
-    running, spoke_s, quiet, asked = False, 0.0, False, False
-    said = missed_before = sent_before = begun_ns = begun_index = index = longest = 0
+class _Run:
+    """The bench in real time: the arm moves to its target, the script runs, the hands move back."""
 
-    def report_now() -> None:
-        report(
-            _report(
-                bench,
-                commands,
-                hands=bridge.hands_sent - sent_before,
-                periods=index - begun_index,
-                skipped=deadlines.missed - missed_before,
-                longest_pause_ms=1000 * longest * bench.period_s,
-                begun_ns=begun_ns,
-            )
+    def __init__(
+        self,
+        bench: Bench,
+        bridge: Bridge,
+        live: Live,
+        tracked: TrackedHands | None,
+        *,
+        report: Callable[[RunReport], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self._bench = bench
+        self._bridge = bridge
+        self._live = live
+        self._tracked = tracked
+        self._report = report
+        self._say = say
+        rate_hz = round(1.0 / bench.period_s)
+        self._hands_every = max(1, round(rate_hz / live.hands_hz))
+        self._things_every = max(1, round(rate_hz / THINGS_HZ))
+        self._led = Led(bench, bridge.commands, bridge.gripper)
+        self._deadlines = Deadlines(rate_hz)
+        self._key = channels.key(live.cell, "joints/command")
+
+        self._index = -1  # of the newest period
+        self._ready_s: float | None = None  # time from which commands arrive and the hands wait at their start
+        self._is_running = False  # the script runs
+        self._commanded_s = 0.0
+        self._is_quiet = False  # missing commands were reported
+        self._is_asked = False  # the hands were asked for
+        self._announced = 0  # events of this run that were reported
+        self._longest_pause = 0  # periods
+        self._begun_ns = self._begun_index = self._begun_missed = self._begun_hands = 0
+
+    def play(self, stop: threading.Event) -> None:
+        """Run until `stop`, or as long as `Live` says. Raises BenchError."""
+        self._say(
+            f"waiting for {self._key} (the service sends none without an arm, or in a fault: see thirdhand status)"
         )
+        while not stop.is_set():
+            index = self._deadlines.wait()[0]
+            now_s = index * self._bench.period_s
+            if now_s >= self._live.duration_s:
+                return
+            self._longest_pause = max(self._longest_pause, index - self._index)
+            seen, commanded = self._led.step(index - self._index)
+            self._index = index
+            self._bridge.publish_joints(seen)
+            self._note_commands(commanded, now_s)
+            self._publish(seen)
+            if self._is_ended(commanded, now_s):
+                self._let_stop()
+                return
+            if self._ready_s == math.inf and self._bench.back:
+                self._ready_s = now_s
+        if self._tracked and self._is_running:  # the person has ended the task
+            self._report(self._reported())
+            self._let_stop()
 
-    say(f"waiting for {key} (the service sends none without an arm, or in a fault: see thirdhand status)")
-    while not stop.is_set():
-        index = deadlines.wait()[0]
-        now_s = index * bench.period_s
-        if now_s >= live.duration_s:
-            return
-        longest = max(longest, index - before)
-        (seen, commanded), before = led.step(index - before), index
-        bridge.publish_joints(seen)
+    def _note_commands(self, commanded: bool, now_s: float) -> None:
+        """Report that commands end, and that they arrive again."""
         if commanded:
-            if quiet:
-                say("commands arrive again")
-            spoke_s, quiet = now_s, False
-        elif ready_s is not None and not quiet and now_s - spoke_s > QUIET_S:
-            quiet = True
-            say("no commands arrive: thirdhand status shows the cause, and thirdhand reset ends a fault")
-        if bench.tick % hands_every == 0:
-            hidden = live.dropout.hand if live.dropout and running and live.dropout.at(seen.time_s) else None
-            bridge.publish_hands(bench.script.sample(seen.time_s), hidden=hidden)
-        if bench.tick % things_every == 0:
-            bridge.publish_things(bench)
+            if self._is_quiet:
+                self._say("commands arrive again")
+            self._commanded_s = now_s
+            self._is_quiet = False
+        elif self._ready_s is not None and not self._is_quiet and now_s - self._commanded_s > QUIET_S:
+            self._is_quiet = True
+            self._say("no commands arrive: thirdhand status shows the cause, and thirdhand reset ends a fault")
 
-        if ready_s is None:
-            if commanded:
-                ready_s = now_s
-                say("commands arrive, the arm moves to its target")
-            elif now_s > live.wait_s:
-                if isinstance(bench.world, ObservedWorld) and not bench.world.heard:
-                    states = channels.key(live.cell, "joints/state")
-                    raise BenchError(
-                        f"no joint states arrive on {states}: start the arm's program, or omit --hands-only"
-                    )
-                refused = f" ({commands.rejected} refused: {commands.last_error})" if commands.rejected else ""
-                raise BenchError(
-                    f"no command on {key} within {live.wait_s:g} s{refused}. Is the service running in this cell?"
-                )
-        elif not running:
-            waited = now_s - ready_s
-            if tracked and not asked and (tracked.foreign or not tracked.ready):
-                asked = True
-                say(f"waiting for both hands{tracked.refusal}")
-            if not bench.script.ready and waited > live.wait_s:
-                raise BenchError(f"no hands arrived within {live.wait_s:g} s{tracked.refusal if tracked else ''}")
-            if bench.script.ready and bench.settled(waited):
-                bench.begin()
-                commands.restart()
-                running, said, missed_before, sent_before = True, 0, deadlines.missed, bridge.hands_sent
-                begun_ns, begun_index, longest = time.time_ns(), index, 0
-                say("the script begins")
+    def _publish(self, seen: Observation) -> None:
+        """Publish hands and things, each at its rate."""
+        dropout = self._live.dropout
+        if self._bench.tick % self._hands_every == 0:
+            is_hidden = dropout is not None and self._is_running and dropout.at(seen.time_s)
+            hidden = dropout.hand if dropout is not None and is_hidden else None
+            self._bridge.publish_hands(self._bench.script.sample(seen.time_s), hidden=hidden)
+        if self._bench.tick % self._things_every == 0:
+            self._bridge.publish_things(self._bench)
+
+    def _is_ended(self, commanded: bool, now_s: float) -> bool:
+        """Go on with the run; true if it was the only one, and has ended."""
+        if self._ready_s is None:
+            self._wait_for_commands(commanded, now_s)
+        elif not self._is_running:
+            self._wait_for_hands(now_s - self._ready_s)
         else:
-            for name in TaskEvents.__struct_fields__[said : bench.closed]:
-                say(_line(name, getattr(bench.events(), name)))
-            said = bench.closed
-            if bench.finished:
-                report_now()
-                if live.once:
-                    _let_stop(bench, bridge, led, deadlines)
-                    return
-                say("the hands move back")
-                bench.turn_back()
-                running, ready_s = False, math.inf
-        if ready_s == math.inf and bench.back:
-            ready_s = now_s
-    if tracked and running:  # the person has ended the task
-        report_now()
-        _let_stop(bench, bridge, led, deadlines)
+            for name in TaskEvents.__struct_fields__[self._announced : self._bench.closed]:
+                self._say(_line(name, getattr(self._bench.events(), name)))
+            self._announced = self._bench.closed
+            if self._bench.finished:
+                self._report(self._reported())
+                if self._live.once:
+                    return True
+                self._say("the hands move back")
+                self._bench.turn_back()
+                self._is_running = False
+                self._ready_s = math.inf
+        return False
 
+    def _wait_for_commands(self, commanded: bool, now_s: float) -> None:
+        commands = self._bridge.commands
+        if commanded:
+            self._ready_s = now_s
+            self._say("commands arrive, the arm moves to its target")
+        elif now_s > self._live.wait_s:
+            if isinstance(self._bench.world, ObservedWorld) and not self._bench.world.heard:
+                states = channels.key(self._live.cell, "joints/state")
+                raise BenchError(f"no joint states arrive on {states}: start the arm's program, or omit --hands-only")
+            refused = f" ({commands.rejected} refused: {commands.last_error})" if commands.rejected else ""
+            raise BenchError(
+                f"no command on {self._key} within {self._live.wait_s:g} s{refused}. "
+                "Is the service running in this cell?"
+            )
 
-def _let_stop(bench: Bench, bridge: Bridge, led: Led, deadlines: Deadlines) -> None:
-    """Run without hands until the service has stopped the arm: an arm that disappears while it
-    moves is a fault.
-    """
-    for _ in range(round(FINAL_STOP_S / bench.period_s)):
-        deadlines.wait()
-        bridge.publish_joints(led.step()[0])
+    def _wait_for_hands(self, waited_s: float) -> None:
+        """Begin the script once the hands are ready and the arm has settled."""
+        tracked = self._tracked
+        if tracked and not self._is_asked and (tracked.foreign or not tracked.ready):
+            self._is_asked = True
+            self._say(f"waiting for both hands{tracked.refusal}")
+        is_ready = self._bench.script.ready
+        if not is_ready and waited_s > self._live.wait_s:
+            refusal = tracked.refusal if tracked else ""
+            raise BenchError(f"no hands arrived within {self._live.wait_s:g} s{refusal}")
+        if is_ready and self._bench.settled(waited_s):
+            self._bench.begin()
+            self._bridge.commands.restart()
+            self._is_running = True
+            self._announced = self._longest_pause = 0
+            self._begun_missed = self._deadlines.missed
+            self._begun_hands = self._bridge.hands_sent
+            self._begun_index = self._index
+            self._begun_ns = time.time_ns()
+            self._say("the script begins")
 
+    def _let_stop(self) -> None:
+        """Run without hands until the service has stopped the arm: an arm that disappears while it
+        moves is a fault.
+        """
+        for _ in range(round(FINAL_STOP_S / self._bench.period_s)):
+            self._deadlines.wait()
+            self._bridge.publish_joints(self._led.step()[0])
 
-def _report(
-    bench: Bench, commands: Commands, *, hands: int, periods: int, skipped: int, longest_pause_ms: float, begun_ns: int
-) -> RunReport:
-    events = bench.events()
-    latencies = list(commands.latencies_ms)
-    percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
-    return RunReport(
-        success=events.success,
-        events=events,
-        latency_ms=requests.Percentiles(*percentiles),
-        answered=len(latencies),
-        hands=hands,
-        commands=commands.count,
-        rejected=commands.rejected,
-        largest_gap_ms=round(commands.largest_gap_ms, 3),
-        periods=periods,
-        skipped=skipped,
-        longest_pause_ms=round(longest_pause_ms, 1),
-        begun_ns=begun_ns,
-        seed=bench.script.seed,
-        scene=bench.scene,
-    )
+    def _reported(self) -> RunReport:
+        """The report of the run since the script began."""
+        commands = self._bridge.commands
+        events = self._bench.events()
+        latencies = list(commands.latencies_ms)
+        percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
+        return RunReport(
+            success=events.success,
+            events=events,
+            latency_ms=requests.Percentiles(*percentiles),
+            answered=len(latencies),
+            hands=self._bridge.hands_sent - self._begun_hands,
+            commands=commands.count,
+            rejected=commands.rejected,
+            largest_gap_ms=round(commands.largest_gap_ms, 3),
+            periods=self._index - self._begun_index,
+            skipped=self._deadlines.missed - self._begun_missed,
+            longest_pause_ms=round(1000 * self._longest_pause * self._bench.period_s, 1),
+            begun_ns=self._begun_ns,
+            seed=self._bench.script.seed,
+            scene=self._bench.scene,
+        )
 
 
 def _line(name: str, event: TaskEvent) -> str:
