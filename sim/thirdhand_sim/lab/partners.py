@@ -245,68 +245,98 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
 
     Those of the service are of accepted takes alone, and `beside_mm` has each rival on these takes.
     """
-    methods = {name: summary([one for part in found for one in part.rivals[name]]) for name in found[0].rivals}
+    methods = {name: summary([take for part in found for take in part.rivals[name]]) for name in found[0].rivals}
     for name in found[0].service:
-        folds, told = [part.service[name] for part in found], name.removeprefix(SERVICE)
-        accepted = [one is not None for fold in folds for one in fold.accepted]
-        beside = {rival: [one for part in found for one in part.rivals[rival + told]] for rival in RIVALS}
-        there = {rival: summary(list(itertools.compress(rows, accepted))) for rival, rows in beside.items()}
-        reasons = [text for fold in folds for text in (*fold.refusals, *fold.take_refusals)]
-        figures = [fold.figures for fold in folds if fold.figures]
-        methods[name] = summary([one for fold in folds for one in fold.accepted if one]) | {
-            "folds": len(folds),
-            "folds_refused": sum(bool(fold.refusals) for fold in folds),
-            "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
-            "risks": list(dict.fromkeys(text for fold in folds for text in fold.residual))[:2],
-            "refuses": accepted.count(False),
-            "reasons": list(dict.fromkeys(reasons))[:2],
-            "again": {
-                f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
-                for i, rest_s in enumerate(SESSION_RESTS_S)
-            },
-            "in_spite_of_refusal": summary([one for fold in folds for one in fold.in_spite]),
-            "beside_mm": {rival: rows.get("rms_mm") for rival, rows in there.items()},
-            "model": next((fold.model for fold in folds if fold.model), None),
-            "learn_says_mm": float(np.mean([one.all.error_mm for one in figures])) if figures else None,
-            "ambiguous": float(np.mean([one.ambiguous for one in figures])) / 100 if figures else None,
-            "unsafe": sum(bool(one.unsafe) for one in figures),
-            "says": [*figures[0].unsafe, *figures[0].warnings] if figures else [],
-        }
-    more: dict[str, Any] = {"moved": [part.moved for part in found]} if found[0].moved else {}
-    if own := [part.own for part in found if part.own]:
-        weights = [fold.figures.weight for fold in own if fold.figures]
-        more["own_takes"] = summary([one for fold in own for one in fold.accepted if one]) | {
+        methods[name] = _service_numbers(found, name)
+    numbers: dict[str, Any] = {"folds": len(found), "methods": methods}
+    if found[0].moved:
+        numbers["moved"] = [part.moved for part in found]
+    own = [part.own for part in found if part.own]
+    if own:
+        numbers["own_takes"] = summary(_accepted(own)) | {
             "own": OWN,
             "folds_refused": sum(bool(fold.refusals) for fold in own),
-            "weights": weights,
+            "weights": [fold.figures.weight for fold in own if fold.figures],
         }
-    return {"folds": len(found), "methods": methods, **more}
+    return numbers
 
 
-def summary(rows: Sequence[Judged]) -> dict[str, Any]:
-    """Errors over all samples [mm], and shares of samples; none of no takes."""
-    if not rows:
-        return {"takes": 0}
-    count = sum(one.samples for one in rows)
-    inside = [one.inside for one in rows if one.inside is not None]
-    held, unsure, told, falsely = (
-        [x for x in column if x is not None]
-        for column in zip(*((r.held, r.unsure, r.told, r.falsely_told) for r in rows), strict=True)
-    )
-    wrong = sum(one.wrong for one in rows)
-    return {
-        "takes": len(rows),
-        "rms_mm": 1000 * float(np.sqrt(sum(one.squares for one in rows) / count)),
-        "shifted_rms_mm": 1000 * float(np.sqrt(sum(one.shifted for one in rows) / count)),
-        "shift_s": float(np.median([one.shift_s for one in rows])),
-        "worst_mm": 1000 * max(one.worst_m for one in rows),
-        "coverage": [float(x) / count for x in np.sum(inside, axis=0)] if inside else None,
-        "held": sum(held) / count if held else None,
-        "unsure": sum(unsure) / count if unsure else None,
-        "wrong": wrong / count,
-        "told": sum(told) / wrong if told and wrong else None,  # of the wrong ones, held or unsure
-        "falsely_told": sum(falsely) / (count - wrong) if falsely and count > wrong else None,
+def _accepted(folds: Sequence[Fold]) -> list[Judged]:
+    """The accepted takes of some folds."""
+    return [take for fold in folds for take in fold.accepted if take]
+
+
+def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:
+    """The numbers of the service in one setting."""
+    folds = [part.service[name] for part in found]
+    accepted = [take is not None for fold in folds for take in fold.accepted]
+    reasons = [text for fold in folds for text in (*fold.refusals, *fold.take_refusals)]
+    residuals = [text for fold in folds for text in fold.residual]
+    return summary(_accepted(folds)) | {
+        "folds": len(folds),
+        "folds_refused": sum(bool(fold.refusals) for fold in folds),
+        "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
+        "risks": list(dict.fromkeys(residuals))[:2],
+        "refuses": accepted.count(False),
+        "reasons": list(dict.fromkeys(reasons))[:2],
+        "again": {
+            f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
+            for i, rest_s in enumerate(SESSION_RESTS_S)
+        },
+        "in_spite_of_refusal": summary([take for fold in folds for take in fold.in_spite]),
+        "beside_mm": _beside(found, name.removeprefix(SERVICE), accepted),
+        "model": next((fold.model for fold in folds if fold.model), None),
+        **_said([fold.figures for fold in folds if fold.figures]),
     }
+
+
+def _beside(found: Sequence[Found], setting: str, accepted: Sequence[bool]) -> dict[str, float | None]:
+    """The error [mm] of each rival on the takes that the service accepted."""
+    errors: dict[str, float | None] = {}
+    for rival in RIVALS:
+        takes = [take for part in found for take in part.rivals[rival + setting]]
+        errors[rival] = summary(list(itertools.compress(takes, accepted))).get("rms_mm")
+    return errors
+
+
+def _said(figures: Sequence[Figures]) -> dict[str, Any]:
+    """What `learn` says of its skills."""
+    if not figures:
+        return {"learn_says_mm": None, "ambiguous": None, "unsafe": 0, "says": []}
+    return {
+        "learn_says_mm": float(np.mean([skill.all.error_mm for skill in figures])),
+        "ambiguous": float(np.mean([skill.ambiguous for skill in figures])) / 100,
+        "unsafe": sum(bool(skill.unsafe) for skill in figures),
+        "says": [*figures[0].unsafe, *figures[0].warnings],
+    }
+
+
+def summary(takes: Sequence[Judged]) -> dict[str, Any]:
+    """Errors over all samples [mm], and shares of samples; none of no takes."""
+    if not takes:
+        return {"takes": 0}
+    count = sum(take.samples for take in takes)
+    inside = [take.inside for take in takes if take.inside is not None]
+    wrong = sum(take.wrong for take in takes)
+    return {
+        "takes": len(takes),
+        "rms_mm": 1000 * float(np.sqrt(sum(take.squares for take in takes) / count)),
+        "shifted_rms_mm": 1000 * float(np.sqrt(sum(take.shifted for take in takes) / count)),
+        "shift_s": float(np.median([take.shift_s for take in takes])),
+        "worst_mm": 1000 * max(take.worst_m for take in takes),
+        "coverage": [float(x) / count for x in np.sum(inside, axis=0)] if inside else None,
+        "held": _share([take.held for take in takes], count),
+        "unsure": _share([take.unsure for take in takes], count),
+        "wrong": wrong / count,
+        "told": _share([take.told for take in takes], wrong),  # of the wrong ones, held or unsure
+        "falsely_told": _share([take.falsely_told for take in takes], count - wrong),
+    }
+
+
+def _share(counts: Sequence[float | None], total: int) -> float | None:
+    """The share that the known counts are of a total; None if none is known, or the total is 0."""
+    known = [count for count in counts if count is not None]
+    return sum(known) / total if known and total > 0 else None
 
 
 def _line(fold: Fold) -> str:
