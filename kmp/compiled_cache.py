@@ -115,8 +115,8 @@ def cache_folder() -> Path | None:
     """The first folder that can be written: `NUMBA_CACHE_DIR`, or the user's cache, or the one of
     this package's bytecode; None if there is none.
     """
-    own = config.CACHE_DIR or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "numba")
-    for folder in (Path(own, "kmp"), Path(__file__).parent / "__pycache__"):
+    user_cache = config.CACHE_DIR or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "numba")
+    for folder in (Path(user_cache, "kmp"), Path(__file__).parent / "__pycache__"):
         with contextlib.suppress(OSError):
             if folder.is_absolute():
                 folder.mkdir(parents=True, exist_ok=True)

@@ -64,7 +64,7 @@ class LinearConstraints(Immutable):
     def joined(self, other: LinearConstraints) -> LinearConstraints:
         """These constraints, then the others. Raises ValueError if I or O differs."""
         check_kind("other", other, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
-        shapes = [(one.inputs.shape[1], one.normals.shape[1]) for one in (self, other)]
+        shapes = [(constraints.inputs.shape[1], constraints.normals.shape[1]) for constraints in (self, other)]
         if shapes[0] != shapes[1]:
             raise ValueError(f"other: constraints of {shapes[1]} inputs and outputs given, {shapes[0]} needed.")
         points = Functionals.concatenated([self.functionals, other.functionals])
@@ -124,15 +124,15 @@ class Constrained(Expansion):
             mean = mean_of(self.with_weights(weights(multipliers)), points)
             return np.asarray((mean * constraints.normals).sum(axis=1) - constraints.bounds)
 
-        found = _multipliers((stiffness + stiffness.T) / 2, slack)
+        kkt_multipliers = _multipliers((stiffness + stiffness.T) / 2, slack)
         size = np.linalg.norm(constraints.normals, axis=1)
-        missed = -slack(found) / size
+        missed = -slack(kkt_multipliers) / size
         for worst in np.flatnonzero(missed > _VIOLATION)[:1]:
             raise ValueError(
                 f"The constraints cannot be met together: {worst} is missed by {missed[worst]:.3g}. They contradict "
                 "each other, or the reference's variance there is too small: give it more, or fewer constraints."
             )
-        return frozen(weights(found))
+        return frozen(weights(kkt_multipliers))
 
     def solved(self) -> Self:
         self.solution.solved()
@@ -170,13 +170,13 @@ def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
     root = np.sqrt(np.maximum(values, _RIDGE * values[-1]))
     from scipy.optimize import nnls  # its import takes a quarter of a second
 
-    found = nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[0] / size
+    multipliers = nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[0] / size
     for _ in range(_ROUNDS):
-        left = slack(found)
-        acts = (found > 0) | (left < 0)
+        left = slack(multipliers)
+        acts = (multipliers > 0) | (left < 0)
         if not acts.any() or np.abs(left[acts]).max() <= _CONVERGED:
             break
         step = np.linalg.lstsq(scaled[np.ix_(acts, acts)], -left[acts] / size[acts], rcond=1e-13)[0] / size[acts]
-        found = found.copy()
-        found[acts] = np.maximum(found[acts] + step, 0.0)
-    return found
+        multipliers = multipliers.copy()
+        multipliers[acts] = np.maximum(multipliers[acts] + step, 0.0)
+    return multipliers

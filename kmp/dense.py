@@ -63,11 +63,11 @@ class _Removed(NamedTuple):
         padded = np.zeros((len(base), right.shape[1]), order="F")
         padded[self.kept] = right
         if removed is None:
-            found, _ = lapack.dtrtrs(base, padded, lower=1)
-            removed = -lapack.dtrtrs(self.root, self.span.T @ found)[0]
+            forward, _ = lapack.dtrtrs(base, padded, lower=1)
+            removed = -lapack.dtrtrs(self.root, self.span.T @ forward)[0]
         padded[self.rows] = removed
-        found, _ = lapack.dtrtrs(base, padded, lower=1)
-        return np.asarray(found - self.span @ (self.span.T @ found))
+        forward, _ = lapack.dtrtrs(base, padded, lower=1)
+        return np.asarray(forward - self.span @ (self.span.T @ forward))
 
 
 class _Bordered(NamedTuple):
@@ -152,8 +152,8 @@ class Dense(Expansion):
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self.inverse_factor.times_one(row.T)
-        own = self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
-        return self._for_all_outputs(np.asarray(own - blas.dgemm(1.0, root, root, trans_b=1)))
+        prior_covariance = self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
+        return self._for_all_outputs(np.asarray(prior_covariance - blas.dgemm(1.0, root, root, trans_b=1)))
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
@@ -162,12 +162,12 @@ class Dense(Expansion):
     def adapted(self, changes: Changes) -> Dense:
         """The base's solution with these changes; it shares the base's factor if that is faster."""
         base = self.base or self
-        count, gone = len(base.database), changes.replaced
-        database, first = base.database.changed(changes), int(gone[0]) if len(gone) else count
-        if count - first > 2 * len(gone) and len(gone) <= _MOST_REMOVED * count:
-            found = Dense(self.hyperparameters, database, base, count - len(gone), gone)
-            if found.distinct >= base.distinct:
-                return found
+        count, replaced = len(base.database), changes.replaced
+        database, first = base.database.changed(changes), int(replaced[0]) if len(replaced) else count
+        if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
+            solution = Dense(self.hyperparameters, database, base, count - len(replaced), replaced)
+            if solution.distinct >= base.distinct:
+                return solution
         return Dense(self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0)
 
     def extended(self, database: Database) -> Dense:
@@ -245,16 +245,16 @@ class Dense(Expansion):
         if base_factor is None or self.same == 0:
             # In place: the matrix is symmetric, and its transpose has LAPACK's order.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
-            found: Array | _Bordered = frozen(factor)
+            solver: Array | _Bordered = frozen(factor)
         else:
-            found, info = self._bordered(rows, base_factor)
+            solver, info = self._bordered(rows, base_factor)
         if info:
             point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.distinct)
             raise ValueError(
                 f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
                 f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
             )
-        return found
+        return solver
 
     def _bordered(self, rows: Array, base_factor: Array) -> tuple[_Bordered, int]:
         """The base's factor bordered by these rows, without removed points; LAPACK's info."""
@@ -265,25 +265,25 @@ class Dense(Expansion):
             border, _ = lapack.dtrtrs(shared, columns, lower=1)
         else:
             shared, kernel = np.asfortranarray(base_factor), self.hyperparameters.kernel
-            o, gone = kernel.channels * self.distinct, self.base.database.functionals.take(self.gone)
+            o, removed_points = kernel.channels * self.distinct, self.base.database.functionals.take(self.gone)
             removed = _Removed.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
-            across = between(kernel, gone, self.database.functionals.take(slice(self.same, None)))
+            across = between(kernel, removed_points, self.database.functionals.take(slice(self.same, None)))
             border = removed.projected(shared, columns, kron_identity(across, self.distinct))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), removed), info
 
     def _rows(self, penalty: float) -> Array:
         """The rows of K (x) I + lambda Sigma that the base does not share, with all columns."""
-        kernel, same = self.hyperparameters.kernel, self.same
+        kernel, first = self.hyperparameters.kernel, self.same
         c, d, outputs = kernel.channels, self.distinct, self.hyperparameters.channel_outputs
         o = c * d
-        points, count, changed = self.database.functionals, len(self.database), len(self.database) - same
+        points, count, changed = self.database.functionals, len(self.database), len(self.database) - first
         rows = np.zeros((changed, c, d, count, c, d))
-        k = between(kernel, points.take(slice(same, None)), points).reshape(changed, c, count, c)
+        k = between(kernel, points.take(slice(first, None)), points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
         diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        covariance = self.database.reference.covariance[same:].reshape(changed, c, outputs, c, outputs)[:, :, :d, :, :d]
-        blocks[diagonal, :, diagonal + same, :] += penalty * covariance.reshape(changed, o, o)
+        covariance = self.database.reference.covariance[first:].reshape(changed, c, outputs, c, outputs)[:, :, :d, :, :d]
+        blocks[diagonal, :, diagonal + first, :] += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)

@@ -94,9 +94,9 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         inputs = validate_data(self, X, reset=False, dtype=np.float64)
         if not return_std:
             return self._shaped(self.primitive_.mean(inputs))
-        found = self.primitive_.predict(inputs)
-        deviations = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        return self._shaped(found.mean), self._shaped(deviations)
+        prediction = self.primitive_.predict(inputs)
+        deviations = np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2))
+        return self._shaped(prediction.mean), self._shaped(deviations)
 
     def _shaped(self, outputs: Array) -> Array:
         return outputs[:, 0] if self._one_output else outputs

@@ -44,8 +44,8 @@ class Functionals(Immutable):
     @staticmethod
     def concatenated(parts: Sequence[Functionals]) -> Functionals:
         """All functionals of the parts, in order."""
-        if len(some := [part for part in parts if len(part)]) == 1:
-            return some[0]
+        if len(nonempty := [part for part in parts if len(part)]) == 1:
+            return nonempty[0]
         inputs = frozen(np.concatenate([part.inputs for part in parts]))
         if all(part.directions is None for part in parts):
             return Functionals(inputs)

@@ -44,12 +44,12 @@ class Gaussians(Immutable):
 
         Raises ValueError if a number is not finite, shapes do not agree, or a deviation is below 0.
         """
-        given = real("mean", mean)
-        means = numbers("mean", given[None] if given.ndim == 1 else given, "N", "O")
+        array = real("mean", mean)
+        means = numbers("mean", array[None] if array.ndim == 1 else array, "N", "O")
         deviations = real("deviation", deviation)
         if deviations.shape not in {(), means.shape[1:], means.shape}:
-            wanted = f"(), {means.shape[1:]} or {means.shape}"
-            raise ValueError(f"deviation: shape {deviations.shape} given, {wanted} needed for a mean of {means.shape}.")
+            shape_text = f"(), {means.shape[1:]} or {means.shape}"
+            raise ValueError(f"deviation: shape {deviations.shape} given, {shape_text} needed for a mean of {means.shape}.")
         check_finite("deviation", deviations)
         if (deviations < 0).any():
             raise ValueError(f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact.")
@@ -106,7 +106,7 @@ class Gaussians(Immutable):
             check_gaussians("product", other)
             if other.mean.shape != self.mean.shape:
                 raise ValueError(f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed.")
-        precisions = [np.linalg.inv(one.covariance) for one in factors]
+        precisions = [np.linalg.inv(factor.covariance) for factor in factors]
         covariance = symmetric(np.linalg.inv(np.sum(precisions, axis=0)))
         return Gaussians(fused_mean(covariance, precisions, factors), covariance)
 
@@ -115,8 +115,8 @@ class Gaussians(Immutable):
         """All distributions of the parts, in order. Raises ValueError if O differs."""
         for i, part in enumerate(parts_of("parts", parts)):
             check_gaussians(f"parts[{i}]", part, parts[0].outputs if i else None)
-        if len(some := [part for part in parts if len(part)]) == 1:
-            return some[0]
+        if len(nonempty := [part for part in parts if len(part)]) == 1:
+            return nonempty[0]
         return unchecked(
             np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
         )
@@ -131,7 +131,7 @@ def unchecked(mean: Array, covariance: Array) -> Gaussians:
 
 def fused_mean(covariance: Array, precisions: Sequence[NDArray[Any]], factors: Sequence[Gaussians]) -> Array:
     """Sigma sum_l P_l mu_l (N, O), of precisions P_l and a covariance Sigma (N, O, O)."""
-    pulls = [precision @ one.mean[:, :, None] for precision, one in zip(precisions, factors, strict=True)]
+    pulls = [precision @ factor.mean[:, :, None] for precision, factor in zip(precisions, factors, strict=True)]
     return np.asarray((covariance @ np.sum(pulls, axis=0))[:, :, 0])
 
 
@@ -146,8 +146,8 @@ def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> No
     """Raise ValueError unless each input (N, I) has one normal, over this number of outputs."""
     check_gaussians(name, points)
     if points.mean.shape != (len(inputs), outputs):
-        n, given = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
-        raise ValueError(f"{name}: {given} given for {n} inputs; {n} over {outputs} needed.")
+        n, points_text = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
+        raise ValueError(f"{name}: {points_text} given for {n} inputs; {n} over {outputs} needed.")
 
 
 def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
@@ -160,9 +160,9 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
         fault = f"is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}"
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
-    own = np.diagonal(covariance, axis1=1, axis2=2)
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
     alone = np.count_nonzero(covariance, axis=2) == 1
-    exact = alone & (own > 0) & (own < _EXACT_BELOW)  # exact outputs of `Gaussians.of`, beside others that are not
+    exact = alone & (variances > 0) & (variances < _EXACT_BELOW)  # exact outputs of `Gaussians.of`, beside others that are not
     filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
     try:
         smallest = np.linalg.eigvalsh(filled)[:, 0]

@@ -162,10 +162,10 @@ class GaussianKernel(Immutable):
         x, y = x - origin, y - origin
         left = 2 * scale * (u @ y.T - np.vecdot(x[i], u)[:, None])  # (I', B)
         right = 2 * scale * (x @ v.T - np.vecdot(y[j], v))  # (A, J')
-        both = k[np.ix_(i, j)] * (left[:, j] * right[i] + 2 * scale * (u @ v.T))
+        mixed = k[np.ix_(i, j)] * (left[:, j] * right[i] + 2 * scale * (u @ v.T))
         k[i] *= left
         k[:, j] *= right
-        k[np.ix_(i, j)] = both
+        k[np.ix_(i, j)] = mixed
         return k
 
     def variances(self, along: Array) -> Array:

@@ -124,17 +124,17 @@ def mixture_of(
     whole("components", components)
     seeded(seed)
     if len(data) < components:
-        given = f"{len(data)} samples given for {components} components"
-        raise ValueError(f"{given}: give at least {components} samples, or fewer components.")
+        shortage = f"{len(data)} samples given for {components} components"
+        raise ValueError(f"{shortage}: give at least {components} samples, or fewer components.")
     # scikit-learn loads slowly, and predictions do not need it.
     from sklearn.mixture import GaussianMixture as Estimator
     from threadpoolctl import threadpool_limits
 
-    known = {}
+    initial = {}
     if start is not None:
         precisions = np.asarray(np.linalg.inv(start.covariances), dtype=np.float64)
-        known = {"weights_init": start.weights / start.weights.sum(), "means_init": start.means}
-        known["precisions_init"] = symmetric(precisions)
+        initial = {"weights_init": start.weights / start.weights.sum(), "means_init": start.means}
+        initial["precisions_init"] = symmetric(precisions)
     estimator = Estimator(
         components,
         covariance_type="full",
@@ -143,12 +143,12 @@ def mixture_of(
         reg_covar=added,
         tol=_TOLERANCE,
         max_iter=_ITERATIONS,
-        **known,
+        **initial,
     )
     try:
         with threadpool_limits(1):  # k-means sums its threads' results in the order in which they finish
-            found = estimator.fit(data)
-        return GaussianMixture(found.weights_, found.means_, symmetric(found.covariances_))
+            fitted = estimator.fit(data)
+        return GaussianMixture(fitted.weights_, fitted.means_, symmetric(fitted.covariances_))
     except ValueError:  # a covariance is not positive definite
         raise ValueError(
             f"samples: with regularization {added:g} no mixture of {components} components was found, as one of their "

@@ -133,8 +133,8 @@ def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Cons
             "constraints: given for a low rank solution, a dense one needed. Leave out the arrays of either."
         )
     inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
-    given = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
-    return Constrained(solution, given)
+    constraints = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
+    return Constrained(solution, constraints)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
@@ -212,7 +212,7 @@ def _value(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
 
 
 def _fields(kind: Any) -> tuple[str, ...]:
-    return tuple(one.name for one in fields(kind)) if is_dataclass(kind) else kind._fields
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else kind._fields
 
 
 def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:

@@ -40,12 +40,12 @@ def continuous(quaternions: ArrayLike) -> Array:
 def multiplied(a: Array, b: Array) -> Array:
     """The products a b (..., 4): rotation b, then a. Raises ValueError if shapes differ."""
     a, b = real("a", a), real("b", b)
-    for name, one, other in (("a", a, b), ("b", b, a)):
-        if one.shape[-1:] != (4,) or (one.ndim > 1 and other.ndim > 1 and one.shape != other.shape):
+    for name, factor, other in (("a", a, b), ("b", b, a)):
+        if factor.shape[-1:] != (4,) or (factor.ndim > 1 and other.ndim > 1 and factor.shape != other.shape):
             raise ValueError(
-                f"{name}: shape {one.shape} given, for a of {a.shape} and b of {b.shape}; (..., 4) needed."
+                f"{name}: shape {factor.shape} given, for a of {a.shape} and b of {b.shape}; (..., 4) needed."
             )
-        check_finite(name, one)
+        check_finite(name, factor)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
@@ -112,9 +112,9 @@ class OrientationKMP(Immutable):
     """(4,) q_a, x y z w."""
 
     def __post_init__(self) -> None:
-        wanted = 3 * checked_primitive(self.primitive).kernel.channels
-        if (outputs := self.primitive.outputs) != wanted:
-            raise ValueError(f"primitive: {outputs} outputs given, {wanted} needed for an orientation.")
+        needed_outputs = 3 * checked_primitive(self.primitive).kernel.channels
+        if (outputs := self.primitive.outputs) != needed_outputs:
+            raise ValueError(f"primitive: {outputs} outputs given, {needed_outputs} needed for an orientation.")
         auxiliary = _unit("auxiliary", self.auxiliary, 4)
         object.__setattr__(self, "auxiliary", frozen(auxiliary.copy()))
 
@@ -128,10 +128,10 @@ class OrientationKMP(Immutable):
         The covariances are those of small rotations in the world, with J of `rotation_per_zeta`.
         Raises ValueError as `KMP.predict`.
         """
-        found = self.primitive.predict(queries)
-        zeta = found.mean[:, :3]
-        turn = np.array([rotation_per_zeta(one) for one in zeta]).reshape(-1, 3, 3)
-        return exp(zeta, self.auxiliary), turn @ found.covariance[:, :3, :3] @ turn.transpose(0, 2, 1)
+        prediction = self.primitive.predict(queries)
+        zeta = prediction.mean[:, :3]
+        turn = np.array([rotation_per_zeta(tangent) for tangent in zeta]).reshape(-1, 3, 3)
+        return exp(zeta, self.auxiliary), turn @ prediction.covariance[:, :3, :3] @ turn.transpose(0, 2, 1)
 
     def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
         """omega (3,) [rad/s] at one query (I,) that moves with (I,) [unit of the inputs / s].
@@ -168,7 +168,7 @@ class OrientationKMP(Immutable):
             not_negative("tolerance", tolerance)
         q = _unit("quaternions", numbers("quaternions", quaternions, len(where), 4))
         zeta = self._nearest(where, q)
-        back = np.array([np.linalg.inv(rotation_per_zeta(one)) for one in zeta]).reshape(-1, 3, 3)
+        back = np.array([np.linalg.inv(rotation_per_zeta(tangent)) for tangent in zeta]).reshape(-1, 3, 3)
         turned = self._turned("covariance", covariance, back, self.primitive.least_variance)
         if self.primitive.kernel.channels == 1:
             if angular_velocities is not None or velocity_covariance is not None:
@@ -197,14 +197,14 @@ class OrientationKMP(Immutable):
         a rotation's is at most 4 times that of zeta. Raises ValueError if a covariance is not
         positive definite, or too small.
         """
-        count, given = len(back), real(name, covariance)
-        given = numbers(name, np.broadcast_to(given, (count, 3, 3)) if given.shape == (3, 3) else given, count, 3, 3)
-        exact = ~given.any(axis=(1, 2), keepdims=True)
-        checked = covariances(name, np.where(exact, np.eye(3), given), count, 3)
+        count, array = len(back), real(name, covariance)
+        array = numbers(name, np.broadcast_to(array, (count, 3, 3)) if array.shape == (3, 3) else array, count, 3, 3)
+        exact = ~array.any(axis=(1, 2), keepdims=True)
+        checked = covariances(name, np.where(exact, np.eye(3), array), count, 3)
         turned = symmetric(back @ checked @ back.transpose(0, 2, 1))
         check_finite(name, turned, "too large:")
         for n in np.flatnonzero(np.linalg.eigvalsh(turned)[:, 0] < least)[:1]:
-            smallest = np.linalg.eigvalsh(given[n])[0]
+            smallest = np.linalg.eigvalsh(array[n])[0]
             raise ValueError(
                 f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is {smallest:.3g}, and "
                 f"{4.1 * least:.2g} is enough. Give 0 for the least, or the primitive a larger lambda_covariance."
@@ -224,7 +224,7 @@ def _unit(name: str, quaternions: ArrayLike, *shape: int) -> Array:
     q = numbers(name, quaternions, *(shape or ("T", 4)))
     length = np.linalg.norm(q, axis=-1, keepdims=True)
     for n in np.flatnonzero(np.abs(length - 1) > _UNIT)[:1]:
-        which = "" if shape else f"[{n}]"
+        index_text = "" if shape else f"[{n}]"
         norm = f"{length.flat[n]:.4g}"
-        raise ValueError(f"{name}{which} has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
+        raise ValueError(f"{name}{index_text} has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
     return np.asarray(q / length)

@@ -80,34 +80,34 @@ class Plotted:
             from matplotlib import pyplot as plt
             from matplotlib.axes import Axes
         except ModuleNotFoundError as error:
-            what = "plot draws with Matplotlib, which is not installed: pip install 'kmp[plot]'"
-            raise ModuleNotFoundError(what, name=error.name) from None
+            message = "plot draws with Matplotlib, which is not installed: pip install 'kmp[plot]'"
+            raise ModuleNotFoundError(message, name=error.name) from None
         for name, text in (("label", label), ("input_unit", input_unit), ("output_unit", output_unit)):
             check_kind(name, text, str, "a text")
-        shown = self.to_plot()
-        s = _along(shown) if queries is None else numbers("queries", queries, "M", shown.references.inputs.shape[1])
-        titles = _titles(outputs, shown, input_unit, output_unit)
+        plot_data = self.to_plot()
+        s = _along(plot_data) if queries is None else numbers("queries", queries, "M", plot_data.references.inputs.shape[1])
+        titles = _titles(outputs, plot_data, input_unit, output_unit)
         chosen = None if plane is None else [whole("plane", i, least=0, most=len(titles) - 1) for i in _two(plane)]
-        wanted = len(titles) if chosen is None else 1
+        axes_count = len(titles) if chosen is None else 1
         if axes is None:
-            size = (6.4, 1.0 + 1.9 * wanted) if chosen is None else (6.4, 5.0)
-            axes = plt.subplots(wanted, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")[1]
+            size = (6.4, 1.0 + 1.9 * axes_count) if chosen is None else (6.4, 5.0)
+            axes = plt.subplots(axes_count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")[1]
         into: list[Any] = [axes]
         if isinstance(axes, (list, tuple, np.ndarray)):
             into = list(np.ravel(np.asarray(axes, dtype=object)))
-        if len(into) != wanted:
-            raise ValueError(f"axes: {len(into)} given, {wanted} needed.")
-        for i, one in enumerate(into):
-            check_kind(f"axes[{i}]", one, Axes, "pyplot.subplots makes them")
-        found = self.predict(s)
+        if len(into) != axes_count:
+            raise ValueError(f"axes: {len(into)} given, {axes_count} needed.")
+        for i, ax in enumerate(into):
+            check_kind(f"axes[{i}]", ax, Axes, "pyplot.subplots makes them")
+        prediction = self.predict(s)
         if chosen is None:
-            for i, one in enumerate(into):
-                _draw_over_input(one, s, found, shown, i, label)
-                one.set_ylabel(one.get_ylabel() or titles[i])
+            for i, ax in enumerate(into):
+                _draw_over_input(ax, s, prediction, plot_data, i, label)
+                ax.set_ylabel(ax.get_ylabel() or titles[i])
             title = _named("input", input_unit) if s.shape[1] == 1 else "query"
             into[-1].set_xlabel(into[-1].get_xlabel() or title)
         else:
-            _draw_plane(into[0], found, shown, chosen, label)
+            _draw_plane(into[0], prediction, plot_data, chosen, label)
             into[0].set_xlabel(into[0].get_xlabel() or titles[chosen[0]])
             into[0].set_ylabel(into[0].get_ylabel() or titles[chosen[1]])
         _add_legend(into[0])
@@ -115,16 +115,16 @@ class Plotted:
 
 
 def _two(plane: Sequence[int]) -> list[int]:
-    if len(given := parts_of("plane", plane)) != 2:
-        raise ValueError(f"plane: {brief(given)} given, the numbers of two outputs needed.")
-    return given
+    if len(indices := parts_of("plane", plane)) != 2:
+        raise ValueError(f"plane: {brief(indices)} given, the numbers of two outputs needed.")
+    return indices
 
 
 def _along(shown: Shown) -> Array:
-    known = shown.references.inputs
-    if known.shape[1] != 1:
-        raise ValueError(f"queries: none given, a path (M, {known.shape[1]}) needed.")
-    low, high = (known.min(), known.max()) if shown.period is None else (0.0, shown.period)
+    inputs = shown.references.inputs
+    if inputs.shape[1] != 1:
+        raise ValueError(f"queries: none given, a path (M, {inputs.shape[1]}) needed.")
+    low, high = (inputs.min(), inputs.max()) if shown.period is None else (0.0, shown.period)
     return np.linspace(low, high, _QUERIES)[:, None]
 
 
@@ -147,26 +147,26 @@ def _titles(outputs: Sequence[str] | None, shown: Shown, input_unit: str, unit: 
 
 def _draw_over_input(axes: Axes, s: Array, found: Gaussians, shown: Shown, i: int, label: str) -> None:
     alone = s.shape[1] == 1
-    at, mean, deviation = s[:, 0] if alone else np.arange(len(s)), found.mean[:, i], np.sqrt(found.covariance[:, i, i])
-    [line] = axes.plot(at, mean, label=label, zorder=4)
-    for times, opacity, said in _REGIONS:
+    x, mean, deviation = s[:, 0] if alone else np.arange(len(s)), found.mean[:, i], np.sqrt(found.covariance[:, i, i])
+    [line] = axes.plot(x, mean, label=label, zorder=4)
+    for times, opacity, region_label in _REGIONS:
         style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
-        axes.fill_between(at, mean - times * deviation, mean + times * deviation, label=said, **style)
+        axes.fill_between(x, mean - times * deviation, mean + times * deviation, label=region_label, **style)
     if alone:  # with more inputs, no axis shows their position
-        known, via = shown.references, shown.via_points
-        axes.plot(known.inputs[:, 0], known.normals.mean[:, i], label="reference", **_REFERENCE)
+        references, via = shown.references, shown.via_points
+        axes.plot(references.inputs[:, 0], references.normals.mean[:, i], label="reference", **_REFERENCE)
         if len(via.normals):
-            both = 2 * np.sqrt(via.normals.covariance[:, i, i])
-            axes.errorbar(via.inputs[:, 0], via.normals.mean[:, i], both, label="via-point", capsize=3, **_VIA_POINT)
+            error_bar = 2 * np.sqrt(via.normals.covariance[:, i, i])
+            axes.errorbar(via.inputs[:, 0], via.normals.mean[:, i], error_bar, label="via-point", capsize=3, **_VIA_POINT)
 
 
 def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], label: str) -> None:
     from matplotlib.patches import PathPatch
 
     [line] = axes.plot(*found.mean[:, plane].T, label=label, zorder=4)
-    for times, opacity, said in _REGIONS:
+    for times, opacity, region_label in _REGIONS:
         style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
-        axes.add_patch(PathPatch(_ellipses(found, plane, times), label=said, **style))
+        axes.add_patch(PathPatch(_ellipses(found, plane, times), label=region_label, **style))
     via = shown.via_points.normals
     axes.plot(*shown.references.normals.mean[:, plane].T, label="reference", **_REFERENCE)
     if len(via):
@@ -185,7 +185,7 @@ def _ellipses(normals: Gaussians, plane: list[int], times: int) -> Path:
     vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None] ** np.array([1, 0])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     around = normals.mean[:, None, plane] + times * (np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)], 1) @ root.mT)
-    return Path.make_compound_path(*(Path(one, closed=True) for one in around))
+    return Path.make_compound_path(*(Path(ellipse, closed=True) for ellipse in around))
 
 
 def _add_legend(axes: Axes) -> None:
@@ -194,4 +194,4 @@ def _add_legend(axes: Axes) -> None:
     named = dict(zip(reversed(labels), reversed(handles), strict=True))
     look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}
     order = sorted(named, key=labels.index)
-    axes.legend([named[one] for one in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, **look)
+    axes.legend([named[label] for label in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, **look)

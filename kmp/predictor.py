@@ -82,8 +82,8 @@ class Predictor(Immutable):
         ValueError if the shape differs or a number is not finite.
         """
         s = real("queries", queries)
-        if (found := self._compiled_mean(s)) is not None:
-            return found[0]
+        if (mean_and_row := self._compiled_mean(s)) is not None:
+            return mean_and_row[0]
         s = self._checked_many(s)
         return (
             self.inner.query.mean(self.inner.query.row(s[0]))[None] if len(s) == 1 else mean_at(self.inner.solution, s)
@@ -99,14 +99,14 @@ class Predictor(Immutable):
         """
         s = real("queries", queries)
         compiled = self.inner.compiled_query if s.shape[:1] == (1,) else None
-        if compiled is not None and (found := self._compiled_mean(s)) is not None:
-            return unchecked(found[0], compiled.covariance(found[1])[None])
+        if compiled is not None and (mean_and_row := self._compiled_mean(s)) is not None:
+            return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
         if len(s) == 1:
             row = self.inner.query.row(s[0])
             return unchecked(self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None])
         batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
-        posterior = [self.inner.solution.posterior_covariance(self._rows(one)) for one in batches]
+        posterior = [self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches]
         stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
         return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale)
 
@@ -155,9 +155,9 @@ class Predictor(Immutable):
         s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
         compiled = self.inner.compiled_query
         if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
-            found = compiled.motion(s, v, a, covariance=covariance)
-            if found is not None:
-                return found
+            motion = compiled.motion(s, v, a, covariance=covariance)
+            if motion is not None:
+                return motion
         checked = self._checked("velocity", v), self._checked("acceleration", a)
         return self.inner.query.motion(self._one_query(s), *checked, covariance=covariance)
 
@@ -168,8 +168,8 @@ class Predictor(Immutable):
         finite.
         """
         s, compiled = real("query", query), self.inner.compiled_query
-        if compiled is not None and s.shape == (self._dimensions,) and (found := compiled.jacobian(s)) is not None:
-            return found
+        if compiled is not None and s.shape == (self._dimensions,) and (jacobian := compiled.jacobian(s)) is not None:
+            return jacobian
         return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
 
     def jacobians(self, queries: ArrayLike) -> Array:

@@ -169,9 +169,9 @@ class KMP(Predictor, Plotted):
         Raises ValueError as `adapt` does.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
-        given = numbers("jacobians", jacobians, len(via), self.outputs, self._dimensions)
+        matrices = numbers("jacobians", jacobians, len(via), self.outputs, self._dimensions)
         axes = np.tile(np.eye(self._dimensions), (len(via), 1))
-        means = given.transpose(0, 2, 1).reshape(len(axes), self.outputs)
+        means = matrices.transpose(0, 2, 1).reshape(len(axes), self.outputs)
         variance = squared("deviation", deviation)
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(frozen(np.repeat(via, self._dimensions, axis=0)), axes)
@@ -190,12 +190,12 @@ class KMP(Predictor, Plotted):
         Raises ValueError if shapes do not agree, or the constraints cannot be met together.
         """
         check_kind("constraints", constraints, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
-        for name, given, needed in (
+        for name, count, needed in (
             ("inputs", constraints.inputs.shape[1], self._dimensions),
             ("outputs", constraints.normals.shape[1], self.outputs),
         ):
-            if given != needed:
-                raise ValueError(f"constraints: {given} {name} given, {needed} needed.")
+            if count != needed:
+                raise ValueError(f"constraints: {count} {name} given, {needed} needed.")
         solution: Solution = self.inner.solution
         if isinstance(solution, Constrained):
             constraints = solution.constraints.joined(constraints)
@@ -276,10 +276,10 @@ class KMP(Predictor, Plotted):
 
     def to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""
-        known, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
-        values = known.functionals.values
+        database, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
+        values = database.functionals.values
         before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
-        references, via = (Points(self.inputs[part], known.reference.take(part)) for part in (before, taught))
+        references, via = (Points(self.inputs[part], database.reference.take(part)) for part in (before, taught))
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
     def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
@@ -330,9 +330,9 @@ class KMP(Predictor, Plotted):
         ValueError as `adapt` does.
         """
         pairs = parts_of("points", points)
-        for i, one in enumerate(pairs):
-            if not (isinstance(one, (tuple, list)) and len(one) == 2):
-                raise ValueError(f"points[{i}]: {brief(one)} given, a pair of inputs (V, I) and V normals needed.")
+        for i, pair in enumerate(pairs):
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
+                raise ValueError(f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals needed.")
         return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
@@ -353,7 +353,7 @@ class KMP(Predictor, Plotted):
         desired = Gaussians.of(self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs])
         point = Functionals(s[None])
         adapted = self._through(point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0)
-        found = np.empty(len(s))
+        reach = np.empty(len(s))
         for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
             path = np.tile(s, (2, len(r), 1))
@@ -364,8 +364,8 @@ class KMP(Predictor, Plotted):
             matters = moved.reshape(2, -1) >= share * moved[0]
             if self.kernel.period is None:  # outside the data the mean extrapolates
                 matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (path[:, :, i] <= self.inputs[:, i].max())
-            found[i] = r[matters.any(axis=0)].max(initial=0.0)
-        return found
+            reach[i] = r[matters.any(axis=0)].max(initial=0.0)
+        return reach
 
     @cached_property
     def spacing(self) -> float:

@@ -104,9 +104,9 @@ class Query(Immutable):
 
     def mean(self, row: KernelRow) -> Array:
         """xi(s) (O,). Equation (8)."""
-        found = row.kernel @ self.weights
-        found = (found if found.ndim == 1 else found.ravel()) + self.prior_offset
-        return np.asarray(found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:] @ row.query)
+        mean = row.kernel @ self.weights
+        mean = (mean if mean.ndim == 1 else mean.ravel()) + self.prior_offset
+        return np.asarray(mean if self.prior_mean.shape[1] == 1 else mean + self.prior_mean[:, 1:] @ row.query)
 
     def covariance(self, kernel: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
@@ -115,9 +115,9 @@ class Query(Immutable):
 
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""
-        found = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
-        found = found if self.unstretched else found * self.stretch
-        return found if self.prior_mean.shape[1] == 1 else found + self.prior_mean[:, 1:]
+        jacobian = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
+        jacobian = jacobian if self.unstretched else jacobian * self.stretch
+        return jacobian if self.prior_mean.shape[1] == 1 else jacobian + self.prior_mean[:, 1:]
 
     def jacobians(self, queries: Array) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
@@ -125,14 +125,14 @@ class Query(Immutable):
         if isinstance(kernel, GaussianKernel) and self.derivatives is None:
             # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
             # at the mean of the centres, the differences lose few digits.
-            found = between(kernel, Functionals(queries), functionals) @ self._moments
+            products = between(kernel, Functionals(queries), functionals) @ self._moments
             x = queries * self.stretch - self._origin
-            pulls, moments = found[:, : self.weights.shape[1], None], found[:, self.weights.shape[1] :]
+            pulls, moments = products[:, : self.weights.shape[1], None], products[:, self.weights.shape[1] :]
             slopes = (pulls * x[:, None, :] - moments.reshape(len(x), -1, i)) * (-2 * self.scale * self.stretch)
         else:
             along = Functionals(np.repeat(queries, i, axis=0), np.tile(np.eye(i), (len(queries), 1)))
-            found = between(kernel, along, functionals) @ self.weights
-            slopes = found.reshape(len(queries), i, -1).transpose(0, 2, 1)
+            products = between(kernel, along, functionals) @ self.weights
+            slopes = products.reshape(len(queries), i, -1).transpose(0, 2, 1)
         return slopes if self.prior_mean.shape[1] == 1 else slopes + self.prior_mean[:, 1:]
 
     @cached_property

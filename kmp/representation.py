@@ -46,10 +46,10 @@ def solved(
         return Dense(parameters, database).solved()
     solution = LowRank.fit(parameters, database, features, values=values).solved()
     if not enough:
-        off = solution.error_bounds.at_points
+        error_bound = solution.error_bounds.at_points
         warnings.warn(
             f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} is required: the mean at them may be off by up to {off:.2g} "
+            f"{tolerance:.2g} is required: the mean at them may be off by up to {error_bound:.2g} "
             "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
             RankReached,
             stacklevel=3,

@@ -79,19 +79,19 @@ class Learned(Immutable):
         """
         base = self.primitive.base
         places = base.inputs[np.linspace(0, len(base.inputs) - 1, _PLACES).round().astype(int)]
-        return frozen(np.median([base.via_point_reach(one) for one in np.unique(places, axis=0)], axis=0))
+        return frozen(np.median([base.via_point_reach(place) for place in np.unique(places, axis=0)], axis=0))
 
     def report(self, count: int = 10) -> str:
         """The best `count` of the scores as a table, then what was chosen and its reach."""
         lines = [f"{'ell':>40} {'lambda':>10} {'lambda_c':>10} {'RMSE':>10} {'-log lik.':>10}"]
-        for one in self.scores[: whole("count", count)]:
-            ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(one.ell))
-            other = "" if one.lambda_covariance is None else f"{one.lambda_covariance:.3g}"
-            likelihood = "" if one.negative_log_likelihood is None else f"{one.negative_log_likelihood:.3f}"
-            lines.append(f"{ell:>40} {one.lambda_mean:>10.3g} {other:>10} {one.rmse:>10.4g} {likelihood:>10}")
+        for score in self.scores[: whole("count", count)]:
+            ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell))
+            other = "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}"
+            likelihood = "" if score.negative_log_likelihood is None else f"{score.negative_log_likelihood:.3f}"
+            lines.append(f"{ell:>40} {score.lambda_mean:>10.3g} {other:>10} {score.rmse:>10.4g} {likelihood:>10}")
         lines.append(f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}")
         kernel, penalty = self.primitive.kernel, self.primitive.lambda_mean
-        reach = " ".join(f"{one:.3g}" for one in self.reach)
+        reach = " ".join(f"{distance:.3g}" for distance in self.reach)
         lines.append(f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it")
         return "\n".join(lines)
 
@@ -110,7 +110,7 @@ class _Recipe:
         """The mixture of all samples, from that of a few more if it is known."""
         try:
             return mixture_of(
-                np.concatenate([np.hstack(one) for one in data]),
+                np.concatenate([np.hstack(pair) for pair in data]),
                 components=self.components,
                 seed=self.seed,
                 regularization=self.regularization,
@@ -138,14 +138,14 @@ class _Recipe:
 
     def folds(self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool) -> _Folds:
         """Those that hold out one demonstration each, with the mixtures of the others."""
-        return _Folds(tuple(self._fold(data, h, one, shown) for h, one in enumerate(mixtures)), shown, self.channels)
+        return _Folds(tuple(self._fold(data, h, mixture, shown) for h, mixture in enumerate(mixtures)), shown, self.channels)
 
     def _fold(self, data: Sequence[tuple[Array, Array]], h: int, mixture: GaussianMixture, shown: bool) -> Fold:
-        rest = self.reference([*data[:h], *data[h + 1 :]], mixture, shown)
-        some = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
-        inputs, outputs = data[h][0][some], data[h][1][some]
+        training = self.reference([*data[:h], *data[h + 1 :]], mixture, shown)
+        indices = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
+        inputs, outputs = data[h][0][indices], data[h][1][indices]
         miss = (mixture.regress(inputs).mean - outputs)[:, : outputs.shape[1] // self.channels]
-        return Fold(rest.inputs, rest.reference, rest.prior_mean, inputs, outputs, rms(miss))
+        return Fold(training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss))
 
 
 class _Folds(NamedTuple):
@@ -162,13 +162,13 @@ class _Folds(NamedTuple):
 
     def rmses(self, kernel: Kernel, penalties: Sequence[float]) -> list[float]:
         """Of all folds, for each penalty."""
-        each = [fold.rmses(kernel, penalties, self.outputs) for fold in self.each]
-        return [float(one) for one in np.sqrt(np.mean(np.square(each), axis=0))]
+        fold_rmses = [fold.rmses(kernel, penalties, self.outputs) for fold in self.each]
+        return [float(rmse) for rmse in np.sqrt(np.mean(np.square(fold_rmses), axis=0))]
 
     def likelihoods(self, kernel: Kernel, penalty: float, others: Sequence[float]) -> list[float]:
         """The mean negative log likelihoods, for each lambda of the covariance."""
-        each = [fold.negative_log_likelihoods(kernel, penalty, others, self.outputs) for fold in self.each]
-        return [float(one) for one in np.mean(each, axis=0)]
+        fold_likelihoods = [fold.negative_log_likelihoods(kernel, penalty, others, self.outputs) for fold in self.each]
+        return [float(likelihood) for likelihood in np.mean(fold_likelihoods, axis=0)]
 
 
 def learn(
@@ -229,37 +229,37 @@ def learn(
     recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1)
     mixture = recipe.mixture(data)
     _check_scale(data, regularization)
-    shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
+    is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
     plain = np.nan
-    wanted = kernel is None or lambda_mean is None or lambda_covariance is None
-    if wanted and criterion == "left-out":
+    is_incomplete = kernel is None or lambda_mean is None or lambda_covariance is None
+    if is_incomplete and criterion == "left-out":
         if len(data) < 2:
             raise ValueError(
                 f"{len(data)} demonstration given: at least 2 needed to choose parameters by leaving one out. "
                 'Give kernel, lambda_mean and lambda_covariance, or criterion "likelihood", or another demonstration.'
             )
         mixtures = [recipe.mixture([*data[:h], *data[h + 1 :]], mixture) for h in range(len(data))]
-        asked = [shown, False] if points == "auto" and shown else [shown]
+        asked = [is_shown, False] if points == "auto" and is_shown else [is_shown]
         search = _Search(kernel, lambda_mean, scales == "one")
-        choices = [recipe.folds(data, mixtures, one) for one in asked]
+        choices = [recipe.folds(data, mixtures, option) for option in asked]
         folds, kernel, lambda_mean, scores = search.best(choices)
-        shown = folds.shown
+        is_shown = folds.shown
         plain = float(np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds.each])))
         if lambda_covariance is None:
             lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
-    full = recipe.reference(data, mixture, shown)
-    if wanted and criterion == "likelihood":
+    full = recipe.reference(data, mixture, is_shown)
+    if is_incomplete and criterion == "likelihood":
         start = 0.5 / _variances(full.inputs)
-        found = most_likely(
+        likeliest = most_likely(
             Database(Functionals(full.inputs), full.reference),
             full.prior_mean,
             kernel or (VelocityKernel(float(start[0])) if velocity else GaussianKernel(start)),
             lambda_mean,
             free="none" if kernel else scales,
         )
-        kernel, lambda_mean = found.kernel, found.lambda_mean
-        lambda_covariance = lambda_covariance or len(full.inputs) / found.signal_variance
+        kernel, lambda_mean = likeliest.kernel, likeliest.lambda_mean
+        lambda_covariance = lambda_covariance or len(full.inputs) / likeliest.signal_variance
     assert kernel is not None, "given or chosen"
     assert lambda_mean is not None, "given or chosen"
     order = sorted(scores, key=_best_first)
@@ -302,12 +302,12 @@ def _likeliest(folds: _Folds, kernel: Kernel, lambda_mean: float, scores: list[S
     """The lambda of the covariance of the least negative log likelihood. Notes the scores."""
     others = [factor * lambda_mean for factor in _OF_MEAN]
     [rmse] = folds.rmses(kernel, [lambda_mean])
-    found = folds.likelihoods(kernel, lambda_mean, others)
+    likelihoods = folds.likelihoods(kernel, lambda_mean, others)
     scores += [
-        Score(kernel.ell, lambda_mean, other, rmse if np.isfinite(one) else np.inf, one)
-        for other, one in zip(others, found, strict=True)
+        Score(kernel.ell, lambda_mean, other, rmse if np.isfinite(likelihood) else np.inf, likelihood)
+        for other, likelihood in zip(others, likelihoods, strict=True)
     ]
-    return min(zip(found, others, strict=True))[1]
+    return min(zip(likelihoods, others, strict=True))[1]
 
 
 class _Tried(NamedTuple):
@@ -332,16 +332,16 @@ class _Search:
         changes no more of the skill than the demonstrations ask for.
         """
         grids: list[list[Score]] = [[] for _ in choices]
-        found = [self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)]
-        i = min(range(len(choices)), key=lambda i: found[i])
-        folds, scores, best = choices[i], grids[i], found[i]
+        candidates = [self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)]
+        i = min(range(len(choices)), key=lambda i: candidates[i])
+        folds, scores, best = choices[i], grids[i], candidates[i]
         dimensions = folds.each[0].inputs.shape[1]
         lengths = [range(dimensions)] if self.one_length else [[i] for i in range(dimensions)]
         free = ([] if self.kernel else lengths) + ([] if self.lambda_mean else [[dimensions]])
         for _ in range(_SWEEPS):
-            for some in free:
+            for indices in free:
                 for step in (np.log(_STEP), -np.log(_STEP)):
-                    other = tuple(value + step * (n in some) for n, value in enumerate(best.parameters))
+                    other = tuple(value + step * (n in indices) for n, value in enumerate(best.parameters))
                     best = min(best, *self._tried(folds, other[:-1], [other[-1]], scores))
         chosen = self._shortest(folds, best, scores)
         return folds, self._kernel(folds, chosen.parameters[:-1]), self._penalty(chosen.parameters[-1]), scores
@@ -352,12 +352,12 @@ class _Search:
             return best
         *lengths, penalty = best.parameters
         last = max(_ELLS) * 0.5 / self._spread(folds)  # beyond it, a via-point is a spike
-        penalties = [0.0] if self.lambda_mean else [penalty + np.log(one) for one in _AROUND]
-        found = [best]
+        penalties = [0.0] if self.lambda_mean else [penalty + np.log(multiple) for multiple in _AROUND]
+        candidates = [best]
         for factor in _SHORTER[(_SHORTER * np.exp(lengths)[:, None] <= _ROUNDED * last[:, None]).all(axis=0)]:
-            found.append(min(self._tried(folds, tuple(one + np.log(factor) for one in lengths), penalties, scores)))
-        shortest_first = found[::-1]
-        return preferred(shortest_first, [one.rmse for one in shortest_first], _AS_GOOD * best.rmse)
+            candidates.append(min(self._tried(folds, tuple(length + np.log(factor) for length in lengths), penalties, scores)))
+        shortest_first = candidates[::-1]
+        return preferred(shortest_first, [candidate.rmse for candidate in shortest_first], _AS_GOOD * best.rmse)
 
     def _grid(self, folds: _Folds, scores: list[Score]) -> _Tried:
         variances = self._spread(folds)
@@ -366,7 +366,7 @@ class _Search:
         lengths = [0.0] if self.kernel else np.log(_ELLS)
         penalties = [0.0] if self.lambda_mean else np.log(_LAMBDAS) - np.log(variance)
         start = np.log(0.5 / variances)
-        return min(one for n in lengths for one in self._tried(folds, tuple(start + n), penalties, scores))
+        return min(candidate for n in lengths for candidate in self._tried(folds, tuple(start + n), penalties, scores))
 
     @staticmethod
     def _spread(folds: _Folds) -> Array:
@@ -376,10 +376,10 @@ class _Search:
     def _tried(
         self, folds: _Folds, lengths: tuple[float, ...], penalties: Sequence[float], scores: list[Score]
     ) -> list[_Tried]:
-        kernel, values = self._kernel(folds, lengths), [self._penalty(one) for one in penalties]
-        found = folds.rmses(kernel, values)
-        scores += [Score(kernel.ell, value, None, rmse, None) for value, rmse in zip(values, found, strict=True)]
-        return [_Tried(rmse, (*lengths, one)) for rmse, one in zip(found, penalties, strict=True)]
+        kernel, values = self._kernel(folds, lengths), [self._penalty(penalty) for penalty in penalties]
+        rmses = folds.rmses(kernel, values)
+        scores += [Score(kernel.ell, value, None, rmse, None) for value, rmse in zip(values, rmses, strict=True)]
+        return [_Tried(rmse, (*lengths, penalty)) for rmse, penalty in zip(rmses, penalties, strict=True)]
 
     def _kernel(self, folds: _Folds, lengths: Sequence[float]) -> Kernel:
         ell = np.exp(np.array(lengths))

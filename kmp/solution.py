@@ -123,12 +123,12 @@ def mean_of(solution: Solution, queries: Functionals) -> Array:
     """
     parameters = solution.hyperparameters
     weights = solution.weights.reshape(-1, parameters.channel_outputs)
-    found = np.empty((len(queries) * parameters.kernel.channels, parameters.channel_outputs))
+    means = np.empty((len(queries) * parameters.kernel.channels, parameters.channel_outputs))
     for a in range(0, len(queries), BLOCK):
-        some = queries.take(slice(a, a + BLOCK)) if len(queries) > BLOCK else queries
-        rows = between(parameters.kernel, some, solution.functionals)
-        found[a * parameters.kernel.channels :][: len(rows)] = rows @ weights
-    return np.asarray(found.reshape(-1, parameters.outputs) + parameters.prior_at(queries))
+        block = queries.take(slice(a, a + BLOCK)) if len(queries) > BLOCK else queries
+        rows = between(parameters.kernel, block, solution.functionals)
+        means[a * parameters.kernel.channels :][: len(rows)] = rows @ weights
+    return np.asarray(means.reshape(-1, parameters.outputs) + parameters.prior_at(queries))
 
 
 def check_resolved(
@@ -151,7 +151,7 @@ def check_resolved(
         smaller = min(parameters.lambda_mean, parameters.lambda_covariance) if both else penalty
         accepted = least_variances(parameters, points.functionals.take(slice(n, n + 1)), smaller)[0]
         of = ("",) if len(accepted) == 1 else (" of the values", " of their rates")
-        named = " and ".join(f"{one:.2g}{what}" for one, what in zip(accepted, of, strict=True))
+        named = " and ".join(f"{variance:.2g}{suffix}" for variance, suffix in zip(accepted, of, strict=True))
         raise ValueError(
             f"The covariance at point {first + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} of "
             f"k(s, s) there, at least {_RESOLVED:g} needed. Give the point a variance of at least {named} "

@@ -54,12 +54,12 @@ def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: 
     Or any other value of this package. No suffix is added to the path. Raises OSError if the file
     cannot be written, and ValueError if the value is of another type.
     """
-    for name, given in (
+    for name, text in (
         ("path", str(path) if isinstance(path, Path) else path),
         ("input_unit", input_unit),
         ("output_unit", output_unit),
     ):
-        check_kind(name, given, str, "a text")
+        check_kind(name, text, str, "a text")
     units = {
         "kmp_format": np.array(_FORMAT),
         "input_unit": np.array(input_unit),
@@ -90,8 +90,8 @@ def load(path: str | Path) -> Stored:
         if is_pointer:
             raise ValueError(f"{path}: a pointer of Git LFS and not the file itself; `git lfs pull` fetches that.")
         raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again.")
-    if (given := arrays["kmp_format"].tolist()) != _FORMAT:
-        raise ValueError(f"{path}: format {brief(given)} given, {_FORMAT} needed. Load it with the kmp that wrote it.")
+    if (version := arrays["kmp_format"].tolist()) != _FORMAT:
+        raise ValueError(f"{path}: format {brief(version)} given, {_FORMAT} needed. Load it with the kmp that wrote it.")
     if str(arrays.get("checksum")) != checksum(arrays):
         raise ValueError(
             f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."

@@ -48,11 +48,11 @@ class _OneInput(Immutable):
         if along_a is not None or along_b is not None:
             i, u = directed(along_a, stretch)
             j, v = directed(along_b, stretch)
-            both = np.ix_(i, j)
-            through = self.blocks(r[both], values[both], scale, 2) * (-u * v.T)[:, :, None, None]
+            index = np.ix_(i, j)
+            through = self.blocks(r[index], values[index], scale, 2) * (-u * v.T)[:, :, None, None]
             k[i] = self.blocks(r[i], values[i], scale, 1) * u[:, :, None, None]
             k[:, j] = self.blocks(r[:, j], values[:, j], scale, 1) * -v[:, :, None]
-            k[both] = through
+            k[index] = through
         return k.transpose(0, 2, 1, 3).reshape(self.channels * len(a), self.channels * len(b))
 
     def variances(self, along: Array) -> Array:

@@ -89,11 +89,11 @@ def pytest_runtestloop(session: pytest.Session) -> None:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Where only what is timed, or only what is quick, is asked for, no other file is imported."""
-    wanted = config.option.markexpr
-    if collection_path.suffix != ".py" or wanted not in {"timed", "quick"}:
+    mark = config.option.markexpr
+    if collection_path.suffix != ".py" or mark not in {"timed", "quick"}:
         return None
-    is_wanted = f"mark.{wanted}" in collection_path.read_text(encoding="utf-8")
-    return None if is_wanted or (wanted == "quick" and tiers.is_quick_file(collection_path)) else True
+    is_wanted = f"mark.{mark}" in collection_path.read_text(encoding="utf-8")
+    return None if is_wanted or (mark == "quick" and tiers.is_quick_file(collection_path)) else True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -133,11 +133,11 @@ def golden(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
     """The golden session with a frame for each tick: made by a replay, once for all workers if
     none begins before another has ended.
     """
-    own = tmp_path_factory.mktemp("whole")
-    whole = (own if worker_id == "master" else own.parent.parent) / "golden.mcap"
+    folder = tmp_path_factory.mktemp("whole")
+    whole = (folder if worker_id == "master" else folder.parent.parent) / "golden.mcap"
     if not whole.exists():
-        assert replay(RECORDINGS / "golden.mcap", output=own / "replayed.mcap").within_tolerance
-        (own / "replayed.mcap").replace(whole)
+        assert replay(RECORDINGS / "golden.mcap", output=folder / "replayed.mcap").within_tolerance
+        (folder / "replayed.mcap").replace(whole)
     return whole
 
 

@@ -72,8 +72,8 @@ class Walk:
     @property
     def files(self) -> list[str]:
         """The files in the order in which they are entered."""
-        found = dict.fromkeys([LOOP, *(end for *_, end, _ in self.calls)])
-        return [str(Path(file).relative_to(ROOT)) for file in found if file != __file__]
+        paths = dict.fromkeys([LOOP, *(end for *_, end, _ in self.calls)])
+        return [str(Path(file).relative_to(ROOT)) for file in paths if file != __file__]
 
     @property
     def re_entries(self) -> int:
@@ -88,7 +88,7 @@ def _file_of(frame: FrameType) -> str:
 
 def walk() -> Walk:
     """A sample's way, while the arm follows."""
-    settings, skill, seen = Settings(), shipped_skill().for_loop(), Walk()
+    settings, skill, trace = Settings(), shipped_skill().for_loop(), Walk()
     controller = Controller(settings, skill, urdf=robot_description(settings))
     hands, names = skill.hands[0].reshape(2, 3), settings.joints.names
     listening = open_session(listen=["tcp/127.0.0.1:0"])
@@ -128,23 +128,23 @@ def walk() -> Walk:
         until = time.monotonic() + 10.0
         while not newest and time.monotonic() < until:
             sys.setprofile(None)
-            seen.calls.clear()
-            sys.setprofile(seen.see)
+            trace.calls.clear()
+            sys.setprofile(trace.see)
             newest = streams.receive()
         run(controller, [Tick(PERIODS, tuple(newest))], [publish])
         sys.setprofile(None)
     streams.close()
     listening.close()  # type: ignore[no-untyped-call]
-    return seen
+    return trace
 
 
 def main() -> None:
     """Prints the way, and counts it."""
-    seen = walk()
-    print("\n".join(f"{number:2} {file}" for number, file in enumerate(seen.files, 1)))
-    print(f"{len(seen.files)} files, {len(seen.calls)} calls between them, {seen.re_entries} re-entries")
+    trace = walk()
+    print("\n".join(f"{number:2} {file}" for number, file in enumerate(trace.files, 1)))
+    print(f"{len(trace.files)} files, {len(trace.calls)} calls between them, {trace.re_entries} re-entries")
     if "--calls" in sys.argv:
-        for start, caller, end, called in seen.calls:
+        for start, caller, end, called in trace.calls:
             print(f"{Path(start).relative_to(ROOT)} {caller} -> {Path(end).relative_to(ROOT)} {called}")
 
 

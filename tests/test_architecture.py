@@ -99,13 +99,13 @@ def named(path: Path) -> str:
 
 def imported(path: Path) -> set[str]:
     """The first parts of the names of all modules that a file imports, wherever in it."""
-    found: set[str] = set()
+    packages: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {name.name.split(".")[0] for name in node.names}
+            packages |= {name.name.split(".")[0] for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module.split(".")[0])
-    return found
+            packages.add(node.module.split(".")[0])
+    return packages
 
 
 def modules_imported(folder: Path) -> dict[str, set[str]]:
@@ -115,7 +115,7 @@ def modules_imported(folder: Path) -> dict[str, set[str]]:
         for path in (folder / place / package).rglob("*.py"):
             module = ".".join(path.relative_to(folder / place).with_suffix("").parts)
             names[module.removesuffix(".__init__")] = path
-    found: dict[str, set[str]] = {}
+    graph: dict[str, set[str]] = {}
     for module, path in names.items():
         imports: set[str] = set()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -124,8 +124,8 @@ def modules_imported(folder: Path) -> dict[str, set[str]]:
             elif isinstance(node, ast.ImportFrom) and node.module:
                 parts = {f"{node.module}.{name.name}" for name in node.names}
                 imports |= parts & names.keys() if parts <= names.keys() else parts & names.keys() | {node.module}
-        found[module] = (imports & names.keys()) - {module}
-    return found
+        graph[module] = (imports & names.keys()) - {module}
+    return graph
 
 
 def circle(imports: dict[str, set[str]]) -> list[str]:
@@ -249,15 +249,15 @@ def test_no_module_has_a_name_that_says_nothing() -> None:
 
 def defined(path: Path) -> set[str]:
     """The classes and constants that a module defines at its top level."""
-    found: set[str] = set()
+    identifiers: set[str] = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef):
-            found.add(node.name)
+            identifiers.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             names = (name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))
-            found |= {name.id for name in names if isinstance(name.ctx, ast.Store) and name.id.strip("_").isupper()}
-    return found
+            identifiers |= {name.id for name in names if isinstance(name.ctx, ast.Store) and name.id.strip("_").isupper()}
+    return identifiers
 
 
 def test_a_class_or_constant_has_a_name_of_its_own() -> None:
@@ -278,14 +278,14 @@ def test_tests_share_what_stands_in_support_and_never_import_each_other() -> Non
 
 def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
     """Nor as an attribute, which the linter finds."""
-    found = []
+    findings = []
     for path in (path for path in MODULES if path.is_relative_to(ROOT / "tests")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
-                found += [f"{named(path)}: {name.name}" for name in node.names if re.match("_[a-z]", name.name)]
+                findings += [f"{named(path)}: {name.name}" for name in node.names if re.match("_[a-z]", name.name)]
             elif isinstance(node, ast.Constant) and re.search(PRIVATE, str(node.value)):
-                found.append(f"{named(path)}: {node.value}")
-    assert found == []
+                findings.append(f"{named(path)}: {node.value}")
+    assert findings == []
 
 
 def test_every_file_that_a_tier_names_exists() -> None:

@@ -67,7 +67,7 @@ def test_the_services_are_commands_of_this_version_and_reach_each_other() -> Non
     assert metrics.run == "thirdhand.workbench.cli.metrics.metrics"
     settings = parse(configs["bench"]["content"], origin="compose.yaml")
     assert isinstance(settings, Settings)
-    assert [str(cell.config)] == [one["target"] for one in services["cell"]["configs"]]
+    assert [str(cell.config)] == [config["target"] for config in services["cell"]["configs"]]
     router = services["router"]["command"]
     assert list(settings.network.connect) == metrics.connect == [router[router.index("--listen") + 1]]
     assert services["router"]["image"].split(":")[1] in (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8")

@@ -50,19 +50,19 @@ def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
 
 def test_what_to_do_names_fields_settings_and_causes_that_exist() -> None:
     settings = msgspec.to_builtins(Settings())
-    known = {*requests.Status.__struct_fields__, *incidents.BY_WORD, *settings, BASE}
-    known |= {name for section in settings.values() if isinstance(section, dict) for name in section}
+    terms = {*requests.Status.__struct_fields__, *incidents.BY_WORD, *settings, BASE}
+    terms |= {name for section in settings.values() if isinstance(section, dict) for name in section}
     named = {
         name for row in incidents.BY_WORD.values() for name in re.findall(r"`([a-z]+(?:_[a-z]+)*)`", row.what_to_do)
     }
-    assert {"hand_age_ms", "rejected", "older", "keep_mb"} <= named <= known
+    assert {"hand_age_ms", "rejected", "older", "keep_mb"} <= named <= terms
 
 
 def test_each_view_that_a_page_names_by_its_title_exists() -> None:
     titles = {view.title for view in plot_views(Settings()).values()}
     for name in ("incidents.md", "viewing.md"):
         text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-        named = {" ".join(found.split()) for found in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
+        named = {" ".join(title.split()) for title in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
         assert named <= titles
         assert named or name != "incidents.md"
 
@@ -149,9 +149,9 @@ def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() 
     }
     text = json.dumps(layout)
     topics = {topic("thirdhand", channel.key) for channel in CHANNELS if channel.recorded}
-    shown = set(layout["configById"]["3D!scene"]["topics"])
-    assert {"/robot_description", "/thirdhand/objects", "/thirdhand/hands/left", "/thirdhand/tool/target"} <= shown
-    assert shown <= topics
+    scene_topics = set(layout["configById"]["3D!scene"]["topics"])
+    assert {"/robot_description", "/thirdhand/objects", "/thirdhand/hands/left", "/thirdhand/tool/target"} <= scene_topics
+    assert scene_topics <= topics
     named = re.findall(r'"(/thirdhand/\w+)\.(\w+)', text)
     assert len(named) >= 8
     assert all(field in fields.get(name, {"data"}) and name in topics for name, field in named)
@@ -174,7 +174,7 @@ PAGES = sorted(
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser."""
     actions = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))  # noqa: SLF001
-    return {name: found for action in actions for name, found in action.choices.items()}
+    return {name: command for action in actions for name, command in action.choices.items()}
 
 
 def options(parser: argparse.ArgumentParser) -> set[str]:
@@ -183,18 +183,18 @@ def options(parser: argparse.ArgumentParser) -> set[str]:
 
 
 OPTIONS = {
-    name: options(found) for name, found in (commands(main.parser()) | {"sim": thirdhand_sim.__main__.parser()}).items()
+    name: options(command) for name, command in (commands(main.parser()) | {"sim": thirdhand_sim.__main__.parser()}).items()
 }
-TABLES = {name: set(found) for name, found in msgspec.to_builtins(Settings()).items() if isinstance(found, dict)}
+TABLES = {name: set(section) for name, section in msgspec.to_builtins(Settings()).items() if isinstance(section, dict)}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_options_settings_and_files_that_a_page_names_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     code = re.findall(r"```(?:sh|console)\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL)
-    for name, rest in re.findall(r"(?:^|\s)thirdhand ([a-z][a-z-]*)([^|&#\n]*)", "\n".join(map("".join, code))):
+    for name, arguments in re.findall(r"(?:^|\s)thirdhand ([a-z][a-z-]*)([^|&#\n]*)", "\n".join(map("".join, code))):
         assert name in OPTIONS, f"thirdhand {name}"
-        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest)) <= OPTIONS[name] | {"--help"}, name + rest
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", arguments)) <= OPTIONS[name] | {"--help"}, name + arguments
     for table, name in re.findall(r"\[(\w+)\] (\w+)", text):
         assert table not in TABLES or name in TABLES[table], f"[{table}] {name}"
     for file in re.findall(r"`((?:service|sim|kmp|tests|docs|examples)/[\w./-]+\.\w+)`", text):

@@ -32,33 +32,33 @@ def example(name: str) -> ModuleType:
 @pytest.mark.thorough
 def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Once more with twice the time where a busy machine did not let them."""
-    said, ended = "", dict[str, Any]()
+    output, ended = "", dict[str, Any]()
     with serving(tmp_path) as daemon:
-        at = ["--connect", daemon.endpoint]
-        example("teach").main(at)
+        options = ["--connect", daemon.endpoint]
+        example("teach").main(options)
         modules = {name: example(name) for name in ("watch", "follower", "tracker")}
         for seconds in (2, 4, 8, 16):
             daemon.client.reset()
 
             def run(name: str, *arguments: str) -> None:
-                ended[name] = modules[name].main([*at, *arguments])
+                ended[name] = modules[name].main([*options, *arguments])
 
             running = [threading.Thread(target=run, args=(name, "--seconds", f"{seconds}")) for name in modules]
             for thread in running:
                 thread.start()
             for thread in running:
                 thread.join(60)
-            said += capsys.readouterr().out
-            if "thirdhand: follow" in said:
+            output += capsys.readouterr().out
+            if "thirdhand: follow" in output:
                 break
         received = daemon.client.status().received
     assert ended.keys() == modules.keys()
     assert received.keys() == {"hands/left", "hands/right", "joints/state", "joints/guided", "objects"}
-    assert "thirdhand: follow" in said
-    assert "commands arrive, at tick " in said
-    assert "were none of this arm's" not in said
-    assert "example: missed by " in said
-    assert "refused: $.names[0]: no via-point 'no such place'" in said
+    assert "thirdhand: follow" in output
+    assert "commands arrive, at tick " in output
+    assert "were none of this arm's" not in output
+    assert "example: missed by " in output
+    assert "refused: $.names[0]: no via-point 'no such place'" in output
     assert np.abs(ended["follower"]).max() > 0.1
 
 

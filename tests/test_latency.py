@@ -76,22 +76,22 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The empty loop and the core, which no plant changes, are not measured again."""
     report, measure = json.loads((kept / "bench.json").read_text()), benchmark.probe
-    known = {kind: report[kind] for kind in ("empty", "core")}
-    monkeypatch.setattr(benchmark, "probe", lambda kind, *more: known.get(kind) or measure(kind, *more))
+    reports = {kind: report[kind] for kind in ("empty", "core")}
+    monkeypatch.setattr(benchmark, "probe", lambda kind, *more: reports.get(kind) or measure(kind, *more))
 
 
 def complaints(report: dict[str, Any]) -> list[str]:
     """What of the loop's time is not as it should be."""
     ratios = report["ratios"]
-    found = {
+    checks = {
         "work": (ratios["work_to_fixed_work"], MOST_WORK),
         "latency": (ratios["latency"], MOST_LATENCY),
         "missed": (ratios["missed_more"], MOST_MISSED),
     }
-    for which, most in MOST_LATE.items():
-        empty, whole = (report[kind]["lateness_us"][which] for kind in ("empty", "whole"))
-        found[f"lateness, {which}"] = 1e-6 * RATE_HZ * (whole - empty), most
-    return [f"{name} {value:g}, at most {most:g}" for name, (value, most) in found.items() if value > most]
+    for percentile, most in MOST_LATE.items():
+        empty, whole = (report[kind]["lateness_us"][percentile] for kind in ("empty", "whole"))
+        checks[f"lateness, {percentile}"] = 1e-6 * RATE_HZ * (whole - empty), most
+    return [f"{name} {value:g}, at most {most:g}" for name, (value, most) in checks.items() if value > most]
 
 
 def test_the_loop_keeps_its_time(kept: Path) -> None:
@@ -108,7 +108,7 @@ def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
     whole, ticks = json.loads((kept / "bench.json").read_text())["whole"], SECONDS / 3 * RATE_HZ
     assert whole["ticks"] == pytest.approx(ticks, abs=0.1 * ticks)
     assert sum(whole["work_counts"]) == pytest.approx(ticks, abs=0.1 * ticks)
-    segments = sum(one["p50"] for one in whole["stages_us"].values())
+    segments = sum(stage["p50"] for stage in whole["stages_us"].values())
     assert 0.2 < segments / whole["work_us"]["p50"] < 1.1
     assert {"daemon", "fork server", "scribe", "skill worker"} == set(whole["processes"])
     assert (kept / "bench.png").read_bytes().startswith(b"\x89PNG")

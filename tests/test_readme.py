@@ -18,9 +18,9 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def program() -> str:
     """The program that is marked as one."""
-    found = re.findall(r"<!-- program -->\n```python\n(.*?)```", README, re.DOTALL)
-    assert len(found) == 1
-    return str(found[0])
+    programs = re.findall(r"<!-- program -->\n```python\n(.*?)```", README, re.DOTALL)
+    assert len(programs) == 1
+    return str(programs[0])
 
 
 def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(tmp_path: Path) -> None:

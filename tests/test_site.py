@@ -105,10 +105,10 @@ def test_the_pages_on_python_are_those_of_the_docstrings_and_have_every_name() -
 
 
 def test_the_index_and_the_navigation_have_every_page() -> None:
-    there = {path.stem for path in DOCS.glob("*.md")} - {"index"}
+    stems = {path.stem for path in DOCS.glob("*.md")} - {"index"}
     linked = {link.removesuffix(".md") for link in LINK.findall((DOCS / "index.md").read_text(encoding="utf-8"))}
-    assert there <= linked
-    assert there <= {name for names in program("conf").GROUPS.values() for name in names}
+    assert stems <= linked
+    assert stems <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
 @pytest.mark.parametrize("name", ["frames", "loop", "path"])
@@ -129,8 +129,8 @@ def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() ->
     page = program("experiments_page")
     options = {"share": 1.0, "arm": "wam", "set": "test"}
     results: dict[str, dict[str, Any]] = {
-        name: {"depends_on": dict.fromkeys(one.depends_on, "a"), "options": options, "commit": "1234+"}
-        for name, one in EXPERIMENTS.items()
+        name: {"depends_on": dict.fromkeys(experiment.depends_on, "a"), "options": options, "commit": "1234+"}
+        for name, experiment in EXPERIMENTS.items()
     }
     results["motion"]["depends_on"] |= {"kmp": "b"}
 
@@ -160,7 +160,7 @@ def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them()
         "by_tracker": {group: {"camera": errors} for group in groups},
         "all": dict.fromkeys(groups, errors),
     }
-    gains = {who: {"setpoint": [1.0, 1.25], "tool": [1.0, 1.125]} for who in ("ours", "chase")}
+    gains = {method: {"setpoint": [1.0, 1.25], "tool": [1.0, 1.125]} for method in ("ours", "chase")}
     results["motion"]["gain_by_frequency"] = {"hz": [1, 2], **dict.fromkeys(SMALL_KINDS, gains)}
     text = page.wrapped(page.templates(results, page.tree()).get_template("experiments.md.jinja").render())
     row = "| 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 |"
@@ -174,10 +174,10 @@ def test_names_and_programs_for_users_of_other_libraries_exist_and_run() -> None
     names = {name for cell in cells for name in re.findall(r"`([A-Za-z]\w*(?:\.\w+)*)[`(]", cell)}
     assert len(names) > 20
     for name in names:
-        found: object = kmp
+        value: object = kmp
         for part in name.removeprefix("kmp.").split("."):
-            assert hasattr(found, part), name
-            found = getattr(found, part)
+            assert hasattr(value, part), name
+            value = getattr(value, part)
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, {})
 

@@ -37,11 +37,11 @@ def test_it_holds_service_bench_and_recordings_and_nothing_else(wheel: Path) -> 
 
 
 def test_how_to_cite_it_is_told_with_its_version_and_the_papers_it_follows(wheel: Path) -> None:
-    told = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text(encoding="utf-8"))
-    assert f"-{told['version']}-" in wheel.name
-    paper, article = told["preferred-citation"], *told["references"]
+    citation = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text(encoding="utf-8"))
+    assert f"-{citation['version']}-" in wheel.name
+    paper, article = citation["preferred-citation"], *citation["references"]
     assert (paper["year"], paper["start"], paper["end"], article["volume"]) == (2019, 5266, 5272, 38)
-    assert [one["family-names"] for one in paper["authors"]] == ["Huang", "Rozo", "Silvério", "Caldwell"]
+    assert [author["family-names"] for author in paper["authors"]] == ["Huang", "Rozo", "Silvério", "Caldwell"]
     assert paper["title"] in (ROOT / "kmp" / "README.md").read_text(encoding="utf-8").replace("\n", " ")
 
 
@@ -64,7 +64,7 @@ def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_reposit
 def test_the_bench_wants_a_library_only_where_that_has_wheels(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
-    wanted = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
-    assert wanted
-    assert all("python_version < '3.12'" in line and "extra ==" in line for line in wanted)
+    requirements = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
+    assert requirements
+    assert all("python_version < '3.12'" in line and "extra ==" in line for line in requirements)
     assert any(line.startswith("Requires-Dist: mujoco-core") and "python" not in line for line in page.splitlines())

@@ -25,14 +25,14 @@ class RankReached(UserWarning):
 def real(name: str, value: ArrayLike) -> Array:
     """The value as an array of float64, not copied if it is one. Raises ValueError if not real."""
     try:
-        given = np.asarray(value)
+        array = np.asarray(value)
     except ValueError:
         raise ValueError(f"{name}: rows of different lengths given, an array of real numbers needed.") from None
-    if given.dtype.char == "d":
-        return given
-    if given.dtype.kind not in "biuf":
-        raise ValueError(f"{name}: numbers of type {given.dtype} given, real ones needed.")
-    return np.asarray(given, dtype=np.float64)
+    if array.dtype.char == "d":
+        return array
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name}: numbers of type {array.dtype} given, real ones needed.")
+    return np.asarray(array, dtype=np.float64)
 
 
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
@@ -78,15 +78,15 @@ def check_shape(name: str, array: Array, *shape: int | str) -> None:
         return
     if array.ndim == len(shape) and all(n == m or isinstance(n, str) for n, m in zip(shape, array.shape, strict=True)):
         return
-    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-    raise ValueError(f"{name}: shape {array.shape} given, ({wanted}) needed.")
+    shape_text = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    raise ValueError(f"{name}: shape {array.shape} given, ({shape_text}) needed.")
 
 
 def positive(name: str, value: float | Array) -> float:
     """The value as a float. Raises ValueError unless it is one finite number above 0."""
-    given = real(name, value)
-    check_shape(name, given)
-    number = float(given)
+    array = real(name, value)
+    check_shape(name, array)
+    number = float(array)
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"{name} is {number:g}, and must be finite and above 0.")
     return number
@@ -94,11 +94,11 @@ def positive(name: str, value: float | Array) -> float:
 
 def not_negative(name: str, value: float | Array) -> float:
     """The value as a float. Raises ValueError unless it is one number of at least 0."""
-    given = real(name, value)
-    check_shape(name, given)
-    if not given >= 0:
-        raise ValueError(f"{name} is {given:g}, and must not be below 0.")
-    return float(given)
+    array = real(name, value)
+    check_shape(name, array)
+    if not array >= 0:
+        raise ValueError(f"{name} is {array:g}, and must not be below 0.")
+    return float(array)
 
 
 def squared(name: str, deviation: float | Array) -> float:

@@ -59,10 +59,10 @@ def held_out_covariances(kernel: Array, scatter: Array, ratios: Array, group: ND
     out = np.empty((len(ratios), count, width, width))
     for number in np.unique(group):
         mine = np.flatnonzero(group == number)
-        rows, each = vectors[(width * mine[:, None] + np.arange(width)).ravel()], np.arange(len(mine))
+        rows, diagonal = vectors[(width * mine[:, None] + np.arange(width)).ravel()], np.arange(len(mine))
         blocks = np.linalg.inv(rows / (values + ratios[:, None])[:, None] @ rows.T)
-        found = blocks.reshape(-1, len(mine), width, len(mine), width)[:, each, :, each].swapaxes(0, 1)
-        out[:, mine] = roots[mine] @ (found - ratios[:, None, None, None] * np.eye(width)) @ roots[mine].mT
+        diagonal_blocks = blocks.reshape(-1, len(mine), width, len(mine), width)[:, diagonal, :, diagonal].swapaxes(0, 1)
+        out[:, mine] = roots[mine] @ (diagonal_blocks - ratios[:, None, None, None] * np.eye(width)) @ roots[mine].mT
     return np.asarray(0.5 * (out + out.mT))
 
 

@@ -123,13 +123,13 @@ class DirectSelection:
             raise ValueError(f"group: {count} number given, at least 2 needed to hold one out.")
         ridges, ells = self.scales.ridges, np.array(self.scales.ells if ell is None else [ell])
         tried = list(self._tried(ells, (None, *ridges) if may_be_linear and self.joint else (None,)))
-        constant = min((one for one in tried if one[1].ridge is None), key=lambda one: one[0])
+        constant = min((candidate for candidate in tried if candidate[1].ridge is None), key=lambda one: one[0])
         if not may_be_linear:
             return constant
         # Chosen one after the other, both means have the same kernel, and the covariance grows
         # equally fast off the data.
         tried = tried if self.joint else list(self._tried(np.array([constant[1].ell]), ridges))
-        linear = min((one for one in tried if one[1].ridge is not None), key=lambda one: one[0])
+        linear = min((candidate for candidate in tried if candidate[1].ridge is not None), key=lambda one: one[0])
         return linear if linear[0] < self.scales.linear_share * constant[0] else constant
 
     def _tried(self, ells: Array, ridges: Sequence[float | None]) -> Iterator[tuple[float, Parameters]]:
@@ -152,9 +152,9 @@ class DirectSelection:
         groups = np.unique(self.group[self._counted])
         for number in groups.tolist():
             mine = self.group == number
-            found = self.primitive(unscaled, residuals, without=number).predict(self.inputs[mine])
-            squares.append(mahalanobis(self.outputs[mine] - found.mean, found.covariance))
-            floors.append(self.scales.noise**2 * np.trace(np.linalg.inv(found.covariance), axis1=1, axis2=2))
+            prediction = self.primitive(unscaled, residuals, without=number).predict(self.inputs[mine])
+            squares.append(mahalanobis(self.outputs[mine] - prediction.mean, prediction.covariance))
+            floors.append(self.scales.noise**2 * np.trace(np.linalg.inv(prediction.covariance), axis1=1, axis2=2))
         few = (len(groups) + 1) / (len(groups) - 1)
         scale = max(few * np.concatenate(squares).mean(), np.concatenate(floors).mean()) / 3
         return unscaled._replace(deviation=float(np.sqrt(scale)))
@@ -171,20 +171,20 @@ class DirectSelection:
             return np.hstack([self._target(ridge, number) for ridge in ridges])
 
         if self.factors is None:
-            found = held_out_residuals(kernel, noises, self.group, targets)
+            residuals = held_out_residuals(kernel, noises, self.group, targets)
         else:  # K + r F = F^1/2 (F^-1/2 K F^-1/2 + r I) F^1/2
             roots = np.sqrt(self.factors)[:, None]
             white = kernel / (roots * roots.T)
-            found = roots * held_out_residuals(white, noises, self.group, lambda number: targets(number) / roots)
-        return np.asarray(found.reshape(shape).swapaxes(1, 2))
+            residuals = roots * held_out_residuals(white, noises, self.group, lambda number: targets(number) / roots)
+        return np.asarray(residuals.reshape(shape).swapaxes(1, 2))
 
     def _target(self, ridge: float | None, without: int) -> Array:
         """The outputs (N, 3) minus the prior mean that is fitted without a group."""
         if ridge is None:
             return np.asarray(self.outputs - self._constant)
         if (ridge, without) not in self._targets:
-            kept = self.group != without
-            mean = self._affine(ridge, kept)
+            training_mask = self.group != without
+            mean = self._affine(ridge, training_mask)
             self._targets[ridge, without] = self.outputs - self.inputs @ mean.matrix.T - mean.offset
         return self._targets[ridge, without]
 
@@ -194,27 +194,27 @@ class DirectSelection:
         With the covariance of IJRR 2019, N / lambda_c = d^2 and lambda_c Sigma_n = q S_n; for the
         mean, lambda Sigma_n = r S_n.
         """
-        kept = np.ones(len(self.group), bool) if without is None else self.group != without
-        lambda_covariance = kept.sum() / parameters.deviation**2
+        training_mask = np.ones(len(self.group), bool) if without is None else self.group != without
+        lambda_covariance = training_mask.sum() / parameters.deviation**2
         size = parameters.spread / lambda_covariance
         return KMP.fit(
-            self.inputs[kept],
-            Gaussians(self.outputs[kept], size * self._scatter(residuals, kept)),
+            self.inputs[training_mask],
+            Gaussians(self.outputs[training_mask], size * self._scatter(residuals, training_mask)),
             kernel=GaussianKernel(parameters.ell),
             lambda_mean=parameters.noise / size,
             lambda_covariance=lambda_covariance,
-            prior_mean=self._constant if parameters.ridge is None else self._affine(parameters.ridge, kept),
+            prior_mean=self._constant if parameters.ridge is None else self._affine(parameters.ridge, training_mask),
         )
 
     def _scatter(self, residuals: Array, kept: NDArray[np.bool_]) -> Array:
         """The scatter S (n, 3, 3) of the residuals around the kept points."""
-        known = residuals[kept]
+        errors = residuals[kept]
         weights = np.exp(-0.5 * self._squares[np.ix_(kept, kept)] / self.scales.local**2)
         weights /= weights.sum(axis=1, keepdims=True)
-        local = np.einsum("nm,mi,mj->nij", weights, known, known)
+        local = np.einsum("nm,mi,mj->nij", weights, errors, errors)
         if self.isotropic:
             local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
-        local = (1 - _SHARED) * local + _SHARED * max((known**2).mean(), 1e-12) * np.eye(3)
+        local = (1 - _SHARED) * local + _SHARED * max((errors**2).mean(), 1e-12) * np.eye(3)
         scatter = local / (np.trace(local, axis1=1, axis2=2).mean() / 3)
         return np.asarray(scatter if self.factors is None else scatter * self.factors[kept, None, None])
 
@@ -248,9 +248,9 @@ def ridge_mean(
     limited to `max_gain`.
     """
     centre, middle = (np.average(part, axis=0, weights=weights) for part in (inputs, outputs))
-    off, total = inputs - centre, len(inputs) if weights is None else float(weights.sum())
-    weighed = off if weights is None else weights[:, None] * off
-    square = weighed.T @ off + total * ridge**2 * np.eye(inputs.shape[1])
+    centred, total = inputs - centre, len(inputs) if weights is None else float(weights.sum())
+    weighed = centred if weights is None else weights[:, None] * centred
+    square = weighed.T @ centred + total * ridge**2 * np.eye(inputs.shape[1])
     u, gains, v = np.linalg.svd(np.linalg.solve(square, weighed.T @ (outputs - middle)).T, full_matrices=False)
     matrix = (u * np.minimum(gains, max_gain)) @ v
     return AffineMean(matrix, middle - matrix @ centre)

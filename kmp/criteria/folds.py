@@ -57,15 +57,15 @@ class Fold:
 
         Of the first `outputs` only [unit of the outputs].
         """
-        found = []
+        rmses = []
         system = _System(self, kernel)
         for penalty in penalties:
             try:
                 miss = (system.mean(penalty) - self.held_outputs)[:, :outputs]
-                found.append(rms(miss))
+                rmses.append(rms(miss))
             except ValueError:  # not solvable to working precision: no candidate
-                found.append(np.inf)
-        return found
+                rmses.append(np.inf)
+        return rmses
 
     def negative_log_likelihoods(
         self, kernel: Kernel, lambda_mean: float, penalties: Sequence[float], outputs: int
@@ -79,14 +79,14 @@ class Fold:
             residual = (self.held_outputs - system.mean(lambda_mean))[:, :outputs]
         except ValueError:
             return [np.inf] * len(penalties)
-        found = []
+        losses_nat = []
         for penalty in penalties:
             try:
                 covariance = system.covariance(penalty)[:, :outputs, :outputs]
-                found.append(_negative_log_likelihood(residual, covariance))
+                losses_nat.append(_negative_log_likelihood(residual, covariance))
             except ValueError:
-                found.append(np.inf)
-        return found
+                losses_nat.append(np.inf)
+        return losses_nat
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +157,8 @@ class _System:
         rank, points = int(_MOST_FEATURES * len(self.fold.inputs)), Functionals(self.fold.inputs)
         if rank == 0 or self.fold.inputs.shape[1] > 1:  # with more inputs the rank is too high
             return None
-        found, left = Features.of(self.kernel, points, rank=rank, tolerance=_RESIDUAL)
-        return found if left <= _RESIDUAL else None
+        features, left = Features.of(self.kernel, points, rank=rank, tolerance=_RESIDUAL)
+        return features if left <= _RESIDUAL else None
 
     @cached_property
     def _rows(self) -> Array:

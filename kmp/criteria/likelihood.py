@@ -60,10 +60,10 @@ def most_likely(
         return with_ell(kernel, ell) if lengths else kernel, lambda_mean or float(np.exp(penalty + x[lengths]))
 
     def target(x: Array) -> tuple[float, Array]:
-        found = negative_log_likelihood(points, prior_mean, *parameters(x))
-        if found is None:
+        likelihood = negative_log_likelihood(points, prior_mean, *parameters(x))
+        if likelihood is None:
             return _UNLIKELY, np.zeros(len(x))
-        value, gradient, _ = found
+        value, gradient, _ = likelihood
         of_lengths = gradient[:-1] if free == "each" else gradient[:-1].sum(keepdims=True)
         return value, np.concatenate([of_lengths[:lengths], gradient[-1:] if lambda_mean is None else []])
 
@@ -77,12 +77,12 @@ def most_likely(
         value, _ = target(x)
         best, least = (x, value) if value < least else (best, least)
     likeliest, other = parameters(best)
-    found = negative_log_likelihood(points, prior_mean, likeliest, other)
-    if found is None:
+    likelihood = negative_log_likelihood(points, prior_mean, likeliest, other)
+    if likelihood is None:
         raise ValueError(
             "criterion: no likelihood to working precision. Give kernel and lambda_mean, or more regularization."
         )
-    return MostLikely(likeliest, other, found[2])
+    return MostLikely(likeliest, other, likelihood[2])
 
 
 def negative_log_likelihood(
@@ -111,9 +111,9 @@ def negative_log_likelihood(
     inverse = np.tril(lower) + np.tril(lower, -1).T
     pull = (inverse - np.outer(weights, weights) / signal).reshape(count * c, d, count * c, d)
     shared = np.einsum("idjd->ij", pull)  # twice the derivative of -log p by each entry of K
-    by_lengths = [0.5 * float((shared * one).sum()) for one in _by_log_ell(kernel, points.inputs, k)]
-    own = pull.reshape(count, outputs, count, outputs)[every, :, every, :]
-    by_lambda = 0.5 * lambda_mean * float((own * reference.covariance).sum())
+    by_lengths = [0.5 * float((shared * derivative).sum()) for derivative in _by_log_ell(kernel, points.inputs, k)]
+    diagonal_blocks = pull.reshape(count, outputs, count, outputs)[every, :, every, :]
+    by_lambda = 0.5 * lambda_mean * float((diagonal_blocks * reference.covariance).sum())
     return float(value), np.array([*by_lengths, by_lambda]), signal
 
 

@@ -67,15 +67,15 @@ def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Ar
     inputs = len(x)
     values[:] = 0.0
     for i in range(0, inputs - 1, 2):
-        here, there, centres, others = x[i], x[i + 1], table[i], table[i + 1]
+        coordinate, other_coordinate, centres, others = x[i], x[i + 1], table[i], table[i + 1]
         for r in range(len(values)):
-            one, other = here - centres[r], there - others[r]
-            values[r] += one * one + other * other
+            offset, other = coordinate - centres[r], other_coordinate - others[r]
+            values[r] += offset * offset + other * other
     if inputs % 2:
-        here, centres = x[inputs - 1], table[inputs - 1]
+        coordinate, centres = x[inputs - 1], table[inputs - 1]
         for r in range(len(values)):
-            one = here - centres[r]
-            values[r] += one * one
+            offset = coordinate - centres[r]
+            values[r] += offset * offset
     exponentials(values, scale, room)
 
 
@@ -93,12 +93,12 @@ def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scal
 def _sum(a: Array, b: Array) -> float:
     """sum_r a_r b_r (P,)."""
     # Signed indices may count from the end, which costs a check each.
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
+    unit, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     first = second = third = fourth = 0.0
     for k in range(len(a) // LANES):
         r = np.uint64(LANES * k)
         first += a[r] * b[r]
-        second += a[r + one] * b[r + one]
+        second += a[r + unit] * b[r + unit]
         third += a[r + two] * b[r + two]
         fourth += a[r + three] * b[r + three]
     return (first + second) + (third + fourth)
@@ -173,9 +173,9 @@ def slopes(
                 out[o, i] -= share * along[n, i]
     _derive(x, table, places, along, scale, values)
     for i in range(inputs):
-        here, centres, offset = x[i], table[i], offsets[i]
+        coordinate, centres, offset = x[i], table[i], offsets[i]
         for r in range(len(values)):
-            offset[r] = here - centres[r]
+            offset[r] = coordinate - centres[r]
     for o in range(outputs):
         weights = table[inputs + o]
         for r in range(len(values)):

@@ -78,17 +78,17 @@ class CompiledQuery(Immutable):
         Equal to `Query.mean` but for rounding; None if a query or a result is not finite.
         """
         table, places, along, coordinates, prior = self._reads
-        given = np.array(queries, np.float64, order="C")  # one type of array, and so compiled once
-        values, out = np.empty(table.shape[1]), np.empty((len(given), len(prior)))
-        finite = means(given, table, places, along, coordinates, prior, values, out)
+        query_array = np.array(queries, np.float64, order="C")  # one type of array, and so compiled once
+        values, out = np.empty(table.shape[1]), np.empty((len(query_array), len(prior)))
+        finite = means(query_array, table, places, along, coordinates, prior, values, out)
         return (out, values[: len(self.rows)]) if finite else None
 
     def jacobian(self, query: Array) -> Array | None:
         """As `Query.jacobian`, to rounding; None as in `mean`."""
         table, places, along, coordinates, prior = self._reads
-        given = np.array(query, np.float64, order="C")
-        out = np.empty((len(prior), len(given)))
-        return out if slopes(given, table, places, along, coordinates, prior, out) else None
+        query_array = np.array(query, np.float64, order="C")
+        out = np.empty((len(prior), len(query_array)))
+        return out if slopes(query_array, table, places, along, coordinates, prior, out) else None
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -100,8 +100,8 @@ class CompiledQuery(Immutable):
         out = np.empty((MEANS + len(query), len(q.prior_mean)))
         if not _motion(moving, self.rows, self.along, q.stretch, q.scale, q.prior_mean, values, out):
             return None
-        found = self.covariance(values) if covariance else None
-        return MotionPrediction(out[0], out[1], out[2], found, out[MEANS:].reshape(-1, len(query)), out[3])
+        posterior = self.covariance(values) if covariance else None
+        return MotionPrediction(out[0], out[1], out[2], posterior, out[MEANS:].reshape(-1, len(query)), out[3])
 
     def covariance(self, values: Array) -> Array:
         """As `Query.covariance`, to rounding."""
@@ -109,11 +109,11 @@ class CompiledQuery(Immutable):
         if self.columns is None or not isinstance(q.solution, Dense):
             return q.covariance(values)
         distinct = q.solution.distinct
-        found = np.empty((distinct, distinct))
-        if not _posterior(values, self.columns, np.zeros((distinct, len(values) * distinct)), found):
-            found = nearest_positive_semidefinite(found[None])[0]
-        found *= q.covariance_scale
-        return found if distinct > 1 else found[0, 0] * np.eye(len(q.prior_mean))
+        posterior = np.empty((distinct, distinct))
+        if not _posterior(values, self.columns, np.zeros((distinct, len(values) * distinct)), posterior):
+            posterior = nearest_positive_semidefinite(posterior[None])[0]
+        posterior *= q.covariance_scale
+        return posterior if distinct > 1 else posterior[0, 0] * np.eye(len(q.prior_mean))
 
 
 def _packed(query: Query, solution: Dense) -> Array:
@@ -241,15 +241,15 @@ def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
     By the roots (O, R O) = (L^-1 (k^T (x) I))^T, which must be 0 at first.
     """
     outputs, size = roots.shape
-    at = 0
+    start = 0
     for r in range(len(values)):
         value, first = values[r], r * outputs
         length = size - first
         for o in range(outputs):
-            root, column = roots[o, first:], columns[at : at + length]
+            root, column = roots[o, first:], columns[start : start + length]
             for i in range(length):
                 root[i] += value * column[i]
-            at += length
+            start += length
     for a in range(outputs):
         for b in range(a + 1):
             total = 1.0 if a == b else 0.0

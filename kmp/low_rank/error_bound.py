@@ -30,7 +30,7 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     (4) is quadratic and least at the dense solution, so |Sigma^-1/2 df|^2 is at most the cost (4).
     """
     kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
-    points, reference, known = solution.database.functionals, solution.database.reference, solution.functionals
+    points, reference, functionals = solution.database.functionals, solution.database.reference, solution.functionals
     c, count, rank = kernel.channels, len(points), len(features.pivots)
     blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
     error = reference.mean - np.concatenate([mean_of(solution, block) for block in blocks])
@@ -38,7 +38,7 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     spread = np.linalg.eigvalsh(reference.covariance)
 
     alpha = pull.reshape(count, c, -1) / lambda_mean  # (N, C, D)
-    weights = solution.weights.reshape(len(known), c, -1)
+    weights = solution.weights.reshape(len(functionals), c, -1)
     neglected = alpha.copy()
     neglected[count - added :] = 0  # to via-points, the residual is included
     alpha[count - added :] -= weights[rank:]
@@ -59,8 +59,8 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     squared = (unsolved**2).sum() + (between_via**2).sum()
     by_means = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum()) + np.sqrt(lambda_mean * squared) / 2
 
-    flat = weights.reshape(len(known) * c, -1)
-    penalty = (flat * (between(kernel, known, known) @ flat)).sum()
+    flat = weights.reshape(len(functionals) * c, -1)
+    penalty = (flat * (between(kernel, functionals, functionals) @ flat)).sum()
     by_cost = np.sqrt((error * pull).sum() + lambda_mean * max(float(penalty), 0.0))
     at_points = float(np.sqrt(spread[:, -1].max()) * min(by_means, by_cost))
     return ErrorBounds(at_points, float(np.sqrt(kernel.prior_variance.max()) * distance))

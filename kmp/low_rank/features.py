@@ -50,8 +50,8 @@ class Features(Immutable):
     @classmethod
     def of(cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float) -> tuple[Features, float]:
         """The features and the largest residual, as `with_values` returns them."""
-        found, residual, _ = cls.with_values(kernel, points, rank=rank, tolerance=tolerance)
-        return found, residual
+        features, residual, _ = cls.with_values(kernel, points, rank=rank, tolerance=tolerance)
+        return features, residual
 
     @classmethod
     def spanning(cls, kernel: Kernel, points: Functionals, *, tolerance: float) -> Features:
@@ -70,35 +70,35 @@ class Features(Immutable):
         count, c = len(points), kernel.channels
         index = np.linspace(0, count - 1, min(count, _CANDIDATES // c)).astype(np.intp)
         chosen = _pivots(kernel, points.take(index), rank, _MARGIN * tolerance)
-        found = cls.at(kernel, points.take(index[chosen // c]), chosen % c)
+        features = cls.at(kernel, points.take(index[chosen // c]), chosen % c)
         blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
-        z = [found(block) for block in blocks] if count * c * rank <= KEPT else []
+        z = [features(block) for block in blocks] if count * c * rank <= KEPT else []
         for n in range(_ROUNDS):
-            each = zip(blocks, z, strict=True) if z else ((block, found(block)) for block in blocks)
-            residual = np.concatenate([found.residual_of(block, one).max(axis=1) for block, one in each])
+            pairs = zip(blocks, z, strict=True) if z else ((block, features(block)) for block in blocks)
+            residual = np.concatenate([features.residual_of(block, z_block).max(axis=1) for block, z_block in pairs])
             worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // (2 * c)]
             worst = np.sort(worst[residual[worst] > tolerance])
-            if len(worst) == 0 or len(found.pivots) >= rank or n == _ROUNDS - 1:
+            if len(worst) == 0 or len(features.pivots) >= rank or n == _ROUNDS - 1:
                 break
-            some = points.take(worst)
-            more = _pivots(kernel, some, rank, tolerance, found(some))
-            pivots = Functionals.concatenated([found.pivots, some.take(more // c)])
-            grown = cls.at(kernel, pivots, np.concatenate([found.channels, more % c]))
-            if len(grown.pivots) <= len(found.pivots):
+            worst_points = points.take(worst)
+            more = _pivots(kernel, worst_points, rank, tolerance, features(worst_points))
+            pivots = Functionals.concatenated([features.pivots, worst_points.take(more // c)])
+            grown = cls.at(kernel, pivots, np.concatenate([features.channels, more % c]))
+            if len(grown.pivots) <= len(features.pivots):
                 break
-            z = [grown._grown(block, one) for block, one in zip(blocks, z, strict=False)]  # noqa: SLF001
-            found = grown
-        return found, float(residual.max()), z
+            z = [grown._grown(block, z_block) for block, z_block in zip(blocks, z, strict=False)]  # noqa: SLF001
+            features = grown
+        return features, float(residual.max()), z
 
     def _grown(self, points: Functionals, z: Array) -> Array:
         """The features (r, n C) of n points, of which the first (r', n C) are known."""
         r = len(z)
         added = between(self.kernel, points, self.pivots.take(slice(r, None)))
         columns = _columns(added, self.channels[r:], self.kernel).T
-        found = np.empty((len(self.pivots), columns.shape[1]), order="F")
-        found[:r] = z
-        found[r:] = lapack.dtrtrs(self.root[r:, r:], columns - self.root[r:, :r] @ z, lower=1)[0]
-        return found
+        features = np.empty((len(self.pivots), columns.shape[1]), order="F")
+        features[:r] = z
+        features[r:] = lapack.dtrtrs(self.root[r:, r:], columns - self.root[r:, :r] @ z, lower=1)[0]
+        return features
 
     def __call__(self, points: Functionals) -> Array:
         """z (r, n C) of n points, for each channel."""

@@ -195,8 +195,8 @@ class LowRank(Expansion):
 
     def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
         """k(s, s) minus what the features have explained (..., C, C), per output (..., O, O)."""
-        own = self.features.kernel.prior_variance if prior is None else prior
-        return kron_identity(own - explained, self.w.shape[1])
+        prior_variance = self.features.kernel.prior_variance if prior is None else prior
+        return kron_identity(prior_variance - explained, self.w.shape[1])
 
     @cached_property
     def mean_factor(self) -> Array:
@@ -302,8 +302,8 @@ class Conditioned(Expansion):
         shared = penalty == self.hyperparameters.lambda_covariance
         system = self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
-        wanted = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
-        pull = system.solve((wanted - mean).ravel())
+        target = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
+        pull = system.solve((target - mean).ravel())
         back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
         columns = self._added_columns
         w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]

@@ -63,14 +63,14 @@ class Database(Immutable):
 
         Of S^-1 Sigma_n S^-1, where S^2 is the diagonal of k(s_n, s_n). The last kernel's are kept.
         """
-        known: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
-        if known is None or known[0] is not kernel:
+        cached: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
+        if cached is None or cached[0] is not kernel:
             repeats = self.reference.outputs // kernel.channels
             scale = np.sqrt(variances(kernel, self.functionals)).repeat(repeats, axis=1)
             covariance = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
-            known = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
-            self.__dict__["_known_shares"] = known
-        return known[1]
+            cached = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
+            self.__dict__["_known_shares"] = cached
+        return cached[1]
 
     def since(self, first: int) -> Database:
         """The points from index `first` on."""
@@ -91,8 +91,8 @@ class Database(Immutable):
         """The database after the changes: the points not replaced, then the via-points."""
         functionals, reference = self.functionals, self.reference
         if len(changes.replaced):
-            kept = np.delete(np.arange(len(self)), changes.replaced)
-            functionals, reference = functionals.take(kept), reference.take(kept)
+            remaining = np.delete(np.arange(len(self)), changes.replaced)
+            functionals, reference = functionals.take(remaining), reference.take(remaining)
         return Database(
             Functionals.concatenated([functionals, changes.functionals]),
             Gaussians.concatenated([reference, changes.points]),

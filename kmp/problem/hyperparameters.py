@@ -75,10 +75,10 @@ class Hyperparameters(Immutable):
             offset = numbers("prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs)
         if kernel.channels > 1:
             values = outputs // kernel.channels
-            own, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
-            if not np.array_equal(rates := offset[values:], own) or np.any(of_rates):
+            slopes, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
+            if not np.array_equal(rates := offset[values:], slopes) or np.any(of_rates):
                 raise ValueError(
-                    f"prior_mean: rates of {brief(rates)} given, {brief(own)} needed: those of the values' prior mean."
+                    f"prior_mean: rates of {brief(rates)} given, {brief(slopes)} needed: those of the values' prior mean."
                 )
         return cls(kernel, penalty, other, offset, matrix)
 

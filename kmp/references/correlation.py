@@ -77,8 +77,8 @@ class Correlation(Immutable):
         Raises ValueError if the numbers of inputs or outputs differ.
         """
         base = checked_primitive(primitive).base
-        if (given := self.theta.shape[1]) != base.outputs:
-            raise ValueError(f"correlation: {given} outputs given, {base.outputs} needed.")
+        if (outputs := self.theta.shape[1]) != base.outputs:
+            raise ValueError(f"correlation: {outputs} outputs given, {base.outputs} needed.")
         scale, sigma = self(base.inputs), base.reference.covariance
         variances = np.diagonal(sigma, axis1=1, axis2=2)
         lacking = np.maximum(_LEAST_FACTOR**2 - scale**2, 0.0) * variances
@@ -141,12 +141,12 @@ def improve(
     rewards = [best[0]]
     for _ in range(updates):
         epsilon = exploration * random.standard_normal((rollouts, *theta.shape))
-        found = [tried(theta + one) for one in epsilon]
-        values = np.array([value for value, _ in found])
+        trials = [tried(theta + sample) for sample in epsilon]
+        values = np.array([value for value, _ in trials])
         span = max(values.max() - values.min(), np.finfo(np.float64).tiny)
         weights = np.exp(_SHARPNESS * (values - values.max()) / span)
         theta = theta + np.tensordot(weights / weights.sum(), epsilon, axes=1)
         now = tried(theta)
         rewards.append(now[0])
-        best = max([best, now, *found], key=lambda one: one[0])
+        best = max([best, now, *trials], key=lambda one: one[0])
     return Improvement(best[1], best[1].applied(primitive), frozen(np.array(rewards)))

@@ -110,8 +110,8 @@ class LocalKMP(Immutable, Plotted):
             checked_primitive(primitive, f"primitives[{i}]")
         _check_frames("frames", self.frames)
         needed = [primitive.outputs for primitive in self.primitives]
-        if (given := [len(frame.offset) for frame in self.frames]) != needed:
-            raise ValueError(f"frames: over {brief(given)} outputs given, over {brief(needed)} needed.")
+        if (outputs := [len(frame.offset) for frame in self.frames]) != needed:
+            raise ValueError(f"frames: over {brief(outputs)} outputs given, over {brief(needed)} needed.")
 
     @classmethod
     def learn(
@@ -137,12 +137,12 @@ class LocalKMP(Immutable, Plotted):
         """
         kernel = checked_kernel(kernel)
         parts_of("demonstrations", demonstrations)
-        counts = [_check_frames(f"frames[{h}]", one) for h, one in enumerate(parts_of("frames", frames))]
+        counts = [_check_frames(f"frames[{h}]", frame_set) for h, frame_set in enumerate(parts_of("frames", frames))]
         if len(counts) != len(demonstrations) or len(set(counts)) != 1:
             count = len(demonstrations)
             raise ValueError(f"frames: {brief(counts)} given for {count} demonstrations, as many for each needed.")
         where = numbers("inputs", inputs, "N", "I")
-        data = [pair(f"demonstrations[{h}]", one) for h, one in enumerate(demonstrations)]
+        data = [pair(f"demonstrations[{h}]", demonstration) for h, demonstration in enumerate(demonstrations)]
         primitives = []
         for f in range(counts[0]):
             samples = [
@@ -202,16 +202,16 @@ class LocalKMP(Immutable, Plotted):
             not_negative("tolerance", tolerance)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
         pairs = zip(self.frames, self.primitives, strict=True)
-        adapted = (one.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, one in pairs)
+        adapted = (primitive.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, primitive in pairs)
         return LocalKMP(tuple(adapted), self.frames)
 
     def to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""
-        each = [one.to_plot() for one in self.primitives]
+        plots = [primitive.to_plot() for primitive in self.primitives]
         placed = [
-            Points(known.references.inputs, frame.placed(known.references.normals))
-            for frame, known in zip(self.frames, each, strict=True)
+            Points(plot.references.inputs, frame.placed(plot.references.normals))
+            for frame, plot in zip(self.frames, plots, strict=True)
         ]
         inputs = np.concatenate([points.inputs for points in placed])
-        known, via = Points(inputs, Gaussians.concatenated([points.normals for points in placed])), each[0].via_points
-        return each[0]._replace(references=known, via_points=Points(via.inputs, self.frames[0].placed(via.normals)))
+        references, via = Points(inputs, Gaussians.concatenated([points.normals for points in placed])), plots[0].via_points
+        return plots[0]._replace(references=references, via_points=Points(via.inputs, self.frames[0].placed(via.normals)))

@@ -54,13 +54,13 @@ def gaussian_process_reference(
     most = max(1, whole("count", count) // len(data))
     added = positive("regularization", regularization)
     chosen = [np.linspace(0, len(s) - 1, min(most, len(s))).astype(int) for s, _ in data]
-    of = np.repeat(np.arange(len(data)), [len(one) for one in chosen])
-    s, y = (np.concatenate([one[i][some] for one, some in zip(data, chosen, strict=True)]) for i in (0, 1))
+    of = np.repeat(np.arange(len(data)), [len(rows) for rows in chosen])
+    s, y = (np.concatenate([part[i][rows] for part, rows in zip(data, chosen, strict=True)]) for i in (0, 1))
     scale, size, centre = _deviations(s), _deviations(y), y.mean(axis=0)
     s, queries = s / scale, where / scale
     check_finite("inputs", queries, "over the demonstrations' deviation:")
-    found = [_process(s, one, of, queries) for one in ((y - centre) / size).T]
-    mean, deviation, errors = (np.stack(parts, axis=1) for parts in zip(*found, strict=True))
+    processes = [_process(s, column, of, queries) for column in ((y - centre) / size).T]
+    mean, deviation, errors = (np.stack(parts, axis=1) for parts in zip(*processes, strict=True))
     scaled = deviation * size
     correlation = errors.T @ errors / len(errors) if len(data) > 1 else np.eye(len(centre))
     covariance = scaled[:, :, None] * correlation * scaled[:, None, :] + added * np.eye(len(centre))
@@ -71,9 +71,9 @@ def gaussian_process_reference(
 
 def _deviations(values: Array) -> Array:
     """The deviation of each column; 1 for a constant one."""
-    found = values.std(axis=0)
-    check_finite("demonstrations", found, "too large for their deviation:")
-    return np.where(found > 0, found, 1.0)
+    deviations = values.std(axis=0)
+    check_finite("demonstrations", deviations, "too large for their deviation:")
+    return np.where(deviations > 0, deviations, 1.0)
 
 
 def _process(s: Array, y: Array, of: NDArray[np.intp], queries: Array) -> tuple[Array, Array, Array]:
@@ -94,11 +94,11 @@ def _process(s: Array, y: Array, of: NDArray[np.intp], queries: Array) -> tuple[
         tried = [likeliest]
         if of[-1] > 0:
             tried += [_with(likeliest, longer, noise) for longer in _LONGER for noise in _NOISES]
-        each = [_left_out(one(s), y, of) for one in tried]
-        best = min(range(len(tried)), key=lambda i: np.sum(np.log(each[i][1]) + 0.5 * (each[i][0]) ** 2))
+        left_out = [_left_out(candidate(s), y, of) for candidate in tried]
+        best = min(range(len(tried)), key=lambda i: np.sum(np.log(left_out[i][1]) + 0.5 * (left_out[i][0]) ** 2))
         fitted = GaussianProcessRegressor(tried[best], optimizer=None).fit(s, y)
         mean, deviation = fitted.predict(queries, return_std=True)
-    return mean, deviation, each[best][0]
+    return mean, deviation, left_out[best][0]
 
 
 def _with(kernel: Any, longer: float, noise: float) -> Any:
@@ -114,8 +114,8 @@ def _left_out(gram: Array, y: Array, of: NDArray[np.intp]) -> tuple[Array, Array
     precision = np.linalg.inv(gram)
     pull, errors, deviations = precision @ y, np.empty_like(y), np.empty_like(y)
     for h in np.unique(of):  # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
-        own = of == h
-        covariance = np.linalg.inv(precision[np.ix_(own, own)])
-        deviations[own] = np.sqrt(np.diag(covariance))
-        errors[own] = covariance @ pull[own] / deviations[own]
+        rows = of == h
+        covariance = np.linalg.inv(precision[np.ix_(rows, rows)])
+        deviations[rows] = np.sqrt(np.diag(covariance))
+        errors[rows] = covariance @ pull[rows] / deviations[rows]
     return errors, deviations

@@ -29,7 +29,7 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
         if other.mean.shape != (n, outputs):
             raise ValueError(f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed.")
     g = _priorities(priorities, len(references), n)
-    inverses = [np.linalg.inv(one.covariance) for one in references]
+    inverses = [np.linalg.inv(normals.covariance) for normals in references]
     precisions = [weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)]
     covariance = np.linalg.inv(np.sum(precisions, axis=0))
     return Gaussians(fused_mean(covariance, precisions, references), symmetric(covariance))
@@ -37,10 +37,10 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
 
 def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
     """The priorities (L, N) or (L, 1), checked."""
-    given = real("priorities", priorities)
-    g = numbers("priorities", given[:, None] if given.ndim == 1 else given, count, "N")
+    array = real("priorities", priorities)
+    g = numbers("priorities", array[:, None] if array.ndim == 1 else array, count, "N")
     if g.shape[1] not in {1, n}:
-        raise ValueError(f"priorities: shape {given.shape} given, ({count},) or {(count, n)} needed.")
+        raise ValueError(f"priorities: shape {array.shape} given, ({count},) or {(count, n)} needed.")
     least, total = g.min(), g.sum(axis=0)
     if least < 0 or np.abs(total - 1).max() > 1e-6:
         raise ValueError(f"priorities: from {least:g}, of sum {total[0]:g} given; needed are sums of 1, none below 0.")

@@ -158,8 +158,8 @@ def main(arguments: list[str] | None = None) -> int:
             seed=scene.seed if args.seed is None else args.seed,
             speed=args.speed,
             pauses=[
-                *(ScriptPause(at, lasts) for at, lasts in args.pause),
-                *(ScriptPause(at, lasts, depth=2.0) for at, lasts in args.turn),
+                *(ScriptPause(start_s, lasts) for start_s, lasts in args.pause),
+                *(ScriptPause(start_s, lasts, depth=2.0) for start_s, lasts in args.turn),
             ],
             offset_std=args.offset_mm / 1000,
             tremor_rms=args.tremor_mm / 1000,
@@ -170,8 +170,8 @@ def main(arguments: list[str] | None = None) -> int:
         if target and target != "-":
             Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
         before_others()
-        own = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
-        session = own or reach.session(timeout_s=None)
+        listener = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
+        session = listener or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
         with session, Bench(script, settings=settings, world=world) as bench:
@@ -182,8 +182,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     if not args.once:
-        kept = f"their reports are in {target}" if target else "without --output no report was written"
-        print(f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {kept}", file=sys.stderr)
+        report_note = f"their reports are in {target}" if target else "without --output no report was written"
+        print(f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {report_note}", file=sys.stderr)
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

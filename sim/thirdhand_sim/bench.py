@@ -234,15 +234,15 @@ class Bench:
         self.world.step()
         self.tick += 1
         self._ticks_since_begin = max(0, self._ticks_since_begin + self._direction)
-        seen = self._observe()
+        observation = self._observe()
         self._still += 1
-        if math.dist(seen.tool.position, self._still_at) > STILL_WITHIN:
-            self._still, self._still_at = 0, seen.tool.position
-        self._handle(seen)
+        if math.dist(observation.tool.position, self._still_at) > STILL_WITHIN:
+            self._still, self._still_at = 0, observation.tool.position
+        self._handle(observation)
         if self._direction == 1:
-            self._watch(seen)
-        self._observation = seen
-        return seen
+            self._watch(observation)
+        self._observation = observation
+        return observation
 
     def _begins_here(self, position: Floats, velocity: Floats | None) -> bool:
         """True for a command at the standing arm, which begins a new sequence.
@@ -250,8 +250,8 @@ class Bench:
         After an interruption a network may deliver old commands at once, which would move the arm
         along a past path.
         """
-        off = max(abs(aim - is_at) for aim, is_at in zip(position, self._observation.joints, strict=True))
-        return off <= STAND_RAD and max(map(abs, velocity or (0.0,))) <= STAND_RADPS
+        offset_rad = max(abs(aim - is_at) for aim, is_at in zip(position, self._observation.joints, strict=True))
+        return offset_rad <= STAND_RAD and max(map(abs, velocity or (0.0,))) <= STAND_RADPS
 
     def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
         alone = self._since_command * self.period_s >= REJOIN_AFTER_S
@@ -279,12 +279,12 @@ class Bench:
         After a pause of a busy machine, the commands are far ahead. A real servo would not leap
         after them, so the difference is limited.
         """
-        at = self._observation.joints
-        behind = max(abs(aim - is_at) for aim, is_at in zip(position, at, strict=True))
+        joints_rad = self._observation.joints
+        behind = max(abs(aim - is_at) for aim, is_at in zip(position, joints_rad, strict=True))
         most = CATCH_UP_RADPS * self.period_s / POSITION_GAIN
         if behind <= most:
             return position
-        return tuple(is_at + most / behind * (aim - is_at) for aim, is_at in zip(position, at, strict=True))
+        return tuple(is_at + most / behind * (aim - is_at) for aim, is_at in zip(position, joints_rad, strict=True))
 
     def _grip(self, command: float | None) -> None:
         """Move the fingers toward the newest command."""
@@ -348,15 +348,15 @@ class Bench:
         """The things on the bench as viewers draw them: those that the arm holds in the frame of
         its plate, all others in `base`.
         """
-        found = []
+        objects = []
         for name, look in self.world.things.items():
             holder, grip = self._held.get(name, (None, None))
             held = grip is not None and holder == self.world.arm
             frame, pose = BASE, self.world.pose(name)
             if held and grip:
                 frame, pose = self._plate, carried_by(self.world.plate_from_tool, grip)
-            found.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
-        return (*found, *self.script.places())
+            objects.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
+        return (*objects, *self.script.places())
 
     def _held_by_arm(self) -> list[str]:
         return [thing for thing, (holder, _) in self._held.items() if holder == self.world.arm]

@@ -82,8 +82,8 @@ def led(settings: Settings, seconds: float, random: np.random.Generator, *, rate
         swings += size / 3 * np.sin(2 * np.pi * frequency * times_s[:, None] + phase)
     low, high = np.array(settings.joints.lower) + MARGIN_RAD, np.array(settings.joints.upper) - MARGIN_RAD
     led_joints = np.clip(np.array(settings.arm.posture) + swings, low, high)
-    poses, kept = tool_poses(settings, robot_description(settings), np.rint(1e9 * times_s).astype(np.int64), led_joints)
-    return LedArm(times_s[kept], led_joints[kept], poses[:, :3], poses[:, 3:])
+    poses, indices = tool_poses(settings, robot_description(settings), np.rint(1e9 * times_s).astype(np.int64), led_joints)
+    return LedArm(times_s[indices], led_joints[indices], poses[:, :3], poses[:, 3:])
 
 
 def tracked(base: Array, kind: TrackerKind, random: np.random.Generator, *, rate_hz: float) -> Array:
@@ -113,7 +113,7 @@ def touched(arm: LedArm, count: int, kind: TrackerKind, random: np.random.Genera
         rows.append(int(np.linalg.norm(arm.tool[:, None] - arm.tool[rows], axis=2).min(axis=1).argmax()))
     base = arm.tool[rows]
     finger = base + FINGER_M * random.normal(size=base.shape)
-    return np.stack([tracked(one[None], kind, random, rate_hz=1.0)[0] for one in finger]), base
+    return np.stack([tracked(position_m[None], kind, random, rate_hz=1.0)[0] for position_m in finger]), base
 
 
 def error_m(found: Calibration, bench: Array = BENCH) -> float:
@@ -135,13 +135,13 @@ def errors_mm(arm: str, kind: TrackerKind, method: float, seeds: range) -> Array
         path = led(settings, 40.0 if isinstance(method, int) else method, random)
         try:
             if isinstance(method, int):
-                found = solve_points(*touched(path, method, kind, random), corners)
+                calibration = solve_points(*touched(path, method, kind, random), corners)
             else:
-                found = solve_held(held(path, kind, random), corners)
+                calibration = solve_held(held(path, kind, random), corners)
         except CalibrationError:
             rows.append((np.inf, np.inf))
         else:
-            rows.append((1e3 * error_m(found), 1e3 * found.std_m))
+            rows.append((1e3 * error_m(calibration), 1e3 * calibration.std_m))
     return np.array(rows)
 
 

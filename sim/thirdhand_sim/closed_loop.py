@@ -74,15 +74,15 @@ class ClosedLoop:
             newest = self._newest
             if newest is not None and newest["commanded"]:
                 position, velocity = tuple(newest["joints"].tolist()), tuple(newest["joint_velocities"].tolist())
-                known = newest["gripper"] != UNKNOWN
-                seen = bench.step(position, velocity, gripper=float(newest["gripper"] == CLOSED) if known else None)
+                is_gripper_known = newest["gripper"] != UNKNOWN
+                observation = bench.step(position, velocity, gripper=float(newest["gripper"] == CLOSED) if is_gripper_known else None)
             else:
-                seen = bench.step()
+                observation = bench.step()
             inbox: list[Event] = []
             if bench.tick % every == 0:
                 stamp_ns = START_NS + bench.tick * round(bench.period_s * 1e9)
                 for side, pose in zip(SIDES, bench.script.sample(bench.time_s), strict=True):
                     x, y, z, *orientation = pose.tolist()
                     inbox += self._spoil(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))
-                inbox.append(joints_event(bench.joint_names, seen.joints, seen.joint_velocities, stamp_ns))
+                inbox.append(joints_event(bench.joint_names, observation.joints, observation.joint_velocities, stamp_ns))
             yield Tick(bench.tick, tuple(inbox))

@@ -66,6 +66,6 @@ def _cover(link: Element, ends: list[list[float]], radius: float) -> None:
         SubElement(shape, "origin", xyz=" ".join(map(str, middle)), rpy=turn)
         length = math.hypot(x, y, z)
         long = length > SHORTEST
-        made = SubElement(SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius))
+        geometry = SubElement(SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius))
         if long:
-            made.set("length", str(length))
+            geometry.set("length", str(length))

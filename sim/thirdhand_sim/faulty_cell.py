@@ -97,9 +97,9 @@ class _Arm:
             deadlines = Deadlines(round(1 / bench.period_s))
             while not self._end.is_set():
                 deadlines.wait()
-                seen = bench.step(*bridge.commands.take())
-                bridge.publish_joints(seen)
-                self.steps.append((time.monotonic(), *seen.tool.position, math.hypot(*seen.tool_velocity)))
+                observation = bench.step(*bridge.commands.take())
+                bridge.publish_joints(observation)
+                self.steps.append((time.monotonic(), *observation.tool.position, math.hypot(*observation.tool_velocity)))
 
     @property
     def speed(self) -> float:
@@ -136,12 +136,12 @@ class FaultyCell:
                 self.link = parts.enter_context(contextlib.closing(Link()))
             parts.callback(self._life.close)
             self.begin_service()
-            here = self.service.endpoint
+            endpoint = self.service.endpoint
             if self.network == "relays":
-                self.to_tracker, self.to_arm = (self._part(parts, "relay", here, "0") for _ in range(2))
+                self.to_tracker, self.to_arm = (self._part(parts, "relay", endpoint, "0") for _ in range(2))
                 to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
             else:
-                to_tracker = to_arm = self.router.endpoint if self.network == "router" else here
+                to_tracker = to_arm = self.router.endpoint if self.network == "router" else endpoint
             # The operator connects to the service directly, to observe commands during network
             # faults.
             with as_usual_afterwards():

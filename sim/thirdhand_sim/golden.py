@@ -155,8 +155,8 @@ def record(
         path, settings=settings, skill=skill.file, state=start, constants=constants, checksums=table.tobytes()
     ) as recorder:
         for tick, frame in steps:
-            kept = frame if tick.index % WHOLE_EVERY == 0 else None
-            recorder.write(tick, kept, time_ns=_time_ns(tick, settings))
+            whole_frame = frame if tick.index % WHOLE_EVERY == 0 else None
+            recorder.write(tick, whole_frame, time_ns=_time_ns(tick, settings))
     return [frame for _, frame in steps]
 
 

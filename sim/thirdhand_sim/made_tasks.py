@@ -131,7 +131,7 @@ def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list
 
     Raises ValueError for a kind outside TASK_KINDS.
     """
-    return [Take(who, run(kind, who, number, seed=seed).demonstration()) for who in people for number in range(each)]
+    return [Take(subject, run(kind, subject, number, seed=seed).demonstration()) for subject in people for number in range(each)]
 
 
 def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | None = None) -> Run:
@@ -196,8 +196,8 @@ class Run:
         share = progress - np.floor(progress)
         arc = np.outer(ARC_M * 64.0 * (share * (1.0 - share)) ** 3, (0.0, 0.0, 1.0))
         follow = between(self.task.follow[:, None])
-        beside = follow * (left - between(self.scene.left))
-        return between(self.scene.tool + scatter) + arc * (1.0 - follow) + beside, turns
+        hand_offset = follow * (left - between(self.scene.left))
+        return between(self.scene.tool + scatter) + arc * (1.0 - follow) + hand_offset, turns
 
     def demonstration(self) -> Demonstration:
         """The run as measured by a tracker and the arm, with the places as perceived."""
@@ -228,12 +228,12 @@ class Run:
         """The places with errors of PERCEIVED_M; a place that is visited twice has one error."""
         parts = []
         for part, column in zip(self.scene[:3], self.task.segments.T, strict=True):
-            off = PERCEIVED_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
-            parts.append(np.round(part + off[column], 6))
+            error_m = PERCEIVED_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))
+            parts.append(np.round(part + error_m[column], 6))
         rows = [
             {
                 "name": name,
-                **{side: at.tolist() for side, at in zip(("left", "right", "tool"), ends, strict=True)},
+                **{side: position.tolist() for side, position in zip(("left", "right", "tool"), ends, strict=True)},
                 "std": 0.003,
                 "radius": 0.03,
                 "follow": "left" if follow else "none",
@@ -260,16 +260,16 @@ def _usual(kind: str, seed: int) -> list[Array]:
     boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
     out = []
     for box, column in zip(boxes, task.segments.T, strict=True):
-        found: list[Array] = []
-        apart, way = 0.16, 0.22  # [m] least distance from all other places, and from the one before
-        while len(found) <= column.max():
+        places: list[Array] = []
+        spacing_m, step_m = 0.16, 0.22  # [m] least distance from all other places, and from the one before
+        while len(places) <= column.max():
             tried = _within(box, random)
-            if all(np.linalg.norm(tried - one) > apart for one in found) and (
-                not found or np.linalg.norm(tried - found[-1]) > way
+            if all(np.linalg.norm(tried - place) > spacing_m for place in places) and (
+                not places or np.linalg.norm(tried - places[-1]) > step_m
             ):
-                found.append(tried)
-            apart, way = 0.998 * apart, 0.999 * way  # the distances shrink until all places fit
-        out.append(np.array(found))
+                places.append(tried)
+            spacing_m, step_m = 0.998 * spacing_m, 0.999 * step_m  # the distances shrink until all places fit
+        out.append(np.array(places))
     return [*out, np.array(TURNS_RAD) * random.standard_normal((len(out[0]), 3))]
 
 
@@ -299,7 +299,7 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> T
             places.append(placed(part, index, places[-1] if places else None))
         parts.append(np.array(places))
     turns = usual[3] + np.array(TURNS_RAD) * random.standard_normal(usual[3].shape)
-    left, right, tool = (at[column] for at, column in zip(parts, task.segments.T, strict=True))
+    left, right, tool = (positions[column] for positions, column in zip(parts, task.segments.T, strict=True))
     turns = turns[task.segments[:, 0]]
     if task.carried:
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
@@ -323,13 +323,13 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
     or with one segment left out, repeated or interrupted.
     """
     order = [(i, False) for i in range(count)]
-    at, how = int(random.integers(1, count - 1)), int(random.integers(4))
+    index, how = int(random.integers(1, count - 1)), int(random.integers(4))
     if how == 1:
-        order.pop(at)
+        order.pop(index)
     elif how == 2:
-        order[at + 1 : at + 1] = [(at - 1, False), (at, False)]
+        order[index + 1 : index + 1] = [(index - 1, False), (index, False)]
     elif how == 3:
-        order[at] = (at, True)
+        order[index] = (index, True)
     return order
 
 
@@ -343,12 +343,12 @@ def _legs(
     habit = np.random.default_rng([*key[:2], key[-2], 6])
     ends = np.stack([scene.left, scene.right])
     for side, column in enumerate(task.segments[:, :2].T):
-        off = habit.standard_normal((len(task.names), 3))
-        off *= habit.uniform(*HAND_OFF_M, (len(off), 1)) / np.linalg.norm(off, axis=1, keepdims=True)
-        ends[side] += (off + HAND_SCATTER_M * random.standard_normal(off.shape))[column]
+        offset_m = habit.standard_normal((len(task.names), 3))
+        offset_m *= habit.uniform(*HAND_OFF_M, (len(offset_m), 1)) / np.linalg.norm(offset_m, axis=1, keepdims=True)
+        ends[side] += (offset_m + HAND_SCATTER_M * random.standard_normal(offset_m.shape))[column]
     legs: tuple[list[Leg], list[Leg]] = ([], [])
     free = [0.5, 0.5]  # [s] time from which each hand may move
-    both = START_REST_S + max(who.lead_s, 0.0)
+    ready_s = START_REST_S + max(who.lead_s, 0.0)
 
     def go(
         side: int, at: float, way: Array, progress: tuple[float, float], bow: Array | None, *, curve: bool = False
@@ -365,32 +365,32 @@ def _legs(
 
     for i, ((a, _), (b, breaks)) in enumerate(itertools.pairwise(order)):
         if breaks:  # both hands return to their first place, and move again
-            for way, progress in (((a, 0), (i, i)), ((0, a), (i, i))):
+            for nodes, progress in (((a, 0), (i, i)), ((0, a), (i, i))):
                 for side in (0, 1):
-                    if not np.array_equal(ends[side, way[0]], ends[side, way[1]]):
-                        go(side, both, ends[side, list(way)], progress, None)
-                both = max(*free, both) + random.uniform(1.0, 2.0)
+                    if not np.array_equal(ends[side, nodes[0]], ends[side, nodes[1]]):
+                        go(side, ready_s, ends[side, list(nodes)], progress, None)
+                ready_s = max(*free, ready_s) + random.uniform(1.0, 2.0)
         for side in (0, 1):
-            begin = max(free[side] + 0.1, both - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
+            begin = max(free[side] + 0.1, ready_s - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
             if task.segments[a, side] == task.segments[b, side]:  # the hand rests, and the other does not wait for it
-                here = ends[side, a]
+                start = ends[side, a]
                 begin, at_once = max(free[side], begin - 0.6), np.linspace(0, 1, SHAPE_STEPS)
-                legs[side].append(Leg(begin, 0.1, here, here, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))
+                legs[side].append(Leg(begin, 0.1, start, start, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))
                 free[side] = begin + 0.1
                 continue
-            here, there, bow = ends[side, a], ends[side, b], who.bows[side, i % 2]
+            start, goal, bow = ends[side, a], ends[side, b], who.bows[side, i % 2]
             if random.random() < STRAYS and not who.lead_s > 1.0:
-                stray = here + random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.3)
-                go(side, begin, np.array([here, stray]), (i, i), None)
-                go(side, free[side] + 0.1, np.array([stray, here]), (i, i), None)
+                stray = start + random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.3)
+                go(side, begin, np.array([start, stray]), (i, i), None)
+                go(side, free[side] + 0.1, np.array([stray, start]), (i, i), None)
                 begin = free[side] + 0.2
             if random.random() < task.pauses and i != task.curved:
-                half = here + random.uniform(0.35, 0.65) * (there - here)
-                go(side, begin, np.array([here, half]), (i, i + 0.5), bow)
-                go(side, free[side] + random.uniform(0.5, 1.5), np.array([half, there]), (i + 0.5, i + 1), bow)
+                half = start + random.uniform(0.35, 0.65) * (goal - start)
+                go(side, begin, np.array([start, half]), (i, i + 0.5), bow)
+                go(side, free[side] + random.uniform(0.5, 1.5), np.array([half, goal]), (i + 0.5, i + 1), bow)
             else:
-                go(side, begin, np.array([here, there]), (i, i + 1), bow, curve=i == task.curved and side == 0)
-        both = max(free) + random.uniform(*task.dwells)
+                go(side, begin, np.array([start, goal]), (i, i + 1), bow, curve=i == task.curved and side == 0)
+        ready_s = max(free) + random.uniform(*task.dwells)
         if random.random() < task.pauses:
-            both += random.uniform(1.0, 3.0)
+            ready_s += random.uniform(1.0, 3.0)
     return tuple(legs[0]), tuple(legs[1])

@@ -74,10 +74,10 @@ class MujocoWorld(World):
     @staticmethod
     def _add(spec: Any, name: str, body: WorldBody) -> None:
         x, y, z = body.look.size
-        made = spec.worldbody.add_body(
+        spec_body = spec.worldbody.add_body(
             name=name, pos=body.at.position, quat=_w_first(body.at.orientation), mocap=not body.solid
         )
-        made.add_geom(
+        spec_body.add_geom(
             name=name,
             type=GEOM_TYPES[body.look.shape],
             size=(x / 2, y / 2, z / 2) if body.look.shape == "box" else (x / 2, z / 2, 0),
@@ -105,8 +105,8 @@ class MujocoWorld(World):
         velocity.
         """
         data, motors = self._data, self._motors
-        wanted = self._velocity + POSITION_GAIN / self._period_s * (self._position - data.qpos[self._joints])
-        acceleration = (wanted - data.qvel[motors]) / self._period_s
+        target_velocity = self._velocity + POSITION_GAIN / self._period_s * (self._position - data.qpos[self._joints])
+        acceleration = (target_velocity - data.qvel[motors]) / self._period_s
         mujoco.mj_fullM(self._model, data, self._inertia)
         inertia = self._inertia[np.ix_(motors, motors)]
         others = (data.qfrc_bias - data.qfrc_passive - data.qfrc_constraint)[motors]
@@ -128,8 +128,8 @@ class MujocoWorld(World):
         w, *turn = self._data.xquat[self._tool].tolist()
         speed = np.empty(6)
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0)
-        at = Pose(tuple(self._data.xpos[self._tool].tolist()), (*turn, w))
-        return self._tool_on(at, tuple(speed[3:].tolist()), tuple(speed[:3].tolist()))
+        pose = Pose(tuple(self._data.xpos[self._tool].tolist()), (*turn, w))
+        return self._tool_on(pose, tuple(speed[3:].tolist()), tuple(speed[:3].tolist()))
 
     def _place(self, body: str, pose: Pose) -> None:
         number = self._mocap[body]
@@ -141,19 +141,19 @@ class MujocoWorld(World):
         mujoco.mj_kinematics(self._model, self._data)  # bodies may have moved
         other = self._model.geom(body).id
         return min(
-            float(mujoco.mj_geomDistance(self._model, self._data, one, other, within, None)) for one in self._felt
+            float(mujoco.mj_geomDistance(self._model, self._data, geom, other, within, None)) for geom in self._felt
         )
 
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
         mujoco.mj_kinematics(self._model, self._data)
-        lens, shown = mujoco.MjvCamera(), mujoco.MjvOption()
+        lens, option = mujoco.MjvCamera(), mujoco.MjvOption()
         away = np.subtract(target, eye)
         lens.lookat[:], lens.distance = target, np.linalg.norm(away)
         lens.azimuth = np.degrees(np.arctan2(away[1], away[0]))
         lens.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
-        shown.geomgroup[FELT_GROUP] = 0
+        option.geomgroup[FELT_GROUP] = 0
         with mujoco.Renderer(self._model, size[1], size[0]) as renderer:
-            renderer.update_scene(self._data, lens, shown)
+            renderer.update_scene(self._data, lens, option)
             return renderer.render()
 
     def close(self) -> None:

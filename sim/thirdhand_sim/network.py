@@ -200,8 +200,8 @@ class Bridge:
         self._names, self._observed, self._tracked = names, observed, tracked
         self.hands_sent = 0  # samples of both hands, published or received
         hands, arm = tuple(f"hands/{side}" for side in SIDES), ("joints/state", "gripper/state")
-        own = ("objects", *(() if tracked else hands), *(() if observed else arm))
-        self._publishers = {suffix: Publisher(session, live.cell, suffix) for suffix in own}
+        suffixes = ("objects", *(() if tracked else hands), *(() if observed else arm))
+        self._publishers = {suffix: Publisher(session, live.cell, suffix) for suffix in suffixes}
         # Callbacks run on another thread for 20 µs and note the time of arrival of each command.
         self._subscribers = [
             session.declare_subscriber(channels.key(live.cell, suffix), receive)

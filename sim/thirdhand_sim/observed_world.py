@@ -36,10 +36,10 @@ class ObservedWorld(World):
         thread.
         """
         try:
-            found = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
-            if found is None:
+            joint_state = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
+            if joint_state is None:
                 return
-            state = measured(found, self._names)
+            state = measured(joint_state, self._names)
         except messages.WireError:
             return
         if messages.finite(state[0] + state[1]):
@@ -58,11 +58,11 @@ class ObservedWorld(World):
     def tool(self) -> tuple[Pose, Floats]:
         """Pose and velocity [m/s] of the tool."""
         position, velocity = self._newest
-        here, turn = self._arm.at(np.array(position)), np.empty(4)
-        quaternion_of(here.rotation, turn)
+        tool_frame, turn = self._arm.at(np.array(position)), np.empty(4)
+        quaternion_of(tool_frame.rotation, turn)
         x, y, z, w = turn.tolist()
-        speed = here.jacobian[:3] @ velocity
-        return Pose(tuple(here.position.tolist()), (x, y, z, w)), tuple(speed.tolist())
+        speed = tool_frame.jacobian[:3] @ velocity
+        return Pose(tuple(tool_frame.position.tolist()), (x, y, z, w)), tuple(speed.tolist())
 
     def _place(self, body: str, pose: Pose) -> None:
         """Do nothing: the base class stores the pose."""
@@ -72,10 +72,10 @@ class ObservedWorld(World):
         capsules, near = self._body.capsules, np.empty(9)
         placed = np.empty((len(capsules), 2, 3))
         place(np.array(self._newest[0]), self._body.frames, self._body.axes, capsules, placed)
-        at, look = self.pose(body), self._bodies[body].look
-        hand = np.array([at.position, carried_by(at, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position])
-        apart = [between_segments(one, hand, near) for one in placed] - capsules["radius"]
-        return min(within, float(apart.min()) - look.size[0] / 2)
+        pose, look = self.pose(body), self._bodies[body].look
+        hand = np.array([pose.position, carried_by(pose, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position])
+        distances_m = [between_segments(segment, hand, near) for segment in placed] - capsules["radius"]
+        return min(within, float(distances_m.min()) - look.size[0] / 2)
 
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
         raise NotImplementedError("there is no engine that draws; thirdhand view live shows the cell")

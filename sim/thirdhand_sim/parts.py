@@ -156,11 +156,11 @@ class CellPart:
         clock = threading.Timer(START_TIMEOUT_S, self.process.kill)
         clock.start()
         assert self.process.stdout is not None
-        said = self.process.stdout.readline().split()
+        words = self.process.stdout.readline().split()
         clock.cancel()
-        if not said:
+        if not words:
             raise PartError(f"python -m thirdhand_sim.parts {' '.join(self._arguments)} did not begin")
-        self.endpoint = said[-1]
+        self.endpoint = words[-1]
 
     def send(self, number: int) -> None:
         """Send a signal to the process."""
@@ -242,8 +242,8 @@ def main(arguments: list[str] | None = None) -> int:
     relaying = kinds.add_parser("relay", help="a network between two ends")
     relaying.add_argument("target", metavar="TARGET", help="the endpoint of the other end, like tcp/127.0.0.1:7447")
     routing = kinds.add_parser("router", help="a Zenoh router")
-    for one in (relaying, routing):
-        one.add_argument("port", metavar="PORT", type=int, help="the port to listen on; 0 for a free one")
+    for subparser in (relaying, routing):
+        subparser.add_argument("port", metavar="PORT", type=int, help="the port to listen on; 0 for a free one")
     args = p.parse_args(arguments)
     child.end_with_parent()
     before_others()

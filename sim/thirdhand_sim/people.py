@@ -46,8 +46,8 @@ class Places(NamedTuple):
 
     def perceived(self, sigma_m: float, random: np.random.Generator) -> Places:
         """The perceived places with errors of `sigma_m` (3-D rms), except the robot's own place."""
-        off = sigma_m / np.sqrt(3.0) * random.standard_normal((6, 3))
-        left_start, right_start, handover, glass, board, iron = np.array(self[:6]) + off
+        errors_m = sigma_m / np.sqrt(3.0) * random.standard_normal((6, 3))
+        left_start, right_start, handover, glass, board, iron = np.array(self[:6]) + errors_m
         return Places(left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m)
 
 

@@ -42,7 +42,7 @@ class PyBulletWorld(World):
     def _body(self, body: WorldBody) -> int:
         size, kind = body.look.size, getattr(pybullet, f"GEOM_{body.look.shape.upper()}")
         box = {"halfExtents": tuple(0.5 * edge for edge in size)}
-        shown = box if body.look.shape == "box" else {"radius": size[0] / 2, "length": size[2]}
+        visual = box if body.look.shape == "box" else {"radius": size[0] / 2, "length": size[2]}
         felt = box if body.look.shape == "box" else {"radius": size[0] / 2, "height": size[2]}
         position, turn = body.offset
         look = pybullet.createVisualShape(
@@ -51,14 +51,14 @@ class PyBulletWorld(World):
             visualFramePosition=position,
             visualFrameOrientation=turn,
             physicsClientId=self._id,
-            **shown,
+            **visual,
         )
         shape = -1
         if body.solid or body.measured:
             shape = pybullet.createCollisionShape(
                 kind, collisionFramePosition=position, collisionFrameOrientation=turn, physicsClientId=self._id, **felt
             )
-        made: int = pybullet.createMultiBody(
+        body_id: int = pybullet.createMultiBody(
             baseMass=0.0,
             baseCollisionShapeIndex=shape,
             baseVisualShapeIndex=look,
@@ -67,8 +67,8 @@ class PyBulletWorld(World):
             physicsClientId=self._id,
         )
         if not body.solid:
-            pybullet.setCollisionFilterGroupMask(made, -1, 0, 0, physicsClientId=self._id)
-        return made
+            pybullet.setCollisionFilterGroupMask(body_id, -1, 0, 0, physicsClientId=self._id)
+        return body_id
 
     def follow(self, position: Floats, velocity: Floats) -> None:
         """Set the motors' target positions [rad] and velocities [rad/s]."""
@@ -113,7 +113,7 @@ class PyBulletWorld(World):
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
         projection, view = camera(eye, target, size)
         width, height = size
-        seen = pybullet.getCameraImage(
+        image = pybullet.getCameraImage(
             width,
             height,
             view.ravel("F").tolist(),
@@ -123,7 +123,7 @@ class PyBulletWorld(World):
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self._id,
         )
-        return np.reshape(np.asarray(seen[2], dtype=np.uint8), (height, width, 4))[:, :, :3]
+        return np.reshape(np.asarray(image[2], dtype=np.uint8), (height, width, 4))[:, :, :3]
 
     def close(self) -> None:
         """End the simulation."""

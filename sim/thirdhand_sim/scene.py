@@ -75,17 +75,17 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def __post_init__(self) -> None:
         for name, lowest in MIN_HEIGHT_M.items():
-            given: Point = getattr(self, name)
+            place: Point = getattr(self, name)
             nominal = _nominal(name)
-            moved = math.dist(given, nominal)
+            moved = math.dist(place, nominal)
             if not moved <= MOST_MOVED + 1e-9:
                 raise ValueError(
-                    f"{name}: {list(given)} lies {moved:.3g} m from the nominal {list(nominal)} m; "
+                    f"{name}: {list(place)} lies {moved:.3g} m from the nominal {list(nominal)} m; "
                     f"up to {MOST_MOVED:g} m is reachable{'. Is it in metres?' if moved > FAR_OFF else ''}"
                 )
-            if given[2] < lowest:
+            if place[2] < lowest:
                 raise ValueError(
-                    f"{name}: {list(given)} lies {100 * given[2]:.1f} cm above the table; "
+                    f"{name}: {list(place)} lies {100 * place[2]:.1f} cm above the table; "
                     f"at least {100 * lowest:.0f} cm is needed"
                 )
 
@@ -151,15 +151,15 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         for name, tool in (("handover", self.offer), ("glass", self.glass), ("soldering", self.carry)):
             up, out = tool[2] - centre[2], math.dist(tool[:2], centre[:2])
             low, high = (max(r * r - up * up, 0.0) ** 0.5 for r in (reach.inner + IN_REACH, reach.outer - IN_REACH))
-            wanted = min(max(out, low), high)
-            share, by = (wanted - out) / out if out else 0.0, abs(wanted - out)
+            radius_m = min(max(out, low), high)
+            share, by = (radius_m - out) / out if out else 0.0, abs(radius_m - out)
             shift = (share * (tool[0] - centre[0]), share * (tool[1] - centre[1]), 0.0)
-            place, at = _add(getattr(self, name), shift), _add(tool, shift)
-            is_in = reach.inner <= math.dist(at, centre) <= reach.outer
+            place, moved_tool = _add(getattr(self, name), shift), _add(tool, shift)
+            is_in = reach.inner <= math.dist(moved_tool, centre) <= reach.outer
             if math.dist(place, _nominal(name)) > MOST_MOVED or not is_in:
                 lost.append(f"{name} needs the tool {math.dist(tool, centre):.2f} m from the shoulder")
-            elif at[0] < reach.min_x or at[2] < reach.min_z:
-                lost.append(f"{name} needs the tool at x = {at[0]:.2f}, z = {at[2]:.2f} m")
+            elif moved_tool[0] < reach.min_x or moved_tool[2] < reach.min_z:
+                lost.append(f"{name} needs the tool at x = {moved_tool[0]:.2f}, z = {moved_tool[2]:.2f} m")
             elif by:
                 places[name] = place
                 moves.append(f"{name} moved by {100 * by:.0f} cm into the arm's reach")

@@ -80,9 +80,9 @@ class Clock:
             if not 0.0 < pause.depth <= 2.0:
                 raise ValueError(f"a pause of depth {pause.depth} given, above 0 (slower) to 2 (back as fast) accepted")
         ordered = sorted(pauses)
-        for one, other in itertools.pairwise(ordered):
-            if other.at_s < one.at_s + one.lasts_s:
-                raise ValueError(f"pauses at {one.at_s} s and {other.at_s} s overlap")
+        for earlier, other in itertools.pairwise(ordered):
+            if other.at_s < earlier.at_s + earlier.lasts_s:
+                raise ValueError(f"pauses at {earlier.at_s} s and {other.at_s} s overlap")
         self.speed = speed
         self.pauses = tuple(ordered)
 
@@ -125,13 +125,13 @@ class Path:
         i = max((k for k, begin in enumerate(self._begins) if script_s >= begin), default=0)
         lasts = self._lasts[i]
         u = min(max((script_s - self._begins[i]) / lasts, 0.0), 1.0)
-        start, way, arc = self._points[i], self._points[i + 1] - self._points[i], self._arcs[i]
+        start, chord, arc = self._points[i], self._points[i + 1] - self._points[i], self._arcs[i]
         v = 1.0 - u
         share, d_share, dd_share = u**3 * (10 - 15 * u + 6 * u * u), 30 * u * u * v * v, 60 * u * v * (v - u)
         bump, d_bump, dd_bump = 64 * (u * v) ** 3, 192 * (u * v) ** 2 * (v - u), 384 * u * v * ((v - u) ** 2 - u * v)
-        d = (d_share * way + d_bump * arc) / lasts
-        dd = (dd_share * way + dd_bump * arc) / lasts**2
-        return PointMotion(start + share * way + bump * arc, d * rate, dd * rate * rate + d * rate_change)
+        d = (d_share * chord + d_bump * arc) / lasts
+        dd = (dd_share * chord + dd_bump * arc) / lasts**2
+        return PointMotion(start + share * chord + bump * arc, d * rate, dd * rate * rate + d * rate_change)
 
 
 class HandScript:

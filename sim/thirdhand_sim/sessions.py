@@ -101,22 +101,22 @@ class Session:
         """
         tracker, random = self.person.tracker, np.random.default_rng([*self.seed, 1])
         stamps = np.arange(0.0, self.lasts_s, 1.0 / tracker.rate_hz)
-        seen = self.hands(stamps)
+        positions = self.hands(stamps)
         if tracker.residual is None:
-            seen = seen + tracker.noise_m * random.standard_normal(seen.shape)
+            positions = positions + tracker.noise_m * random.standard_normal(positions.shape)
         else:
             begin = int(random.integers(len(tracker.residual)))
-            seen = seen + tracker.residual[(begin + np.arange(len(stamps))) % len(tracker.residual)]
+            positions = positions + tracker.residual[(begin + np.arange(len(stamps))) % len(tracker.residual)]
         keep = np.ones((len(stamps), 2), bool)
         for side in (0, 1):
             part = slice(3 * side, 3 * side + 3)
-            for at in np.flatnonzero(random.random(len(stamps)) < tracker.jumps_hz / tracker.rate_hz):
-                seen[at : at + int(random.integers(1, 3)), part] += 0.04 * random.standard_normal(3)
-            for at in np.flatnonzero(random.random(len(stamps)) < tracker.dropouts_hz / tracker.rate_hz):
-                keep[at : at + int(0.1 * 10 ** random.random() * tracker.rate_hz), side] = False
+            for index in np.flatnonzero(random.random(len(stamps)) < tracker.jumps_hz / tracker.rate_hz):
+                positions[index : index + int(random.integers(1, 3)), part] += 0.04 * random.standard_normal(3)
+            for index in np.flatnonzero(random.random(len(stamps)) < tracker.dropouts_hz / tracker.rate_hz):
+                keep[index : index + int(0.1 * 10 ** random.random() * tracker.rate_hz), side] = False
         swapped = (stamps >= self.swapped_s[0]) & (stamps < self.swapped_s[1])
-        seen[swapped] = np.roll(seen[swapped], 3, axis=1)
-        return (stamps[keep[:, 0]], seen[keep[:, 0], :3]), (stamps[keep[:, 1]], seen[keep[:, 1], 3:])
+        positions[swapped] = np.roll(positions[swapped], 3, axis=1)
+        return (stamps[keep[:, 0]], positions[keep[:, 0], :3]), (stamps[keep[:, 1]], positions[keep[:, 1], 3:])
 
     def _leg_to_handover(self) -> int:
         return max(i for i, leg in enumerate(self.legs[0]) if leg.progress[1] == 1.0)
@@ -130,8 +130,8 @@ def along(legs: Sequence[Leg], times: Array) -> tuple[Array, Array]:
         u = np.clip((times[on] - leg.begin_s) / leg.lasts_s, 0.0, 1.0)
         grid = np.linspace(0.0, 1.0, len(leg.share))
         share = np.interp(u, grid, leg.share)
-        off = np.stack([np.interp(u, grid, column) for column in leg.deviation.T], axis=1)
-        x[on] = leg.start + share[:, None] * (leg.end - leg.start) + off
+        deviation = np.stack([np.interp(u, grid, column) for column in leg.deviation.T], axis=1)
+        x[on] = leg.start + share[:, None] * (leg.end - leg.start) + deviation
         done = np.clip(share, 0.0, 1.0)
         progress[on] = leg.progress[0] + done * (leg.progress[1] - leg.progress[0])
     return x, progress
@@ -161,8 +161,8 @@ def session(who: Person, number: int, *, group: Group, sigma_m: float = 0.0, mov
     places = Places(left, right, handover, glass, board, iron, np.array(scene.robot_start))
     mistake = str(random.choice(MISTAKES)) if random.random() < who.mistakes else ""
     lead = float(np.clip(who.lead_s + 0.3 * random.standard_normal(), -LONGEST_LEAD_S, LONGEST_LEAD_S))
-    told = places.perceived(sigma_m, random)
-    return played(who._replace(lead_s=lead), number, places, told, seed=seed, mistake=mistake)
+    perceived = places.perceived(sigma_m, random)
+    return played(who._replace(lead_s=lead), number, places, perceived, seed=seed, mistake=mistake)
 
 
 def played(
@@ -191,19 +191,19 @@ def played(
         at = go(side, at, lasts_s, np.array([here, there]), progress)
         return go(side, at + 0.1, lasts_s, np.array([there, here]), progress[::-1])
 
-    at = REST_S
+    start_s = REST_S
     if mistake == "board first":
-        at = there_and_back(0, at, left[0], left[0] + 0.7 * (left[2] - left[0]), (0.0, 0.0)) + 0.2
+        start_s = there_and_back(0, start_s, left[0], left[0] + 0.7 * (left[2] - left[0]), (0.0, 0.0)) + 0.2
     if mistake == "right to the board":
-        there_and_back(1, at, right[0], right[0] + 0.7 * (right[2] - right[0]), (0.0, 0.0))
-        at += 1.0  # the left hand waits for the right one
+        there_and_back(1, start_s, right[0], right[0] + 0.7 * (right[2] - right[0]), (0.0, 0.0))
+        start_s += 1.0  # the left hand waits for the right one
     elif random.random() < who.strays:
         stray = right[0] + random.uniform(-0.1, 0.1, 3) * (1.0, 1.0, 0.3)
-        there_and_back(1, at + random.uniform(0.0, lasts[0]), right[0], stray, (0.0, 0.0))
-    given = go(0, at, lasts[0], left[:2], (0.0, 1.0), leg=0)
+        there_and_back(1, start_s + random.uniform(0.0, lasts[0]), right[0], stray, (0.0, 0.0))
+    handover_s = go(0, start_s, lasts[0], left[:2], (0.0, 1.0), leg=0)
     if mistake == "handover again":
-        given = there_and_back(0, given + 0.5, left[1], left[1] + 0.6 * (left[0] - left[1]), (1.0, 0.4))
-    taken = given + dwell[0]
+        handover_s = there_and_back(0, handover_s + 0.5, left[1], left[1] + 0.6 * (left[0] - left[1]), (1.0, 0.4))
+    taken = handover_s + dwell[0]
     brought = go(0, taken, lasts[1], left[1:], (1.0, 2.0), leg=1)
     begin = max([taken - who.lead_s, *(leg.end_s + 0.1 for leg in hands[1])])
     fetched = go(1, begin, who.haste * lasts[1], right[:2], (0.0, 1.0), leg=0)
@@ -218,7 +218,7 @@ def played(
     if random.random() < who.swaps:
         begin = float(random.uniform(REST_S, end - 1.5))
         swapped = (begin, begin + float(random.uniform(0.2, 1.0)))
-    windows = ((given, taken), (max(brought, fetched), leaves), (soldered, end))
+    windows = ((handover_s, taken), (max(brought, fetched), leaves), (soldered, end))
     return Session(who, number, places, told, (tuple(hands[0]), tuple(hands[1])), windows, end, seed, swapped, mistake)
 
 
@@ -238,10 +238,10 @@ def demonstration(run: Session, *, rate_hz: float = 25.0) -> SessionDemonstratio
     of some millimetres.
     """
     random = np.random.default_rng([*run.seed, 4])
-    lag, off = TEACHERS_LAG_S * random.random(), TEACHERS_SCATTER_M * random.standard_normal((4, 3))
+    lag, scatter_m = TEACHERS_LAG_S * random.random(), TEACHERS_SCATTER_M * random.standard_normal((4, 3))
     times = np.arange(0.2, run.lasts_s - 0.05, 1.0 / rate_hz)
-    hands = [np.interp(times, stamps, column) for stamps, seen in run.samples() for column in seen.T]
-    return SessionDemonstration(times, np.stack(hands, axis=1), run.tool(times - lag, off=off), run.told)
+    hands = [np.interp(times, stamps, column) for stamps, positions in run.samples() for column in positions.T]
+    return SessionDemonstration(times, np.stack(hands, axis=1), run.tool(times - lag, off=scatter_m), run.told)
 
 
 def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[SessionDemonstration]:
@@ -250,8 +250,8 @@ def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[SessionDemons
     """
     careful = [person("demonstrations", number)._replace(mistakes=0.0, swaps=0.0) for number in range(people)]
     return [
-        demonstration(session(who, number, group="demonstrations", sigma_m=sigma_m, moved_m=moved))
-        for who in careful
+        demonstration(session(subject, number, group="demonstrations", sigma_m=sigma_m, moved_m=moved))
+        for subject in careful
         for number, moved in enumerate((0.0, 0.10))
     ]
 
@@ -264,25 +264,25 @@ def breaking(kind: str, number: int, *, group: Group) -> Session:
     """
     seed = (PROJECT_SEED, GROUP_SEEDS[group], 1000 + BREAKING.index(kind), number)
     random = np.random.default_rng(seed)
-    scene, who = Scene(), PLAIN_PERSON
+    scene, subject = Scene(), PLAIN_PERSON
     usual = (scene.handover, scene.glass, scene.soldering)
     handover, glass, board = (_moved(np.array(place), MOST_MOVED, random) for place in usual)
     starts = np.array(scene.left_start), np.array(scene.right_start)
-    told = places = Places(*starts, handover, glass, board, np.array(scene.iron), np.array(scene.robot_start))
+    perceived = places = Places(*starts, handover, glass, board, np.array(scene.iron), np.array(scene.robot_start))
     if kind == BREAKING[0]:
-        who = who._replace(scatter=0.024)
+        subject = subject._replace(scatter=0.024)
     elif kind == BREAKING[1]:
         left, right = (_away(start, 0.15, random) for start in starts)
-        places = told._replace(left_start=left, right_start=right)
+        places = perceived._replace(left_start=left, right_start=right)
     elif kind == BREAKING[2]:
         bows = random.standard_normal((2, 2, 3))
         bows[..., 2] = np.abs(bows[..., 2])
-        who = who._replace(bows=0.10 * bows / np.linalg.norm(bows, axis=2, keepdims=True))
+        subject = subject._replace(bows=0.10 * bows / np.linalg.norm(bows, axis=2, keepdims=True))
     elif kind == BREAKING[3]:
-        who = who._replace(lead_s=2.0)
+        subject = subject._replace(lead_s=2.0)
     else:
-        places = told._replace(iron=_away(told.iron, 0.10, random))
-    return played(who, number, places, told, seed=seed)
+        places = perceived._replace(iron=_away(perceived.iron, 0.10, random))
+    return played(subject, number, places, perceived, seed=seed)
 
 
 def _moved(place: Array, most_m: float, random: np.random.Generator) -> Array:
@@ -296,28 +296,28 @@ def _moved(place: Array, most_m: float, random: np.random.Generator) -> Array:
 def _away(place: Array, distance_m: float, random: np.random.Generator) -> Array:
     """A random place at a distance from a place, and above the table."""
     while True:
-        way = random.standard_normal(3) * (1.0, 1.0, 0.5)
-        there = place + distance_m * way / np.linalg.norm(way)
-        if there[2] >= MIN_HAND_HEIGHT_M:
-            return np.asarray(there)
+        direction = random.standard_normal(3) * (1.0, 1.0, 0.5)
+        candidate = place + distance_m * direction / np.linalg.norm(direction)
+        if candidate[2] >= MIN_HAND_HEIGHT_M:
+            return np.asarray(candidate)
 
 
 def shape(who: Person, ends: Array, bow: Array | None, random: np.random.Generator) -> tuple[Array, Array]:
     """The tables of a leg between ends (2, 3) [m]: shares of the path (M,), deviations (M, 3)
     [m].
     """
-    way = ends[1] - ends[0]
-    length = float(np.linalg.norm(way))
+    chord = ends[1] - ends[0]
+    length = float(np.linalg.norm(chord))
     if who.shapes and bow is not None:
-        share, off = who.shapes[int(random.integers(len(who.shapes)))]
-        deviation = length * off @ _turn_from_x(way / length).T
+        share, profile = who.shapes[int(random.integers(len(who.shapes)))]
+        deviation = length * profile @ _turn_from_x(chord / length).T
         return share, deviation * min(1.0, 0.12 / max(float(np.abs(deviation).max()), 1e-9))
     u = np.linspace(0.0, 1.0, SHAPE_STEPS)
     u = u + who.skew * u * (1.0 - u)
     share = (1.0 - who.correction) * _minimum_jerk(u) + who.correction * _minimum_jerk(np.clip((u - 0.6) / 0.4, 0, 1))
     if bow is None:
         return share, np.zeros((SHAPE_STEPS, 3))
-    across = bow - (bow @ way) / length**2 * way
+    across = bow - (bow @ chord) / length**2 * chord
     across *= np.linalg.norm(bow) / max(float(np.linalg.norm(across)), 1e-9) * random.uniform(0.8, 1.2)
     return share, (64.0 * (u * (1.0 - u)) ** 3)[:, None] * across
 

@@ -32,10 +32,10 @@ class CountingRelay:
 
     @staticmethod
     def _close(*sockets: socket.socket) -> None:
-        for one in sockets:
+        for connection in sockets:
             with contextlib.suppress(OSError):  # it is closed, or was never connected
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
+                connection.shutdown(socket.SHUT_RDWR)
+            connection.close()
 
     @staticmethod
     def _spawn(work: object, *arguments: object) -> None:

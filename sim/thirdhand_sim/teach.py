@@ -81,7 +81,7 @@ def by_people(people: int) -> list[Demonstration]:
     """Two demonstrations of each modelled person, with things in their nominal places and moved,
     and with via-points.
     """
-    return [recorded(one, begin_s=60 * number) for number, one in enumerate(sessions.demonstrations(people))]
+    return [recorded(demonstration, begin_s=60 * number) for number, demonstration in enumerate(sessions.demonstrations(people))]
 
 
 def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demonstration:
@@ -111,7 +111,7 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
     rows = [
         {
             "name": name,
-            **{part: np.round(at, 6).tolist() for part, at in zip(("left", "right", "tool"), ends, strict=True)},
+            **{part: np.round(position, 6).tolist() for part, position in zip(("left", "right", "tool"), ends, strict=True)},
             "std": std,
             "radius": RADIUS_M,
             "follow": "left" if name == "handover" else "none",
@@ -137,13 +137,13 @@ def perform(
 
 def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float) -> bool:
     """Publish a person's run of the task that visits a place twice, see `publish`."""
-    shown = visits(number)
-    times = shown.period_s * np.arange(len(shown.tool)) / speed
+    demonstration = visits(number)
+    times = demonstration.period_s * np.arange(len(demonstration.tool)) / speed
 
     def poses(t: float) -> tuple[Array, ...]:
         row = int(np.clip(np.searchsorted(times, t), 0, len(times) - 1))
-        at = ([np.interp(t, times, column) for column in part[:, :3].T] for part in shown[1:4])
-        return tuple(np.append(one, part[row, 3:]) for one, part in zip(at, shown[1:4], strict=True))
+        positions = ([np.interp(t, times, column) for column in part[:, :3].T] for part in demonstration[1:4])
+        return tuple(np.append(position, part[row, 3:]) for position, part in zip(positions, demonstration[1:4], strict=True))
 
     return publish(poses, float(times[-1]), REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
 
@@ -245,12 +245,12 @@ def main(arguments: list[str] | None = None) -> int:
             return _perform_all(scene, args, reach)
         args.output.mkdir(parents=True, exist_ok=True)
         seed = scene.seed if args.seed is None else args.seed
-        made = (
+        takes = (
             by_people(args.count)
             if args.people
             else demonstrations(scene, count=args.count, seed=seed, gripper=args.gripper)
         )
-        for number, taught in enumerate(made, start=1):
+        for number, taught in enumerate(takes, start=1):
             path = args.output / f"demonstration-{number}.mcap"
             write_demonstration(path, taught, cell=reach.cell)
             print(path)

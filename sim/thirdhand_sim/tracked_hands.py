@@ -109,7 +109,7 @@ class TrackedHands:
         hands = self.truth(t)._asdict()
         if self._over == len(self._places):
             return TaskProgress(None, self._over)
-        arrived = all(math.dist(hands[side].position, at) <= ARRIVED_M for side, at, _ in self._places[self._over])
+        arrived = all(math.dist(hands[side].position, position) <= ARRIVED_M for side, position, _ in self._places[self._over])
         if reached > self._over:
             self._reached_s = min(self._reached_s, t)
             if not arrived or t - self._reached_s >= OBSERVED_S:
@@ -125,8 +125,8 @@ class TrackedHands:
         """
         size = (2 * ARRIVED_M,) * 3
         return tuple(
-            SceneObject(f"{side} hand: {task}", "ball", BASE, at, LEVEL, size, _faint(side))
-            for side, at, task in (self._places[self._over] if self._over < len(self._places) else ())
+            SceneObject(f"{side} hand: {task}", "ball", BASE, position, LEVEL, size, _faint(side))
+            for side, position, task in (self._places[self._over] if self._over < len(self._places) else ())
         )
 
 

@@ -171,16 +171,16 @@ def furniture(scene: Scene, settings: Settings) -> dict[str, WorldBody]:
     slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD_RGBA)
     bodies = {"table": WorldBody(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
     for name in ("soldering", "glass", "iron"):  # stands below these things
-        at = getattr(scene, name)
-        stand = Look("box", (0.06, 0.06, at[2]), WOOD_RGBA)
-        bodies[f"stand of {name}"] = WorldBody(stand, Pose((at[0], at[1], at[2] / 2), LEVEL))
-    for name, shape, size, colour, at in (
+        position = getattr(scene, name)
+        stand = Look("box", (0.06, 0.06, position[2]), WOOD_RGBA)
+        bodies[f"stand of {name}"] = WorldBody(stand, Pose((position[0], position[1], position[2] / 2), LEVEL))
+    for name, shape, size, colour, position in (
         (World.board, "box", (0.08, 0.05, 0.002), BOARD_RGBA, (0.0, 0.0, 0.0)),
         (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL_RGBA, scene.glass),
         (World.iron, "cylinder", (0.016, 0.016, 0.18), IRON_RGBA, scene.iron),
         (World.solder, "cylinder", (0.04, 0.04, 0.03), STEEL_RGBA, scene.solder),
     ):
-        bodies[name] = WorldBody(Look(shape, size, colour), Pose(at, LEVEL))
+        bodies[name] = WorldBody(Look(shape, size, colour), Pose(position, LEVEL))
     # A hand is a capsule from the palm along the forearm. It is for measuring distances and pushes
     # nothing.
     hand = Look("capsule", (2 * people.radius, 2 * people.radius, people.length), SKIN_RGBA)
@@ -192,8 +192,8 @@ def furniture(scene: Scene, settings: Settings) -> dict[str, WorldBody]:
 
 def pixels(points: Any, matrix: Any, size: tuple[int, int]) -> Any:
     """Pixels (N, 2) of points (N, 3) [m] in a picture of a size, by its matrix (4, 4)."""
-    seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    flat = seen[:, :2] / seen[:, 3:]
+    clip_points = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    flat = clip_points[:, :2] / clip_points[:, 3:]
     return (flat * (1, -1) + 1) / 2 * size
 
 
@@ -207,5 +207,5 @@ def seen_from(holder: Pose, thing: Pose) -> Pose:
 
 def carried_by(holder: Pose, grip: Pose) -> Pose:
     """The pose of a thing whose pose in its holder's frame is `grip`."""
-    at = rotation(holder.orientation) @ grip.position + holder.position
-    return Pose(tuple(at.tolist()), multiply(holder.orientation, grip.orientation))
+    position = rotation(holder.orientation) @ grip.position + holder.position
+    return Pose(tuple(position.tolist()), multiply(holder.orientation, grip.orientation))

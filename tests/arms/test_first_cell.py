@@ -32,16 +32,16 @@ SAWYER = Path(__file__).with_name("sawyer.urdf")
 def published(name: str) -> Path:
     """A description of `example-robot-data`; who asks is skipped where that is not installed."""
     try:
-        return next(Path(str(one.locate())) for one in files("example-robot-data") or () if one.name == name)
+        return next(Path(str(file.locate())) for file in files("example-robot-data") or () if file.name == name)
     except PackageNotFoundError:
         pytest.skip("example-robot-data, whose descriptions these are, is not installed")
 
 
 def iiwa() -> Path:
-    found = importlib.util.find_spec("pybullet_data")
-    if found is None or found.origin is None:
+    spec = importlib.util.find_spec("pybullet_data")
+    if spec is None or spec.origin is None:
         pytest.skip("pybullet_data, whose description this is, is not installed")
-    return Path(found.origin).with_name("kuka_iiwa") / "model.urdf"
+    return Path(spec.origin).with_name("kuka_iiwa") / "model.urdf"
 
 
 ARMS: dict[str, tuple[Callable[[], Path], str]] = {
@@ -75,13 +75,13 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
     cell = load(in_folder(proposal, path, tmp_path))
     robot = robot_description(cell)
     arm, posture = Arm(cell, robot), np.array(cell.arm.posture)
-    here = arm.at(posture)
-    assert here.rotation[2, 2] < -math.cos(math.radians(50.0))
+    pose = arm.at(posture)
+    assert pose.rotation[2, 2] < -math.cos(math.radians(50.0))
     low = [cell.table.centre[i] - cell.table.half_size[i] for i in range(2)]
     high = [cell.table.centre[i] + cell.table.half_size[i] for i in range(2)]
-    assert (here.position[:2] > low).all()
-    assert (here.position[:2] < high).all()
-    assert 0.1 < here.position[2] < 0.8
+    assert (pose.position[:2] > low).all()
+    assert (pose.position[:2] < high).all()
+    assert 0.1 < pose.position[2] < 0.8
     beyond_m = Separation(cell, robot).clearance(posture, np.empty((0, 3)))[0]
     assert beyond_m > 0.0
     assert proposal.clearance[0] == pytest.approx(beyond_m + cell.obstacles.clearance)
@@ -112,7 +112,7 @@ def test_accelerations_follow_from_velocities_and_less_where_efforts_are_small(
         re.sub(r' effort="[^"]*"', "", text),
         re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL),
     ):
-        found, _, by_effort = rates(without, moving)
+        fallback, _, by_effort = rates(without, moving)
         assert not by_effort
-        np.testing.assert_allclose(found, np.minimum(velocity / 0.25, 15.0), rtol=0.01)
+        np.testing.assert_allclose(fallback, np.minimum(velocity / 0.25, 15.0), rtol=0.01)
     assert capfd.readouterr().err == ""

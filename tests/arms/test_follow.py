@@ -56,7 +56,7 @@ class Following:
         self.said += iter(self.process.stderr.readline, "")
 
     def until(self, line: str, times: int = 1, timeout_s: float = 60.0) -> None:
-        self.waits(lambda: sum(line in said for said in self.said) >= times, timeout_s)
+        self.waits(lambda: sum(line in log_line for log_line in self.said) >= times, timeout_s)
 
     def waits(self, what: Callable[[], bool], timeout_s: float = 60.0) -> None:
         end = time.monotonic() + timeout_s
@@ -109,9 +109,9 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
     config = folder / "arm.toml"
     config.write_text(network)
     with hub(folder) as session, Tracker(session) as tracker:
-        at, joints = ("--connect", *endpoints(session)), Joints(session)
-        with following(arm, *at, "--config", str(config), *more) as running:  # it waits for the daemon
-            with serving(folder, *at, network=network) as daemon:
+        connect, joints = ("--connect", *endpoints(session)), Joints(session)
+        with following(arm, *connect, "--config", str(config), *more) as running:  # it waits for the daemon
+            with serving(folder, *connect, network=network) as daemon:
                 running.until("commands arrive")
                 for attempt in range(20):
                     tracker.left = LEFT if attempt % 2 else NEAR_LEFT
@@ -124,7 +124,7 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
             stands = joints.position
             time.sleep(0.3)
             assert np.abs(joints.position - stands).max() < 1e-3
-            with serving(folder, *at, network=network) as daemon:
+            with serving(folder, *connect, network=network) as daemon:
                 running.until("commands arrive", times=2)
                 tracker.left = LEFT if tracker.left == NEAR_LEFT else NEAR_LEFT
                 running.waits(joints.moving)
@@ -150,12 +150,12 @@ def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(t
 @simulated
 def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path: Path) -> None:
     network = franka_toml().replace("[arm]\n", "[arm]\nsilent_ms = 1000\nfault_error_rad = 0.5\n")
-    with robot(tmp_path) as there:
+    with robot(tmp_path) as device:
         killed_and_started_again(
-            tmp_path, "franka", network + PATIENT.split("[arm]", maxsplit=1)[0], "--robot", there.address
+            tmp_path, "franka", network + PATIENT.split("[arm]", maxsplit=1)[0], "--robot", device.address
         )
-    assert there.new.mean() > 0.99
-    assert_allowed(there.velocity[there.new], there.joints[there.new])
+    assert device.new.mean() > 0.99
+    assert_allowed(device.velocity[device.new], device.joints[device.new])
 
 
 # --- bad input -----------------------------------------------------------------------------------
@@ -175,21 +175,21 @@ def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
     with serving(tmp_path) as daemon:
-        at = ("--connect", daemon.endpoint)
-        assert "only daemons of other cells run" in refused("simulated", *at, "--cell", "nowhere", "--wait", "0.2")
-        assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *at, "--config", str(six)))
+        connect = ("--connect", daemon.endpoint)
+        assert "only daemons of other cells run" in refused("simulated", *connect, "--cell", "nowhere", "--wait", "0.2")
+        assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *connect, "--config", str(six)))
         assert "the settings here have 6" in line
         assert "give the daemon's settings by --config" in line
-        assert "give --config with its own URDF" in refused("franka", *at)
+        assert "give --config with its own URDF" in refused("franka", *connect)
 
 
 @pytest.mark.thorough
 def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> None:
-    at = f"tcp/127.0.0.1:{free_port()}"
-    with following("simulated", "--connect", at) as running:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with following("simulated", "--connect", endpoint) as running:
         running.until("waiting, up to 60 s: ")
         time.sleep(3.0)  # longer than a connection or a request is tried
-        with serving(tmp_path, network=f'[network]\nlisten = ["{at}"]\n') as daemon, Tracker(daemon.session):
+        with serving(tmp_path, network=f'[network]\nlisten = ["{endpoint}"]\n') as daemon, Tracker(daemon.session):
             running.until("commands arrive, the arm follows")
             assert running.ended() == 0
 

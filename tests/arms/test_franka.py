@@ -66,37 +66,37 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     commands = motion(np.vstack((sway(5.0), np.zeros((750, 7)))))
     late = np.where(rng.uniform(size=len(commands)) < lost, math.inf, rng.uniform(0.0, 1.0, len(commands)) * jitter_s)
     arriving = sorted(((i * TICK + late[i], command) for i, command in enumerate(commands)), key=lambda one: one[0])
-    measured, passed_s, at = [], 0.0, 0
-    with robot(tmp_path, "--fast") as there:
-        arm = franka.FrankaArm(cell(), there.address)
+    measured, passed_s, index = [], 0.0, 0
+    with robot(tmp_path, "--fast") as device:
+        arm = franka.FrankaArm(cell(), device.address)
         playback = Playback(arm.limits, arm.stands_at(), period_s=arm.period_s, speed_limits=arm.speed_limits)
         with arm:
             while passed_s < 6.3:
                 now = arm.read()
                 passed_s += now.elapsed_s
                 came = []
-                while at < len(arriving) and arriving[at][0] <= passed_s:
-                    came.append(arriving[at][1])
-                    at += 1
+                while index < len(arriving) and arriving[index][0] <= passed_s:
+                    came.append(arriving[index][1])
+                    index += 1
                 measured.append((passed_s, now.position))
                 moved = playback.step(came, measured=now.position, elapsed_s=now.elapsed_s)
                 arm.write(moved.position, moved.velocity)
     assert playback.refused == 0
-    assert there.new.mean() > 0.999
-    assert_allowed(there.velocity, there.joints)
-    times, commanded = TICK * np.arange(len(commands)), np.array([one.position for one in commands])
-    speeds = np.array([one.velocity for one in commands])
-    when, where = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
-    wanted, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (commanded, speeds))
-    error = where - wanted
+    assert device.new.mean() > 0.999
+    assert_allowed(device.velocity, device.joints)
+    times, commanded = TICK * np.arange(len(commands)), np.array([command.position for command in commands])
+    speeds = np.array([command.velocity for command in commands])
+    when, where = np.array([sample[0] for sample in measured]), np.array([sample[1] for sample in measured])
+    expected, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (commanded, speeds))
+    error = where - expected
     late_s = -float((error * fast).sum() / (fast * fast).sum())
     rms = float(np.sqrt((error**2).mean()))
     print(f"jitter {jitter_s}: {1e3 * rms:.2f} mrad rms, {1e3 * np.abs(error).max():.1f} worst, {1e3 * late_s:.1f} ms")
     assert rms <= rms_rad
     assert late_s <= 0.010
     kinematics = Arm(cell(), robot_description(cell()))
-    off = max(math.dist(kinematics.at(q).position, kinematics.at(commanded[-1]).position) for q in where[-100:])
-    assert off <= 1e-3, "at rest the tool is within 1 mm"
+    distance_m = max(math.dist(kinematics.at(q).position, kinematics.at(commanded[-1]).position) for q in where[-100:])
+    assert distance_m <= 1e-3, "at rest the tool is within 1 mm"
 
 
 @pytest.mark.parametrize("which", ["six joints", "another arm"])

@@ -137,16 +137,16 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
     hostile: list[tuple[float, Command]],
     restart: tuple[int, int, float, float] | None,
 ) -> None:
-    wanted = np.array([value for value, count in wishes for _ in range(count)])
-    commands = motion(wanted)
-    arriving = [*sent(commands, late), *(Sent(*one) for one in hostile)]
+    wishes_radps = np.array([value for value, count in wishes for _ in range(count)])
+    commands = motion(wishes_radps)
+    arriving = [*sent(commands, late), *(Sent(*pair) for pair in hostile)]
     if restart is not None:  # by a daemon that counts anew, and takes the arm to be somewhere near
-        after, tick, off, silent_s = restart
+        after, tick, offset_rad, silent_s = restart
         commands, end = commands[:after], commands[min(after, len(commands) - 1)]
-        again = motion(-wanted, at=(np.array(end.position) + off).clip(LOWER, UPPER), tick=tick)
-        arriving = [*sent(commands, late), *sent(again, late, len(commands) * TICK + silent_s)]
+        restarted = motion(-wishes_radps, at=(np.array(end.position) + offset_rad).clip(LOWER, UPPER), tick=tick)
+        arriving = [*sent(commands, late), *sent(restarted, late, len(commands) * TICK + silent_s)]
     playback = Playback(limits, AT, period_s=period)
-    written = play(playback, arriving, len(wanted) * TICK + 1.0, period, clocks)
+    written = play(playback, arriving, len(wishes_radps) * TICK + 1.0, period, clocks)
     assert_held(limits, written, period)
 
 
@@ -164,14 +164,14 @@ def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, whic
 
 def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
     commands = motion(sway(1.0))
-    jumping = [Sent(one.at_s, one.command._replace(position=tuple(AT))) for one in sent(commands)[300::50]]
+    jumping = [Sent(message.at_s, message.command._replace(position=tuple(AT))) for message in sent(commands)[300::50]]
     playback = Playback(COMMANDED, AT, period_s=0.001)
-    kept = [one for i, one in enumerate(sent(commands)) if i < 300 or i % 50]
-    written = play(playback, [*kept, *jumping], 1.0, 0.001)
+    regular = [message for i, message in enumerate(sent(commands)) if i < 300 or i % 50]
+    written = play(playback, [*regular, *jumping], 1.0, 0.001)
     assert (playback.refused, playback.reason) == (4, "a jump from the command before")
-    late, off = behind(written, commands, 0.001)
+    late, error_rad = behind(written, commands, 0.001)
     assert late < 0.006
-    assert off < 2e-3
+    assert error_rad < 2e-3
 
 
 def test_another_number_of_joints_is_refused_and_named() -> None:
@@ -197,7 +197,7 @@ def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow(
 
 def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
     playback, commands = Playback(STRONG, AT, period_s=0.001), motion(sway(2.0))
-    cut = [one for one in sent(commands) if not 1.0 < one.at_s < 1.06]
+    cut = [message for message in sent(commands) if not 1.0 < message.at_s < 1.06]
     written = play(playback, cut, 2.0, 0.001)
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.01
     assert_held(STRONG, written, 0.001)
@@ -225,7 +225,7 @@ def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
 def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
     """Half a second of motion comes at once, half a second late."""
     playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.5))
-    held = [Sent(1.0, one.command) if 0.5 < one.at_s < 1.0 else one for one in sent(commands[:500])]
+    held = [Sent(1.0, message.command) if 0.5 < message.at_s < 1.0 else message for message in sent(commands[:500])]
     written = play(playback, held, 1.5, 0.001)
     assert (written.position[1000:] == written.position[999]).all()
     assert playback.refused > 200
@@ -235,18 +235,18 @@ def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -
     playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.0), tick=70_000)
     before = play(playback, sent(commands[:400]), 0.8 + 0.5, 0.001)
     stands = before.position[-1]
-    again = motion(sway(1.0), at=stands)
-    written = play(playback, sent(again), 1.0, 0.001)
-    assert np.abs(written.position[-1] - again[-1].position).max() < 0.02
+    restarted = motion(sway(1.0), at=stands)
+    written = play(playback, sent(restarted), 1.0, 0.001)
+    assert np.abs(written.position[-1] - restarted[-1].position).max() < 0.02
     assert_held(COMMANDED, Written(*map(np.vstack, zip(before, written, strict=True))), 0.001)
 
 
 def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
     """The one that came first is followed; the other's ticks are none of that sequence."""
-    one, other = motion(sway(1.0)), motion(-sway(1.0), tick=40_000)
+    first, other = motion(sway(1.0)), motion(-sway(1.0), tick=40_000)
     playback = Playback(COMMANDED, AT, period_s=0.001)
-    written = play(playback, [*sent(one), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
-    assert np.abs(written.position[-1] - one[-1].position).max() < 0.01
+    written = play(playback, [*sent(first), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
+    assert np.abs(written.position[-1] - first[-1].position).max() < 0.01
     assert playback.refused > 400
 
 
@@ -266,9 +266,9 @@ def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT, begin_s: float = 0
 
 def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> float:
     """The largest distance between what is written and what was commanded by then [rad]."""
-    when, where = [one.at_s for one in arriving], [one.command.position[0] for one in arriving]
-    told = np.interp(period * np.arange(1, len(written.position) + 1), when, where)
-    return float(np.abs(written.position[:, 0] - told).max())
+    when, where = [message.at_s for message in arriving], [message.command.position[0] for message in arriving]
+    expected_rad = np.interp(period * np.arange(1, len(written.position) + 1), when, where)
+    return float(np.abs(written.position[:, 0] - expected_rad).max())
 
 
 @pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
@@ -292,8 +292,8 @@ def test_commands_of_any_rate_are_played_back_at_their_own_pace(rate_hz: int, pe
 )
 def test_a_clock_that_is_set_does_not_change_the_pace(since: int, stamped: Callable[[int, int], int]) -> None:
     arriving = [
-        one if k < since else one._replace(command=one.command._replace(stamp_ns=stamped(one.command.stamp_ns, k)))
-        for k, one in enumerate(at_rate(500, 4.0))
+        message if k < since else message._replace(command=message.command._replace(stamp_ns=stamped(message.command.stamp_ns, k)))
+        for k, message in enumerate(at_rate(500, 4.0))
     ]
     playback = Playback(STRONG, AT, period_s=0.001)
     written = play(playback, arriving, 4.0, 0.001)
@@ -304,8 +304,8 @@ def test_a_clock_that_is_set_does_not_change_the_pace(since: int, stamped: Calla
 def test_a_daemon_of_another_rate_that_takes_over_is_followed_at_its_own() -> None:
     playback, first = Playback(STRONG, AT, period_s=0.001), at_rate(250, 1.0)
     stands = play(playback, first, 1.5, 0.001).position[-1]
-    then = at_rate(1000, 3.0, at=stands)
-    assert farthest_rad(play(playback, then, 3.0, 0.001), then, 0.001) < 0.003
+    second = at_rate(1000, 3.0, at=stands)
+    assert farthest_rad(play(playback, second, 3.0, 0.001), second, 0.001) < 0.003
     assert playback.tick_s == pytest.approx(0.001, rel=1e-3)
 
 
@@ -323,7 +323,7 @@ def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_
 
 def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
     playback = Playback(COMMANDED, AT, period_s=0.001)
-    unstamped = [one._replace(command=one.command._replace(stamp_ns=0)) for one in at_rate(500, 1.0)]
+    unstamped = [message._replace(command=message.command._replace(stamp_ns=0)) for message in at_rate(500, 1.0)]
     assert (play(playback, unstamped, 0.1, 0.001).position == AT).all()
     assert "no length of a tick" in playback.reason
     assert playback.reason.endswith("1 to 20 ms a tick needed")
@@ -336,9 +336,9 @@ def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
 def behind(written: Written, commands: Sequence[Command], period: float) -> tuple[float, float]:
     """By how much it is late [s], and how far off it is beside that [rad]."""
     times = TICK * np.arange(len(commands))
-    at, speed = (np.array([getattr(one, name) for one in commands]) for name in ("position", "velocity"))
+    positions, speed = (np.array([getattr(command, name) for command in commands]) for name in ("position", "velocity"))
     when = period * np.arange(1, len(written.position) + 1)
-    where, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (at, speed))
+    where, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (positions, speed))
     error = written.position - where
     late = -float((error * fast).sum() / (fast * fast).sum())
     return late, float(np.abs(error + late * fast).max())
@@ -357,9 +357,9 @@ def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as
     late_s = np.where(rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands)))
     playback = Playback(STRONG, AT, period_s=period)
     written = play(playback, sent(commands, late_s.tolist()), 6.0, period)
-    late, off = behind(written, commands, period)
+    late, error_rad = behind(written, commands, period)
     assert 0.0 < late < delay_s + period
-    assert off < off_rad
+    assert error_rad < off_rad
     assert 0.9 <= playback.delay_ticks < (delay_s + period) / TICK
     assert playback.refused == 0
     jerk = np.diff(written.velocity, n=2, axis=0) / period**2
@@ -371,7 +371,7 @@ def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(sh
     """A step is taken each 0.97 or 1.03 ms, by a drive whose period is 1 ms."""
     commands = motion(sway(6.0))
     playback = Playback(STRONG, AT, period_s=0.001)
-    arriving = [Sent(one.at_s / share, one.command) for one in sent(commands)]
+    arriving = [Sent(message.at_s / share, message.command) for message in sent(commands)]
     written = play(playback, arriving, 6.0 / share, 0.001, [0.001 * share])
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.02
     assert playback.delay_ticks < 3.0

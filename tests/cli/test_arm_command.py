@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_it_prints_what_was_understood(made: tuple[Path, str]) -> None:
     folder, text = made
-    for wanted in (
+    for phrase in (
         "my.urdf: 8 links, 6 joints before the plate",
         "plate     tool0",
         "shoulder_pan_joint           revolute      -6.28     6.28      3.14",
@@ -41,7 +41,7 @@ def test_it_prints_what_was_understood(made: tuple[Path, str]) -> None:
         "[tool] allows 0.8 m/s and 10 m/s²; a joint in brackets allows less",
         f"next:    thirdhand demo --arm {folder / 'cell.toml'}",
     ):
-        assert wanted in text, wanted
+        assert phrase in text, phrase
 
 
 def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:

@@ -47,13 +47,13 @@ def simulated(
     else:
         measured = followed(commanded, lag_s)
     measured += np.array([0.02, -0.01, 0.0])  # what gravity bends
-    seen = times >= 2.0
+    window = times >= 2.0
     every = round(1 / (state_hz * PERIOD_S))
 
     def arrived(values: np.ndarray, step: int, noise_rad: float) -> dict[str, list[tuple[float, float]]]:
-        at = times[seen][::step] + rng.uniform(0, 0.0015, len(times[seen][::step]))
-        noisy = values[seen][::step] + rng.normal(0, noise_rad, (len(at), 3))
-        return {name: list(zip(at.tolist(), noisy[:, i].tolist(), strict=True)) for i, name in enumerate(NAMES)}
+        stamps_s = times[window][::step] + rng.uniform(0, 0.0015, len(times[window][::step]))
+        noisy = values[window][::step] + rng.normal(0, noise_rad, (len(stamps_s), 3))
+        return {name: list(zip(stamps_s.tolist(), noisy[:, i].tolist(), strict=True)) for i, name in enumerate(NAMES)}
 
     return lag(arrived(commanded, 1, 0.0), arrived(measured, every, noise_rad))
 
@@ -66,9 +66,9 @@ def test_the_lag_of_a_servo_is_measured(servo: str, lag_ms: int, state_hz: float
     """Within 1 ms; a servo is late by up to 2 % less than its constant at these frequencies."""
     errors_ms = []
     for seed in range(3):
-        found = simulated(servo, lag_ms / 1000, state_hz=state_hz, noise_rad=noise_rad, seed=seed)
-        assert found is not None
-        errors_ms.append(1000 * found.lag_s - lag_ms)
+        estimate = simulated(servo, lag_ms / 1000, state_hz=state_hz, noise_rad=noise_rad, seed=seed)
+        assert estimate is not None
+        errors_ms.append(1000 * estimate.lag_s - lag_ms)
     assert max(errors_ms) < 1.0
     assert min(errors_ms) > -1.0 - (0.02 * lag_ms if servo == "servo" else 0.0)
 
@@ -79,6 +79,6 @@ def test_a_continuous_joint_may_wrap() -> None:
     late = 3.0 + 0.4 * np.sin(2 * (times - 0.05))
     wrapped = (late + np.pi) % (2 * np.pi) - np.pi
     pairs = [list(zip(times.tolist(), values.tolist(), strict=True)) for values in (path, wrapped)]
-    found = lag({"a": pairs[0]}, {"a": pairs[1]})
-    assert found is not None
-    assert found.lag_s == pytest.approx(0.05, abs=0.001)
+    estimate = lag({"a": pairs[0]}, {"a": pairs[1]})
+    assert estimate is not None
+    assert estimate.lag_s == pytest.approx(0.05, abs=0.001)

@@ -37,8 +37,8 @@ def unpacked(path: Path) -> dict[str, bytes]:
     """The files of an archive by name."""
     with tarfile.open(path) as archive:
         entries = archive.getmembers()
-        assert all(one.isfile() and not one.name.startswith(("/", "..")) for one in entries)
-        return {one.name: archive.extractfile(one).read() for one in entries}  # type: ignore[union-attr]
+        assert all(entry.isfile() and not entry.name.startswith(("/", "..")) for entry in entries)
+        return {entry.name: archive.extractfile(entry).read() for entry in entries}  # type: ignore[union-attr]
 
 
 def everything_in(name: str, content: bytes, folder: Path) -> bytes:
@@ -71,29 +71,29 @@ def test_an_archive_holds_what_it_says_and_no_secret(tmp_path: Path, capsys: pyt
         printed = capsys.readouterr().out
         assert daemon.end() == 0
 
-    found = unpacked(output)
-    (recording,) = (name for name in found if name.startswith("recordings/"))
-    assert set(found) == {
+    files = unpacked(output)
+    (recording,) = (name for name in files if name.startswith("recordings/"))
+    assert set(files) == {
         *("README.txt", "status.json", "doctor.txt", "versions.txt", "log.txt", "settings.json", recording),
     }
     listed = [line.split(": ")[0] for line in printed.splitlines()[1:]]
-    assert set(listed) == set(found) - {"README.txt"}
-    assert all(f"{name}: " in found["README.txt"].decode() for name in listed)
-    for name, content in found.items():
+    assert set(listed) == set(files) - {"README.txt"}
+    assert all(f"{name}: " in files["README.txt"].decode() for name in listed)
+    for name, content in files.items():
         whole = everything_in(name, content, tmp_path)
         for secret in (SECRET, "planted", *(line for key in keys for line in key.splitlines()[1:-1])):
             assert secret.encode() not in whole, name
     assert output.stat().st_mode & 0o077 == 0
 
-    assert json.loads(found["status.json"])["mode"] == "follow"
-    settings = msgspec.json.decode(found["settings.json"], type=Settings)
+    assert json.loads(files["status.json"])["mode"] == "follow"
+    settings = msgspec.json.decode(files["settings.json"], type=Settings)
     assert settings.network.listen == ("tcp/127.0.0.1:0",)
-    assert "left hand" in found["doctor.txt"].decode()
-    versions = found["versions.txt"].decode()
+    assert "left hand" in files["doctor.txt"].decode()
+    versions = files["versions.txt"].decode()
     assert all(f"{name}: " in versions for name in ("thirdhand", "python", "cpu", "eclipse-zenoh"))
-    assert "listening" not in found["log.txt"].decode()  # that is on standard output
-    assert "a line\ntls/bench:7447#(left out)\n(a private key, left out)\n" in found["log.txt"].decode()
-    (tmp_path / "cut.mcap").write_bytes(found[recording])
+    assert "listening" not in files["log.txt"].decode()  # that is on standard output
+    assert "a line\ntls/bench:7447#(left out)\n(a private key, left out)\n" in files["log.txt"].decode()
+    (tmp_path / "cut.mcap").write_bytes(files[recording])
     result = replay(tmp_path / "cut.mcap")  # a recording that was being written, up to its cut
     assert result.identical == result.ticks > 0
 
@@ -123,11 +123,11 @@ def test_without_a_daemon_the_archive_says_so_and_has_the_newest_recording(tmp_p
         os.utime(tmp_path / "recordings" / f"{name}.mcap", (0, 0))
     done = succeeded("bundle", "--output", str(output), "--config", str(config), "--connect", "tcp/127.0.0.1:1")
     assert "no status: nothing listens at tcp/127.0.0.1:1" in done.stdout
-    found = unpacked(output)
-    assert "nothing listens" in found["status.json"].decode()
-    assert "nothing listens" in found["doctor.txt"].decode()
-    assert found["log.txt"]
-    assert [name for name in found if "recordings/" in name] == ["recordings/thirdhand-20260102T000000Z.mcap"]
+    files = unpacked(output)
+    assert "nothing listens" in files["status.json"].decode()
+    assert "nothing listens" in files["doctor.txt"].decode()
+    assert files["log.txt"]
+    assert [name for name in files if "recordings/" in name] == ["recordings/thirdhand-20260102T000000Z.mcap"]
 
 
 def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_archive(tmp_path: Path) -> None:

@@ -154,8 +154,8 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
     few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
     figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}
     files = {"recording": "a.mcap", "rrd": None}
-    told = {"success": not any(whys), "events": events, "realtime": True, "missing": missing, "busy": ""}
-    return told | figures | files | more
+    outcome = {"success": not any(whys), "events": events, "realtime": True, "missing": missing, "busy": ""}
+    return outcome | figures | files | more
 
 
 @pytest.mark.parametrize(
@@ -170,9 +170,9 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
 def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | None, missing: str, code: int) -> None:
     report = report_of(None, None, why, missing=missing)
     assert exit_code(report) == code
-    shown = text(report)
-    assert shown.endswith("held it over the board.") == (why is None)
-    assert (f"The recording is not complete: {missing}." in shown) == bool(missing)
+    printed = text(report)
+    assert printed.endswith("held it over the board.") == (why is None)
+    assert (f"The recording is not complete: {missing}." in printed) == bool(missing)
 
 
 BUSY = "the bench paused for 118 ms"
@@ -196,8 +196,8 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    made = [report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)]
-    left = iter(made)
+    attempts = [report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)]
+    left = iter(attempts)
 
     rates_hz: list[int | None] = []
 
@@ -214,8 +214,8 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     assert len(reports) - len(list(left)) == runs <= DEMO_ATTEMPTS
     assert [path.name for path in tmp_path.glob("*.*")] == [f"{runs - 1}.mcap"]
     assert len(list((tmp_path / TOO_BUSY).glob("*"))) == runs - 1
-    said = capsys.readouterr()
-    assert said.err.count(": it is tried again at 100 Hz") == runs - 1
+    output = capsys.readouterr()
+    assert output.err.count(": it is tried again at 100 Hz") == runs - 1
     assert rates_hz == [None, *[SLOW_RATE_HZ] * (runs - 1)]
-    assert said.err.count("there is no drawing: ") == 1  # the recordings are empty
-    assert f"thirdhand view {tmp_path}/{runs - 1}.mcap" in said.out
+    assert output.err.count("there is no drawing: ") == 1  # the recordings are empty
+    assert f"thirdhand view {tmp_path}/{runs - 1}.mcap" in output.out

@@ -74,10 +74,10 @@ def source(name: str, **changed: Any) -> dict[str, Source]:
 
 
 def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
-    found = diagnosed()
-    assert {finding.level for finding in found} == {"ok"}
-    told = {finding.what for finding in found}
-    assert told >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
+    diagnosis = diagnosed()
+    assert {finding.level for finding in diagnosis} == {"ok"}
+    subjects = {finding.what for finding in diagnosis}
+    assert subjects >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
 
 
 def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
@@ -185,7 +185,7 @@ def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
 
 
 def test_what_need_not_be_mended_is_a_note() -> None:
-    assumed = {name: one for name, one in HEALTHY.sources.items() if name != "arm"}
+    assumed = {name: entry for name, entry in HEALTHY.sources.items() if name != "arm"}
     levels = {
         finding.what: finding.level
         for finding in diagnosed(mode="hold", reason="operator", sources=assumed, scribe={"state": "off"})
@@ -198,29 +198,29 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
     assert rows(ahead)["latency"] == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
     assert rows(HEALTHY)["latency"] == "p50 1.00, p99 2.00, max 3.00 ms"
-    gone = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
-    one = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": gone})
-    assert rows(one)["nearest"].endswith("; the left hand is assumed where it was last seen")
+    lost_hand = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
+    status = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": lost_hand})
+    assert rows(status)["nearest"].endswith("; the left hand is assumed where it was last seen")
     rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
 
 
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
     silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
-    found = diagnosed(mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False)
-    told = [(finding.level, finding.what) for finding in found]
-    assert [what for level, what in told if level == "wrong"] == ["arm", "arm's driver", "mode", "real time"]
-    assert [level for level, _ in told] == sorted((level for level, _ in told), reverse=True)
+    diagnosis = diagnosed(mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False)
+    ranked = [(finding.level, finding.what) for finding in diagnosis]
+    assert [subject for level, subject in ranked if level == "wrong"] == ["arm", "arm's driver", "mode", "real time"]
+    assert [level for level, _ in ranked] == sorted((level for level, _ in ranked), reverse=True)
 
 
 def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> None:
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
-    told = wrongs(
+    lines = wrongs(
         diagnosed(more={"travels": travels}, mode="fault", reason="arm_error", because="a joint was 0.102 rad off")
     )
-    assert "b was commanded to move by 0.31 rad, but has not moved since commands began" in told[0]
-    assert "are the drives on?" in told[0]
-    assert [line.split()[1] for line in told] == ["arm's", "mode"]
+    assert "b was commanded to move by 0.31 rad, but has not moved since commands began" in lines[0]
+    assert "are the drives on?" in lines[0]
+    assert [line.split()[1] for line in lines] == ["arm's", "mode"]
     assert "whether its drives are on" in what_to_do("arm_error")
 
 
@@ -233,10 +233,10 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
     ],
 )
 def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, level: str, words: str) -> None:
-    found = diagnosed(more={"lag_ms": lag_ms})
-    (one,) = (finding for finding in found if finding.what == "arm's lag")
-    assert (one.level, one.found) == (level, words)
-    assert ("lead by the lag: write position + lag * velocity" in one.text()) == (level == "note")
+    diagnosis = diagnosed(more={"lag_ms": lag_ms})
+    (lag_finding,) = (finding for finding in diagnosis if finding.what == "arm's lag")
+    assert (lag_finding.level, lag_finding.found) == (level, words)
+    assert ("lead by the lag: write position + lag * velocity" in lag_finding.text()) == (level == "note")
     assert "arm's lag" not in {finding.what for finding in diagnosed(sources={"left": GOOD, "right": GOOD})}
 
 
@@ -261,7 +261,7 @@ def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(change
 
 def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:
     """The findings of statuses in which left and right hand are there, over two seconds."""
-    seen = [
+    statuses = [
         msgspec.structs.replace(
             HEALTHY,
             tick=1000 * (i + 1),
@@ -270,32 +270,32 @@ def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]])
         )
         for i, (left, right) in enumerate(hands)
     ]
-    return findings(*seen, own_ns=seen[-1].time_ns, own_version="0.1.0")
+    return findings(*statuses, own_ns=statuses[-1].time_ns, own_version="0.1.0")
 
 
 def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
     raised = [((-0.2, 0.9 + up, 0.5), (0.2, 0.95 + up / 2, 0.51)) for up in (0.0, 0.1, 0.2)]
-    told = [line for line in wrongs(paths(*raised)) if "tracker's axes" in line]
-    assert "write base_from_tracker = [0, 0, 0, 0.7071, 0, 0, 0.7071]" in told[0]
+    lines = [line for line in wrongs(paths(*raised)) if "tracker's axes" in line]
+    assert "write base_from_tracker = [0, 0, 0, 0.7071, 0, 0, 0.7071]" in lines[0]
     settings = converted({"hands": {"base_from_tracker": list(Y_UP)}}, origin="here")
     turned = rotation(settings.hands.base_from_tracker[3:]) @ np.array([0.0, 1.0, 0.0])
     assert np.allclose(turned, [0, 0, 1], atol=1e-4)
 
 
 def test_hands_that_slide_over_the_table_are_of_no_tracker_whose_y_points_up() -> None:
-    known = [((0.8, -0.3 + off, 0.1), (0.9, 0.3, 0.1)) for off in (0.0, 0.1, 0.2)]
-    beside = [((1.4, -0.3 + off, 0.1), (1.4, 0.3, 0.1)) for off in (0.0, 0.1, 0.2)]
-    assert not any(finding.what == "tracker's axes" for hands in (known, beside) for finding in paths(*hands))
+    inside = [((0.8, -0.3 + shift_m, 0.1), (0.9, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
+    outside = [((1.4, -0.3 + shift_m, 0.1), (1.4, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
+    assert not any(finding.what == "tracker's axes" for hands in (inside, outside) for finding in paths(*hands))
 
 
 def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
     first = msgspec.structs.replace(HEALTHY, target_m=(0.5, 0.2, 0.3))
     now = {"target_m": (0.5, 0.15, 0.3)}
-    told = wrongs(diagnosed(first, **now))
-    assert "tool               15 cm or more from its target for 2.0 s" in told[0]
-    found = diagnosed(first, flags=("separation",), **now)
-    assert [(one.level, "give it room" in one.remedy) for one in found if one.what == "tool"] == [("note", True)]
-    assert not any(one.what == "tool" for one in diagnosed(first, target_m=HEALTHY.target_m))
+    lines = wrongs(diagnosed(first, **now))
+    assert "tool               15 cm or more from its target for 2.0 s" in lines[0]
+    diagnosis = diagnosed(first, flags=("separation",), **now)
+    assert [(finding.level, "give it room" in finding.remedy) for finding in diagnosis if finding.what == "tool"] == [("note", True)]
+    assert not any(finding.what == "tool" for finding in diagnosed(first, target_m=HEALTHY.target_m))
 
 
 def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
@@ -306,12 +306,12 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
         "hands_m": {"left": HEALTHY.hands_m["left"]},
         "demonstrated_m": {"left": BOXES["left"]},
     }
-    found = diagnosed(**unseen)
-    assert {finding.level for finding in found} == {"ok"}
-    assert "right hand         nothing arrives; the skill does not need it" in [one.text()[7:] for one in found]
+    diagnosis = diagnosed(**unseen)
+    assert {finding.level for finding in diagnosis} == {"ok"}
+    assert "right hand         nothing arrives; the skill does not need it" in [finding.text()[7:] for finding in diagnosis]
     assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
-    gone = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
-    assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | gone))[0]  # it may be anywhere
+    lost_fields = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
+    assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]  # it may be anywhere
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
     assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: the skill needs both hands"

@@ -75,8 +75,8 @@ def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> 
     """Exit code and findings of `thirdhand doctor`, without those of this machine."""
     capsys.readouterr()
     code = main(["doctor", "--json", "--seconds", "0.5", "--connect", daemon.endpoint, *more])
-    told = json.loads(capsys.readouterr().out)
-    return code, [finding for finding in told if finding["what"] not in OF_THE_MACHINE]
+    report = json.loads(capsys.readouterr().out)
+    return code, [finding for finding in report if finding["what"] not in OF_THE_MACHINE]
 
 
 @pytest.mark.thorough
@@ -89,8 +89,8 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
     ):
         daemon = Daemon(service, session)
         with misnamed(daemon.session):
-            code, found = findings(daemon, capsys)
-        wrong = {finding["what"]: finding for finding in found if finding["level"] == "wrong"}
+            code, report = findings(daemon, capsys)
+        wrong = {finding["what"]: finding for finding in report if finding["level"] == "wrong"}
         assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
         assert all(finding["wanted"] and finding["remedy"] for finding in wrong.values())
         assert "no joint states arrived yet" in wrong["mode"]["found"]
@@ -102,11 +102,11 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
             for _ in range(5):  # a rate is known once its driver has been heard for a while
-                _, found = findings(daemon, capsys)
-                if all(finding["level"] == "ok" for finding in found):
+                _, report = findings(daemon, capsys)
+                if all(finding["level"] == "ok" for finding in report):
                     break
-            assert {finding["level"] for finding in found} == {"ok"}, found
-            assert {"left hand", "right hand", "arm", "recording"} <= {finding["what"] for finding in found}
+            assert {finding["level"] for finding in report} == {"ok"}, report
+            assert {"left hand", "right hand", "arm", "recording"} <= {finding["what"] for finding in report}
 
             tracker.left = NEAR_LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
@@ -131,19 +131,19 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
                 daemon.session.put("thirdhand/hands/left", payload)
                 return "wrong_frame" in str(status["because"])
 
-            told = daemon.until(refused)
-            assert (told["reason"], told["remedy"][:19]) == ("stale_hand", "find [hands] frame ")
-            assert "frame 'camera'; 'base', 'optitrack' or none accepted" in told["because"]
-            assert set(told["hands_m"]) == {"left", "right"}
+            refusal = daemon.until(refused)
+            assert (refusal["reason"], refusal["remedy"][:19]) == ("stale_hand", "find [hands] frame ")
+            assert "frame 'camera'; 'base', 'optitrack' or none accepted" in refusal["because"]
+            assert set(refusal["hands_m"]) == {"left", "right"}
             time.sleep(1.5)  # for a line of the watch
             tracker.left = LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
             daemon.process.kill()
             daemon.process.wait()
             until(lambda: not any(arm.velocity))  # type: ignore[attr-defined]
-        said, ended = watch.communicate(timeout=20)
-        assert "hold (stale_hand)" in said
-        assert "left not seen for" in said
+        output, ended = watch.communicate(timeout=20)
+        assert "hold (stale_hand)" in output
+        assert "left not seen for" in output
         assert (watch.returncode, "nothing arrives on thirdhand/status" in ended) == (1, True)
         log = daemon.log.read_text()
         assert log.count("left hand: rejected as wrong_frame: frame 'camera'") == 1
@@ -164,9 +164,9 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
         token = near.liveliness().declare_token("lab/bench2/daemon/1")
         assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
         token.undeclare()  # type: ignore[no-untyped-call]
-    said = capsys.readouterr().out
-    assert "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in said
-    assert "give the name of the cell by --cell" in said
+    output = capsys.readouterr().out
+    assert "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in output
+    assert "give the name of the cell by --cell" in output
 
 
 def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,6 +178,6 @@ def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: py
         assert main(["status", *reach]) == 1
         status = capsys.readouterr().err
         token.undeclare()  # type: ignore[no-untyped-call]
-    for said in (doctor, status):
-        assert "its daemon is alive, but it is starting or ending" in said
-        assert "start `thirdhand serve`" not in said
+    for output in (doctor, status):
+        assert "its daemon is alive, but it is starting or ending" in output
+        assert "start `thirdhand serve`" not in output

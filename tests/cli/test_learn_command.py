@@ -22,8 +22,8 @@ from thirdhand_sim.teach import demonstrations
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("demonstrations")
     paths = [folder / f"demonstration-{number}.mcap" for number in (1, 2, 3)]
-    for path, one in zip(paths, demonstrations(Scene(), count=3, seed=1), strict=True):
-        write_demonstration(path, one.every(8))
+    for path, demonstration in zip(paths, demonstrations(Scene(), count=3, seed=1), strict=True):
+        write_demonstration(path, demonstration.every(8))
     return paths
 
 
@@ -39,9 +39,9 @@ def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) 
 
 
 def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:
-    one = demonstrations(Scene(), count=1, seed=1)[0].every(8)
-    mirrored = one.tool * np.array([1, -1, 1, 1, 1, 1, 1])
-    write_demonstration(tmp_path / "mirrored.mcap", one._replace(tool=mirrored))
+    demonstration = demonstrations(Scene(), count=1, seed=1)[0].every(8)
+    mirrored = demonstration.tool * np.array([1, -1, 1, 1, 1, 1, 1])
+    write_demonstration(tmp_path / "mirrored.mcap", demonstration._replace(tool=mirrored))
     out = tmp_path / "skill.npz"
     done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out))
     assert done.returncode == 1
@@ -70,17 +70,17 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
 def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Path) -> None:
     theirs, mine = tmp_path / "theirs.npz", tmp_path / "mine.npz"
     done = succeeded("learn", *map(str, files), "--output", str(theirs))
-    own = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
-    for path, one in zip(own, demonstrations(Scene(), count=2, seed=5), strict=True):
-        write_demonstration(path, one.every(8))
-    refine = ("learn", *map(str, own), "--output", str(mine), "--from")
+    own_paths = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
+    for path, demonstration in zip(own_paths, demonstrations(Scene(), count=2, seed=5), strict=True):
+        write_demonstration(path, demonstration.every(8))
+    refine = ("learn", *map(str, own_paths), "--output", str(mine), "--from")
     done = succeeded(*refine, str(theirs))
     assert "the weight of your demonstrations against the skill's, with errors; " in done.stdout
-    names = [one.name for one in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))]
-    assert names == [path.stem for path in (*own, *files)]
+    names = [demonstration.name for demonstration in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))]
+    assert names == [path.stem for path in (*own_paths, *files)]
     for skill, says in (
         (RECORDINGS / "experiments" / "as-paper.npz", "its file does not hold the demonstrations"),
-        (own[0], "not a skill"),
+        (own_paths[0], "not a skill"),
         (tmp_path / "missing.npz", "cannot read skill"),
     ):
         done = told(*refine, str(skill))

@@ -31,13 +31,13 @@ Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 def samples(text: str) -> Samples:
     """The values of a scraped page by name and labels, without the cell."""
-    found = {}
+    values = {}
     for family in text_string_to_metric_families(text):
-        for one in family.samples:
-            labels = frozenset((name, value) for name, value in one.labels.items() if name != "cell")
-            assert (one.name, labels) not in found
-            found[one.name, labels] = one.value
-    return found
+        for sample in family.samples:
+            labels = frozenset((name, value) for name, value in sample.labels.items() if name != "cell")
+            assert (sample.name, labels) not in values
+            values[sample.name, labels] = sample.value
+    return values
 
 
 def value(found: Samples, name: str, **labels: str) -> float | None:
@@ -48,9 +48,9 @@ def value(found: Samples, name: str, **labels: str) -> float | None:
 def page(endpoint: str) -> Iterator[str]:
     """The address of the page that `thirdhand metrics` serves, until the context ends."""
     with started("metrics", "--listen", "127.0.0.1:0", "--connect", endpoint) as process:
-        found = re.search(r"http://127\.0\.0\.1:\d+/metrics", process.stderr.readline())
-        assert found is not None
-        yield found[0]
+        url_match = re.search(r"http://127\.0\.0\.1:\d+/metrics", process.stderr.readline())
+        assert url_match is not None
+        yield url_match[0]
 
 
 def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(tmp_path: Path) -> None:
@@ -68,21 +68,21 @@ def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_
             with Tracker(daemon.session):
                 daemon.session.put("thirdhand/hands/left", b"no message")
                 now = daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
-                found = scrape()
+                scraped = scrape()
             later = Client(daemon.session).status()
-            assert value(found, "up") == 1
-            assert value(found, "info", version=later.version, skill=later.skill) == 1
-            assert [value(found, "mode", mode=mode) for mode in ("hold", "follow", "fault")] == [0, 1, 0]
-            assert value(found, "reason", reason="operator") == 0
-            assert now["tick"] < (value(found, "ticks_total") or 0) <= later.tick + 1
-            assert value(found, "rejected_samples_total", cause="malformed hands/left") == 1
-            assert 0 < (value(found, "lateness_seconds", percentile="50") or 0) < 1
-            assert 0 < (value(found, "work_seconds", percentile="99") or 0) < 1
-            assert 0 < (value(found, "latency_seconds", percentile="100") or 0) < 10
-            assert 20e6 < (value(found, "memory_bytes", process="scribe") or 0) < 5e9
-            assert 20e6 < (value(found, "memory_bytes", process="daemon") or 0) < 5e9
-            assert (value(found, "disk_free_bytes") or 0) > 0
-            assert value(found, "recording") == 1
+            assert value(scraped, "up") == 1
+            assert value(scraped, "info", version=later.version, skill=later.skill) == 1
+            assert [value(scraped, "mode", mode=mode) for mode in ("hold", "follow", "fault")] == [0, 1, 0]
+            assert value(scraped, "reason", reason="operator") == 0
+            assert now["tick"] < (value(scraped, "ticks_total") or 0) <= later.tick + 1
+            assert value(scraped, "rejected_samples_total", cause="malformed hands/left") == 1
+            assert 0 < (value(scraped, "lateness_seconds", percentile="50") or 0) < 1
+            assert 0 < (value(scraped, "work_seconds", percentile="99") or 0) < 1
+            assert 0 < (value(scraped, "latency_seconds", percentile="100") or 0) < 10
+            assert 20e6 < (value(scraped, "memory_bytes", process="scribe") or 0) < 5e9
+            assert 20e6 < (value(scraped, "memory_bytes", process="daemon") or 0) < 5e9
+            assert (value(scraped, "disk_free_bytes") or 0) > 0
+            assert value(scraped, "recording") == 1
             daemon.process.kill()
             daemon.process.wait(20)
         assert scrape() == {("thirdhand_up", frozenset()): 0.0}
@@ -132,7 +132,7 @@ def exposition(statuses: dict[str, Status | None]) -> str:
 
 def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
     now = msgspec.convert(STATUS, Status)
-    found = samples(exposition({"lab/one": now}))
+    scraped = samples(exposition({"lab/one": now}))
     expected = {
         ("ticks_total",): 100,
         ("missed_deadlines_total",): 7,
@@ -151,9 +151,9 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
         ("info", ("version", "0.1.0"), ("skill", 'a "skill"\\')): 1,
     }
     for (name, *labels), figure in expected.items():
-        assert value(found, name, **dict(labels)) == (None if figure is None else pytest.approx(figure)), name
+        assert value(scraped, name, **dict(labels)) == (None if figure is None else pytest.approx(figure)), name
     for kind, codes in (("mode", Mode), ("reason", Reason)):
-        states = [one for (name, _), one in found.items() if name == f"thirdhand_{kind}"]
+        states = [state for (name, _), state in scraped.items() if name == f"thirdhand_{kind}"]
         assert (len(states), sum(states)) == (len(codes) - (codes is Reason), 1)
     two = exposition({"lab/one": now, "lab/two": None})
     assert 'thirdhand_up{cell="lab/two"} 0.0' in two
@@ -163,8 +163,8 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
 
 def test_the_alerts_use_metrics_that_exist() -> None:
     rules = [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
-    known = {name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))}
+    exported = {name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))}
     named = {name for rule in rules for name in re.findall(r"thirdhand_\w+", rule["expr"])}
     assert len(rules) == 11
     assert len(named) > 8
-    assert named <= known
+    assert named <= exported

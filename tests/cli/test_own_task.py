@@ -35,23 +35,23 @@ class Shell:
 
     def run(self, line: str) -> None:
         words = shlex.split(line.replace(ENDPOINT, self.at).replace("--rest 2", f"--rest {REST_S}"))
-        words = [found for word in words for found in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
+        words = [argument for word in words for argument in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
         match words:
-            case ["python", "-m", "thirdhand_sim.teach", *rest, "&"]:
-                rest += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
-                self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(rest)), daemon=True))
+            case ["python", "-m", "thirdhand_sim.teach", *options, "&"]:
+                options += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
+                self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(options)), daemon=True))
                 self.teachers[-1].start()
-            case ["python", "-m", "thirdhand_sim.teach", *rest]:
-                assert teach.main(rest) == 0
-            case ["thirdhand", "serve", *rest, "&"]:
-                command = [sys.executable, "-m", "thirdhand", "serve", *rest, "--listen", self.at]
+            case ["python", "-m", "thirdhand_sim.teach", *options]:
+                assert teach.main(options) == 0
+            case ["thirdhand", "serve", *options, "&"]:
+                command = [sys.executable, "-m", "thirdhand", "serve", *options, "--listen", self.at]
                 self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert self.daemon.stdout is not None
                 assert self.daemon.stdout.readline().startswith("listening on ")
             case ["thirdhand", "via-points" | "segment" | "status", *_]:
                 assert main([*words[1:], "--connect", self.at]) == 0
-            case ["thirdhand", *rest]:
-                assert main(rest) == 0
+            case ["thirdhand", *options]:
+                assert main(options) == 0
             case ["kill", "%1"]:
                 assert self.daemon is not None
                 self.daemon.terminate()
@@ -84,12 +84,12 @@ def test_the_tutorial_runs_as_it_stands(
     finally:
         shell.close()
     assert shell.codes[0] == 0
-    said = capsys.readouterr()
-    assert "3 takes in demonstrations" in said.err
-    assert "6 via-points in force" in said.out
-    assert re.search(r"^nearer +tool .*missed by .* mm$", said.out, re.MULTILINE)
-    assert re.search(r"^at start since tick \d+: ", said.out, re.MULTILINE)
-    assert re.search(r"^the teacher was .* late", said.out, re.MULTILINE)
+    output = capsys.readouterr()
+    assert "3 takes in demonstrations" in output.err
+    assert "6 via-points in force" in output.out
+    assert re.search(r"^nearer +tool .*missed by .* mm$", output.out, re.MULTILINE)
+    assert re.search(r"^at start since tick \d+: ", output.out, re.MULTILINE)
+    assert re.search(r"^the teacher was .* late", output.out, re.MULTILINE)
     skill = decoded((tmp_path / "skill.npz").read_bytes(), origin="skill")
     assert skill.model.names == ("start", "tray", "work", "tray again", "done")
     for name in ("take-3.png", "skill.png"):

@@ -25,12 +25,12 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
 ) -> None:
     page, folder = tmp_path / "report.html", tmp_path / "tables"
     assert main(["report", str(golden), str(golden), "--html", str(page), "--csv", str(folder)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for words in ("Nothing is missing in it.", "hold: stale_hand", "Side by side", "difference", "same"):
-        assert words in said
-    assert "Settings, versions" not in said  # one file twice: none differs
+        assert words in output
+    assert "Settings, versions" not in output  # one file twice: none differs
 
-    verdict = said.splitlines()[0]
+    verdict = output.splitlines()[0]
     counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 4 holds and no faults"
     assert re.fullmatch(
         rf"{counted}; the worst was hold: far_from_demonstrations, for 0\.8 s from 13\.2 s on\.", verdict
@@ -44,7 +44,7 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     for drawn in re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL):
         assert ET.fromstring(drawn) is not None
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
-    assert [one for one in fetched if not one.startswith("#")] == []
+    assert [url for url in fetched if not url.startswith("#")] == []
     assert "far_from_demonstrations" in text
     for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.BY_MODE.values()):  # as in the viewer
         assert palette.written(colour) in text
@@ -84,10 +84,10 @@ def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
     heads, total = rows(folder / "totals.csv")
     totals = dict(zip(heads, total, strict=True))
     assert totals["recordings [1]"] == "12"
-    one = dict(zip(figures[0], figures[1], strict=True))
-    held_s = 12 * float(one["hold: far_from_demonstrations [s]"])
+    first_row = dict(zip(figures[0], figures[1], strict=True))
+    held_s = 12 * float(first_row["hold: far_from_demonstrations [s]"])
     found_s = float(re.search(r"far_from_demonstrations ([\d.]+) s", totals["holds"])[1])  # type: ignore[index]
     assert found_s == pytest.approx(held_s, abs=12 * 0.05)
     assert float(totals["followed [%]"]) == pytest.approx(
-        100 * float(one["follow [s]"]) / float(one["duration [s]"]), abs=1
+        100 * float(first_row["follow [s]"]) / float(first_row["duration [s]"]), abs=1
     )

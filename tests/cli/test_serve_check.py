@@ -43,17 +43,17 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
     """What the check prints, by level and condition, after its exit code was compared."""
     done = told("serve", "--check", "--config", cell(folder, **settings), *arguments)
     assert done.returncode == code, done.stdout + done.stderr
-    found: dict[str, list[str]] = {}
+    checks: dict[str, list[str]] = {}
     for line in done.stdout.splitlines():
         match = re.fullmatch(r"(ok|wrong) +(\w+) +(.+)", line)
         assert match is not None, line
-        found.setdefault(f"{match[1]} {match[2]}", []).append(match[3])
-    return found
+        checks.setdefault(f"{match[1]} {match[2]}", []).append(match[3])
+    return checks
 
 
 def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_path: Path) -> None:
-    found = lines(tmp_path, code=0)
-    assert list(found) == [
+    checks = lines(tmp_path, code=0)
+    assert list(checks) == [
         *(
             "ok configuration",
             "ok imports",
@@ -103,10 +103,10 @@ def test_what_prevents_a_start_is_one_line_and_exit_code_1(
     if condition == "state":
         (tmp_path / "state").write_text("a file")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        given = [f"tcp/127.0.0.1:{taken.getsockname()[1]}" if one == "TAKEN" else one for one in arguments]
-        found = lines(tmp_path, *given, code=1, **settings)
-    assert [level for level in found if level.startswith("wrong ")] == [f"wrong {condition}"]
-    assert words in found[f"wrong {condition}"][0]
+        options = [f"tcp/127.0.0.1:{taken.getsockname()[1]}" if argument == "TAKEN" else argument for argument in arguments]
+        checks = lines(tmp_path, *options, code=1, **settings)
+    assert [level for level in checks if level.startswith("wrong ")] == [f"wrong {condition}"]
+    assert words in checks[f"wrong {condition}"][0]
     assert {path.name for path in tmp_path.iterdir()} <= {"cell.toml", "state"}
 
 
@@ -125,28 +125,28 @@ def test_a_certificate_and_a_key_that_do_not_fit_are_wrong(
 ) -> None:
     secrets = make_certificates(tmp_path)
     path = secrets / "daemon" / name
-    given = (secrets / "operator" / name).read_text() if content == "another's" else content
-    path.unlink() if given is None else path.write_text(given)
-    found = lines(tmp_path, code=1, listen=TLS, network=f"certificate = '{secrets}/daemon'\n")
-    assert words in found["wrong certificates"][0]
+    text = (secrets / "operator" / name).read_text() if content == "another's" else content
+    path.unlink() if text is None else path.write_text(text)
+    checks = lines(tmp_path, code=1, listen=TLS, network=f"certificate = '{secrets}/daemon'\n")
+    assert words in checks["wrong certificates"][0]
 
 
 def test_keys_in_endpoints_are_not_shown(tmp_path: Path) -> None:
     secured = f"certificate = '{make_certificates(tmp_path)}/daemon'\n"
     endpoint = "tls/127.0.0.1:0#connect_private_key_base64=c2VjcmV0"
-    found = lines(tmp_path, code=0, listen=endpoint, network=secured)
-    assert "c2VjcmV0" not in str(found)
+    checks = lines(tmp_path, code=0, listen=endpoint, network=secured)
+    assert "c2VjcmV0" not in str(checks)
 
 
 @contextlib.contextmanager
 def unprivileged() -> Iterator[None]:
     """A context in which this process has no rights of the superuser."""
-    own = os.geteuid()
-    os.seteuid(65534 if own == 0 else own)
+    euid = os.geteuid()
+    os.seteuid(65534 if euid == 0 else euid)
     try:
         yield
     finally:
-        os.seteuid(own)
+        os.seteuid(euid)
 
 
 def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
@@ -171,10 +171,10 @@ def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_
     listen = f"tcp/127.0.0.1:{free_port()}"
     network, sabotage = f"[network]\nlisten = ['{listen}']\n", SABOTAGE.format(folder=str(tmp_path))
     with serving(tmp_path, "--joints", "assumed", network=network, before=sabotage) as daemon:
-        found = lines(tmp_path, code=0, listen=listen)
-        assert found["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
-        found = lines(tmp_path, "--cell", "another", code=1, listen=listen)
-        assert "Address already in use" in found["wrong port"][0]
+        checks = lines(tmp_path, code=0, listen=listen)
+        assert checks["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
+        checks = lines(tmp_path, "--cell", "another", code=1, listen=listen)
+        assert "Address already in use" in checks["wrong port"][0]
         status = ("status", "--exit-code", "--connect", daemon.endpoint)
         succeeded(*status)
         fail(tmp_path, "step", "once")

@@ -95,8 +95,8 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert re.fullmatch(r"hold carried out at tick \d+; mode then: hold \(operator\)", text)
     held = page.daemon.until(lambda status: status["mode"] == "hold")
     assert (held["reason"], held["remedy"]) == ("operator", "thirdhand resume")
-    told = json.loads(page.ask("GET", "/status")[1])
-    assert (told["because"], told["remedy"]) == (held["because"], "press Resume")
+    reply = json.loads(page.ask("GET", "/status")[1])
+    assert (reply["because"], reply["remedy"]) == (held["because"], "press Resume")
     assert page.ask("POST", "/resume", X_Thirdhand_Token=token)[0] == 200
     page.daemon.until(lambda status: status["mode"] == "follow")
 
@@ -110,10 +110,10 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
             return tab.until(f"document.getElementById('mode').textContent == '{until}'")
 
         def grey() -> list[str]:
-            found: list[str] = json.loads(
+            button_ids: list[str] = json.loads(
                 tab.ask("JSON.stringify([...document.querySelectorAll('button:disabled')].map(one => one.id))")
             )
-            return found
+            return button_ids
 
         assert tab.until("document.getElementById('mode').className == 'follow'")
         assert grey() == ["resume", "reset"]

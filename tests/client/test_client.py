@@ -134,8 +134,8 @@ def test_places_are_asked_for_as_the_wire_says(
     answering("bench/via_points", take)
     client = Client(session, "bench")
     client.wait_until_ready()
-    there = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
-    assert client.add([there], tolerance=0.1) == requests.Reply(3)
+    point = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
+    assert client.add([point], tolerance=0.1) == requests.Reply(3)
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
@@ -184,17 +184,17 @@ def test_a_query_that_is_lost_is_asked_again_if_nothing_is_done_twice(
 def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
     """A session to the daemon, and a call that breaks its connection for 0.3 s."""
     (target,) = endpoints(daemon)
-    relays, again = [CountingRelay(target)], list[threading.Timer]()
-    at = relays[0].endpoint
+    relays, timers = [CountingRelay(target)], list[threading.Timer]()
+    endpoint = relays[0].endpoint
 
     def cut() -> None:
         relays[-1].__exit__()
-        again.append(threading.Timer(0.3, lambda: relays.append(CountingRelay(target, int(at.rpartition(":")[2])))))
-        again[-1].start()
+        timers.append(threading.Timer(0.3, lambda: relays.append(CountingRelay(target, int(endpoint.rpartition(":")[2])))))
+        timers[-1].start()
 
-    with open_session(connect=[at]) as session:
+    with open_session(connect=[endpoint]) as session:
         yield session, cut
-    for timer in again:
+    for timer in timers:
         timer.join()
     for relay in relays:
         relay.__exit__()

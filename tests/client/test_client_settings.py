@@ -29,15 +29,15 @@ def test_an_option_goes_before_the_environment_the_file_and_the_default(
 ) -> None:
     assert (client_settings().cell, client_settings().connect) == ("thirdhand", ())
     file.write_text('connect = "tcp/127.0.0.1:1"\ncell = "filed"\ncertificate = "secrets/operator"\n')
-    found = client_settings()
-    assert (found.cell, found.connect) == ("filed", ("tcp/127.0.0.1:1",))
-    assert found.certificate == str(file.parent / "secrets" / "operator")
+    settings = client_settings()
+    assert (settings.cell, settings.connect) == ("filed", ("tcp/127.0.0.1:1",))
+    assert settings.certificate == str(file.parent / "secrets" / "operator")
     monkeypatch.setenv("THIRDHAND_CELL", "told")
     monkeypatch.setenv("THIRDHAND_CONNECT", "tcp/127.0.0.1:2, tcp/127.0.0.1:3")
-    found = client_settings()
-    assert (found.cell, found.connect) == ("told", ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3"))
-    found = client_settings(cell="said", connect=["tcp/127.0.0.1:4"], certificate="mine")
-    assert (found.cell, found.connect, found.certificate) == ("said", ("tcp/127.0.0.1:4",), "mine")
+    settings = client_settings()
+    assert (settings.cell, settings.connect) == ("told", ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3"))
+    settings = client_settings(cell="said", connect=["tcp/127.0.0.1:4"], certificate="mine")
+    assert (settings.cell, settings.connect, settings.certificate) == ("said", ("tcp/127.0.0.1:4",), "mine")
 
 
 def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(

@@ -52,8 +52,8 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(capsys: pytest.Cap
             sent: list[int] = []
             until(all_counted)
     assert watch.lost > COUNT / 10
-    told = "messages on thirdhand/joints/command are lost: this program or its network is too slow"
-    assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [told]
+    warning = "messages on thirdhand/joints/command are lost: this program or its network is too slow"
+    assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [warning]
 
 
 def test_a_slow_loop_knows_what_its_queue_dropped_and_message_numbers_may_wrap_around() -> None:

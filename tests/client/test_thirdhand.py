@@ -229,9 +229,9 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
     ):
         cell.hands(left=(0, 0, 0))
         tracker, follower = Tracker(cell.session, "bench", timeout_s=10), Follower(cell.session, ("a",), "bench")
-        seen: list[list[Any]] = []
+        received: list[list[Any]] = []
         watches = [cell.watch("tool/target"), cell.watch("status", timeout_s=60)]
-        loops = [threading.Thread(target=lambda one=one: seen.append(list(one)), daemon=True) for one in watches]
+        loops = [threading.Thread(target=lambda one=watch: received.append(list(one)), daemon=True) for watch in watches]
         for loop in loops:
             loop.start()
         alone = cell.watch("tool/pose")
@@ -240,7 +240,7 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
         cell.close()
         for loop in loops:
             loop.join(10)
-        assert seen == [[], []]
+        assert received == [[], []]
         calls: tuple[Callable[[], object], ...] = (
             lambda: cell.hands(left=(0, 0, 0)),
             lambda: cell.tool((0, 0, 0)),

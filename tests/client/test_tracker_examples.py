@@ -25,8 +25,8 @@ def test_rigid_bodies_that_are_tracked_are_hands() -> None:
         return SimpleNamespace(id_num=number, pos=(0.1, 1.0, 0.2), rot=(0.0, 0.6, 0.0, 0.8), tracking_valid=tracked)
 
     keys = {1: "hands/left", 2: "hands/right", None: "tool/pose"}
-    found = dict(example("optitrack_hands").poses([body(2), body(1, tracked=False), body(7)], keys, 9))
-    assert found == {"hands/right": PoseStamped(9, "optitrack", (0.1, 1.0, 0.2), (0.0, 0.6, 0.0, 0.8))}
+    poses = dict(example("optitrack_hands").poses([body(2), body(1, tracked=False), body(7)], keys, 9))
+    assert poses == {"hands/right": PoseStamped(9, "optitrack", (0.1, 1.0, 0.2), (0.0, 0.6, 0.0, 0.8))}
 
 
 def vicon_packet(*objects: tuple[bytes, tuple[float, ...]]) -> bytes:

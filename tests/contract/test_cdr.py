@@ -187,7 +187,7 @@ def test_transforms_are_the_bytes_of_another_implementation(stamp_ns: int, items
     slashless = [(child.lstrip("/"), pose._replace(frame_id=pose.frame_id.lstrip("/"))) for child, pose in read]
     assert cdr.decode_transforms(ours) == slashless
     for child, _ in slashless:
-        assert cdr.decode_transforms(ours, (child,)) == [one for one in slashless if one[0] == child]
+        assert cdr.decode_transforms(ours, (child,)) == [pair for pair in slashless if pair[0] == child]
 
 
 def test_the_frames_of_a_message_are_read_each_with_its_own_stamp_and_parent() -> None:
@@ -197,8 +197,8 @@ def test_the_frames_of_a_message_are_read_each_with_its_own_stamp_and_parent() -
     frames = {"wrist": (1, "world"), "my_wrist": (2, "w"), "/wrist": (3, "/rig/1"), "wrist_2": (4, ""), "é": (5, "map")}
     theirs = [stamped(_header(stamp, parent), child, still) for child, (stamp, parent) in frames.items()]
     data = _bytes("tf2_msgs/msg/TFMessage", theirs)
-    found = [(name, pose.stamp_ns, pose.frame_id) for name, pose in cdr.decode_transforms(data, ("wrist", "é"))]
-    assert found == [("wrist", 1, "world"), ("wrist", 3, "rig/1"), ("é", 5, "map")]
+    decoded = [(name, pose.stamp_ns, pose.frame_id) for name, pose in cdr.decode_transforms(data, ("wrist", "é"))]
+    assert decoded == [("wrist", 1, "world"), ("wrist", 3, "rig/1"), ("é", 5, "map")]
     assert cdr.decode_transforms(data, ("elbow",)) == []
     assert all(cdr.bytes_of_frame(child) in data for child in frames)
 
@@ -280,9 +280,9 @@ def test_the_error_of_a_malformed_message_says_what_is_wrong(data: bytes, error:
 
 
 def test_a_joint_state_that_claims_millions_of_joints_is_refused_without_memory_for_them() -> None:
-    at = 4 + 8 + 4 + 1 + 3
+    offset = 4 + 8 + 4 + 1 + 3
     with pytest.raises(messages.WireError, match="a length of 4294967295"):
-        cdr.decode_joints(JOINTS[:at] + b"\xff\xff\xff\xff" + JOINTS[at + 4 :])
+        cdr.decode_joints(JOINTS[:offset] + b"\xff\xff\xff\xff" + JOINTS[offset + 4 :])
 
 
 @given(st.permutations(range(7)), st.booleans())
@@ -290,8 +290,8 @@ def test_joints_are_found_in_any_order_among_others(order: list[int], moving: bo
     names = ("gripper", *(JOINT_NAMES[i] for i in order))
     position = (9.0, *(float(i) for i in order))
     message = messages.JointState(0, names, position, tuple(-value for value in position) if moving else ())
-    found, velocity = messages.in_order(message, JOINT_NAMES)
-    assert found == tuple(float(i) for i in range(7))
+    ordered, velocity = messages.in_order(message, JOINT_NAMES)
+    assert ordered == tuple(float(i) for i in range(7))
     assert velocity == (tuple(-float(i) for i in range(7)) if moving else (0.0,) * 7)
 
 
@@ -410,7 +410,7 @@ def test_joints_whose_layout_is_known_are_read_as_at_first(counts: tuple[int, in
 def test_no_stamp_stops_what_encodes_it(stamp_ns: int) -> None:
     """From 2038-01-19 on its seconds are more than an int32 holds; they are told until 2106."""
     message = messages.PoseStamped(stamp_ns, "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    told = cdr.decode_pose(cdr.encode_pose(message)).stamp_ns
-    assert told == stamp_ns % (2**32 * 10**9)
+    decoded_ns = cdr.decode_pose(cdr.encode_pose(message)).stamp_ns
+    assert decoded_ns == stamp_ns % (2**32 * 10**9)
     values = (0.0,) * 7
-    assert cdr.decode_joints(cdr.encode_command(stamp_ns, JOINT_NAMES, values, values)).stamp_ns == told
+    assert cdr.decode_joints(cdr.encode_command(stamp_ns, JOINT_NAMES, values, values)).stamp_ns == decoded_ns

@@ -26,13 +26,13 @@ SOON_S = 5.0  # on a machine that does much else; what is quadratic takes minute
 
 @pytest.mark.parametrize("name", DECODERS)
 def test_mutated_messages_are_taken_or_refused_in_words(name: str) -> None:
-    random, kept = Random(name), seeds(name)
+    random, corpus = Random(name), seeds(name)
     taken = 0
     for _ in range(MANY):
-        data = mutated(name, random.choice(kept), random)
+        data = mutated(name, random.choice(corpus), random)
         taken += check(name, data)
-        if len(kept) < 200 and random.random() < 0.1:
-            kept.append(data[:4000])
+        if len(corpus) < 200 and random.random() < 0.1:
+            corpus.append(data[:4000])
     assert taken < MANY
 
 

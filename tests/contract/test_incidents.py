@@ -77,11 +77,11 @@ def test_an_arm_error_amid_states_that_contradict_each_other_is_explained_by_two
     busy: str, share: float, cause: str, told: str
 ) -> None:
     arm = Source(rate_hz=500.0, fresh=True, contested=share, cause=cause, refused="elbow from 1 to 2 rad")
-    seen = Evidence({"arm": arm}, contested=0.1, busy=busy)
-    seen = seen._replace(error_rad=(0.12, 0.1), worst_joint=("elbow", 0.24, "rad"))
-    found = explained(Reason.ARM_ERROR, seen)
-    assert "a joint was 0.120 rad off" in found.why
-    assert found.what_to_do.endswith("then thirdhand reset")
-    assert found.why.startswith(told)
-    assert ("two drivers publish joints/state" in found.what_to_do) is bool(told)
-    assert ("too busy" in found.why) is (bool(busy) and not told)
+    evidence = Evidence({"arm": arm}, contested=0.1, busy=busy)
+    evidence = evidence._replace(error_rad=(0.12, 0.1), worst_joint=("elbow", 0.24, "rad"))
+    explanation = explained(Reason.ARM_ERROR, evidence)
+    assert "a joint was 0.120 rad off" in explanation.why
+    assert explanation.what_to_do.endswith("then thirdhand reset")
+    assert explanation.why.startswith(told)
+    assert ("two drivers publish joints/state" in explanation.what_to_do) is bool(told)
+    assert ("too busy" in explanation.why) is (bool(busy) and not told)

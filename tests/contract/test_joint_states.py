@@ -60,20 +60,20 @@ def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_
 
 @pytest.mark.parametrize("split", ["a bc", "c ba", "a b c", "ab bc ca", "ax by cz"])
 def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(split: str) -> None:
-    states, found, parts = JointStates(NAMES, 0.1), [], split.split()
+    states, samples, parts = JointStates(NAMES, 0.1), [], split.split()
     dice = random.Random(1)
     for k in range(500):
         at_s = k / 1000
         for number in dice.sample(range(len(parts)), len(parts)):
             if k % (1 + 9 * (number == 0)) == 0:  # the first publishes at 100 Hz, the others at 1000 Hz
                 state = states.take(part(parts[number], k + 1, value=at_s), at_s)
-                found += [] if state is None else [(at_s, state)]
-    assert len(found) >= 49
-    for at_s, state in found:
+                samples += [] if state is None else [(at_s, state)]
+    assert len(samples) >= 49
+    for at_s, state in samples:
         assert state.names == NAMES
         assert all(at_s - value <= 0.011 for value in state.position)
         assert state.velocity == (0.0, 0.0, 0.0)
-    stamps = [state.stamp_ns for _, state in found]
+    stamps = [state.stamp_ns for _, state in samples]
     assert stamps == sorted(stamps)
     assert len(set(stamps)) == len(stamps) or split == "ab bc ca"  # two publishers of a joint may repeat a stamp
 

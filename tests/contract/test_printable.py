@@ -23,10 +23,10 @@ from thirdhand.skills.skill_file import SkillError
 
 @given(st.text())
 def test_any_text_becomes_one_printable_line_and_stays_so(text: str) -> None:
-    shown = printable(text)
-    assert shown.isprintable()
-    assert printable(shown) == shown
-    assert shown == text or not text.isprintable()
+    cleaned = printable(text)
+    assert cleaned.isprintable()
+    assert printable(cleaned) == cleaned
+    assert cleaned == text or not text.isprintable()
     assert all(line.isprintable() for line in printable_lines(text).split("\n"))
 
 

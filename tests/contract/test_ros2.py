@@ -34,7 +34,7 @@ LATCHED = ("/arm/tf_static", "/robot_description")
 @pytest.mark.parametrize("store", [Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
 def test_the_hashes_of_the_types_are_those_of_ros2(store: Stores) -> None:
     types = get_typestore(store)
-    assert {kind: f"RIHS01_{own}" for kind, own in ros2.TYPE_HASHES.items()} == {
+    assert {kind: f"RIHS01_{digest}" for kind, digest in ros2.TYPE_HASHES.items()} == {
         kind: types.hash_rihs01(kind) for kind in ros2.TYPE_HASHES
     }
 
@@ -46,10 +46,10 @@ def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -
     node = NodeEntity(DOMAIN, SESSION, 0, ros2.NODE, f"/{CELL}")
     assert tokens.pop(("", False)) == node_liveliness_keyexpr(node)
     streams = [c.key for c in channels.CHANNELS if c.direction == "out" or (c.direction == "in" and c.event)]
-    own = [f"/{CELL}/{suffix}" for suffix in streams]
-    assert {name for name, _ in tokens} == {*own, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED, *FRAMES}
-    once = [*{(one.name, one.heard): one for one in topics}.values()]  # three frames are heard on two topics
-    assert [(one.frame, one.channel) for one in topics if one.frame] == [
+    stream_names = [f"/{CELL}/{suffix}" for suffix in streams]
+    assert {name for name, _ in tokens} == {*stream_names, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED, *FRAMES}
+    once = [*{(topic.name, topic.heard): topic for topic in topics}.values()]  # three frames are heard on two topics
+    assert [(topic.frame, topic.channel) for topic in topics if topic.frame] == [
         ("left_wrist", "hands/left"),
         ("right", "hands/right"),
         ("iron", "tool/pose"),
@@ -67,17 +67,17 @@ def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -
 
 def test_what_controllers_are_told_is_read_by_others() -> None:
     types = get_typestore(Stores.ROS2_JAZZY)
-    told: Any = types.deserialize_cdr(cdr.encode_numbers((0.5, -1.0, 2.0)), "std_msgs/msg/Float64MultiArray")
-    assert (told.data.tolist(), told.layout.dim, told.layout.data_offset) == ([0.5, -1.0, 2.0], [], 0)
+    array: Any = types.deserialize_cdr(cdr.encode_numbers((0.5, -1.0, 2.0)), "std_msgs/msg/Float64MultiArray")
+    assert (array.data.tolist(), array.layout.dim, array.layout.data_offset) == ([0.5, -1.0, 2.0], [], 0)
     for names in (("a",), ("base", "elbow", "wrist_1")):
         raw = cdr.encode_trajectory(names, (0.1,) * len(names), (-0.2,) * len(names), 2_000_000)
-        way: Any = types.deserialize_cdr(raw, "trajectory_msgs/msg/JointTrajectory")
-        [point] = way.points
-        assert (way.header.stamp.sec, way.header.stamp.nanosec, tuple(way.joint_names)) == (0, 0, names)
+        trajectory: Any = types.deserialize_cdr(raw, "trajectory_msgs/msg/JointTrajectory")
+        [point] = trajectory.points
+        assert (trajectory.header.stamp.sec, trajectory.header.stamp.nanosec, tuple(trajectory.joint_names)) == (0, 0, names)
         assert point.positions.tolist() == [0.1] * len(names)
         assert point.velocities.tolist() == [-0.2] * len(names)
         assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 2_000_000)
-        assert bytes(types.serialize_cdr(way, "trajectory_msgs/msg/JointTrajectory")) == raw
+        assert bytes(types.serialize_cdr(trajectory, "trajectory_msgs/msg/JointTrajectory")) == raw
 
 
 @pytest.mark.parametrize(

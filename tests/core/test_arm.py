@@ -46,8 +46,8 @@ ARM = Arm(CELL, URDF)
 def facing(direction: Vector) -> Vector:
     """A quaternion (4,) that turns +z there, the shortest way."""
     x, y, z = direction / np.linalg.norm(direction)
-    found = np.array([-y, x, 0.0, 1.0 + z])
-    return np.asarray(found / np.linalg.norm(found)) if found.any() else np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([-y, x, 0.0, 1.0 + z])
+    return np.asarray(quaternion / np.linalg.norm(quaternion)) if quaternion.any() else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 AHEAD = facing(AHEAD_AND_DOWN)
@@ -228,6 +228,6 @@ def test_velocities_are_continuous_at_limits() -> None:
         i = rng.integers(7)
         q[i] = rng.choice([LOWER[i], UPPER[i]]) + rng.uniform(-0.02, 0.02)
         target = ARM.at(q).position + rng.normal(size=3) * 0.005
-        here = ARM.step(q, target, STILL, AHEAD).velocity
-        there = ARM.step(q + 1e-9 * rng.normal(size=7), target, STILL, AHEAD).velocity
-        assert np.abs(here - there).max() < 1e-4
+        velocity = ARM.step(q, target, STILL, AHEAD).velocity
+        nearby = ARM.step(q + 1e-9 * rng.normal(size=7), target, STILL, AHEAD).velocity
+        assert np.abs(velocity - nearby).max() < 1e-4

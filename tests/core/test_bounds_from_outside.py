@@ -122,11 +122,11 @@ def test_parts_and_tool_are_where_pinocchio_has_them(arm: str) -> None:
     at_zero, _ = geometry.place(np.zeros((1, len(joints))))
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     zero = [data.oMi[joint].copy() for joint in joints]
-    for q, ends, at in zip(postures, capsules, tools, strict=True):
+    for q, ends, position_m in zip(postures, capsules, tools, strict=True):
         full = pin.neutral(model)
         full[[model.joints[joint].idx_q for joint in joints]] = q
         pin.framesForwardKinematics(model, data, full)
-        np.testing.assert_allclose(at, data.oMf[plate].act(tool), atol=1e-9)
+        np.testing.assert_allclose(position_m, data.oMf[plate].act(tool), atol=1e-9)
         for link, moved, still in zip(geometry.links, ends, at_zero[0], strict=True):
             place = data.oMi[joints[link - 1]] * zero[link - 1].inverse() if link else pin.SE3.Identity()
             np.testing.assert_allclose(moved, [place.act(end) for end in still], atol=1e-9)

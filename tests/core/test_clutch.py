@@ -39,9 +39,9 @@ def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Eve
 
 
 def reasons(settings: Settings, skill: Skill, ticks: list[Tick]) -> np.ndarray:
-    seen = followed(skill, ticks, settings)
-    assert ((seen["mode"] == Mode.FOLLOW) == (seen["reason"] == Reason.NONE)).all()
-    return seen["reason"]
+    frames = followed(skill, ticks, settings)
+    assert ((frames["mode"] == Mode.FOLLOW) == (frames["reason"] == Reason.NONE)).all()
+    return frames["reason"]
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
@@ -49,27 +49,27 @@ def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
     """The arm holds from the tick in which the release arrives."""
     release = rate_hz
     ticks = resting(0, 2 * rate_hz, at({release: clutch(False)}, every=rate_hz // SENT_HZ), every=rate_hz // 100)
-    found = reasons(cell(rate_hz=rate_hz), taught, ticks)
-    assert (found[:release] == Reason.NONE).all()
-    assert (found[release:] == Reason.CLUTCH).all()
+    reason = reasons(cell(rate_hz=rate_hz), taught, ticks)
+    assert (reason[:release] == Reason.NONE).all()
+    assert (reason[release:] == Reason.CLUTCH).all()
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
 def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
     """A clutch whose messages cease counts as released."""
     pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
-    found = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
+    reason = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
     silent = 10 + round(STALE_S * rate_hz)
-    assert (found[:silent] == Reason.NONE).all()
-    assert (found[silent:] == Reason.CLUTCH).all()
+    assert (reason[:silent] == Reason.NONE).all()
+    assert (reason[silent:] == Reason.CLUTCH).all()
 
 
 def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
     ticks = resting(0, 20, lambda k: (clutch(True),) if k == 0 else ())
     late = [Tick(k, tick.inbox) for k, tick in zip(range(149, 169), resting(20, 20, every=1), strict=True)]
-    found = reasons(cell(), taught, [*ticks, *late])
-    assert (found[:21] == Reason.NONE).all()  # tick 149 is the last one
-    assert (found[21:] == Reason.CLUTCH).all()
+    reason = reasons(cell(), taught, [*ticks, *late])
+    assert (reason[:21] == Reason.NONE).all()  # tick 149 is the last one
+    assert (reason[21:] == Reason.CLUTCH).all()
 
 
 def test_without_a_clutch_messages_change_nothing(taught: Skill) -> None:
@@ -112,9 +112,9 @@ def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
     """With hysteresis and pause as where a skill decides it, and not while the arm holds."""
     wishes = cell(gripper="key")
     events = {50: wish(0.2), 350: wish(0.7), 400: wish(0.95), 420: wish(0.0)}
-    found = gripper(wishes, taught, events)
-    assert [found[k] for k in (49, 50, 399, 400, 420, 649)] == [UNKNOWN, OPEN, OPEN, CLOSED, CLOSED, CLOSED]
-    assert found[650:] == [OPEN] * 250  # half a second after it began to close
+    states = gripper(wishes, taught, events)
+    assert [states[k] for k in (49, 50, 399, 400, 420, 649)] == [UNKNOWN, OPEN, OPEN, CLOSED, CLOSED, CLOSED]
+    assert states[650:] == [OPEN] * 250  # half a second after it began to close
     held = gripper(wishes, taught, {50: wish(0.2), 390: order("hold"), 400: wish(1.0), 500: order("resume")})
     assert held[50:500] == [OPEN] * 450
     assert held[500:] == [CLOSED] * 400
@@ -123,8 +123,8 @@ def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
 def test_skill_decides_its_gripper_alone(skill: Skill) -> None:
     """A skill with a gripper decides the gripper's state alone."""
     first, *more = Scene().via_points()
-    there = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
-    closing = adapted(skill, (there, *more), tolerance=0.05)
+    point = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
+    closing = adapted(skill, (point, *more), tolerance=0.05)
     wishes = cell(gripper="key")
     alone = followed(closing, resting(0, 300), wishes)
     assert alone["closure"][-1] >= 0.0

@@ -123,9 +123,9 @@ def test_jump_of_a_turn_is_none(cell: Settings, skill: Skill, turns_on: Vector) 
     for turned, rejected in ((TURN, 0), (-3 * TURN, 0), (math.pi, 1)):
         loop.reports = lambda q, dq, turned=turned: (q + turned * turns_on, 0.0 * dq)
         loop.step()
-        found = loop.controller.state
-        assert int(found["rejected"][Cause.JUMPED]) == rejected
-        np.testing.assert_allclose(found["measured"], before, atol=0.01)
+        state = loop.controller.state
+        assert int(state["rejected"][Cause.JUMPED]) == rejected
+        np.testing.assert_allclose(state["measured"], before, atol=0.01)
 
 
 def test_narrow_limits_hold_in_their_turn(tmp_path: Path, skill: Skill) -> None:

@@ -54,20 +54,20 @@ def test_demonstrated_relation_with_little_tremor() -> None:
     """Half a millimetre of tremor at 8 to 10 Hz, and as much noise; a setpoint that can stop lags
     by v / 2a.
     """
-    shown = decoded((RECORDINGS / "experiments" / "as-paper.npz").read_bytes(), origin="as-paper")
-    taught = adapted(shown, Scene().via_points(), tolerance=0.05)
+    skill = decoded((RECORDINGS / "experiments" / "as-paper.npz").read_bytes(), origin="as-paper")
+    taught = adapted(skill, Scene().via_points(), tolerance=0.05)
     script = HandScript(Scene(), seed=6)
-    seen = followed(taught, ticks_of(script))
-    time_s = np.arange(len(seen)) * PERIOD_S - 1.5
+    trace = followed(taught, ticks_of(script))
+    time_s = np.arange(len(trace)) * PERIOD_S - 1.5
     hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
     ideal = taught.mean(hands)
     inner = slice(750, -100)
-    error = np.linalg.norm(seen["tool"][inner] - ideal[inner], axis=1)
+    error = np.linalg.norm(trace["tool"][inner] - ideal[inner], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.014
-    speed, ideal_speed = (np.linalg.norm(np.gradient(x, PERIOD_S, axis=0), axis=1) for x in (seen["tool"], ideal))
+    speed, ideal_speed = (np.linalg.norm(np.gradient(x, PERIOD_S, axis=0), axis=1) for x in (trace["tool"], ideal))
     score = [float(ideal_speed[inner] @ np.roll(speed, -shift)[inner]) for shift in range(-40, 41)]
     assert (int(np.argmax(score)) - 40) * PERIOD_S <= 0.075
-    shaken = seen["tool"][-150:]
+    shaken = trace["tool"][-150:]
     assert np.sqrt(np.mean(np.sum((shaken - shaken.mean(axis=0)) ** 2, axis=1))) < 0.002
     assert speed.max() <= ASSUMED.tool.max_speed + 1e-6
 
@@ -84,9 +84,9 @@ def test_state_continues_bit_for_bit(taught: Skill) -> None:
 
 def test_first_setpoint_is_at_the_tool(taught: Skill) -> None:
     """The first setpoint is where the tool is."""
-    seen = followed(taught, resting(0, 300, every=1))
-    assert modes(seen) == [("follow", "none")]
-    assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < 0.002
+    trace = followed(taught, resting(0, 300, every=1))
+    assert modes(trace) == [("follow", "none")]
+    assert np.linalg.norm(trace["setpoint"] - trace["tool"], axis=1).max() < 0.002
 
 
 def unseen(ticks: Iterable[Tick], when: range, *kinds: str) -> list[Tick]:
@@ -115,27 +115,27 @@ def test_tool_moves_while_one_hand_is_unseen(taught: Skill, moving: Session, sid
     going, held = (followed(taught, ticks, without(ms)) for ms in (500.0, 0.0))
     assert modes(going[1:]) == [("follow", "none")]
     assert modes(held[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
-    off, off_held = (
-        np.linalg.norm(seen["tool"] - whole["tool"][: len(seen)], axis=1)[away.start :].max() for seen in (going, held)
+    deviation_m, off_held = (
+        np.linalg.norm(trace["tool"] - whole["tool"][: len(trace)], axis=1)[away.start :].max() for trace in (going, held)
     )
-    assert off < most * off_held
+    assert deviation_m < most * off_held
 
 
 def test_waits_for_an_unseen_hand_that_matters(taught: Skill, moving: Session) -> None:
     """The arm waits at once if the target depends strongly on the unseen hand."""
     ticks = unseen(moving[0][:2400], range(1650, 2400), "hands/left")
-    seen = followed(taught, ticks, without(1000.0))
-    assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand")]
-    needed = np.flatnonzero(seen["reason"] == Reason.STALE_HAND)[-1] + 1 - np.sum(seen["reason"] == Reason.STALE_HAND)
+    trace = followed(taught, ticks, without(1000.0))
+    assert modes(trace[1:]) == [("follow", "none"), ("hold", "stale_hand")]
+    needed = np.flatnonzero(trace["reason"] == Reason.STALE_HAND)[-1] + 1 - np.sum(trace["reason"] == Reason.STALE_HAND)
     assert 1650 + 50 < needed < 1650 + 490
-    assert (seen["flags"][needed - 1] & Flag.UNSURE) > 0
+    assert (trace["flags"][needed - 1] & Flag.UNSURE) > 0
 
 
 def test_unseen_hand_keeps_arm_farther_away(taught: Skill, moving: Session) -> None:
     """The arm keeps a larger distance from a hand that is out of sight."""
     away = range(3300, 3500)
-    seen = followed(taught, unseen(moving[0][: away.stop], away, "hands/left"))
-    limit = seen["hand_limit"][away.start :]
+    trace = followed(taught, unseen(moving[0][: away.stop], away, "hands/left"))
+    limit = trace["hand_limit"][away.start :]
     assert limit[-1] < limit[55] - 0.2
 
 
@@ -143,32 +143,32 @@ def test_silent_hands_hold_within_100_ms(taught: Skill, moving: Session) -> None
     """Silent hands cause a hold within 100 ms, until both are seen again."""
     ticks = unseen(moving[0], range(1500, 1900), "hands/left", "hands/right")
     ticks = unseen(ticks, range(1900, 1920), "hands/left")
-    seen = followed(taught, ticks)
-    assert modes(seen[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
-    held = np.flatnonzero(seen["mode"] == Mode.HOLD)
+    trace = followed(taught, ticks)
+    assert modes(trace[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
+    held = np.flatnonzero(trace["mode"] == Mode.HOLD)
     assert held[1] - (1500 - 5) <= 50 + 1
     assert held[-1] == 1919
-    assert not seen["joint_velocities"][1919].any()
+    assert not trace["joint_velocities"][1919].any()
 
 
 def test_without_hands_it_holds_and_says_so(taught: Skill) -> None:
-    seen = followed(taught, [Tick(k, (hand("left", LEFT, k + 1),)) for k in range(100)])
-    assert modes(seen) == [("hold", "no_hands")]
-    assert seen["hand_ages"][-1].tolist() == [0, -1]
+    trace = followed(taught, [Tick(k, (hand("left", LEFT, k + 1),)) for k in range(100)])
+    assert modes(trace) == [("hold", "no_hands")]
+    assert trace["hand_ages"][-1].tolist() == [0, -1]
 
 
 def test_far_hands_are_held_with_hysteresis(taught: Skill) -> None:
     """Hands far from the demonstrations are not followed until they are clearly nearer."""
     hands = np.tile((LEFT, RIGHT), (1600, 1, 1))
     hands[400:800, 0, 2] += 0.5
-    seen = followed(taught, led(hands))
-    assert modes(seen[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
+    trace = followed(taught, led(hands))
+    assert modes(trace[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
 
 
 def test_an_operator_holds_and_resumes(taught: Skill) -> None:
     orders = {300: "hold", 900: "resume"}
-    seen = followed(taught, resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ()))
-    assert modes(seen[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
+    trace = followed(taught, resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ()))
+    assert modes(trace[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
 
 
 def test_nothing_is_commanded_before_arm_is_heard(taught: Skill) -> None:
@@ -196,19 +196,19 @@ def loop(taught: Skill) -> Loop:
 def test_arm_error_is_a_fault_until_reset(loop: Loop) -> None:
     """An arm that does not follow is a fault until reset."""
     loop.reports = lambda q, dq: (q + 0.15, dq)
-    seen = loop.run(400)
-    assert modes(seen) == [("fault", "arm_error")]
-    assert not seen["commanded"][-1]
-    assert_limits_hold(seen)
+    trace = loop.run(400)
+    assert modes(trace) == [("fault", "arm_error")]
+    assert not trace["commanded"][-1]
+    assert_limits_hold(trace)
     loop.reports = lambda q, dq: (q, 0.0 * dq)
     assert modes(loop.run(100, {0: order("reset")}))[-1] == ("follow", "none")
 
 
 def test_silent_arm_is_a_fault(loop: Loop) -> None:
     """An arm that falls silent while followed is a fault."""
-    seen = loop.run(300, every=0)
-    assert modes(seen) == [("follow", "none"), ("fault", "arm_silent")]
-    assert np.argmax(seen["mode"] == Mode.FAULT) <= 50
+    trace = loop.run(300, every=0)
+    assert modes(trace) == [("follow", "none"), ("fault", "arm_silent")]
+    assert np.argmax(trace["mode"] == Mode.FAULT) <= 50
 
 
 def test_a_tool_measured_too_fast_is_a_fault(loop: Loop) -> None:
@@ -229,9 +229,9 @@ def test_reset_waits_for_rest(taught: Skill) -> None:
         loop.reports = lambda q, dq, velocity=velocity: (q, 0.0 * dq + velocity)
         frame = loop.step(*([order("reset")] if was_fault and k % 7 == 0 else []))
         was_fault = frame["mode"] == Mode.FAULT
-    seen = loop.frames
-    assert [reason for _, reason in modes(seen)][-3:] == ["tool_speed", "arm_not_ready", "none"]
-    assert_limits_hold(seen)
+    trace = loop.frames
+    assert [reason for _, reason in modes(trace)][-3:] == ["tool_speed", "arm_not_ready", "none"]
+    assert_limits_hold(trace)
 
 
 def test_reset_without_fault_changes_nothing(taught: Skill) -> None:
@@ -245,10 +245,10 @@ def test_new_skill_is_approached_within_limits(skill: Skill, taught: Skill) -> N
     """A new skill is adopted at its tick and approached within the limits."""
     moved = adapted(skill, Scene(handover=(0.66, -0.22, 0.33), glass=(0.45, 0.30, 0.2)).via_points(), tolerance=0.05)
     controller = Controller(ASSUMED, taught, urdf=URDF)
-    seen = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
+    trace = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
     assert controller.skill is moved
     assert controller.state["skill"].tobytes() == moved.digest
-    assert_limits_hold(seen)
+    assert_limits_hold(trace)
 
 
 @pytest.mark.parametrize("wrong_s", [0.05, 0.08])
@@ -260,9 +260,9 @@ def test_repeated_jumps_hold_once(taught: Skill, jump_m: float, wrong_s: float) 
     is_jumped = (time_s > 2.0) & (time_s < 4.0) & (time_s % 0.2 < wrong_s)
     hands[is_jumped, 0, 0] += jump_m
     hands += np.random.default_rng(4).normal(0, 3e-4, hands.shape)
-    seen = followed(taught, led(hands, every=5))
-    assert modes(seen).count(("hold", "far_from_demonstrations")) == 1
-    assert (seen["reason"] != Reason.FAR_FROM_DEMONSTRATIONS)[2200:].all()
+    trace = followed(taught, led(hands, every=5))
+    assert modes(trace).count(("hold", "far_from_demonstrations")) == 1
+    assert (trace["reason"] != Reason.FAR_FROM_DEMONSTRATIONS)[2200:].all()
 
 
 def test_unsure_flag_does_not_change_motion(taught: Skill) -> None:
@@ -310,6 +310,6 @@ def test_twin_decides_the_same(taught: Skill) -> None:
         controller.step(tick)
     before = controller.state.tobytes()
     twin.copy_from(controller)
-    seen = twin.step(ticks[-1])
+    frame = twin.step(ticks[-1])
     assert controller.state.tobytes() == before
-    assert controller.step(ticks[-1]).tobytes() == seen.tobytes()
+    assert controller.step(ticks[-1]).tobytes() == frame.tobytes()

@@ -61,7 +61,7 @@ def reached(taught: Skill) -> tuple[Vector, Vector]:
     """Positions of both hands (K, 2, 3) along the task, and of the tool's target (K, 3)."""
     script = HandScript(Scene(), seed=0)
     hands = np.array([script.sample(t) for t in np.linspace(0.0, script.duration_s, 300)])[:, :, :3]
-    return hands, np.array([taught.mean(both.reshape(1, 6))[0] for both in hands])
+    return hands, np.array([taught.mean(pair.reshape(1, 6))[0] for pair in hands])
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_HZ)
@@ -75,23 +75,23 @@ def test_tool_engages_slowly_after_a_hold(
     between = np.linalg.norm(targets[:, None] - targets, axis=2)
     before, after = np.unravel_index(np.abs(between - apart_m).argmin(), between.shape)
     start_s, hold_s, resume_s, end_s = 0.0, 5.5, 6.5, 12.5
-    at = {round(hold_s * rate_hz): order("hold"), round(resume_s * rate_hz): order("resume")}
+    orders = {round(hold_s * rate_hz): order("hold"), round(resume_s * rate_hz): order("resume")}
     moved = round((hold_s + 0.5) * rate_hz)
     path = (hands[before] if k < moved else hands[after] for k in range(round(end_s * rate_hz)))
     settings = cell(rate_hz=rate_hz)
-    ticks = led(path, lambda k: (at[k],) if k in at else (), every=rate_hz // 100)
-    seen = followed(taught, ticks, settings)
-    slow, speed = engages(seen), tool_speeds(settings, seen)
-    assert np.linalg.norm(seen["setpoint_velocity"][slow], axis=1).max() <= E
+    ticks = led(path, lambda k: (orders[k],) if k in orders else (), every=rate_hz // 100)
+    frames = followed(taught, ticks, settings)
+    slow, speed = engages(frames), tool_speeds(settings, frames)
+    assert np.linalg.norm(frames["setpoint_velocity"][slow], axis=1).max() <= E
     assert speed[slow].max() <= E + TOOL_RISE_MPS
     for begin_s in (start_s, resume_s):
         begin = round(begin_s * rate_hz)
-        first = begin + int(np.argmax(seen["mode"][begin:] == Mode.FOLLOW))
+        first = begin + int(np.argmax(frames["mode"][begin:] == Mode.FOLLOW))
         lasts = int(np.argmin(slow[first:]))
-        gap = float(np.linalg.norm(seen["target"][first] - seen["tool"][first]))
+        gap = float(np.linalg.norm(frames["target"][first] - frames["tool"][first]))
         assert lasts / rate_hz <= 0.4 + max(gap - ENGAGED_GAP_M, 0.0) / (0.95 * E)
         assert not slow[first + lasts : round(hold_s * rate_hz) if begin_s == start_s else None].any(), "engaged once"
-    assert np.linalg.norm(seen["tool"][-1] - seen["target"][-1]) < 0.005
+    assert np.linalg.norm(frames["tool"][-1] - frames["target"][-1]) < 0.005
 
 
 @pytest.mark.parametrize(
@@ -116,12 +116,12 @@ def test_brief_hold_by_hands_does_not_engage(
     unseen = loop.run(round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()})
     assert unseen["mode"][-1] != Mode.FOLLOW
     loop.hands = lambda k: np.array((LEFT, RIGHT))
-    seen = loop.run(1000)
-    begins = int(np.argmax(seen["mode"] == Mode.FOLLOW))
-    assert seen["mode"][begins] == Mode.FOLLOW
-    assert engages(seen)[begins + 1] == anew
-    speed = np.linalg.norm(seen["setpoint_velocity"], axis=1)
-    assert speed[engages(seen)].max() <= E if anew else speed.max() > 2 * E
+    frames = loop.run(1000)
+    begins = int(np.argmax(frames["mode"] == Mode.FOLLOW))
+    assert frames["mode"][begins] == Mode.FOLLOW
+    assert engages(frames)[begins + 1] == anew
+    speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
+    assert speed[engages(frames)].max() <= E if anew else speed.max() > 2 * E
     assert_limits_hold(loop.frames, cell(Settings()))
 
 
@@ -132,9 +132,9 @@ def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
     moving, loop.hands = loop.hands, None
     assert loop.run(150)["mode"][-1] == Mode.HOLD
     loop.hands = moving
-    seen = loop.run(500)
-    assert seen["mode"][-1] == Mode.FOLLOW
-    assert engages(seen)[-1]
+    frames = loop.run(500)
+    assert frames["mode"][-1] == Mode.FOLLOW
+    assert engages(frames)[-1]
 
 
 @pytest.mark.parametrize("rate_hz", LOOP_HZ)
@@ -153,12 +153,12 @@ def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) 
         2 * np.pi * random.uniform(0.3, 0.8, (1, 2, 3)) * times
     )
     settings = cell(rate_hz=rate_hz, **({"clutch": "key"} if what == "clutch" else {}))
-    seen = followed(taught, led(path, messages, every=max(1, rate_hz // 100)), settings)
-    assert not (seen["mode"] == Mode.FAULT).any()
-    held = seen["reason"] == {"resume": Reason.OPERATOR, "clutch": Reason.CLUTCH}[what]
+    frames = followed(taught, led(path, messages, every=max(1, rate_hz // 100)), settings)
+    assert not (frames["mode"] == Mode.FAULT).any()
+    held = frames["reason"] == {"resume": Reason.OPERATOR, "clutch": Reason.CLUTCH}[what]
     assert np.array_equal(held, ~is_on)
-    speed, slow = np.linalg.norm(seen["setpoint_velocity"], axis=1), engages(seen)
-    follows = (seen["mode"] == Mode.FOLLOW)[:-1] & slow[1:]
+    speed, slow = np.linalg.norm(frames["setpoint_velocity"], axis=1), engages(frames)
+    follows = (frames["mode"] == Mode.FOLLOW)[:-1] & slow[1:]
     assert (speed[1:] <= np.maximum(E, speed[:-1]) + 1e-9)[follows].all()
 
 
@@ -189,18 +189,18 @@ def test_engaging_setpoint_keeps_its_bounds(
 def test_turn_is_slowed_in_proportion(taught: Skill) -> None:
     """The turn of the tool is slowed in proportion."""
     ticks = [*resumed(HandScript(Scene(), seed=5))][: RESUMED + 1000]
-    seen = followed(taught, ticks, cell(engage_speed=0.05))[RESUMED:]
-    assert engages(seen).all()
-    turning = np.linalg.norm(seen["setpoint_turning"], axis=1)
+    frames = followed(taught, ticks, cell(engage_speed=0.05))[RESUMED:]
+    assert engages(frames).all()
+    turning = np.linalg.norm(frames["setpoint_turning"], axis=1)
     assert turning.max() <= 0.05 / ASSUMED.tool.max_speed * ASSUMED.tool.max_turn_speed
 
 
 def test_without_engage_speed_nothing_engages(taught: Skill) -> None:
     """Without an engage speed nothing engages."""
     ticks = list(ticks_of(HandScript(Scene(), seed=3), wait_s=0.2))[:800]
-    off, full = (followed(taught, ticks, cell(engage_speed=e)) for e in (0.0, 0.8))
-    assert off.tobytes() == full.tobytes()
-    assert not engages(off).any()
+    disabled, full = (followed(taught, ticks, cell(engage_speed=e)) for e in (0.0, 0.8))
+    assert disabled.tobytes() == full.tobytes()
+    assert not engages(disabled).any()
 
 
 @pytest.mark.parametrize(

@@ -14,17 +14,17 @@ from support.setpoints import FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 @pytest.mark.one_case
 def test_jump_is_approached_without_overshoot(direction: tuple[float, ...], distance_m: float) -> None:
     """A jump is approached without overshoot."""
-    way = distance_m * np.array(direction) / np.linalg.norm(direction)
-    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 2000)
-    assert ((states[:, 0] - MIDDLE) @ way / distance_m).max() <= distance_m + 0.0025
-    np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
+    offset_m = distance_m * np.array(direction) / np.linalg.norm(direction)
+    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + offset_m)] * 2000)
+    assert ((states[:, 0] - MIDDLE) @ offset_m / distance_m).max() <= distance_m + 0.0025
+    np.testing.assert_allclose(states[-1, 0], MIDDLE + offset_m, atol=1e-4)
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.4, 0.6])
 @pytest.mark.parametrize(("acceleration", "jerk"), [(5.0, 120.0), (7.5, 170.0), (10.0, 231.0)])
 def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: float) -> None:
     """After a hard stop it does not swing back."""
-    costs, way = FREE.copy(), np.array([0.6, -0.8, 0.0])
+    costs, direction = FREE.copy(), np.array([0.6, -0.8, 0.0])
     for joint in range(3):
         costs[1, joint, joint], costs[2, joint, joint] = 1 / acceleration, 1 / jerk
     time_s = np.arange(-500, 400) * PERIOD_S
@@ -32,11 +32,11 @@ def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: 
     position = np.cumsum(velocity[::-1])[::-1] * -PERIOD_S
     braking = np.where((time_s > 0.0) & (time_s < 0.02), -speed / 0.02, 0.0)
     targets = [
-        np.array([MIDDLE + way * x, way * v, way * a]) for x, v, a in zip(position, velocity, braking, strict=True)
+        np.array([MIDDLE + direction * x, direction * v, direction * a]) for x, v, a in zip(position, velocity, braking, strict=True)
     ]
     states, _ = driven(targets, costs=costs, start=np.array([targets[0][0], targets[0][1], (0.0,) * 3]))
-    past = ((states[:, 0] - MIDDLE) @ way)[500:]
-    after = past[past.argmax() :]
+    overshoot_m = ((states[:, 0] - MIDDLE) @ direction)[500:]
+    after = overshoot_m[overshoot_m.argmax() :]
     assert after.min() > -0.002
     assert np.abs(after[100:]).max() < 0.001
 
@@ -48,19 +48,19 @@ def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: 
 def test_comes_to_rest_at_any_rate_and_jerk(rate_hz: int, max_jerk: float) -> None:
     """The setpoint comes to rest at any jerk limit and loop rate."""
     tool = msgspec.structs.replace(TOOL, max_jerk=max_jerk)
-    for way in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
+    for offset_m in np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3)):
         u = np.minimum(1.0, np.arange(12 * rate_hz) / (0.4 * rate_hz))[:, None]
         reach = np.stack(
             [
-                MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * way,
-                30 * u * u * (1 - u) ** 2 / 0.4 * way,
-                (60 * u - 180 * u * u + 120 * u**3) / 0.16 * way,
+                MIDDLE + u**3 * (10 - 15 * u + 6 * u * u) * offset_m,
+                30 * u * u * (1 - u) ** 2 / 0.4 * offset_m,
+                (60 * u - 180 * u * u + 120 * u**3) / 0.16 * offset_m,
             ],
             axis=1,
         )
         states, _ = driven(list(reach), tool=tool, rate_hz=rate_hz)
         assert np.abs(states[-rate_hz:, 2]).max() < 1e-3
-        np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-4)
+        np.testing.assert_allclose(states[-1, 0], MIDDLE + offset_m, atol=1e-4)
 
 
 @pytest.mark.parametrize(("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)])
@@ -70,18 +70,18 @@ def test_fast_oscillation_is_still_met(brake: float, hz: float, most_m: float) -
     costs[1, :, 0] = 1.0 / brake
     phases = rate * PERIOD_S * np.arange(2000)
     targets = [
-        np.array([MIDDLE + far * np.sin(at), rate * far * np.cos(at), -(rate**2) * far * np.sin(at)]) for at in phases
+        np.array([MIDDLE + far * np.sin(phase), rate * far * np.cos(phase), -(rate**2) * far * np.sin(phase)]) for phase in phases
     ]
     states, _ = driven(targets, costs=costs)
-    off = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
-    assert off[700:].max() < most_m
+    error_m = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
+    assert error_m[700:].max() < most_m
 
 
 def test_rest_on_target_is_exact() -> None:
     """A setpoint at rest on its target stays there to the bit."""
-    states, said = driven([at_rest(MIDDLE)] * 100)
+    states, flags = driven([at_rest(MIDDLE)] * 100)
     np.testing.assert_array_equal(states, np.broadcast_to(states[0], states.shape))
-    assert not said.any()
+    assert not flags.any()
 
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 100, 500])

@@ -55,7 +55,7 @@ def test_spoilt_bytes_replay_within_bounds(seed: int, skill: Skill, tmp_path: Pa
             if k % EVERY == 0:
                 came = [event(*message) for message in traffic.at(k * SETTINGS.period_s, 2_000_000 * (k + 1))]
                 refused += came.count(None)
-                inbox = [one for one in came if one is not None]
+                inbox = [item for item in came if item is not None]
             sent.append(Tick(k, tuple(inbox)))
             yield sent[-1]
 
@@ -67,8 +67,8 @@ def test_spoilt_bytes_replay_within_bounds(seed: int, skill: Skill, tmp_path: Pa
             recorder.write(tick, frame, time_ns=2_000_000 * (tick.index + 1), state=None)
 
         run(controller, told(), [keep])
-    seen = assert_recorded_session_keeps_the_bounds(path)
+    frames = assert_recorded_session_keeps_the_bounds(path)
     assert refused > 30
-    assert seen["rejected"][-1].sum() > 30
-    share = (seen["mode"] == Mode.FOLLOW).reshape(-1, round(2 * QUIET_S / SETTINGS.period_s))
+    assert frames["rejected"][-1].sum() > 30
+    share = (frames["mode"] == Mode.FOLLOW).reshape(-1, round(2 * QUIET_S / SETTINGS.period_s))
     assert share.mean(axis=1).min() > 0.1, "a second without spoilt bytes is followed"

@@ -52,21 +52,21 @@ def test_noise_is_reduced_and_measured(noise_m: float) -> None:
     hands = Hands()
     states = follow(hands, lambda t: still, until_s=6.0, noise=noise)
     assert np.sqrt(np.mean((states[500:, 0] - still) ** 2)) < 0.65 * noise_m
-    found = math.sqrt(hands.state["noise_variance"][LEFT])
-    assert max(noise_m, LEAST_NOISE_M) * 0.7 < found < max(noise_m, LEAST_NOISE_M) * 1.4
+    estimated_m = math.sqrt(hands.state["noise_variance"][LEFT])
+    assert max(noise_m, LEAST_NOISE_M) * 0.7 < estimated_m < max(noise_m, LEAST_NOISE_M) * 1.4
 
 
 def test_jump_over_ticks_equals_single_ticks() -> None:
     """A jump over missed ticks predicts as single ticks do."""
-    one, many = Hands(), Hands()
-    for hands in (one, many):
+    single, many = Hands(), Hands()
+    for hands in (single, many):
         follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
     for _ in range(20):
-        one.advance()
+        single.advance()
     many.advance(20)
-    assert one.state["tick"] == many.state["tick"]
-    np.testing.assert_allclose(many.state["hands"], one.state["hands"], rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(many.state["mode_covariances"], one.state["mode_covariances"], rtol=1e-9, atol=1e-15)
+    assert single.state["tick"] == many.state["tick"]
+    np.testing.assert_allclose(many.state["hands"], single.state["hands"], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(many.state["mode_covariances"], single.state["mode_covariances"], rtol=1e-9, atol=1e-15)
 
 
 def test_pause_of_minutes_keeps_position() -> None:
@@ -85,8 +85,8 @@ def test_covariances_stay_positive() -> None:
     for tick in range(3000):
         hands.advance()
         if tick % 7 == 0:
-            at = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
-            hands.hand(tick + 1, tuple(at.tolist()))
+            position_m = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
+            hands.hand(tick + 1, tuple(position_m.tolist()))
     state = hands.state
     for mode, whole in enumerate(state["mode_covariances"][LEFT]):
         covariance = whole if mode == REST else whole[:3, :3]
@@ -105,11 +105,11 @@ def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
     noise = np.random.default_rng(11).normal(0.0, 0.0005, (601, 3))
     x = np.array([1.0, 0.0, 0.0])
     motion = np.array([0.0, speed, 0.0])
-    found = follow(Hands(), lambda t: motion * t + size_m * np.sin(2 * np.pi * hz * t) * x, until_s=6.0, noise=noise)[
+    states = follow(Hands(), lambda t: motion * t + size_m * np.sin(2 * np.pi * hz * t) * x, until_s=6.0, noise=noise)[
         1500:
     ]
-    times = PERIOD_S * np.arange(1500, 1500 + len(found))
-    return found[:, 0] - times[:, None] * motion, found[:, 1] - motion
+    times = PERIOD_S * np.arange(1500, 1500 + len(states))
+    return states[:, 0] - times[:, None] * motion, states[:, 1] - motion
 
 
 def part_at(hz: float, deviation: Vector) -> float:
@@ -154,9 +154,9 @@ def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_
 @pytest.mark.parametrize("rate_hz", [30, 100, 240])
 def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
     noise = np.random.default_rng(7).normal(0.0, 0.0005, (8 * rate_hz, 3))
-    found = follow(Hands(), lambda t: np.array([speed * t, 0.0, 0.0]), until_s=8.0, rate_hz=rate_hz, noise=noise)[1500:]
-    assert found[:, 1, 0].std() < 0.001
-    assert found[:, 1, 0].mean() == pytest.approx(speed, abs=1e-3)
+    states = follow(Hands(), lambda t: np.array([speed * t, 0.0, 0.0]), until_s=8.0, rate_hz=rate_hz, noise=noise)[1500:]
+    assert states[:, 1, 0].std() < 0.001
+    assert states[:, 1, 0].mean() == pytest.approx(speed, abs=1e-3)
 
 
 @pytest.mark.parametrize("rate_hz", [100, 334, 500])
@@ -165,12 +165,12 @@ def test_quickest_reaches_are_not_lost(rate_hz: int) -> None:
 
     def hand(t: float) -> Vector:
         turns, u = divmod(t / 0.32, 1.0)
-        there = u**3 * (10 - 15 * u + 6 * u * u)
-        return np.array([0.257 * (1.0 - there if turns % 2 else there), 0.0, 0.0])
+        progress = u**3 * (10 - 15 * u + 6 * u * u)
+        return np.array([0.257 * (1.0 - progress if turns % 2 else progress), 0.0, 0.0])
 
-    found = follow(Hands(), hand, until_s=2.0, rate_hz=rate_hz)
-    wanted = np.array([hand(PERIOD_S * tick) for tick in range(len(found))])
-    assert np.linalg.norm(found[:, 0] - wanted, axis=1).max() < (0.02 if rate_hz == 100 else 0.014)
+    states = follow(Hands(), hand, until_s=2.0, rate_hz=rate_hz)
+    truth_m = np.array([hand(PERIOD_S * tick) for tick in range(len(states))])
+    assert np.linalg.norm(states[:, 0] - truth_m, axis=1).max() < (0.02 if rate_hz == 100 else 0.014)
 
 
 # --- hands that rest ---
@@ -183,9 +183,9 @@ def rest_of(along: Vector, hz: int = HZ) -> Vector:
     """The rest (T,) of a left hand that moves so (T,) [m/s] along x; the right one does not."""
     velocities = np.zeros((len(along), 6))
     velocities[:, 0] = along
-    found = stillness_of(velocities, 1.0 / hz)
-    np.testing.assert_array_equal(found[:, 1], 1.0)
-    return found[:, 0]
+    stillness = stillness_of(velocities, 1.0 / hz)
+    np.testing.assert_array_equal(stillness[:, 1], 1.0)
+    return stillness[:, 0]
 
 
 @pytest.mark.parametrize("tremor_m", [0.0005, 0.0012])
@@ -200,9 +200,9 @@ def test_a_hand_that_trembles_rests(tremor_m: float) -> None:
 def test_rest_ends_at_once_and_begins_slowly(hz: int) -> None:
     """Rest ends at once and begins slowly, at any rate."""
     speed = np.concatenate([np.zeros(hz), np.full(hz, 0.3), np.zeros(hz)])
-    found = rest_of(speed, hz)
-    assert found[hz - 1] == 1.0
-    assert found[hz + round(0.12 * hz)] < 0.1
-    assert found[2 * hz + round(0.1 * hz)] < 0.1
-    assert 0.3 < found[2 * hz + round(0.4 * hz)] < 0.8
-    assert found[-1] > 0.9
+    stillness = rest_of(speed, hz)
+    assert stillness[hz - 1] == 1.0
+    assert stillness[hz + round(0.12 * hz)] < 0.1
+    assert stillness[2 * hz + round(0.1 * hz)] < 0.1
+    assert 0.3 < stillness[2 * hz + round(0.4 * hz)] < 0.8
+    assert stillness[-1] > 0.9

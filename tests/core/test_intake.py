@@ -42,8 +42,8 @@ def test_left_handed_axes_are_mirrored() -> None:
         sample = z_reversed(PoseStamped(1, "unity", (0.1, 0.2, 0.3), turn))
         assert sample.position == (0.1, 0.2, -0.3)
         np.testing.assert_allclose(rotation(sample.orientation), mirrored @ rotation(turn) @ mirrored, atol=1e-15)
-    own = Hands(HandSettings(frame="unity", axes="left-handed"))
-    np.testing.assert_allclose(own.hand(1, (0.5, 0.1, 0.2)), [0.5, 0.1, 0.2])
+    unity_hands = Hands(HandSettings(frame="unity", axes="left-handed"))
+    np.testing.assert_allclose(unity_hands.hand(1, (0.5, 0.1, 0.2)), [0.5, 0.1, 0.2])
 
 
 @contextmanager
@@ -104,8 +104,8 @@ BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
 )
 def test_frame_decides_the_mapping(configured: str, frame: str, at: tuple[float, ...] | None) -> None:
     """A hand is mapped as its frame is configured or refused."""
-    own = HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT))
-    hands = Hands(own, trackers=TRACKERS)
+    settings = HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT))
+    hands = Hands(settings, trackers=TRACKERS)
     hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
     assert hands.fresh() == (at is not None)
     assert hands.rejected() == ({Cause.WRONG_FRAME: 1} if at is None else {})

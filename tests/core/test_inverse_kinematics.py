@@ -24,16 +24,16 @@ GAP_SLOW_M = TUNING.setpoint.gap_slow_m
 def test_bounded_least_squares(seed: int) -> None:
     """The bounded least squares are those of another solver."""
     random = np.random.default_rng(seed)
-    tasks, wanted, posture = random.normal(size=(6, 7)), random.normal(size=6), 0.1 * random.normal(size=7)
+    tasks, target, posture = random.normal(size=(6, 7)), random.normal(size=6), 0.1 * random.normal(size=7)
     damping, width = 10 ** random.uniform(-4, -1), 10 ** random.uniform(-1.5, 0.5)
     bounds = np.sort(random.normal(size=(2, 7)), axis=0) * width
     bounds[0], bounds[1] = np.minimum(bounds[0], -1e-3), np.maximum(bounds[1], 1e-3)
-    found = np.empty(7)
-    least_squares(tasks, wanted, posture, damping, bounds, found)
+    solution = np.empty(7)
+    least_squares(tasks, target, posture, damping, bounds, solution)
     whole = np.vstack([tasks, np.sqrt(damping) * np.eye(7)])
-    right = np.concatenate([wanted, np.sqrt(damping) * posture])
+    right = np.concatenate([target, np.sqrt(damping) * posture])
     best = lsq_linear(whole, right, bounds=(bounds[0], bounds[1]), method="bvls", tol=1e-14).x
-    np.testing.assert_allclose(found, best, atol=1e-7)
+    np.testing.assert_allclose(solution, best, atol=1e-7)
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
@@ -41,8 +41,8 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     random = np.random.default_rng(2)
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
-    here = parameters(tasks=tasks, joints=q)
-    speed, coming, total = tool_speeds(here, dq, ddq, jerk)
+    state = parameters(tasks=tasks, joints=q)
+    speed, coming, total = tool_speeds(state, dq, ddq, jerk)
     crest = np.linalg.norm(tasks[:3] @ (dq + ddq * np.abs(ddq) / (2 * jerk)))
     assert speed == pytest.approx(np.linalg.norm(tasks[:3] @ dq), rel=1e-12)
     assert coming == pytest.approx(max(speed, crest), rel=1e-12)
@@ -50,7 +50,7 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     assert total == pytest.approx(columns @ (np.abs(dq) + ddq**2 / (2 * jerk)), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
     error, fast = measured_error(
-        parameters(measured=measured, measured_velocities=dq), here, parameters(per_rad=np.ones(len(dq)))
+        parameters(measured=measured, measured_velocities=dq), state, parameters(per_rad=np.ones(len(dq)))
     )
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
@@ -61,9 +61,9 @@ def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
     random, settings = np.random.default_rng(3), cell_of(name)
     arm, joints = Arm(settings, robot_description(settings)), len(settings.joints.names)
     for _ in range(20):
-        q, way, dq = random.uniform(-1, 1, (3, joints))
-        speed = tool_speed_after(arm.at(q).record, way, dq)
-        assert speed == pytest.approx(np.linalg.norm(arm.at(q + way).tasks[:3] @ dq), rel=1e-9)
+        q, step_rad, dq = random.uniform(-1, 1, (3, joints))
+        speed = tool_speed_after(arm.at(q).record, step_rad, dq)
+        assert speed == pytest.approx(np.linalg.norm(arm.at(q + step_rad).tasks[:3] @ dq), rel=1e-9)
 
 
 def test_setpoint_waits_for_a_late_tool() -> None:
@@ -84,7 +84,7 @@ def test_setpoint_waits_for_a_late_tool() -> None:
 def test_least_squares_under_inequalities(seed: int) -> None:
     """Least squares under inequalities are those of another solver."""
     random = np.random.default_rng(seed)
-    tasks, wanted, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
+    tasks, target, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
     damping, count = 10 ** random.uniform(-4, -1), int(random.integers(1, 12))
     bounds = np.sort(random.normal(size=(2, 7)), axis=0) * 0.5
     bounds[0], bounds[1] = np.minimum(bounds[0], 0), np.maximum(bounds[1], 0)
@@ -95,32 +95,32 @@ def test_least_squares_under_inequalities(seed: int) -> None:
         limits[0] = 0.3 * rows[0] @ np.where(rows[0] > 0, bounds[0], bounds[1])  # it is to be left
         count = min(count, 3)
         rows, limits = rows[:count], limits[:count]
-    found = np.empty(7)
-    least_squares(tasks, wanted, posture, damping, bounds, found)
-    before = found.copy()
-    met = keep_under(tasks, wanted, posture, damping, bounds, rows, limits, found)
+    solution = np.empty(7)
+    least_squares(tasks, target, posture, damping, bounds, solution)
+    before = solution.copy()
+    met = keep_under(tasks, target, posture, damping, bounds, rows, limits, solution)
     assert met == bool((rows @ before > limits + 1e-9).any())
-    assert (rows @ found <= limits + 1e-8).all()
-    assert ((bounds[0] <= found) & (found <= bounds[1])).all()
+    assert (rows @ solution <= limits + 1e-8).all()
+    assert ((bounds[0] <= solution) & (solution <= bounds[1])).all()
 
     def cost(x: Vector) -> float:
-        return float(np.sum((tasks @ x - wanted) ** 2) + damping * np.sum((x - posture) ** 2))
+        return float(np.sum((tasks @ x - target) ** 2) + damping * np.sum((x - posture) ** 2))
 
     best = minimize(
         cost,
-        0.9 * found,
+        0.9 * solution,
         bounds=list(zip(*bounds, strict=True)),
         constraints=[{"type": "ineq", "fun": lambda x: limits - rows @ x}],
         method="SLSQP",
         options={"ftol": 1e-14, "maxiter": 500},
     )
-    assert cost(found) <= best.fun + 1e-6
+    assert cost(solution) <= best.fun + 1e-6
 
 
 def test_way_along_two_obstacles_is_free() -> None:
     """Between two things that cannot both be left the way along them is free."""
-    tasks, wanted, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
-    rows, found = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
-    least_squares(tasks, wanted, np.zeros(3), 1e-3, bounds, found)
-    assert keep_under(tasks, wanted, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), found)
-    np.testing.assert_allclose(found, [0.3, 0.0, 0.0], atol=1e-3)
+    tasks, target, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
+    rows, solution = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
+    least_squares(tasks, target, np.zeros(3), 1e-3, bounds, solution)
+    assert keep_under(tasks, target, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), solution)
+    np.testing.assert_allclose(solution, [0.3, 0.0, 0.0], atol=1e-3)

@@ -32,17 +32,17 @@ def told(
     """An intake that was told of where a hand was at times, so much later; and the estimates (T, 3)
     [m] at each tick.
     """
-    hands, places, come_s, found = Hands(), moving(made_s), made_s + late_s, []
+    hands, places, come_s, estimates = Hands(), moving(made_s), made_s + late_s, []
     order, stamps_s, nth = np.argsort(come_s, kind="stable"), stamps(made_s), 0
     for tick in range(round(until_s / PERIOD_S)):
         if tick:
             hands.advance()
         while nth < len(order) and come_s[order[nth]] <= tick * PERIOD_S + 1e-9:
-            at = order[nth]
-            hands.hand(ZERO_NS + round(1e9 * stamps_s[at]), tuple(places[at].tolist()))
+            index = order[nth]
+            hands.hand(ZERO_NS + round(1e9 * stamps_s[index]), tuple(places[index].tolist()))
             nth += 1
-        found.append(hands.state["hands"][LEFT, 0].copy())
-    return hands, np.array(found)
+        estimates.append(hands.state["hands"][LEFT, 0].copy())
+    return hands, np.array(estimates)
 
 
 @example_settings(max_examples=30, deadline=None, derandomize=True)
@@ -53,9 +53,9 @@ def test_order_of_arrival_does_not_matter(rate_hz: int, latest_s: float, seed: i
     until_s = WARM_S + 0.6
     made_s = np.arange(0.0, until_s, 1.0 / rate_hz)
     shuffles = (made_s > WARM_S) & (made_s < WARM_S + 0.4)
-    some = latest_s * shuffles * np.random.default_rng(seed).random(len(made_s))
-    in_order = told(made_s, 0.0 * some, until_s=until_s)[0]
-    shuffled = told(made_s, some, until_s=until_s)[0]
+    late_s = latest_s * shuffles * np.random.default_rng(seed).random(len(made_s))
+    in_order = told(made_s, 0.0 * late_s, until_s=until_s)[0]
+    shuffled = told(made_s, late_s, until_s=until_s)[0]
     assert shuffled.rejected() == in_order.rejected() == {}
     np.testing.assert_allclose(shuffled.state["hands"], in_order.state["hands"], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(shuffled.state["noise_variance"], in_order.state["noise_variance"], rtol=1e-6)
@@ -67,14 +67,14 @@ def test_samples_60_ms_late_are_nearly_as_good(rate_hz: int) -> None:
     """A hand whose samples are up to 60 ms late is known nearly as well."""
     made_s = np.arange(0.0, 8.0, 1.0 / rate_hz)
     late_s = 0.06 * np.random.default_rng(1).random(len(made_s))
-    hands, found = told(made_s, late_s, until_s=8.0)
+    hands, estimates = told(made_s, late_s, until_s=8.0)
     assert hands.rejected() == {}
     late_ms = lateness_ms(hands.state, LEFT, PERIOD_S)
     assert late_ms is not None
     np.testing.assert_allclose(late_ms, (29.0, 57.0), atol=6.0)
     assert lateness_ms(hands.state, RIGHT, PERIOD_S) is None
-    truth = moving(np.arange(len(found)) * PERIOD_S)
-    error = np.linalg.norm(found - truth, axis=1)[round(3.0 / PERIOD_S) :]
+    truth = moving(np.arange(len(estimates)) * PERIOD_S)
+    error = np.linalg.norm(estimates - truth, axis=1)[round(3.0 / PERIOD_S) :]
     assert np.sqrt(np.mean(error**2)) < {30: 0.005, 100: 0.003, 500: 0.002}[rate_hz]
 
 

@@ -121,23 +121,23 @@ def test_smooth_motion_passes_unchanged() -> None:
     """Velocities that are smooth and within the limits pass unchanged."""
     times = PERIOD * np.arange(1, 4001)[:, None]
     start = 1.0 - np.exp(-(times**3))
-    wanted = start * 0.4 * np.sin(1.3 * times + np.arange(7))
-    run = drive(LIMITS, START, wanted)
-    assert np.abs(run.velocity - wanted).max() < 2e-5
+    target = start * 0.4 * np.sin(1.3 * times + np.arange(7))
+    run = drive(LIMITS, START, target)
+    assert np.abs(run.velocity - target).max() < 2e-5
     assert not any(run.limited)
 
 
 def test_announced_ramp_is_followed_without_lag() -> None:
     """Velocities with sudden changes are followed if their derivative is given."""
     rate = np.array([5.0, -5.0, 5.0, 4.0, -5.0, 5.0, -3.0])
-    wanted = np.clip(PERIOD * np.arange(1, 201)[:, None], 0.0, 0.25) * rate
-    changing = np.where(wanted == 0.25 * rate, 0.0, rate)
-    told, untold = (np.abs(drive(LIMITS, START, wanted, said).velocity - wanted) for said in (changing, None))
+    target = np.clip(PERIOD * np.arange(1, 201)[:, None], 0.0, 0.25) * rate
+    changing = np.where(target == 0.25 * rate, 0.0, rate)
+    announced, untold = (np.abs(drive(LIMITS, START, target, derivative).velocity - target) for derivative in (changing, None))
     last = slice(80, 124)  # of the ramp
-    assert told[last].max() < 1e-6
+    assert announced[last].max() < 1e-6
     late = rate**2 / (2.0 * np.array(LIMITS.jerk))
     np.testing.assert_allclose(untold[last], np.tile(late, (44, 1)), rtol=0.2)
-    assert told[-1].max() < 1e-9
+    assert announced[-1].max() < 1e-9
 
 
 def test_pushing_against_a_limit_rests_there() -> None:
@@ -172,27 +172,27 @@ def test_stop_is_shortest_and_ends_together() -> None:
 
 def test_joints_together_stay_on_their_way() -> None:
     """Synchronised joints stay between their present velocities and the wanted ones."""
-    limiter, wanted = Limiter(LIMITS, PERIOD), np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
-    there = np.isclose(drive(LIMITS, START, np.tile(wanted, (300, 1))).velocity, wanted, rtol=1e-6, atol=0.0)
-    alone = int(np.argmax(there.all(axis=1)))
+    limiter, target = Limiter(LIMITS, PERIOD), np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
+    is_reached = np.isclose(drive(LIMITS, START, np.tile(target, (300, 1))).velocity, target, rtol=1e-6, atol=0.0)
+    alone = int(np.argmax(is_reached.all(axis=1)))
     state: tuple[Vector, Vector, Vector] = (START, REST, REST)
     for _ in range(round(1.5 * alone)):
-        step = limiter.together(*state, wanted)
+        step = limiter.together(*state, target)
         assert step is not None
-        assert np.ptp(step.velocity / wanted) < 1e-6
-        assert (step.velocity / wanted).max() < 1.001  # of what is left of a tick
+        assert np.ptp(step.velocity / target) < 1e-6
+        assert (step.velocity / target).max() < 1.001  # of what is left of a tick
         assert (np.abs(step.acceleration - state[2]) <= np.array(LIMITS.jerk) * PERIOD * (1 + 1e-9)).all()
         assert (np.abs(step.acceleration) <= np.array(LIMITS.acceleration) * (1 + 1e-9)).all()
         state = step[:3]
-    assert np.allclose(state[1], wanted, rtol=1e-6, atol=0.0)
-    assert limiter.together(START, wanted, 50 * np.sign(wanted), -wanted) is None
+    assert np.allclose(state[1], target, rtol=1e-6, atol=0.0)
+    assert limiter.together(START, target, 50 * np.sign(target), -target) is None
 
 
 def test_a_nan_stops_all_joints() -> None:
     limiter, state = Limiter(LIMITS, PERIOD), moving()
-    wanted = np.array([0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0])
+    target = np.array([0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0])
     for _ in range(300):
-        q, dq, ddq, limited = limiter.step(*state, wanted)
+        q, dq, ddq, limited = limiter.step(*state, target)
         state = (q, dq, ddq)
         assert limited
     assert np.abs(state[1]).max() < 1e-12

@@ -47,10 +47,10 @@ def both_remembered(
     states = np.zeros(1, [(field.name, field.type, field.shape) for field in FIELDS])
     state, out, turned = states[0], [], []
     state["hand_ticks"] = state["memory_ticks"] = -1
-    for tick, (both, turn) in enumerate(zip(hands, turns, strict=True)):
+    for tick, (pair, turn) in enumerate(zip(hands, turns, strict=True)):
         state["tick"] = tick
         if tick not in unseen:
-            state["hand_ticks"], state["hands"][:, 0] = tick, both.reshape(2, 3)
+            state["hand_ticks"], state["hands"][:, 0] = tick, pair.reshape(2, 3)
             state["hand_turns"] = turn.reshape(2, 9)
             remember(states, period_s, MEMORY_LAG_S, TURN_LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
@@ -61,9 +61,9 @@ def both_remembered(
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])
 def test_memory_is_that_of_learning(rate_hz: int) -> None:
     """The service's memory is the learned one, at any rate."""
-    shown = features(motion(np.arange(0.0, 6.0, 0.02))[0], 0.02, ORDER)
+    learned = features(motion(np.arange(0.0, 6.0, 0.02))[0], 0.02, ORDER)
     live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[:: rate_hz // 50]
-    behind = shown[:, 6:].reshape(-1, ORDER, 6) + shown[:, None, :6]
+    behind = learned[:, 6:].reshape(-1, ORDER, 6) + learned[:, None, :6]
     assert np.abs(live - behind).max() < 0.004
 
 
@@ -71,19 +71,19 @@ def test_memory_is_that_of_learning(rate_hz: int) -> None:
 def test_turns_are_those_of_learning(rate_hz: int) -> None:
     """The hands' turns are filtered live as in learning, at any rate."""
     turns = np.tile(motion(np.arange(0.0, 6.0, 0.02))[0], 3)
-    shown = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
-    told = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
-    live = both_remembered(told[:, :6], told, 1.0 / rate_hz)[1][:: rate_hz // 50, -1]
-    assert np.abs(TURN_WEIGHT_M * live - shown).max() < 0.0005
+    learned = features(turns[:, :6], 0.02, 0, turns)[:, 6:]
+    live_turns = np.tile(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 3)
+    live = both_remembered(live_turns[:, :6], live_turns, 1.0 / rate_hz)[1][:: rate_hz // 50, -1]
+    assert np.abs(TURN_WEIGHT_M * live - learned).max() < 0.0005
 
 
 def test_nothing_is_forgotten_unseen() -> None:
     """Nothing is forgotten while no hand is seen."""
     hands = motion(np.arange(0.0, 8.0, 0.01))[0]
     hands[300:] = hands[299]
-    gone = remembered(hands, 0.01, unseen=range(300, 700))
-    np.testing.assert_array_equal(gone[699], gone[299])
-    assert np.abs(gone[701] - remembered(hands, 0.01)[311]).max() < 0.002
+    memory = remembered(hands, 0.01, unseen=range(300, 700))
+    np.testing.assert_array_equal(memory[699], memory[299])
+    assert np.abs(memory[701] - remembered(hands, 0.01)[311]).max() < 0.002
 
 
 def test_inputs_move_with_their_derivatives() -> None:
@@ -92,15 +92,15 @@ def test_inputs_move_with_their_derivatives() -> None:
     times = np.arange(0.0, 4.0, h)
     moving = motion(times)
     memory, turns = both_remembered(moving[0], np.tile(moving[0], 3), h)
-    found = np.empty((len(times), 3, 6 * (1 + ORDER) + 18))
-    for out, now, past, turned in zip(found, moving.transpose(1, 0, 2), memory, turns, strict=True):
-        moving_features(np.ascontiguousarray(now), past, turned, out)
+    inputs = np.empty((len(times), 3, 6 * (1 + ORDER) + 18))
+    for out, now, memory_row, turned in zip(inputs, moving.transpose(1, 0, 2), memory, turns, strict=True):
+        moving_features(np.ascontiguousarray(now), memory_row, turned, out)
     late = slice(3000, None)
     for order in (0, 1):
-        slope = np.gradient(found[:, order], h, axis=0)[late]
-        assert np.abs(slope - found[late, order + 1]).max() < 0.01
+        slope = np.gradient(inputs[:, order], h, axis=0)[late]
+        assert np.abs(slope - inputs[late, order + 1]).max() < 0.01
         assert np.abs(slope[:, -18:]).max() > 0.01
-    for rows, out in zip(turns, found, strict=True):
+    for rows, out in zip(turns, inputs, strict=True):
         turned = np.empty((3, 18))
         turning(rows, TURN_LAG_S, turned)
         np.testing.assert_allclose(TURN_WEIGHT_M * turned, out[:, -18:], rtol=1e-12, atol=1e-12)
@@ -115,12 +115,12 @@ def takes(count: int, *, remembers: bool) -> list[Demonstration]:
     for i in range(count):
         rng, side = np.random.default_rng(i), (-1.0, 1.0)[i % 2]
         share = np.clip((times - 0.5 - 0.2 * rng.random()) / 1.5, 0.0, 1.0)
-        way = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
-        left = (0.6, -0.2, 0.2) + (1.0 - way) * (0.0, 0.25 * side, 0.0) + rng.normal(0.0, 0.004, 3)
+        progress = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
+        left = (0.6, -0.2, 0.2) + (1.0 - progress) * (0.0, 0.25 * side, 0.0) + rng.normal(0.0, 0.004, 3)
         right = (0.7, 0.3, 0.2) + 0.0 * left
-        tool = (0.5, 0.1, 0.4) + way * np.array((0.0, -0.15 * side if remembers else 0.15, 0.1))
+        tool = (0.5, 0.1, 0.4) + progress * np.array((0.0, -0.15 * side if remembers else 0.15, 0.1))
         turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
-        poses = (np.hstack([at + rng.normal(0.0, 0.0005, at.shape), turn]) for at in (left, right, tool))
+        poses = (np.hstack([positions + rng.normal(0.0, 0.0005, positions.shape), turn]) for positions in (left, right, tool))
         out.append(Demonstration((times * 1e9).astype(np.int64), *poses))
     return out
 
@@ -139,7 +139,7 @@ def test_learn_takes_memory_where_needed() -> None:
     assert order(learn(takes(8, remembers=False))) == 0
     back = decoded(skill.file, origin="again")
     hands = np.array(skill.hands[len(skill.hands) // 2]).reshape(2, 3)
-    past = np.tile(hands, (ORDER, 1, 1)) + 0.05
-    there = [at_rest(one, hands, past=past).position for one in (skill, back)]
-    np.testing.assert_array_equal(*there)
-    assert np.linalg.norm(there[0] - at_rest(skill, hands).position) > 0.0
+    memory = np.tile(hands, (ORDER, 1, 1)) + 0.05
+    positions = [at_rest(version, hands, past=memory).position for version in (skill, back)]
+    np.testing.assert_array_equal(*positions)
+    assert np.linalg.norm(positions[0] - at_rest(skill, hands).position) > 0.0

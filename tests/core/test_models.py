@@ -41,40 +41,40 @@ def hands(skill: Skill) -> Vector:
 
 
 def predicted(skill: Skill, hands: Vector, velocity: Vector, **more: object) -> Motion:
-    found = skill.predict(hands.reshape(2, 3), velocity.reshape(2, 3), np.zeros((2, 3)), STILL[0], **more)  # type: ignore[arg-type]
-    return Motion(*found[:6])
+    prediction = skill.predict(hands.reshape(2, 3), velocity.reshape(2, 3), np.zeros((2, 3)), STILL[0], **more)  # type: ignore[arg-type]
+    return Motion(*prediction[:6])
 
 
 def test_prediction_has_its_derivative(skill: Skill, hands: Vector) -> None:
     """A prediction is the mean rounded with its derivative along the motion."""
     velocity = np.array([0.3, -0.4, 0.2, 0.4, 0.3, 0.1])
-    found, belief = predicted(skill, hands, velocity), skill.model.belief(hands)
-    rest = predicted(skill, hands, np.zeros(6))
-    np.testing.assert_allclose(rest.position, skill.mean(hands[None])[0], rtol=0, atol=0.51e-6)
+    prediction, belief = predicted(skill, hands, velocity), skill.model.belief(hands)
+    still = predicted(skill, hands, np.zeros(6))
+    np.testing.assert_allclose(still.position, skill.mean(hands[None])[0], rtol=0, atol=0.51e-6)
     behind, ahead = (predicted(skill, hands + step * velocity, np.zeros(6), belief=belief).position for step in (-H, H))
-    np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * H), atol=0.01)
+    np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * H), atol=0.01)
     assert not predicted(skill, hands, np.zeros(6)).velocity.any()
 
 
 def test_covariance_and_gate_are_those_of_many_hands(skill: Skill, hands: Vector) -> None:
     """Confidence and gate of one hand equal those of a batch."""
-    found = predicted(skill, hands, np.zeros(6))
-    np.testing.assert_allclose(found.covariance, skill.model.covariances(hands[None])[0], rtol=0, atol=0.6e-10)
-    assert found.gate_m == pytest.approx(skill.model.gates_m(hands[None])[0], abs=1e-6)
-    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
-    apart = hands + np.array([0.0, 0.0, 0.5, 0.0, 0.0, -0.5])
-    assert predicted(skill, apart, np.zeros(6)).gate_m > skill.threshold
+    prediction = predicted(skill, hands, np.zeros(6))
+    np.testing.assert_allclose(prediction.covariance, skill.model.covariances(hands[None])[0], rtol=0, atol=0.6e-10)
+    assert prediction.gate_m == pytest.approx(skill.model.gates_m(hands[None])[0], abs=1e-6)
+    assert np.linalg.eigvalsh(prediction.covariance).min() > 0.0
+    far_hands = hands + np.array([0.0, 0.0, 0.5, 0.0, 0.0, -0.5])
+    assert predicted(skill, far_hands, np.zeros(6)).gate_m > skill.threshold
 
 
 def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
     model, velocity = skill.model, np.array([0.1, 0.2, 0.0, 0.0, -0.1, 0.2])
-    moving, past = np.stack([hands, velocity, np.zeros(6)]), np.tile(hands, (ORDER, 1))
-    seen = Seen(moving, STILL[0], past, UNTOLD, TURN_LAG_S, moving, model.belief(hands), 0.0)
-    at, moves = model.moving_inputs(seen)
-    assert at.shape == (model.shape[0],)
-    np.testing.assert_array_equal(at, model.inputs(hands[None])[0])
+    moving, memory = np.stack([hands, velocity, np.zeros(6)]), np.tile(hands, (ORDER, 1))
+    observation = Seen(moving, STILL[0], memory, UNTOLD, TURN_LAG_S, moving, model.belief(hands), 0.0)
+    inputs, moves = model.moving_inputs(observation)
+    assert inputs.shape == (model.shape[0],)
+    np.testing.assert_array_equal(inputs, model.inputs(hands[None])[0])
     behind, ahead = (
-        model.moving_inputs(seen._replace(moving=moving + step * np.outer((1, 0, 0), velocity)))[0] for step in (-H, H)
+        model.moving_inputs(observation._replace(moving=moving + step * np.outer((1, 0, 0), velocity)))[0] for step in (-H, H)
     )
     np.testing.assert_allclose(moves, (ahead - behind) / (2 * H), atol=1e-9)
 

@@ -29,13 +29,13 @@ PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
 
 def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int) -> list[float]:
     """Samples at a rate, one after the other (None: missing); y of the estimate after each."""
-    every, told = 500 // rate_hz, []
+    every, estimates_m = 500 // rate_hz, []
     for place in places:
         hands.advance(every)
         if place is not None:
             hands.hand(10**9 + int(hands.state["tick"]), place)
-        told.append(float(hands.state["hands"][LEFT_SIDE, 0, 1]))
-    return told
+        estimates_m.append(float(hands.state["hands"][LEFT_SIDE, 0, 1]))
+    return estimates_m
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 250, 500])
@@ -57,25 +57,25 @@ def test_jump_is_believed_after_three_samples(rate_hz: int) -> None:
 @pytest.mark.parametrize("length", [1, 2])
 def test_momentary_jump_leaves_no_trace(rate_hz: int, length: int) -> None:
     """Short outliers leave no trace in the estimate."""
-    told, missing = Hands(), Hands()
+    disturbed, missing = Hands(), Hands()
     head, tail = [PLACE] * 40, [PLACE] * 20
-    tell(told, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
+    tell(disturbed, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
     tell(missing, [*head, *[None] * length, *tail], rate_hz)
-    assert told.rejected() == {Cause.JUMPED: length}
+    assert disturbed.rejected() == {Cause.JUMPED: length}
     for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "even_samples", "mode_probabilities"):
-        assert told.state[name].tobytes() == missing.state[name].tobytes(), name
+        assert disturbed.state[name].tobytes() == missing.state[name].tobytes(), name
 
 
 def test_wrong_samples_are_dropped_by_the_next() -> None:
     """They make the hand seem to move at 2 m/s."""
     rate_hz, off_m = 30, (0.068, 0.08)
     hands, random, place = Hands(), np.random.default_rng(5), np.array([0.5, 0.1, 0.2])
-    off = {2 * rate_hz: off_m[0], 2 * rate_hz + 1: off_m[1]}
+    offsets_m = {2 * rate_hz: off_m[0], 2 * rate_hz + 1: off_m[1]}
     for k in range(3 * rate_hz):
-        at = place + random.normal(0.0, 0.0005, 3) + off.get(k, 0.0) * np.array([0.0, 0.6, 0.8])
-        found = hands.hand(round(1e9 * (1 + k / rate_hz)), tuple(at.tolist()))
+        sample_m = place + random.normal(0.0, 0.0005, 3) + offsets_m.get(k, 0.0) * np.array([0.0, 0.6, 0.8])
+        estimate_m = hands.hand(round(1e9 * (1 + k / rate_hz)), tuple(sample_m.tolist()))
         if k == 2 * rate_hz + 2:
-            assert np.linalg.norm(found - place) < 0.005  # it would run off otherwise
+            assert np.linalg.norm(estimate_m - place) < 0.005  # it would run off otherwise
             assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 1]) < 0.1
             assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05  # separation counts with both places
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
@@ -85,15 +85,15 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100])
 def test_quick_motion_is_not_dropped(rate_hz: int) -> None:
     """It starts within 50 ms to 1.2 m/s; none of its samples is dropped."""
-    hands, random, kept = Hands(), np.random.default_rng(6), []
+    hands, random, counts = Hands(), np.random.default_rng(6), []
     for k in range(2 * rate_hz):
         t = k / rate_hz
         moved = 1.2 * max(0.0, t - 1.0 - 0.025 * min(1.0, max(0.0, t - 1.0) / 0.05))
-        at = np.array([0.5, 0.1 + min(moved, 0.4), 0.2]) + random.normal(0.0, 0.0005, 3)
-        hands.hand(round(1e9 * (1 + t)), tuple(at.tolist()))
-        kept.append(int(hands.state["kept"][LEFT_SIDE]))
+        sample_m = np.array([0.5, 0.1 + min(moved, 0.4), 0.2]) + random.normal(0.0, 0.0005, 3)
+        hands.hand(round(1e9 * (1 + t)), tuple(sample_m.tolist()))
+        counts.append(int(hands.state["kept"][LEFT_SIDE]))
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
-    assert (np.diff(kept) >= 0).all()
+    assert (np.diff(counts) >= 0).all()
     assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
 
 
@@ -137,19 +137,19 @@ class BothHands(Hands):
         """How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by
         tick, while some labels are hidden.
         """
-        off, fresh = [], []
+        errors_m, fresh = [], []
         for _ in range(round(500 * seconds)):
             self.advance()
             if int(self.state["tick"]) % self.every == 0:
-                told = self.at()[::-1] if swapped else self.at()
-                for side, place in enumerate(told):
+                places = self.at()[::-1] if swapped else self.at()
+                for side, place in enumerate(places):
                     if side in hidden:
                         continue
-                    seen = np.array(place) + 0.002 * self.noise.standard_normal(3)
-                    self.hand(10**9 + int(self.state["tick"]), tuple(seen.tolist()), side=side)
-            off.append([abs(self.state["hands"][side, 0, 1] - place[1]) for side, place in enumerate(self.at())])
+                    sample_m = np.array(place) + 0.002 * self.noise.standard_normal(3)
+                    self.hand(10**9 + int(self.state["tick"]), tuple(sample_m.tolist()), side=side)
+            errors_m.append([abs(self.state["hands"][side, 0, 1] - place[1]) for side, place in enumerate(self.at())])
             fresh.append([self.fresh(side) for side in (0, 1)])
-        return np.array(off), np.array(fresh)
+        return np.array(errors_m), np.array(fresh)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -158,14 +158,14 @@ def test_swapped_hands_are_held_for(rate_hz: int, lasts_s: float) -> None:
     """Exchanged hands are rejected, and the arm holds."""
     hands = BothHands(rate_hz)
     assert hands.tell(1.0)[1][-1].all()
-    off, fresh = hands.tell(lasts_s, swapped=True)
-    assert off.max() < 0.02
+    errors_m, fresh = hands.tell(lasts_s, swapped=True)
+    assert errors_m.max() < 0.02
     assert not fresh[75:].any()  # 0.15 s
     assert hands.rejected()[Cause.SWAPPED] >= 2 * rate_hz * lasts_s - 4
     assert hands.rejected()[Cause.JUMPED] <= 3
-    off, fresh = hands.tell(1.0)
+    errors_m, fresh = hands.tell(1.0)
     assert fresh[2 * hands.every :].all()
-    assert off.max() < 0.02
+    assert errors_m.max() < 0.02
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -176,12 +176,12 @@ def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]
     hands.tell(1.0)
     hands.tell(0.2, hidden=hidden)  # the hand is covered, then its label goes to the other
     hands.tell(0.1, swapped=True, hidden=hidden)
-    off, fresh = hands.tell(0.8, swapped=True)
-    assert off.max() < 0.02
+    errors_m, fresh = hands.tell(0.8, swapped=True)
+    assert errors_m.max() < 0.02
     assert not fresh[25:].any()
-    off, fresh = hands.tell(0.5)
+    errors_m, fresh = hands.tell(0.5)
     assert fresh[2 * hands.every :].all()
-    assert off[2 * hands.every :].max() < 0.02
+    assert errors_m[2 * hands.every :].max() < 0.02
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
@@ -189,10 +189,10 @@ def test_lasting_swap_is_believed_after_2_s(rate_hz: int) -> None:
     """Labels that stay exchanged are accepted after two seconds."""
     hands = BothHands(rate_hz)
     hands.tell(1.0)
-    off, fresh = hands.tell(3.0, swapped=True)
+    errors_m, fresh = hands.tell(3.0, swapped=True)
     held = np.flatnonzero(~fresh.all(axis=1))
     assert held[-1] / 500 == pytest.approx(2.0, abs=0.07)
-    assert off[held[-1] + 1 :].min() > 0.35
+    assert errors_m[held[-1] + 1 :].min() > 0.35
 
 
 def test_one_hand_may_go_where_the_other_is() -> None:
@@ -250,5 +250,5 @@ def test_sudden_move_of_both_hands_is_followed(skill: Skill) -> None:
     """One sudden move of both hands is followed without a hold."""
     hands = np.tile((LEFT, RIGHT), (2000, 1, 1))
     hands[1000:, :, 1] += 0.09
-    seen = followed(replace(skill, threshold=math.inf), led(hands, every=16))
-    assert set(seen["reason"][50:].tolist()) == {Reason.NONE}
+    frames = followed(replace(skill, threshold=math.inf), led(hands, every=16))
+    assert set(frames["reason"][50:].tolist()) == {Reason.NONE}

@@ -42,20 +42,20 @@ def random_rotations(count: int, seed: int) -> Rotation:
 
 
 def test_rotations_are_those_of_scipy() -> None:
-    for one, other in zip(random_rotations(50, 1), random_rotations(50, 2), strict=True):
+    for rotation, other in zip(random_rotations(50, 1), random_rotations(50, 2), strict=True):
         a, b, turn, axis = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
-        quaternion_of(one.as_matrix(), a)
+        quaternion_of(rotation.as_matrix(), a)
         quaternion_of(other.as_matrix(), b)
-        assert abs(a @ one.as_quat()) == pytest.approx(1.0, abs=1e-8)
+        assert abs(a @ rotation.as_quat()) == pytest.approx(1.0, abs=1e-8)
         turn_between(a, b, turn)
-        np.testing.assert_allclose(turn, (other * one.inv()).as_rotvec(), atol=1e-7)
+        np.testing.assert_allclose(turn, (other * rotation.inv()).as_rotvec(), atol=1e-7)
         axis_of(a, axis)
-        np.testing.assert_allclose(axis, one.as_matrix()[:, 2], atol=1e-8)
+        np.testing.assert_allclose(axis, rotation.as_matrix()[:, 2], atol=1e-8)
         to = other.as_matrix()[:, 2].copy()
         swing(axis, b, turn)
         np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(axis), to, atol=1e-7)
         turn_on(a, turn)
-        assert abs(a @ (Rotation.from_rotvec(turn) * one).as_quat()) == pytest.approx(1.0, abs=1e-8)
+        assert abs(a @ (Rotation.from_rotvec(turn) * rotation).as_quat()) == pytest.approx(1.0, abs=1e-8)
 
 
 def test_learned_orientation_is_that_of_kmp() -> None:
@@ -66,16 +66,16 @@ def test_learned_orientation_is_that_of_kmp() -> None:
     primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.3), lambda_mean=1.0)
     auxiliary = random_rotations(1, 4)[0].as_quat()
     ours, kmp = LearnedOrientation(primitive, auxiliary), OrientationKMP(primitive, auxiliary)
-    for at, velocity in zip(inputs + 0.1, random.normal(size=(12, 6)), strict=True):
-        found, (mean, covariance) = ours.predict(at, velocity), kmp.predict(at[None])
-        assert abs(found.orientation @ mean[0]) == pytest.approx(1.0, abs=1e-9)
-        np.testing.assert_allclose(found.velocity, kmp.angular_velocity(at, velocity), atol=2e-5)
-        np.testing.assert_allclose(found.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max())
-        again = ours.predict(at, velocity, covariance=found.covariance)
-        assert again.orientation.tobytes() == found.orientation.tobytes()
-        ahead = Rotation.from_quat(ours.predict(at + 1e-3 * velocity, velocity).orientation)
-        turned = (ahead * Rotation.from_quat(found.orientation).inv()).as_rotvec() / 1e-3
-        np.testing.assert_allclose(found.velocity, turned, atol=0.05 * np.linalg.norm(turned) + 1e-2)
+    for query, velocity in zip(inputs + 0.1, random.normal(size=(12, 6)), strict=True):
+        prediction, (mean, covariance) = ours.predict(query, velocity), kmp.predict(query[None])
+        assert abs(prediction.orientation @ mean[0]) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(prediction.velocity, kmp.angular_velocity(query, velocity), atol=2e-5)
+        np.testing.assert_allclose(prediction.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max())
+        repeated = ours.predict(query, velocity, covariance=prediction.covariance)
+        assert repeated.orientation.tobytes() == prediction.orientation.tobytes()
+        ahead = Rotation.from_quat(ours.predict(query + 1e-3 * velocity, velocity).orientation)
+        turned = (ahead * Rotation.from_quat(prediction.orientation).inv()).as_rotvec() / 1e-3
+        np.testing.assert_allclose(prediction.velocity, turned, atol=0.05 * np.linalg.norm(turned) + 1e-2)
 
 
 @pytest.mark.parametrize("about", [False, True])
@@ -85,17 +85,17 @@ def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
     lead, state = OrientationSetpoint(settings), blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
     target = Rotation.from_rotvec(math.radians(120) * np.array([1.0, 2.0, 2.0]) / 3.0)
-    seen = []
+    turnings = []
     for _ in range(2500):
         lead.step(state, target.as_quat(), np.zeros(3))
-        seen.append(state["turning"].copy())
-    speeds = np.array(seen)
+        turnings.append(state["turning"].copy())
+    speeds = np.array(turnings)
     assert np.linalg.norm(speeds, axis=1).max() <= PLANNED_SPEED_SHARE * FASTEST + 1e-6
     assert np.linalg.norm(np.diff(speeds, axis=0), axis=1).max() <= HARDEST * PERIOD_S + 1e-6
-    off = target * Rotation.from_quat(state["orientation"]).inv()
+    residual = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])
     assert np.linalg.norm(axis - target.apply([0, 0, 1.0])) < 1e-3
-    assert (off.magnitude() < 1e-3) == about  # where a direction is followed, it does not turn about it
+    assert (residual.magnitude() < 1e-3) == about  # where a direction is followed, it does not turn about it
     assert np.linalg.norm(speeds[-1]) < 1e-2
 
 
@@ -104,13 +104,13 @@ def test_full_orientation_costs_no_position() -> None:
     settings = changed(Settings(), tool={"orientation": "full"})
     arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
     q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
-    here = arm.at(q)
-    target = Rotation.from_rotvec([0.3, -0.2, 0.5]) * Rotation.from_matrix(here.rotation)
+    pose = arm.at(q)
+    target = Rotation.from_rotvec([0.3, -0.2, 0.5]) * Rotation.from_matrix(pose.rotation)
     farthest = 0.0
     for _ in range(1500):
-        wanted = arm.step(q, here.position, np.zeros(3), target.as_quat(), moving=dq)
-        q, dq, ddq, _ = limiter.step(q, dq, ddq, wanted.velocity)
-        farthest = max(farthest, float(np.linalg.norm(arm.at(q).position - here.position)))
+        command = arm.step(q, pose.position, np.zeros(3), target.as_quat(), moving=dq)
+        q, dq, ddq, _ = limiter.step(q, dq, ddq, command.velocity)
+        farthest = max(farthest, float(np.linalg.norm(arm.at(q).position - pose.position)))
     assert (target * Rotation.from_matrix(arm.at(q).rotation).inv()).magnitude() < 0.01
     assert farthest < 5e-4  # it costs the tool's position nothing
 
@@ -122,13 +122,13 @@ def test_taught_orientation_is_followed(skill: Skill) -> None:
     x, y, z, w = turned.tolist()
     taught = adapted(skill, (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))), tolerance=0.05)
     script = HandScript(msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0)
-    seen = followed(taught, ticks_of(script))
-    last = seen[-300:]
+    frames = followed(taught, ticks_of(script))
+    last = frames[-300:]
     assert np.abs(last["orientation"] @ turned).min() > math.cos(math.radians(1.0))
     axis = Rotation.from_quat(last["tool_orientation"]).apply([0, 0, 1.0])
     assert np.degrees(np.arccos(axis @ Rotation.from_quat(turned).apply([0, 0, 1.0]))).max() < 2.0
     assert np.linalg.norm(last["tool"] - last["setpoint"], axis=1).max() < 1e-3
-    turning = np.linalg.norm(seen["setpoint_turning"], axis=1)
+    turning = np.linalg.norm(frames["setpoint_turning"], axis=1)
     assert 0.1 < turning.max() <= FASTEST
     assert (np.linalg.eigvalsh(last["orientation_covariance"]) >= -1e-12).all()
     assert last["orientation_covariance"].any()
@@ -145,7 +145,7 @@ def test_gripper_has_hysteresis() -> None:
     assert decided(CLOSED, 0.05) == OPEN
     assert decided(CLOSED, 0.05, since_s=0.5 * GRIPPER_MOVES_S) == CLOSED  # it is still on its way
     assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is not there yet
-    assert [decided(one, NO_GRIPPER) for one in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
+    assert [decided(state, NO_GRIPPER) for state in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
 
 
 def test_orientation_and_gripper_are_sent() -> None:

@@ -50,8 +50,8 @@ def test_every_round_is_as_the_first(taught: Skill) -> None:
     loop.hands = lambda k: positions[k]
     frames = loop.run(len(positions), events)
     first, *others = (frames[begin : begin + len(whole)] for begin in begins)
-    for number, again in enumerate(others, 1):
+    for number, later in enumerate(others, 1):
         if number != HALF:
-            assert np.abs(again["target"] - first["target"]).max() < 0.001
+            assert np.abs(later["target"] - first["target"]).max() < 0.001
             is_led = np.arange(len(whole)) * period_s < (5.0 if number in EVENTS else 0.5)
-            assert (again["mode"][~is_led] == Mode.FOLLOW).all()
+            assert (later["mode"][~is_led] == Mode.FOLLOW).all()

@@ -66,14 +66,14 @@ def played(cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector
     state = start_state(cell, skill)
     if start is not None:
         state["joints"][0] = start
-    found = frames(Controller(cell, skill, state, urdf=robot_description(cell)), ticks)
-    faults = found["mode"] == Mode.FAULT
-    assert not faults.any(), f"tick {faults.argmax()}: {Reason(found['reason'][faults.argmax()]).name}"
-    assert_limits_hold(found, cell)
-    speeds = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1) / cell.period_s
-    assert speeds[found["mode"][1:] == Mode.FOLLOW].max(initial=0.0) <= 1.001 * cell.tool.max_speed
+    trace = frames(Controller(cell, skill, state, urdf=robot_description(cell)), ticks)
+    faults = trace["mode"] == Mode.FAULT
+    assert not faults.any(), f"tick {faults.argmax()}: {Reason(trace['reason'][faults.argmax()]).name}"
+    assert_limits_hold(trace, cell)
+    speeds = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1) / cell.period_s
+    assert speeds[trace["mode"][1:] == Mode.FOLLOW].max(initial=0.0) <= 1.001 * cell.tool.max_speed
     assert speeds.max() <= RISE * cell.tool.max_speed + RISE_MPS
-    return found
+    return trace
 
 
 def changed(
@@ -120,28 +120,28 @@ def test_legal_hands_are_hardly_held_for(
     ms.
     """
     random, lasts_s = np.random.default_rng(seed), 2.0
-    way = random.standard_normal((2, 3))
-    way *= random.uniform(0.05, 0.3) / np.linalg.norm(way, axis=1, keepdims=True)
-    far = np.linalg.norm(way, axis=1).max()
+    offsets_m = random.standard_normal((2, 3))
+    offsets_m *= random.uniform(0.05, 0.3) / np.linalg.norm(offsets_m, axis=1, keepdims=True)
+    far = np.linalg.norm(offsets_m, axis=1).max()
     # a minimum-jerk reach, which no hand brakes harder at its end than the setpoint takes it to
     reach_s = max(1.875 * far / max_speed, math.sqrt(5.774 * far / HAND_BRAKE_MPS2))
     stamps = np.arange(0.0, lasts_s, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
-    for at in random.uniform(0.0, lasts_s, 2):
-        missing |= (stamps > at) & (stamps < at + random.uniform(0.03, 0.09) - 1.0 / rate_hz)
+    for begin_s in random.uniform(0.0, lasts_s, 2):
+        missing |= (stamps > begin_s) & (stamps < begin_s + random.uniform(0.03, 0.09) - 1.0 / rate_hz)
     inboxes = {}
     for stamp in stamps[~missing]:
         turns, u = divmod(stamp / reach_s, 1.0)
-        there = smooth(u)
-        moved = way * (1.0 - there if turns % 2 else there) + noise_m * random.standard_normal((2, 3))
+        progress = smooth(u)
+        moved = offsets_m * (1.0 - progress if turns % 2 else progress) + noise_m * random.standard_normal((2, 3))
         k = math.ceil(stamp * loop_hz - 1e-9)
         inboxes[k] = seen(np.array((LEFT, RIGHT)) + moved, k)
     ticks = (Tick(k, inboxes.get(k, ())) for k in range(round(lasts_s * loop_hz)))
-    found = played(replace(ASSUMED, rate_hz=loop_hz), stored("soldering"), ticks)
-    assert not found["rejected"][-1].any()
+    trace = played(replace(ASSUMED, rate_hz=loop_hz), stored("soldering"), ticks)
+    assert not trace["rejected"][-1].any()
     # The skill was not shown such reaches, and may say so.
-    unknown = np.isin(found["reason"], (Reason.FAR_FROM_DEMONSTRATIONS, Reason.AMBIGUOUS))
-    assert ((found["mode"] == Mode.HOLD) & ~unknown).mean() <= 0.02
+    unknown = np.isin(trace["reason"], (Reason.FAR_FROM_DEMONSTRATIONS, Reason.AMBIGUOUS))
+    assert ((trace["mode"] == Mode.HOLD) & ~unknown).mean() <= 0.02
 
 
 # --- quick reaches, and lowered speeds ---
@@ -151,18 +151,18 @@ def reaches(skill: Skill, cell: Settings, random: np.random.Generator, count: in
     """Hands (T, 2, 3) [m] that reach for where the skill knows them, in 0.3 to 0.7 s, and rest for
     a while.
     """
-    known = skill.hands.reshape(-1, 2, 3)
-    at = known[random.integers(len(known))].copy()
-    path = [at] * cell.rate_hz
+    places = skill.hands.reshape(-1, 2, 3)
+    hands_m = places[random.integers(len(places))].copy()
+    path = [hands_m] * cell.rate_hz
     for _ in range(count):
-        to, seconds, goal = at.copy(), random.uniform(0.3, 0.7), known[random.integers(len(known))]
+        to, seconds, goal = hands_m.copy(), random.uniform(0.3, 0.7), places[random.integers(len(places))]
         for side in (0, 1):
             if random.random() < 0.7:
                 to[side] = goal[side] + random.normal(0.0, 0.02, 3)
         ticks = int(seconds * cell.rate_hz)
-        path += list(at + smooth(np.arange(1, ticks + 1) / ticks)[:, None, None] * (to - at))
+        path += list(hands_m + smooth(np.arange(1, ticks + 1) / ticks)[:, None, None] * (to - hands_m))
         path += [to] * int(random.uniform(0.2, 1.0) * cell.rate_hz)
-        at = to
+        hands_m = to
     return np.array(path)
 
 
@@ -172,21 +172,21 @@ def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> N
     """As at the first start of a new arm, whose joints docs/hardware.md slows to a tenth."""
     random = np.random.default_rng(seed)
     name = ("wam", "panda", "ur5", "shipped franka", "shipped ur5")[seed % 5]
-    own = shipped(name.removeprefix("shipped ")) if name.startswith("shipped") else cell_of(name)
+    base = shipped(name.removeprefix("shipped ")) if name.startswith("shipped") else cell_of(name)
     slower = float(random.choice([0.1, 1.0, 1.0]))
     cell = changed(
-        replace(own, arm=replace(own.arm, source="assumed")),
+        replace(base, arm=replace(base.arm, source="assumed")),
         rate_hz=int(random.choice([500, 500, 100, 250, 1000])),
         speed=slower,
         max_speed=float(random.choice([0.03, 0.05, 0.08, 0.1, 0.2, 0.5])),
         orientation=str(random.choice(["full", "direction"])),
     )
-    one = everywhere((skill, taught)[random.integers(2)])
+    candidate = everywhere((skill, taught)[random.integers(2)])
     hands = reaches(taught, cell, random, 3)
     stops = set(random.integers(0, len(hands), 2).tolist())
     orders = dict.fromkeys(stops, "hold") | {k + cell.rate_hz // 4: "resume" for k in stops}
-    found = played(cell, one, led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)))
-    speeds = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1) / cell.period_s
+    trace = played(cell, candidate, led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)))
+    speeds = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1) / cell.period_s
     assert speeds.max() >= 0.3 * slower * cell.tool.engaging_speed  # the arm did move
 
 
@@ -199,8 +199,8 @@ def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], se
     """
     times = np.arange(1, round(seconds / cell.period_s)) * cell.period_s
     path = hands[0] + smooth((times - 2.0) / 0.8)[:, None, None] * (hands[1] - hands[0])
-    found = played(cell, skill, led(path, every=every(cell)), start=start)
-    last = found["joint_accelerations"][times > seconds - 1.0]
+    trace = played(cell, skill, led(path, every=every(cell)), start=start)
+    last = trace["joint_accelerations"][times > seconds - 1.0]
     assert np.sqrt(np.mean(last**2, axis=0)).max() < AT_REST_RADPS2
 
 
@@ -231,7 +231,7 @@ def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
 @pytest.fixture(scope="module")
 def reach() -> Skill:
     """A coarse skill of two demonstrations, with which the tool moves a metre."""
-    return learn([one.every(2) for one in demonstrations(Scene(), count=2, seed=1)], components=5, points=60)
+    return learn([demonstration.every(2) for demonstration in demonstrations(Scene(), count=2, seed=1)], components=5, points=60)
 
 
 @pytest.mark.parametrize("arm", ["wam", *MODELS])
@@ -239,13 +239,13 @@ def reach() -> Skill:
 def test_targets_are_followed_to_half_a_mm(arm: str, reach: Skill, tmp_path: Path) -> None:
     """Moving targets are followed to half a millimetre."""
     cell, ticks = cell_of(arm), list(ticks_of(HandScript(Scene(), seed=3)))
-    found = played(cell, reach, ticks)
-    assert_replays(tmp_path / "a.mcap", cell, reach, list(zip(ticks, found, strict=True))[:1500])
-    assert (found["mode"] == Mode.FOLLOW).all()
-    error_mm = 1000 * np.linalg.norm(found["tool"] - found["setpoint"], axis=1)
+    trace = played(cell, reach, ticks)
+    assert_replays(tmp_path / "a.mcap", cell, reach, list(zip(ticks, trace, strict=True))[:1500])
+    assert (trace["mode"] == Mode.FOLLOW).all()
+    error_mm = 1000 * np.linalg.norm(trace["tool"] - trace["setpoint"], axis=1)
     assert np.sqrt(np.mean(error_mm**2)) < 0.5, f"{np.sqrt(np.mean(error_mm**2)):.3f} mm rms"
     assert error_mm.max() < 5.0, f"{error_mm.max():.3f} mm"
-    assert np.ptp(found["tool"], axis=0).max() > 0.3
+    assert np.ptp(trace["tool"], axis=0).max() > 0.3
 
 
 # --- hands that tremble, and slow ones ---
@@ -267,16 +267,16 @@ def above_4_hz(values: Vector) -> float:
 @pytest.mark.parametrize("name", ["soldering", "experiments/as-paper"])
 def test_tremor_does_not_reach_the_tool(name: str, size_m: float) -> None:
     """A tremor of hands at rest does not reach the tool."""
-    one, random, t = stored(name), np.random.default_rng(0), np.arange(0.0, 5.0, PERIOD_S)
-    hands = np.tile(one.hands.mean(axis=0), (len(t), 1))
+    skill, random, t = stored(name), np.random.default_rng(0), np.arange(0.0, 5.0, PERIOD_S)
+    hands = np.tile(skill.hands.mean(axis=0), (len(t), 1))
     for side in (0, 3):
         rates = np.interp(t, np.arange(0.0, 6.0, 0.5), random.uniform(8.0, 12.0, 12))
-        way = random.standard_normal(3)
+        direction = random.standard_normal(3)
         tremor = np.sin(2.0 * np.pi * np.cumsum(rates) * PERIOD_S)
-        hands[:, side : side + 3] += size_m * tremor[:, None] * way / np.linalg.norm(way)
-    found = tracked(one, hands)
-    assert above_4_hz(found["tool"]) < 0.0002
-    axes = Rotation.from_quat(found["tool_orientation"]).apply((0.0, 0.0, 1.0))
+        hands[:, side : side + 3] += size_m * tremor[:, None] * direction / np.linalg.norm(direction)
+    trace = tracked(skill, hands)
+    assert above_4_hz(trace["tool"]) < 0.0002
+    axes = Rotation.from_quat(trace["tool_orientation"]).apply((0.0, 0.0, 1.0))
     assert math.degrees(above_4_hz(axes)) < 0.2
 
 
@@ -284,11 +284,11 @@ def along(speed: float, parts: slice) -> Vector:
     """Speeds (T,) [m/s] of the tool on its way while hands, those parts of (6,), move evenly. The
     skill is a function of where the hands are alone.
     """
-    one, t = stored("experiments/as-paper"), np.arange(0.0, 9.0, PERIOD_S)
-    hands = np.tile(one.hands.mean(axis=0), (len(t), 1))
-    way = np.array([0.3, 0.9, 0.3] * 2)[parts] / np.linalg.norm([0.3, 0.9, 0.3])
-    hands[:, parts] += speed * np.maximum(t - COMES_S, 0.0)[:, None] * way
-    tool = tracked(one, hands)["tool"][round((COMES_S + KNOWN_S) / PERIOD_S) :]
+    skill, t = stored("experiments/as-paper"), np.arange(0.0, 9.0, PERIOD_S)
+    hands = np.tile(skill.hands.mean(axis=0), (len(t), 1))
+    direction = np.array([0.3, 0.9, 0.3] * 2)[parts] / np.linalg.norm([0.3, 0.9, 0.3])
+    hands[:, parts] += speed * np.maximum(t - COMES_S, 0.0)[:, None] * direction
+    tool = tracked(skill, hands)["tool"][round((COMES_S + KNOWN_S) / PERIOD_S) :]
     return np.asarray(np.diff(tool, axis=0) / PERIOD_S @ (tool[-1] - tool[0]) / np.linalg.norm(tool[-1] - tool[0]))
 
 
@@ -314,7 +314,7 @@ def test_quick_reaches_never_fault(taught: Skill, name: str) -> None:
     cell, first = QUICK[name]
     for seed in range(first, first + (MANY or 1)):
         hands = reaches(taught, cell, np.random.default_rng(seed), 8)
-        found = played(cell, taught, led(hands, first=1, every=every(cell)))
-        speed = np.linalg.norm(np.diff(found["tool"], axis=0), axis=1).max() / cell.period_s
+        trace = played(cell, taught, led(hands, first=1, every=every(cell)))
+        speed = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1).max() / cell.period_s
         assert speed <= cell.tool.max_speed, f"seed {seed}: {speed:.4f} m/s"
-        assert np.ptp(found["tool"], axis=0).max() > 0.1
+        assert np.ptp(trace["tool"], axis=0).max() > 0.1

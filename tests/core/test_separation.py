@@ -66,21 +66,21 @@ def test_capsules_cover_collision_shapes() -> None:
     """Capsules enclose the collision shapes as Pinocchio places them."""
     model = pin.buildModelFromXML(URDF)
     shapes = pin.buildGeomFromUrdfString(model, URDF, pin.GeometryType.COLLISION)
-    data, there = model.createData(), pin.GeometryData(shapes)
+    data, geometry = model.createData(), pin.GeometryData(shapes)
     random = np.random.default_rng(1)
     assert len(BODY.capsules) == len(shapes.geometryObjects)
     for q in random.uniform(LOWER, UPPER, (20, 7)):
-        pin.updateGeometryPlacements(model, data, shapes, there, q)
+        pin.updateGeometryPlacements(model, data, shapes, geometry, q)
         capsules = placed(q)
         covered = set()
-        for shape, at in zip(shapes.geometryObjects, there.oMg, strict=True):
+        for shape, placement in zip(shapes.geometryObjects, geometry.oMg, strict=True):
             if isinstance(shape.geometry, coal.Box):
                 corners = shape.geometry.halfSide * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
             else:
                 angles = np.linspace(0, 2 * math.pi, 12)
                 r, h = shape.geometry.radius, shape.geometry.halfLength
                 corners = np.array([[r * math.cos(a), r * math.sin(a), z] for a in angles for z in (-h, h)])
-            points = np.array([at.act(corner) for corner in corners])
+            points = np.array([placement.act(corner) for corner in corners])
             for k in np.flatnonzero(BODY.capsules["link"] == shape.parentJoint):
                 far = [between_segments(np.array([p, p]), capsules[k], np.empty(9)) for p in points]
                 if max(far) <= BODY.capsules["radius"][k] + 1e-9 and max(far) > BODY.capsules["radius"][k] - 1e-3:
@@ -93,28 +93,28 @@ def test_capsules_cover_collision_shapes() -> None:
 
 def coal_capsule(segment: Vector) -> tuple[Any, Any]:
     """A capsule of 1 cm around a segment (2, 3), and its placement."""
-    way = segment[1] - segment[0]
-    along = way if way.any() else np.array([0.0, 0.0, 1.0])
+    axis = segment[1] - segment[0]
+    along = axis if axis.any() else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
-    return coal.Capsule(0.01, float(np.linalg.norm(way))), coal.Transform3s(turn, segment.mean(axis=0))
+    return coal.Capsule(0.01, float(np.linalg.norm(axis))), coal.Transform3s(turn, segment.mean(axis=0))
 
 
 def test_capsule_distances_are_those_of_coal() -> None:
     """Distances of capsules are those of Coal."""
     random, near = np.random.default_rng(2), np.empty(9)
     for _ in range(300):
-        one, other = random.uniform(-0.5, 0.5, (2, 2, 3))
+        segment, other = random.uniform(-0.5, 0.5, (2, 2, 3))
         if random.random() < 0.2:
-            other[1] = other[0] + (one[1] - one[0])  # parallel
+            other[1] = other[0] + (segment[1] - segment[0])  # parallel
         if random.random() < 0.2:
-            one[1] = one[0]  # a ball
-        found = between_segments(one, other, near)
+            segment[1] = segment[0]  # a ball
+        distance_m = between_segments(segment, other, near)
         expected = coal.distance(
-            *coal_capsule(one), *coal_capsule(other), coal.DistanceRequest(), coal.DistanceResult()
+            *coal_capsule(segment), *coal_capsule(other), coal.DistanceRequest(), coal.DistanceResult()
         )
-        assert found - 0.02 == pytest.approx(expected, abs=1e-5)
-        assert np.linalg.norm(near[3:6] - near[:3]) == pytest.approx(found, abs=1e-12)
-        assert near[:3] + found * near[6:] == pytest.approx(near[3:6], abs=1e-9)
+        assert distance_m - 0.02 == pytest.approx(expected, abs=1e-5)
+        assert np.linalg.norm(near[3:6] - near[:3]) == pytest.approx(distance_m, abs=1e-12)
+        assert near[:3] + distance_m * near[6:] == pytest.approx(near[3:6], abs=1e-9)
 
 
 def test_distance_of_capsule_and_box() -> None:
@@ -123,10 +123,10 @@ def test_distance_of_capsule_and_box() -> None:
     box = np.array([[-0.2, -0.3, -0.1], [0.2, 0.3, 0.1]])
     for _ in range(300):
         segment = random.uniform(-0.6, 0.6, (2, 3))
-        found = to_box(segment, nearest_to_box(segment, box), box, near)
+        distance_m = to_box(segment, nearest_to_box(segment, box), box, near)
         points = segment[0] + np.linspace(0, 1, 2001)[:, None] * (segment[1] - segment[0])
         least = np.linalg.norm(points - points.clip(*box), axis=1).min()
-        assert max(found, 0.0) == pytest.approx(least, abs=3e-4)
+        assert max(distance_m, 0.0) == pytest.approx(least, abs=3e-4)
     inside = np.array([[0.0, 0.0, 0.07], [0.0, 0.0, 0.07]])
     assert to_box(inside, 0.0, box, near) == pytest.approx(-0.03)
     assert near[6:].tolist() == [0.0, 0.0, -1.0]  # what goes down goes in
@@ -145,7 +145,7 @@ def test_stop_from_allowed_speed_keeps_clear(hand_speed: float) -> None:
 def test_constraints_are_derivatives_of_distance() -> None:
     """Constraints are the rates at which distances shrink."""
     settings = changed(ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),)))
-    apart, table = Separation(settings, URDF), settings.table
+    separation, table = Separation(settings, URDF), settings.table
     low, high = (
         np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M],
         np.add(table.centre, [*table.half_size, 0.0]),
@@ -154,23 +154,23 @@ def test_constraints_are_derivatives_of_distance() -> None:
     state = with_hands(*(np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]), settings)
     random, near, total = np.random.default_rng(4), np.empty(9), 0
     for q, dq in zip(random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True):
-        here = ARM.at(q)
-        apart.step(state, FRAME, here.record)
-        total += apart.count
-        speeds = apart.constraints["row"][: apart.count] @ dq
-        both = [placed(q + h * dq) for h in (-1e-6, 1e-6)]
-        found = []
+        pose = ARM.at(q)
+        separation.step(state, FRAME, pose.record)
+        total += separation.count
+        speeds = separation.constraints["row"][: separation.count] @ dq
+        pair = [placed(q + h * dq) for h in (-1e-6, 1e-6)]
+        rates = []
         for side in range(2):
             arm = state["hands"][side, 0] + np.array([[0.0, 0, 0], [0.24, 0, 0]])
             for k in np.flatnonzero(BODY.capsules["link"]):
-                found.append(-np.diff([between_segments(at[k], arm, near) for at in both])[0] / 2e-6)
+                rates.append(-np.diff([between_segments(capsules[k], arm, near) for capsules in pair])[0] / 2e-6)
         for i, j in BODY.pairs:
-            found.append(-np.diff([between_segments(at[i], at[j], near) for at in both])[0] / 2e-6)
+            rates.append(-np.diff([between_segments(capsules[i], capsules[j], near) for capsules in pair])[0] / 2e-6)
         for k in np.flatnonzero(BODY.capsules["link"]):
             for box in boxes:
                 for share in (nearest_to_box(placed(q)[k], box), 0.0, 1.0):
-                    found.append(-np.diff([to_box(at[k], share, box, near) for at in both])[0] / 2e-6)
-        expected = np.array(found)
+                    rates.append(-np.diff([to_box(capsules[k], share, box, near) for capsules in pair])[0] / 2e-6)
+        expected = np.array(rates)
         assert all(np.abs(expected - speed).min() < 1e-5 for speed in speeds)
     assert total > 50
 
@@ -192,8 +192,8 @@ def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tu
     near its links come to each other and to the table (T,).
     """
     joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
-    distance, speed, _, own, table = measured(settings, body_of(settings, robot_description(settings)), joints, hands)
-    return distance, speed, own, table
+    distance, speed, _, link_gap, table = measured(settings, body_of(settings, robot_description(settings)), joints, hands)
+    return distance, speed, link_gap, table
 
 
 def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5) -> Iterator[tuple[Tick, Vector]]:
@@ -214,9 +214,9 @@ def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     """The hand stops where the arm, which stays where it is, does not touch it."""
     cell = changed(cell_of(arm), people={"position_uncertainty": 0.03})
     ticks, hands = zip(*thrust((0.53, -0.27, 0.37), 1.2), strict=True)
-    seen = followed(taught, list(ticks), cell)
-    assert (seen["flags"] & Flag.SEPARATION).any() or (seen["mode"] == Mode.HOLD).any()
-    distance, speed, _, _ = nearest(seen, np.array(hands), cell)
+    frames = followed(taught, list(ticks), cell)
+    assert (frames["flags"] & Flag.SEPARATION).any() or (frames["mode"] == Mode.HOLD).any()
+    distance, speed, _, _ = nearest(frames, np.array(hands), cell)
     assert distance.min() > 0
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
     least_m = cell.people.clearance + cell.people.position_uncertainty
@@ -237,18 +237,18 @@ def test_table_and_box_are_not_touched(taught: Skill, arm: str) -> None:
         changed(cell, obstacles=Obstacles(boxes=(box,))),
     ]
     for settings in cells:
-        seen = followed(taught, [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)], settings)
-        assert (seen["mode"] == Mode.FOLLOW).all()
-        assert (seen["flags"] & Flag.SEPARATION).any()
+        frames = followed(taught, [tick for tick, _ in thrust((0.9, 0.3, 0.1), 9.0, 7.5)], settings)
+        assert (frames["mode"] == Mode.FOLLOW).all()
+        assert (frames["flags"] & Flag.SEPARATION).any()
         behind = 0.1 if len(settings.joints.names) > 6 else 0.15  # six joints have no way around
-        assert np.linalg.norm(seen["setpoint"] - seen["tool"], axis=1).max() < behind
+        assert np.linalg.norm(frames["setpoint"] - frames["tool"], axis=1).max() < behind
         if settings.obstacles.boxes:
             corners = np.array([np.subtract(box.centre, box.half_size), np.add(box.centre, box.half_size)])
         else:
             corners = np.array([[0.35, -0.6, -0.73], [1.25, 0.6, 0.27]])
-        apart = np.array([_apart_from(corners, placed(q, body), body) for q in seen["joints"][::5]])
-        least = np.minimum(apart[0], settings.obstacles.clearance)  # one that starts nearer goes away
-        assert (apart > least - 0.001).all(), apart.min(axis=0)
+        distances_m = np.array([_apart_from(corners, placed(q, body), body) for q in frames["joints"][::5]])
+        least = np.minimum(distances_m[0], settings.obstacles.clearance)  # one that starts nearer goes away
+        assert (distances_m > least - 0.001).all(), distances_m.min(axis=0)
 
 
 def _apart_from(corners: Vector, capsules: Vector, body: Body) -> list[float]:
@@ -281,79 +281,79 @@ def test_near_parts_move_apart(arm: str) -> None:
 
 def test_leaving_motion_is_not_slowed() -> None:
     """Motion that leaves a hand is not slowed."""
-    apart = Separation(ASSUMED, URDF)
-    here = ARM.at(POSTURE)
-    state = with_hands(np.add(here.position, (0.09, 0.0, 0.0)))
-    for way in ([-0.4, 0.0, 0.0], [-0.2, 0.1, 0.3]):
-        apart.step(state, FRAME, here.record)
-        free = ARM.step(POSTURE, here.position, np.array(way), orientation_of(here))
-        kept = ARM.step(POSTURE, here.position, np.array(way), orientation_of(here), separation=apart)
-        assert apart.count
-        assert (kept.separated, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
-    toward = ARM.step(POSTURE, here.position, np.array([0.4, 0.0, 0.0]), orientation_of(here), separation=apart)
+    separation = Separation(ASSUMED, URDF)
+    pose = ARM.at(POSTURE)
+    state = with_hands(np.add(pose.position, (0.09, 0.0, 0.0)))
+    for velocity in ([-0.4, 0.0, 0.0], [-0.2, 0.1, 0.3]):
+        separation.step(state, FRAME, pose.record)
+        free = ARM.step(POSTURE, pose.position, np.array(velocity), orientation_of(pose))
+        guarded = ARM.step(POSTURE, pose.position, np.array(velocity), orientation_of(pose), separation=separation)
+        assert separation.count
+        assert (guarded.separated, guarded.velocity.tobytes()) == (False, free.velocity.tobytes())
+    toward = ARM.step(POSTURE, pose.position, np.array([0.4, 0.0, 0.0]), orientation_of(pose), separation=separation)
     assert toward.separated
-    assert here.tasks[0] @ toward.velocity < 0.05
+    assert pose.tasks[0] @ toward.velocity < 0.05
 
 
 @pytest.mark.parametrize("hand_speed", [0.0, 0.05, 1.5])
 def test_passing_hand_is_foreseen(hand_speed: float) -> None:
     """The tool leaves the hand now, but goes where a fast one will be a tenth of a second later."""
-    apart, here, way, near = Separation(ASSUMED, URDF), ARM.at(POSTURE), np.array([0.3, 0.4, 0.0]), np.empty(9)
-    state = with_hands(np.add(here.position, (0.14, -0.16, 0.0)))
+    separation, pose, velocity, near = Separation(ASSUMED, URDF), ARM.at(POSTURE), np.array([0.3, 0.4, 0.0]), np.empty(9)
+    state = with_hands(np.add(pose.position, (0.14, -0.16, 0.0)))
     state["hands"][0, 1, 1] = hand_speed
-    free = ARM.step(POSTURE, here.position, way, orientation_of(here))
+    free = ARM.step(POSTURE, pose.position, velocity, orientation_of(pose))
     state["joints"][1] = free.velocity
-    apart.step(state, FRAME, here.record)
-    kept = ARM.step(POSTURE, here.position, way, orientation_of(here), separation=apart)
+    separation.step(state, FRAME, pose.record)
+    guarded = ARM.step(POSTURE, pose.position, velocity, orientation_of(pose), separation=separation)
     forearm = state["hands"][0, 0] + np.array([[0.0, 0.0, 0.0], [0.24, 0.0, 0.0]])
     for k in np.flatnonzero(BODY.capsules["link"] == 7):
-        then = between_segments(placed(POSTURE + 1e-6 * free.velocity)[k], forearm, near)
-        assert then > between_segments(placed(POSTURE)[k], forearm, near)
+        distance_m = between_segments(placed(POSTURE + 1e-6 * free.velocity)[k], forearm, near)
+        assert distance_m > between_segments(placed(POSTURE)[k], forearm, near)
     if hand_speed < 1.0:
-        assert (kept.separated, kept.velocity.tobytes()) == (False, free.velocity.tobytes())
+        assert (guarded.separated, guarded.velocity.tobytes()) == (False, free.velocity.tobytes())
     else:
-        assert kept.separated
-        assert (here.tasks[:3] @ kept.velocity)[0] < 0.8 * (here.tasks[:3] @ free.velocity)[0]
+        assert guarded.separated
+        assert (pose.tasks[:3] @ guarded.velocity)[0] < 0.8 * (pose.tasks[:3] @ free.velocity)[0]
 
 
 def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
     """The tool alone may touch the hand that receives gently."""
-    apart = Separation(ASSUMED, URDF)
-    apart.set_contacts(taught.via_points)
-    here = ARM.at(POSTURE)
+    separation = Separation(ASSUMED, URDF)
+    separation.set_contacts(taught.via_points)
+    pose = ARM.at(POSTURE)
     tool = BODY.capsules["link"] == 7
-    for off, gentle in ((0.0, True), (0.1, False)):
+    for offset_m, gentle in ((0.0, True), (0.1, False)):
         state = with_hands(Scene().handover, Scene().right_start)
-        state["hands"][:, 0, 2] += off
-        apart.step(state, FRAME, here.record)
-        limits = sorted(set(apart.constraints["planned"][: apart.count].round(6).tolist()))
+        state["hands"][:, 0, 2] += offset_m
+        separation.step(state, FRAME, pose.record)
+        limits = sorted(set(separation.constraints["planned"][: separation.count].round(6).tolist()))
         assert tool.sum() == 1
         assert all(limit >= 0 for limit in limits)
-        state["hands"][0, 0] = here.position  # the hand is at the tool: only where it receives it may be touched
+        state["hands"][0, 0] = pose.position  # the hand is at the tool: only where it receives it may be touched
         if gentle:
             place, *others = taught.via_points
-            apart.set_contacts([msgspec.structs.replace(place, left=tuple(here.position.tolist())), *others])
-        apart.step(state, FRAME, here.record)
-        allowed = apart.constraints["allowed"][: apart.count] - SLIP_SPEED_MPS
+            separation.set_contacts([msgspec.structs.replace(place, left=tuple(pose.position.tolist())), *others])
+        separation.step(state, FRAME, pose.record)
+        allowed = separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
-        state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, here.position  # the other hand receives nothing
-        apart.step(state, FRAME, here.record)
-        assert not (abs(apart.constraints["allowed"][: apart.count] - SLIP_SPEED_MPS - 0.25) < 1e-9).any()
-        state["hands"][0, 0], state["hands"][1, 0] = here.position, Scene().right_start
-        apart.step(state, FRAME, here.record)
-        assert apart.speed_limit == 0.0  # no other part may come nearer
+        state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, pose.position  # the other hand receives nothing
+        separation.step(state, FRAME, pose.record)
+        assert not (abs(separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS - 0.25) < 1e-9).any()
+        state["hands"][0, 0], state["hands"][1, 0] = pose.position, Scene().right_start
+        separation.step(state, FRAME, pose.record)
+        assert separation.speed_limit == 0.0  # no other part may come nearer
 
 
 def test_a_hand_just_seen_counts_as_fast() -> None:
-    apart, here = Separation(ASSUMED, URDF), ARM.at(POSTURE)
-    state = with_hands(np.add(here.position, (0.25, 0.0, 0.0)))
+    separation, pose = Separation(ASSUMED, URDF), ARM.at(POSTURE)
+    state = with_hands(np.add(pose.position, (0.25, 0.0, 0.0)))
     state["mode_probabilities"] = 1 / 3
-    apart.step(state, FRAME, here.record)
-    known = apart.speed_limit
+    separation.step(state, FRAME, pose.record)
+    limit_mps = separation.speed_limit
     state["mode_covariances"][0, :, 1, 1] = 0.3**2
-    apart.step(state, FRAME, here.record)
-    assert apart.speed_limit == pytest.approx(allowed_speed(apart.nearest_m, 1.6, 3.0, 0.13, 0.03))
-    assert apart.speed_limit < 0.5 * known
+    separation.step(state, FRAME, pose.record)
+    assert separation.speed_limit == pytest.approx(allowed_speed(separation.nearest_m, 1.6, 3.0, 0.13, 0.03))
+    assert separation.speed_limit < 0.5 * limit_mps
 
 
 def test_braking_joints_do_not_take_turns() -> None:
@@ -369,9 +369,9 @@ def test_braking_joints_do_not_take_turns() -> None:
     separation.constraints["row"][0] = row = np.array([-0.5, 0.03, -0.48, -0.1, 0.12, 0.06, -0.01])
     separation.constraints["planned"][0], separation.constraints["allowed"][0] = 0.0, 0.006
     separation.count = 1
-    wanted, approach = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1]), []
+    target, approach = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1]), []
     for _ in range(100):
-        segment.step(state, frame, wanted, np.zeros(7), separation)
+        segment.step(state, frame, target, np.zeros(7), separation)
         approach.append(row @ state["joints"][1])
     assert max(approach) < 0.05
     assert max(approach[50:]) <= 0.006

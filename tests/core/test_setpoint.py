@@ -144,16 +144,16 @@ def test_returns_into_the_workspace() -> None:
     start = at_rest((0.05, 0.9, 0.02))
     targets = [at_rest(MIDDLE)] * 1500
     states, _ = driven(targets, start=start)
-    off = np.maximum(BOX[0] - states[:, 0], 0.0) + np.maximum(states[:, 0] - BOX[1], 0.0)
-    assert (np.diff(off, axis=0) <= 1e-9).all()
+    outside_m = np.maximum(BOX[0] - states[:, 0], 0.0) + np.maximum(states[:, 0] - BOX[1], 0.0)
+    assert (np.diff(outside_m, axis=0) <= 1e-9).all()
     np.testing.assert_allclose(states[-1, 0], MIDDLE, atol=1e-4)
 
 
 def test_state_beyond_limits_is_braked() -> None:
     """A state beyond every limit is braked."""
     fast = np.array([MIDDLE, (2.0, -2.0, 0.0), (3.0, 0.0, -3.0)])
-    states, said = driven([at_rest(MIDDLE)] * 2500, start=fast)
-    assert said[0]
+    states, flags = driven([at_rest(MIDDLE)] * 2500, start=fast)
+    assert flags[0]
     assert np.linalg.norm(states[400:, 1], axis=1).max() <= TOOL.max_speed + 1e-9
     np.testing.assert_allclose(states[-1, 0], MIDDLE, atol=1e-3)
 
@@ -162,13 +162,13 @@ def test_slow_joints_slow_it_on_its_way() -> None:
     """Joints that cannot follow slow it down on its way."""
     costs = np.zeros((3, 3, 7))
     costs[0, 1, 2] = 1 / 0.1  # a joint that moves the tool along y by 0.1 m/s at most
-    way = np.array([0.1, 0.3, 0.0])
-    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + way)] * 3000, costs=costs)
+    offset_m = np.array([0.1, 0.3, 0.0])
+    states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + offset_m)] * 3000, costs=costs)
     assert np.abs(states[:, 1, 1]).max() <= 0.1 + 1e-3
-    along = way / np.linalg.norm(way)
+    along = offset_m / np.linalg.norm(offset_m)
     aside = (states[:, 0] - MIDDLE) - np.outer((states[:, 0] - MIDDLE) @ along, along)
     assert np.linalg.norm(aside, axis=1).max() < 0.002
-    np.testing.assert_allclose(states[-1, 0], MIDDLE + way, atol=1e-3)
+    np.testing.assert_allclose(states[-1, 0], MIDDLE + offset_m, atol=1e-3)
 
 
 def test_broken_bound_is_named() -> None:
@@ -176,10 +176,10 @@ def test_broken_bound_is_named() -> None:
     generator, state = SetpointGenerator(Settings()), blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     before = state["setpoint"].copy()
-    for what, row, value in (("speed", 1, 0.9), ("acceleration", 2, 10.1), ("jerk", 2, 1.0), ("position", 0, 9.0)):
+    for bound, row, value in (("speed", 1, 0.9), ("acceleration", 2, 10.1), ("jerk", 2, 1.0), ("position", 0, 9.0)):
         state["setpoint"] = before
         state["setpoint"][row, 0] = value
-        assert generator.name_of_broken_bound(state, before, BOX) == what
+        assert generator.name_of_broken_bound(state, before, BOX) == bound
     state["setpoint"][0, 0] = np.nan
     assert generator.name_of_broken_bound(state, before, BOX) == "not finite"
 

@@ -47,8 +47,8 @@ def test_no_part_is_faster_than_its_bound(cell: Settings) -> None:
     for _ in range(300):
         q = rng.uniform(cell.joints.lower, cell.joints.upper)
         velocity = np.array(cell.joints.velocity) * rng.choice([-1.0, 1.0], len(q))
-        for out, at in zip(ends, (q, q + 1e-6 * velocity), strict=True):
-            place(at, body.frames, body.axes, body.capsules, out)
+        for out, posture in zip(ends, (q, q + 1e-6 * velocity), strict=True):
+            place(posture, body.frames, body.axes, body.capsules, out)
         speed = np.linalg.norm(ends[1] - ends[0], axis=2).max(axis=1) / 1e-6
         assert (speed <= body.capsules["max_speed"] * (1 + 1e-4)).all()
 
@@ -57,11 +57,11 @@ def test_rail_follows_within_limits_and_replays(cell: Settings, skill: Skill, tm
     """It follows with every limit held and replays."""
     loop = Loop(cell, skill)
     loop.hands = script_hands(HandScript(Scene(), seed=3))
-    seen = loop.run(3500)
-    assert (seen["mode"][1000:] == Mode.FOLLOW).all()
-    assert np.ptp(seen["joints"][seen["commanded"] != 0], axis=0)[0] > 0.05, "the rail is not used"
-    assert_limits_hold(seen, cell)
-    off_mm = 1000 * np.linalg.norm(seen["tool"] - seen["setpoint"], axis=1)[1000:]
+    frames = loop.run(3500)
+    assert (frames["mode"][1000:] == Mode.FOLLOW).all()
+    assert np.ptp(frames["joints"][frames["commanded"] != 0], axis=0)[0] > 0.05, "the rail is not used"
+    assert_limits_hold(frames, cell)
+    off_mm = 1000 * np.linalg.norm(frames["tool"] - frames["setpoint"], axis=1)[1000:]
     assert np.sqrt(np.mean(off_mm**2)) < 1.0, off_mm.max()
     assert_replays(tmp_path / "a.mcap", cell, skill, loop.steps)
 
@@ -82,14 +82,14 @@ def test_rail_outside_limits_returns(cell: Settings, skill: Skill, rail_m: float
     loop = Loop(cell, skill, (rail_m, *cell.arm.posture[1:]))
     loop.hands = None
     loop.reports = lambda q, dq: (q, 0.0 * dq)
-    seen = loop.run(1500)
+    frames = loop.run(1500)
     if cause is None:
-        assert not seen["rejected"][-1].any()
+        assert not frames["rejected"][-1].any()
         assert loop.joints[0] <= 0.3
-        assert np.abs(seen["joint_velocities"][seen["commanded"] != 0]).max() <= 0.06
+        assert np.abs(frames["joint_velocities"][frames["commanded"] != 0]).max() <= 0.06
     else:
-        assert not seen["commanded"].any()
-        assert int(seen["rejected"][-1][cause]) == 1500
+        assert not frames["commanded"].any()
+        assert int(frames["rejected"][-1][cause]) == 1500
 
 
 def test_joints_beyond_plate_change_nothing(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_joints_beyond_plate_change_nothing(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         cells.append(cell_in(tmp_path / name, urdf))
     assert cells[0].joints == cells[1].joints
-    arms = [Arm(one, robot_description(one)) for one in cells]
+    arms = [Arm(variant, robot_description(variant)) for variant in cells]
     q = np.array(cells[0].arm.posture) + 0.1
     np.testing.assert_array_equal(arms[0].at(q).jacobian, arms[1].at(q).jacobian)
     assert len(body_of(cells[1], robot_description(cells[1])).capsules) > 5

@@ -47,28 +47,28 @@ def legs(*ends: float) -> np.ndarray:
     """From end to end in a second each, with a second of rest at each."""
     smooth = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 100))
     parts = [np.full(100, ends[0])]
-    for here, there in itertools.pairwise(ends):
-        parts += [here + (there - here) * smooth, np.full(100, there)]
+    for begin, end in itertools.pairwise(ends):
+        parts += [begin + (end - begin) * smooth, np.full(100, end)]
     return np.concatenate(parts)
 
 
 def beliefs(segments: np.ndarray, x: np.ndarray) -> np.ndarray:
     belief, out = np.zeros(MOST_SEGMENTS), []
-    for one in motion(x):
-        recognise(belief, one, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
+    for moving in motion(x):
+        recognise(belief, moving, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
         out.append(belief.copy())
     return np.array(out)
 
 
 def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
     """The past distinguishes repeated visits of a place."""
-    found = beliefs(there_and_back, legs(0.5, 0.9, 0.5, 0.9, 0.5))
-    assert np.abs(found.sum(axis=1) - 1.0).max() < 1e-6
+    history = beliefs(there_and_back, legs(0.5, 0.9, 0.5, 0.9, 0.5))
+    assert np.abs(history.sum(axis=1) - 1.0).max() < 1e-6
     for leg in range(4):
         half = 100 + 200 * leg + 50
-        assert found[half].argmax() == leg
-        assert found[half, leg] > 0.8
-    ends = found[-1]
+        assert history[half].argmax() == leg
+        assert history[half, leg] > 0.8
+    ends = history[-1]
     assert ends[3] > 0.7
 
 
@@ -78,9 +78,9 @@ def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
     segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
     belief = np.zeros(MOST_SEGMENTS)
     belief[0] = 1.0
-    for one in motion(np.full(100, 0.7)):
-        one[0, 1] = 0.4
-        recognise(belief, one, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
+    for moving in motion(np.full(100, 0.7)):
+        moving[0, 1] = 0.4
+        recognise(belief, moving, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
     assert belief[3] > 0.8
 
 
@@ -99,14 +99,14 @@ def test_hands_are_delayed_as_learned() -> None:
     times = np.arange(0.0, 4.0, PERIOD_S)
     hands = np.tile(0.2 * np.sin(times)[:, None], (1, 6))
     rows = along(hands, PERIOD_S, 0.3 / 4, 4)
-    out, at = np.empty((3, 6)), 350
-    moving = np.stack([hands[at], np.gradient(hands, PERIOD_S, axis=0)[at], -hands[at]])
-    behind = np.ascontiguousarray(rows[at])
+    out, index = np.empty((3, 6)), 350
+    moving = np.stack([hands[index], np.gradient(hands, PERIOD_S, axis=0)[index], -hands[index]])
+    behind = np.ascontiguousarray(rows[index])
     delayed(moving, behind, 0.3, out)
-    then = times[at] - 0.3
-    np.testing.assert_allclose(out[:, 0], [0.2 * np.sin(then), 0.2 * np.cos(then), -0.2 * np.sin(then)], atol=0.01)
+    time_s = times[index] - 0.3
+    np.testing.assert_allclose(out[:, 0], [0.2 * np.sin(time_s), 0.2 * np.cos(time_s), -0.2 * np.sin(time_s)], atol=0.01)
     delayed(moving, behind, -0.1, out)
-    assert out[0, 0] == pytest.approx(0.2 * np.sin(times[at] + 0.1), abs=0.002)
+    assert out[0, 0] == pytest.approx(0.2 * np.sin(times[index] + 0.1), abs=0.002)
 
 
 def test_segment_is_set_kept_and_reset() -> None:
@@ -119,8 +119,8 @@ def test_segment_is_set_kept_and_reset() -> None:
     assert state["segment_belief"].argmax() == skill.model.names.index("glass")
     segment.adopt(state, skill)
     assert state["segment_belief"].max() == 1.0
-    another = segment_less(skill)
-    segment.adopt(state, another)
+    plain = segment_less(skill)
+    segment.adopt(state, plain)
     assert not state["segment_belief"].any()
 
 

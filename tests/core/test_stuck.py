@@ -84,10 +84,10 @@ def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) 
     for number, start in enumerate(free_postures(cell, MANY, seed)):
         ran = session(cell, taught, start, hands[random.integers(len(hands))])
         last = ran.steps[-1][1]
-        said = last["flags"] & Flag.STUCK or last["reason"] == Reason.BLOCKED
+        is_reported = last["flags"] & Flag.STUCK or last["reason"] == Reason.BLOCKED
         if ran.there_s is None:
             late.append(number)
-            assert said or last["flags"] & Flag.SEPARATION, f"start {number}: not there, and nothing said"
+            assert is_reported or last["flags"] & Flag.SEPARATION, f"start {number}: not there, and nothing said"
     assert len(late) <= MANY // 50, late
 
 

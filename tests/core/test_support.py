@@ -34,8 +34,8 @@ def errors() -> LocalErrors:
         lambda_mean=1.0,
     )
     inputs = np.concatenate([np.zeros((20, 2)), np.ones((20, 2))])
-    off = np.concatenate([np.tile([0.02, 0.0, 0.0], (20, 1)), np.tile([0.0, 0.05, 0.0], (20, 1))])
-    return LocalErrors.of(primitive, inputs, off, FAR_STD_M)
+    errors_m = np.concatenate([np.tile([0.02, 0.0, 0.0], (20, 1)), np.tile([0.0, 0.05, 0.0], (20, 1))])
+    return LocalErrors.of(primitive, inputs, errors_m, FAR_STD_M)
 
 
 def test_covariance_is_scatter_of_near_errors(errors: LocalErrors) -> None:
@@ -59,10 +59,10 @@ def test_error_probability_follows_levels() -> None:
     at_levels = [error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios]
     np.testing.assert_allclose(at_levels, 1.0 - np.array(LEVELS), atol=1e-6)
     stds = np.geomspace(0.005, 3.0, 60)
-    found = [error_probability(std**2 * np.eye(3), 0.0, ratios) for std in stds]
-    assert (np.diff(found) >= 0.0).all()
-    assert found[0] < 1e-4
-    assert found[-1] > 0.99
+    probabilities = [error_probability(std**2 * np.eye(3), 0.0, ratios) for std in stds]
+    assert (np.diff(probabilities) >= 0.0).all()
+    assert probabilities[0] < 1e-4
+    assert probabilities[-1] > 0.99
     drawn = np.linalg.norm(0.05 * np.random.default_rng(2).normal(size=(20_000, 3)), axis=1) > UNSURE_M
     assert error_probability(0.05**2 * np.eye(3), 0.0, ratios) == pytest.approx(drawn.mean(), abs=0.02)
     assert error_probability(0.05**2 * np.eye(3), 0.0075, ratios) == error_probability(0.005 * np.eye(3), 0.0, ratios)
@@ -79,23 +79,23 @@ def test_unshown_places_are_uncertain() -> None:
     """Between via-points, the prediction is uncertain where nothing was demonstrated or no place is
     given.
     """
-    known = segmented(unknown=None)
-    count = len(known.names)
+    certain = segmented(unknown=None)
+    count = len(certain.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
     model = segmented(unknown=Unknown(FAR_STD_M, scatters))
-    at_last, last = known.hands[-1:], known.names[-1:]
+    at_last, last = certain.hands[-1:], certain.names[-1:]
 
     def covariance(one: SegmentedKMP, hands: np.ndarray) -> np.ndarray:
         belief = np.zeros(64)
         belief[count - 2] = 1.0
         return one.placed.covariance(hands[0], belief)
 
-    given = model.through(Scene().via_points()[-1:], tolerance=0.05, weight=1.0)
-    assert given.via_points[0].name == last[0]
-    added = covariance(model, at_last) - covariance(known, at_last)
+    taught = model.through(Scene().via_points()[-1:], tolerance=0.05, weight=1.0)
+    assert taught.via_points[0].name == last[0]
+    added = covariance(model, at_last) - covariance(certain, at_last)
     assert np.diag(added) == pytest.approx([0.02, 0.03, 0.01], rel=0.2)
-    assert np.abs(covariance(given, at_last) - covariance(known, at_last)).max() < 2e-3
-    few = segmented(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=known.errors[known.errors[:, 2] < 0.5])
+    assert np.abs(covariance(taught, at_last) - covariance(certain, at_last)).max() < 2e-3
+    few = segmented(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=certain.errors[certain.errors[:, 2] < 0.5])
     alone = segmented(errors=few.errors, unknown=None)
     assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this segment"
 
@@ -107,13 +107,13 @@ def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], li
     segment, state = SkillStage(settings, skill), start_state(settings, skill)
     frame = blank(frame_layout(len(settings.joints.names)))
     state["hands"][:, 0], state["hand_stillness"] = hands, 1.0
-    found, unsure = [], []
+    probabilities, unsure = [], []
     for tick in range(1, ticks + 1):
         state["tick"], state["hand_ticks"] = tick, tick
         segment.step(state, frame)
-        found.append(float(frame["error_probability"]))
+        probabilities.append(float(frame["error_probability"]))
         unsure.append(bool(state["unsure"]))
-    return found, unsure, float(state["unprimed_belief"][0])
+    return probabilities, unsure, float(state["unprimed_belief"][0])
 
 
 def test_possible_other_segment_is_unsure() -> None:
@@ -121,14 +121,14 @@ def test_possible_other_segment_is_unsure() -> None:
     shipped = shipped_skill()
     regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
     model = segmented()
-    begin, at = model.hands[0].reshape(2, 3), model.nominal.at.copy()
-    at[2, :6] = model.hands[0]  # the hands return to where they began, and the tool is elsewhere then
-    at[2, 6:] = at[0, 6:] + (0.0, 0.3, 0.0)
-    apart = model.task._replace(corners=np.tile(np.arange(len(at))[:, None], 2))
-    again = replace(model, task=apart, nominal=model.nominal._replace(at=at))
-    alike = replace(shipped, model=again, regions=regions)
-    told, unsure, _ = doubts(alike, begin, 5)
-    assert told[-1] > 0.3
+    begin, places = model.hands[0].reshape(2, 3), model.nominal.at.copy()
+    places[2, :6] = model.hands[0]  # the hands return to where they began, and the tool is elsewhere then
+    places[2, 6:] = places[0, 6:] + (0.0, 0.3, 0.0)
+    task = model.task._replace(corners=np.tile(np.arange(len(places))[:, None], 2))
+    variant = replace(model, task=task, nominal=model.nominal._replace(at=places))
+    alike = replace(shipped, model=variant, regions=regions)
+    probabilities, unsure, _ = doubts(alike, begin, 5)
+    assert probabilities[-1] > 0.3
     assert unsure[-1]
     _, unsure, decided = doubts(replace(shipped, regions=regions), begin, 600)
     assert decided == UNPRIMED_DECIDED

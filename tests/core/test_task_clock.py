@@ -40,9 +40,9 @@ PERIOD_S = 0.01
 def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S) -> np.ndarray:
     """The clock (T, CLOCK_SIZE) while the hands move or rest for these times at these positions."""
     state, out = np.zeros(CLOCK_SIZE), []
-    for what, lasts_s, hands in parts:
+    for activity, lasts_s, hands in parts:
         for _ in range(round(lasts_s / period_s)):
-            moves = what == "move"
+            moves = activity == "move"
             count(hands, 0.3 * moves, 1.0 - moves, period_s, 0, clock.numbers[None], state)
             out.append(state.copy())
     return np.array(out)
@@ -77,10 +77,10 @@ def test_clock_counts_from_first_motion(
 @pytest.mark.parametrize("clock", [RUNS, WAITS])
 def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
     """Its rate and change are its derivatives."""
-    found = along(clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3)
-    assert np.abs(np.diff(found[:, CLOCK_S]) / 1e-3 - found[1:, CLOCK_RATE]).max() < 1e-9
-    assert np.quantile(np.abs(np.diff(found[:, CLOCK_RATE]) / 1e-3 - found[:-1, CLOCK_CHANGE]), 0.99) < 0.1
-    assert found[:, REST_LEFT_S].min() >= 0.0
+    series = along(clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3)
+    assert np.abs(np.diff(series[:, CLOCK_S]) / 1e-3 - series[1:, CLOCK_RATE]).max() < 1e-9
+    assert np.quantile(np.abs(np.diff(series[:, CLOCK_RATE]) / 1e-3 - series[:-1, CLOCK_CHANGE]), 0.99) < 0.1
+    assert series[:, REST_LEFT_S].min() >= 0.0
 
 
 @pytest.mark.parametrize("rate_hz", [24, 100, 500])
@@ -88,9 +88,9 @@ def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
     """A clock is learned as it counts live, at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
     speeds, stillness = np.where(times > 1.0, 0.3, 0.0), np.where(times > 1.0, 0.0, 1.0)
-    shown = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])
+    expected_s = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])
     live = along(RUNS, ("rest", 1.0, AWAY), ("move", 3.0, AWAY), period_s=0.002)[:, CLOCK_S]
-    assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - shown).max() < 0.05
+    assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - expected_s).max() < 0.05
 
 
 def test_task_begins_again_once_in_a_rest() -> None:
@@ -143,14 +143,14 @@ def test_learn_takes_a_clock_for_a_timetable(
     kind_of_takes: Callable[..., list[Demonstration]], says: str, late_s: float, error_mm: float
 ) -> None:
     """Learn takes a clock for a timetable and for nothing else."""
-    shown = kind_of_takes(6, timetable=True)
-    skill = learn(shown)
+    demonstrations = kind_of_takes(6, timetable=True)
+    skill = learn(demonstrations)
     figures = figures_of(skill)
     back = decoded(skill.file, origin="again")
-    found = clock(skill)
-    assert found is not None
-    assert not found.waits
-    assert clock(back) == found
+    task_clock = clock(skill)
+    assert task_clock is not None
+    assert not task_clock.waits
+    assert clock(back) == task_clock
     assert clock(learn(kind_of_takes(6, timetable=False))) is None
     assert figures.taken.endswith("and a clock")
     assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
@@ -158,11 +158,11 @@ def test_learn_takes_a_clock_for_a_timetable(
     assert any(says in text for text in figures.warnings)
 
     def at(one: StoredSkill, clock_s: float) -> Prediction:
-        return at_rest(one, shown[0].hands[-1], clock=np.array([clock_s, 1.0, 0.0]))
+        return at_rest(one, demonstrations[0].hands[-1], clock=np.array([clock_s, 1.0, 0.0]))
 
     late = at(skill, late_s)
     np.testing.assert_array_equal(late.position, at(back, late_s).position)
-    assert 1000.0 * np.linalg.norm(late.position - shown[0].tool[-1, :3]) < error_mm
+    assert 1000.0 * np.linalg.norm(late.position - demonstrations[0].tool[-1, :3]) < error_mm
     assert np.linalg.norm(late.position - at(skill, 3.0).position) > 0.2
     behind, moving, ahead = (at(skill, 4.8 + step_s) for step_s in (-0.02, 0.0, 0.02))
     np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
@@ -175,11 +175,11 @@ def test_every_round_is_predicted_as_the_first(kind: str) -> None:
     skill, asked = learned(kind)
     take = left_out("asked", "", asked)
     rounds = [*predicted_rounds(skill, take), *predicted_rounds(skill, take, broken_share=0.5)]
-    first, *others = [judged(take, said) for said in rounds]
+    first, *others = [judged(take, prediction) for prediction in rounds]
     first_mm = 1e3 * np.sqrt(first.squares / first.samples)
-    for again in others:
-        assert 1e3 * np.sqrt(again.squares / again.samples) < max(1.1 * first_mm, first_mm + 2.0)
-        assert (again.held or 0) - (first.held or 0) <= 0.03 * first.samples
+    for later in others:
+        assert 1e3 * np.sqrt(later.squares / later.samples) < max(1.1 * first_mm, first_mm + 2.0)
+        assert (later.held or 0) - (first.held or 0) <= 0.03 * first.samples
 
 
 def test_each_segment_restarts_the_clock() -> None:

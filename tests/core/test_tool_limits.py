@@ -28,25 +28,25 @@ def test_limit_uses_all_that_is_planned(name: str) -> None:
         q = np.array(settings.arm.posture) + random.uniform(-0.2, 0.2, len(settings.joints.names))
         u = random.normal(size=3)
         u /= np.linalg.norm(u)
-        found, least = tool_limits(arm, quick, q[None], u[None]), tool_limits(arm, quick, q[None])
-        here = arm.at(q)
+        directed, least = tool_limits(arm, quick, q[None], u[None]), tool_limits(arm, quick, q[None])
+        pose = arm.at(q)
         for order, (kind, value, joint) in enumerate(
             (
-                ("velocity", found.speed, found.speed_joint),
-                ("acceleration", found.acceleration, found.acceleration_joint),
+                ("velocity", directed.speed, directed.speed_joint),
+                ("acceleration", directed.acceleration, directed.acceleration_joint),
             )
         ):
             limits = np.array(getattr(settings.joints, kind))
             weights = limits / limits.mean()
-            jacobian = here.tasks[:3] * weights
+            jacobian = pose.tasks[:3] * weights
             moved = weights * (
-                jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + here.damping * np.eye(3), value * u)
+                jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + pose.damping * np.eye(3), value * u)
             )
             shares = np.abs(moved) / limits
             assert shares.max() == pytest.approx(PLANNED_LIMIT_SHARES[order], rel=0.01)
             assert settings.joints.names[int(shares.argmax())] == joint
-        assert least.speed <= found.speed + 1e-3
-        assert least.acceleration <= found.acceleration + 1e-2
+        assert least.speed <= directed.speed + 1e-3
+        assert least.acceleration <= directed.acceleration + 1e-2
 
 
 def test_frame_meets_its_binding_limit() -> None:

@@ -36,8 +36,8 @@ def test_clamped_target_is_reachable(p: Vector, v: Vector, a: Vector) -> None:
     if not clamped:
         assert np.array_equal([position, velocity, acceleration], [p, v, a])
         return
-    again, _, _, _ = clamp(position, v, a, box=EVERYWHERE, reach=REACH)
-    assert again == pytest.approx(position, abs=1e-9)
+    reclamped, _, _, _ = clamp(position, v, a, box=EVERYWHERE, reach=REACH)
+    assert reclamped == pytest.approx(position, abs=1e-9)
     if abs(distance - REACH.outer) < 1e-9 and math.dist(p, REACH.centre) > REACH.outer:
         assert from_shoulder @ velocity <= 1e-6 * (1 + np.linalg.norm(velocity))
 
@@ -59,8 +59,8 @@ def test_clamping_keeps_motion_along_the_boundary() -> None:
 def test_target_stays_at_a_side_of_the_box() -> None:
     """A target outside the box stays at its side and moves along it."""
     box = np.array([[0.3, -0.4, 0.1], [0.7, 0.4, 0.5]])
-    given, velocity = np.array([0.5, 0.6, 0.3]), np.array([0.1, 0.2, 0.3])
-    position, moving, _, clamped = clamp(given, velocity, velocity, box=box, reach=REACH)
+    target, velocity = np.array([0.5, 0.6, 0.3]), np.array([0.1, 0.2, 0.3])
+    position, moving, _, clamped = clamp(target, velocity, velocity, box=box, reach=REACH)
     assert clamped
     assert position.tolist() == [0.5, 0.4, 0.3]
     assert moving.tolist() == [0.1, 0.0, 0.3]

@@ -106,11 +106,11 @@ def test_sleep_ends_before_the_deadline_and_spinning_reaches_it() -> None:
 
 def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
     """What so many deadlines are stamped with."""
-    found = []
+    stamps_ns = []
     for _ in range(count):
         deadlines.wait()
-        found.append(deadlines.stamp_ns)
-    return found
+        stamps_ns.append(deadlines.stamp_ns)
+    return stamps_ns
 
 
 def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None:
@@ -179,12 +179,12 @@ def test_a_machine_that_was_suspended_has_missed_nothing_and_its_stamps_follow_a
 def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str) -> None:
     clock = FakeClock()
     system = SystemClock(now_ns=clock.now_ns, wall_ns=clock.wall_ns)
-    said = []
+    reports = []
     for k in range(100):
         clock.now += 100_000_000
         clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000  # slewed by 500 parts in a million
-        said.append(system.set_by())
-    assert [(k, text) for k, text in enumerate(said) if text] == [(50, words)]
+        reports.append(system.set_by())
+    assert [(k, text) for k, text in enumerate(reports) if text] == [(50, words)]
 
 
 def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -> None:
@@ -215,15 +215,15 @@ def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(monk
     clock.now -= BESIDE_NS  # as before the end of its sleep
     deadlines.between_ticks()  # returns at once
     clock.now += 1
-    beside = threading.Thread(target=deadlines.between_ticks, daemon=True)
-    beside.start()
-    beside.join(0.1)
-    assert beside.is_alive()
+    thread = threading.Thread(target=deadlines.between_ticks, daemon=True)
+    thread.start()
+    thread.join(0.1)
+    assert thread.is_alive()
     clock.now += BESIDE_NS
     for _ in range(100):
         deadlines.wait()  # the tick has ended
-        beside.join(0.1)
-    assert not beside.is_alive()
+        thread.join(0.1)
+    assert not thread.is_alive()
 
 
 def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:

@@ -91,7 +91,7 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     assert first.correction is not None
     assert (first.correction.name, first.correction.segment) == ("correction-1", ("start", "handover"))
     assert held.kinds()[-2:] == ["skill", "segment"]  # the segment of the hold, whatever the hand did that led
-    one = held.client.places()
+    first_places = held.client.places()
     held.state["measured"][0] += 0.1
     second = held.client.correct()
     assert second.correction is not None
@@ -101,7 +101,7 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     undone = held.client.undo_correction().correction
     assert undone is not None
     assert (undone.name, undone.undone) == ("correction-2", True)
-    assert held.client.places() == one
+    assert held.client.places() == first_places
     held.client.undo_correction()
     assert [point.name for point in held.client.places()] == [point.name for point in PLACES]
     with pytest.raises(RefusedError, match="no correction is in force"):

@@ -116,9 +116,9 @@ def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Pa
     assert max(len(stamps) for stamps in came) <= 4
     taken = [stamp_ns for stamps in came for stamp_ns in stamps]
     for burst in sent:
-        at = taken.index(burst[-1]) + 1
+        end = taken.index(burst[-1]) + 1
         if len(burst) <= 4:
-            assert taken[at - len(burst) : at] == burst
+            assert taken[end - len(burst) : end] == burst
 
 
 def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
@@ -129,10 +129,10 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         assert daemon.end() == 0
         assert "earlier run" not in daemon.log.read_text()
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        (said,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
+        (log_line,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
         (file,) = (tmp_path / "state").rglob("places-*.json")
-        assert f"via-points of an earlier run are in force (1): handover. They are saved in {file}; " in said
-        assert "`thirdhand via-points remove NAME` removes one" in said
+        assert f"via-points of an earlier run are in force (1): handover. They are saved in {file}; " in log_line
+        assert "`thirdhand via-points remove NAME` removes one" in log_line
         assert daemon.client.status().places == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]
@@ -158,27 +158,27 @@ def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_
 
 
 def test_the_commands_of_a_client(shared_daemon: Any) -> None:
-    at = ("--connect", shared_daemon.endpoint)
-    assert thirdhand("hold", *at).returncode == 0
-    status = told("status", *at)
+    connect = ("--connect", shared_daemon.endpoint)
+    assert thirdhand("hold", *connect).returncode == 0
+    status = told("status", *connect)
     assert status.returncode == 0
     assert "hold (operator)" in status.stdout or "hold (no_hands)" in status.stdout
-    assert "resume in force since tick" in told("resume", *at).stdout
-    reset = told("reset", *at)
+    assert "resume in force since tick" in told("resume", *connect).stdout
+    reset = told("reset", *connect)
     assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
     place = ("--left", ".62", "-.28", ".3", "--right", ".98", ".32", ".06", "--tool", ".62", "-.28", ".3")
-    added = succeeded("via-points", "add", "my place", *place, *at)
+    added = succeeded("via-points", "add", "my place", *place, *connect)
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
-    again = told("via-points", "add", "my place", *place, *at)
-    assert (again.returncode, again.stdout.endswith("replaced, because a via-point had the same name: my place\n")) == (
+    repeated = told("via-points", "add", "my place", *place, *connect)
+    assert (repeated.returncode, repeated.stdout.endswith("replaced, because a via-point had the same name: my place\n")) == (
         0,
         True,
     )
-    assert "1 via-point in force" in told("via-points", "list", *at).stdout
-    assert_refused(1, "in force: my place", "via-points", "remove", "other", *at)
-    succeeded("via-points", "clear", *at)
-    carried = json.loads(told("status", "--json", *at).stdout)
+    assert "1 via-point in force" in told("via-points", "list", *connect).stdout
+    assert_refused(1, "in force: my place", "via-points", "remove", "other", *connect)
+    succeeded("via-points", "clear", *connect)
+    carried = json.loads(told("status", "--json", *connect).stdout)
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
 
 
@@ -190,8 +190,8 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
-    said = capsys.readouterr().err
-    assert re.search(r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", said)
+    error_text = capsys.readouterr().err
+    assert re.search(r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", error_text)
     shared_daemon.client.ask("hold")
     with Tracker(shared_daemon.session):
         status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
@@ -212,11 +212,11 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
 def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
     settings, urdf = Settings(), robot_description(Settings())
     controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
-    tool, wanted = MeasuredArm(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
+    tool, expected_m = MeasuredArm(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
     assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))
-    np.testing.assert_allclose(tool.position(controller.state), wanted, atol=1e-4)
+    np.testing.assert_allclose(tool.position(controller.state), expected_m, atol=1e-4)
     controller.step(Tick(200))
     assert tool.position(controller.state) is None
 
@@ -225,8 +225,8 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        at = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = thirdhand("serve", "--listen", at, "--joints", "assumed", env=os.environ | {"HOME": str(tmp_path)})
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = thirdhand("serve", "--listen", endpoint, "--joints", "assumed", env=os.environ | {"HOME": str(tmp_path)})
     assert done.returncode == 1
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
 

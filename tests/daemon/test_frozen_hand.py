@@ -22,8 +22,8 @@ def refused(positions: Vector, rate_hz: float, *, unit_m: float = 1.0) -> Vector
     hand = FrozenHand()
     times = np.arange(len(positions)) / rate_hz
     poses = (
-        PoseStamped(10**18 + round(1e9 * at_s), "base", tuple((at / unit_m).tolist()), TURNED)
-        for at_s, at in zip(times, positions, strict=True)
+        PoseStamped(10**18 + round(1e9 * at_s), "base", tuple((position / unit_m).tolist()), TURNED)
+        for at_s, position in zip(times, positions, strict=True)
     )
     return times[[hand.is_frozen(pose) for pose in poses]]
 
@@ -38,8 +38,8 @@ def measured(seconds: float, rate_hz: float, at: tuple[float, ...] = LEFT, seed:
 def test_each_loss_of_a_tracked_hand_is_noticed_after_half_a_second(rate_hz: float, unit_m: float) -> None:
     lost = round(2.0 * rate_hz)
     for default in (None, (0.25, -0.25, 0.1)):  # the last pose again and again, or one of the tracker's own
-        seen = measured(3.0, rate_hz)
-        pieces = [seen, np.tile(seen[-1] if default is None else default, (lost, 1))]
+        tracked = measured(3.0, rate_hz)
+        pieces = [tracked, np.tile(tracked[-1] if default is None else default, (lost, 1))]
         pieces += [measured(3.0, rate_hz, (0.8, -0.1, 0.2), 1)]
         pieces += [np.tile(pieces[-1][-1], (lost, 1)), measured(1.0, rate_hz, LEFT, 2)]
         times = refused(np.concatenate(pieces), rate_hz, unit_m=unit_m)

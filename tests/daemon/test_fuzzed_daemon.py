@@ -45,8 +45,8 @@ def test_a_daemon_under_spoilt_bytes_keeps_every_bound(tmp_path: Path) -> None:
         commands.undeclare()
         assert daemon.end() == 0
     (path,) = (tmp_path / "recorded").glob("*.mcap")
-    seen = assert_recorded_session_keeps_the_bounds(path)
+    frames = assert_recorded_session_keeps_the_bounds(path)
     assert sum(status.rejected.values()) > 20, status
     assert answers.count(False) > 0, "of the spoilt requests none was refused"
-    followed = (seen["mode"] == Mode.FOLLOW).sum() * Settings().period_s
+    followed = (frames["mode"] == Mode.FOLLOW).sum() * Settings().period_s
     assert followed > 0.2 * QUIET_S

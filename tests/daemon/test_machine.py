@@ -51,14 +51,14 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
 
 
 def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
-    seen = Evidence(busy="the loop was up to 45 ms late")
+    evidence = Evidence(busy="the loop was up to 45 ms late")
     for reason in Reason:
-        blamed = explained(reason, seen).why.startswith("this machine was too busy, the loop was up to 45 ms late; ")
+        blamed = explained(reason, evidence).why.startswith("this machine was too busy, the loop was up to 45 ms late; ")
         assert blamed == (reason in (Reason.STALE_HAND, Reason.ARM_ERROR, Reason.ARM_SILENT))
-        assert blamed == ("see what else runs on this machine" in explained(reason, seen).what_to_do)
+        assert blamed == ("see what else runs on this machine" in explained(reason, evidence).what_to_do)
     refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'")
-    assert "busy" not in explained(Reason.STALE_HAND, seen._replace(sources={"left": refused})).why
+    assert "busy" not in explained(Reason.STALE_HAND, evidence._replace(sources={"left": refused})).why
     stale = Source(rate_hz=60.0, age_ms=130.0)
     for left, is_blamed in ((stale, True), (Source(rate_hz=60.0, age_ms=9.0, fresh=True), False)):
         sources = {"left": left, "right": stale}
-        assert ("busy" in explained(Reason.STALE_HAND, seen._replace(sources=sources)).why) == is_blamed
+        assert ("busy" in explained(Reason.STALE_HAND, evidence._replace(sources=sources)).why) == is_blamed

@@ -33,7 +33,7 @@ def test_malformed_messages_of_every_stream_are_counted_and_named(tmp_path: Path
         named = {SOURCES.get(key, key) for key in keys}
         for key, stream in status.streams.items():
             assert f"what arrives on {key} is malformed: {stream.refused}" in status.because
-        told = findings(before, status, own_ns=status.time_ns, own_version=status.version)
-        assert {one.what for one in told if "rejected as malformed: " in one.found} - {"mode"} == named
+        report = findings(before, status, own_ns=status.time_ns, own_version=status.version)
+        assert {finding.what for finding in report if "rejected as malformed: " in finding.found} - {"mode"} == named
     log = daemon.log.read_text(encoding="utf-8")
     assert all(f"{name}: rejected as malformed: " in log for name in named)

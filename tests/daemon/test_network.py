@@ -61,8 +61,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
     play = ["play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "50", "--connect", lab.endpoint]
     assert main([*play, "--cell", NAMES[1]]) == 0
-    assert "of the left hand, " in (said := capsys.readouterr().err)
-    assert "the daemon's loop received" in said
+    assert "of the left hand, " in (output := capsys.readouterr().err)
+    assert "the daemon's loop received" in output
     client = Client(lab.session, NAMES[1])
     status = client.status()
     assert status.received["hands/left"] > 3
@@ -99,7 +99,7 @@ def ros(lab: Lab) -> Iterator[dict[str, Any]]:
 
 
 def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, Any]) -> None:
-    cell, said = NAMES[4], list[Any]()
+    cell, modes = NAMES[4], list[Any]()
     commands, statuses = list[Any](), list[Any]()
     topics = {f"/{cell}/joints/command": ("sensor_msgs/msg/JointState", commands.append)}
     topics |= {f"/{cell}/status": ("std_msgs/msg/String", statuses.append)}
@@ -110,22 +110,22 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
     place, point, turn = (store[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Point", "Quaternion"))
 
     def follows() -> bool:
-        at = header(store, "base")
+        base_header = header(store, "base")
         for hand, (x, y, z) in zip(hands, (LEFT, RIGHT), strict=True):
             hand.publish(
-                header=at, pose=place(position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0))
+                header=base_header, pose=place(position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0))
             )
-        said[:] = [json.loads(status.data)["mode"] for status in statuses]
-        return "follow" in said
+        modes[:] = [json.loads(status.data)["mode"] for status in statuses]
+        return "follow" in modes
 
     until(follows)
-    for one in (*listening, *hands):
-        one.close()
+    for node in (*listening, *hands):
+        node.close()
     assert tuple(commands[-1].name) == JOINT_NAMES
     assert len(commands[-1].position) == len(commands[-1].velocity) == 7
-    own = Client(lab.session, cell).status()
-    assert own.received.keys() == {"hands/left", "hands/right", "objects"}
-    assert own.rejected.keys() <= {"repeated", "older", "ahead"}
+    final_status = Client(lab.session, cell).status()
+    assert final_status.received.keys() == {"hands/left", "hands/right", "objects"}
+    assert final_status.rejected.keys() <= {"repeated", "older", "ahead"}
 
 
 def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
@@ -159,9 +159,9 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
     with open_session(connect=[lab.endpoint], zenoh_config=file) as session:
         assert list(session.info.routers_zid())
         assert endpoints(session) == ()
-        one, came = Publisher(session, "cell", "hands/left"), []
+        publisher, came = Publisher(session, "cell", "hands/left"), []
         with lab.session.declare_subscriber("cell/hands/left", lambda sample: came.append(str(sample.key_expr))):
-            until(lambda: one.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0)))) or came)
+            until(lambda: publisher.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0)))) or came)
     assert set(came) == {"cell/hands/left"}  # and not elsewhere
     with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1"):
         open_session(otherwise=[lab.endpoint], zenoh_config=file, timeout_s=0.3)

@@ -75,10 +75,10 @@ def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -
                 end = time.monotonic() + 5.0
                 while len(published) < before + 3 and time.monotonic() < end:
                     time.sleep(0.01)
-                assert all(one["tick"] >= reply["tick"] for one in published[before:]), request
+                assert all(message["tick"] >= reply["tick"] for message in published[before:]), request
                 status = published[before]
                 if request != "segment":  # which the hands tell anew
-                    assert all(shown(one, request, reply) for one in published[before:]), request
+                    assert all(shown(message, request, reply) for message in published[before:]), request
             assert shown(status, request, reply), (request, status)
             time.sleep(0.013 * round_ % 0.1)  # at every phase of the published ones
     subscriber.undeclare()

@@ -80,9 +80,9 @@ def test_after_the_preparation_nothing_is_compiled(tmp_path: Path, monkeypatch: 
     assert len(cached) > 200
 
     def note(name: str) -> None:
-        found = {path.name for path in cache.rglob("*.nbc")} - cached
-        cached.update(found)
-        late.update({name: found} if found else {})
+        compiled = {path.name for path in cache.rglob("*.nbc")} - cached
+        cached.update(compiled)
+        late.update({name: compiled} if compiled else {})
 
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as hands:
         note("start")

@@ -32,8 +32,8 @@ def state(*names: str, velocity: tuple[float, ...] | None = None, **others: floa
     """A state of joints of the arm at its posture, and of `others`."""
     named = {name: AT[name] for name in names} | others
     unmeasured = (NAN,) * len(named)
-    given = unmeasured if velocity is None else velocity
-    return JointState(time.time_ns(), tuple(named), tuple(named.values()), given, unmeasured)
+    velocities = unmeasured if velocity is None else velocity
+    return JointState(time.time_ns(), tuple(named), tuple(named.values()), velocities, unmeasured)
 
 
 @contextlib.contextmanager
@@ -77,6 +77,6 @@ def test_the_arm_is_found_whatever_else_its_topic_carries(daemon: Daemon, case: 
     daemon.until(lambda now: now["reason"] == "arm_not_ready")
     before = daemon.client.status().rejected
     with published(daemon, CASES[case]):
-        found = daemon.until(lambda now: now["reason"] == "no_hands")
-    lost = {cause: n - before.get(cause, 0) for cause, n in found["rejected"].items()}
+        status = daemon.until(lambda now: now["reason"] == "no_hands")
+    lost = {cause: n - before.get(cause, 0) for cause, n in status["rejected"].items()}
     assert not any(lost.values()), lost

@@ -71,8 +71,8 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
 
 def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
     assert cell.client.add(PLACES).warnings == ()
-    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
-    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
+    tool_m = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=tool_m, std=0.2)))
     missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
     assert missed > 0.1
     assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
@@ -81,10 +81,10 @@ def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> No
 def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: StoredSkill) -> None:
     cell.client.add(PLACES, tolerance=0.04)
     (event,) = cell.taken
-    wanted = adapted(skill, PLACES, tolerance=0.04)
-    assert event.payload == cell.kept[0] == wanted.file
+    expected = adapted(skill, PLACES, tolerance=0.04)
+    assert event.payload == cell.kept[0] == expected.file
     assert type(event.value) is Skill  # without its file, which a recording has beside it
-    assert event.value.digest == wanted.digest
+    assert event.value.digest == expected.digest
 
 
 def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
@@ -248,10 +248,10 @@ def test_the_segment_of_the_task_is_told_by_client_and_command(
     reply = cell.client.set_segment("glass")
     assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "segment")
     command = ["segment", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
-    for mode, reason, told in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
+    for mode, reason, text in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
         cell.mode, cell.reason = mode, reason
         assert main(command) == 0
-        assert re.search(rf"^at soldering since tick \d+: {re.escape(told)}$", capsys.readouterr().out, re.MULTILINE)
+        assert re.search(rf"^at soldering since tick \d+: {re.escape(text)}$", capsys.readouterr().out, re.MULTILINE)
     assert cell.kinds()[-3:] == ["segment"] * 3
 
 

@@ -64,10 +64,10 @@ class Guarded:
         self.asked: set[str] = set()
         self._declared = [self.session.declare_subscriber(key, self._take) for key in keys(INPUTS)]
         self._publishers = [self.session.declare_publisher(key) for key in keys(OUTPUTS)]
-        own = str(self.session.zid())
-        topics = ros2.tokens(DOMAIN, CELL, own, [ros2.of_channel(CELL, one) for one in TOPICS]).values()
+        session_id = str(self.session.zid())
+        topics = ros2.tokens(DOMAIN, CELL, session_id, [ros2.of_channel(CELL, channel) for channel in TOPICS]).values()
         self._tokens = [
-            self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, own), *topics)
+            self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, session_id), *topics)
         ]
         self._answering = [self.session.declare_queryable(channels.key(CELL, key), self._answer) for key in REQUESTS]
 
@@ -125,7 +125,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         heard = [session.declare_subscriber(key, hear) for key in (*full.values(), *streams, "**")]
         false_token = session.liveliness().declare_token(channels.presence(CELL, "f00"))
         false_answers = [session.declare_queryable(full[key], lambda query: query.drop()) for key in REQUESTS]
-        seen = [observer.declare_subscriber(key, observe) for key in keys(OUTPUTS)]
+        observed = [observer.declare_subscriber(key, observe) for key in keys(OUTPUTS)]
         until(lambda: Client(operator, CELL, timeout_s=1.0).ask("status") == {})
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
@@ -135,15 +135,15 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
                 bench.put(channels.key(CELL, key), b"from the bench")
             guarded.publish()
             time.sleep(0.05)
-        own = {str(guarded.session.zid())}
-        until(lambda: living(session, CELL) == own | {"f00"})  # its own words it hears too
-        assert living(observer, CELL) == (own | {"f00"} if name == ROUTER else own)
+        daemon_ids = {str(guarded.session.zid())}
+        until(lambda: living(session, CELL) == daemon_ids | {"f00"})  # its own words it hears too
+        assert living(observer, CELL) == (daemon_ids | {"f00"} if name == ROUTER else daemon_ids)
         listed = session.liveliness().get(ros2.all_tokens(DOMAIN), timeout=5.0)
         assert len({str(reply.ok.key_expr) for reply in listed if reply.ok}) == 1 + len(TOPICS)
         false_token.undeclare()
         asked = [session.get(full[key], payload=b"{}", timeout=PATIENCE_S) for key in REQUESTS]
         answered = sum(reply.ok is not None for replies in asked for reply in replies)
-        for declared in (*heard, *seen, *false_answers):
+        for declared in (*heard, *observed, *false_answers):
             declared.undeclare()
     assert guarded.taken == keys(role.publishes)
     assert got == (keys(OUTPUTS) if role.hears else set())
@@ -166,7 +166,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
             for name in ("tracker", "tracker-2", "operator", "operator-2")
         }
         got: dict[str, set[str]] = {name: set() for name in sessions}
-        said: dict[str, set[bytes]] = {}
+        senders: dict[str, set[bytes]] = {}
         for name, session in sessions.items():
 
             def hear(sample: zenoh.Sample, name: str = name) -> None:
@@ -175,7 +175,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
             for key in (*full.values(), "**"):
                 closing.callback(session.declare_subscriber(key, hear).undeclare)
         taken = daemon.session.declare_subscriber(
-            f"{CELL}/**", lambda s: said.setdefault(str(s.key_expr), set()).add(bytes(s.payload))
+            f"{CELL}/**", lambda s: senders.setdefault(str(s.key_expr), set()).add(bytes(s.payload))
         )
         closing.callback(taken.undeclare)
         until(lambda: Client(sessions["operator"], CELL, timeout_s=1.0).ask("status") == {})
@@ -192,27 +192,27 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
     tracked = {full[key] for key in ROLES["tracker"].publishes}
-    assert {key for key, names in said.items() if b"tracker" in names} == tracked
-    assert {key for key, names in said.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
+    assert {key for key, names in senders.items() if b"tracker" in names} == tracked
+    assert {key for key, names in senders.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}
 
 
 def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     """A subject without a name would be everybody."""
-    told = access_control(CELL, names("tracker"))["access_control"]
-    assert all(subject["cert_common_names"] for subject in told["subjects"])
-    assert "tracker" not in [subject["id"] for subject in told["subjects"]]
-    assert {name for policy in told["policies"] for name in policy["subjects"]} == {s["id"] for s in told["subjects"]}
+    access = access_control(CELL, names("tracker"))["access_control"]
+    assert all(subject["cert_common_names"] for subject in access["subjects"])
+    assert "tracker" not in [subject["id"] for subject in access["subjects"]]
+    assert {name for policy in access["policies"] for name in policy["subjects"]} == {s["id"] for s in access["subjects"]}
 
 
 @pytest.mark.thorough
 def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: Path) -> None:
     """Some have expired, and one is of another authority."""
-    own = make_certificates(tmp_path, expired="daemon-8 operator-8")
+    certificates = make_certificates(tmp_path, expired="daemon-8 operator-8")
     other = make_certificates(tmp_path / "other")
-    shutil.copytree(other / "operator", own / "operator-9")
-    shutil.copy(own / "operator" / "authority.pem", own / "operator-9")
+    shutil.copytree(other / "operator", certificates / "operator-9")
+    shutil.copy(certificates / "operator" / "authority.pem", certificates / "operator-9")
     for daemon, client, words in (
         ("daemon", None, "requires a certificate, and none was given"),
         (
@@ -220,15 +220,15 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
             other / "operator",
             "the certificate of the daemon .* is not from the authority in .*other/secrets/operator",
         ),
-        ("daemon", own / "operator-8", "refuses the certificate in .*operator-8, which has expired by the clock there"),
+        ("daemon", certificates / "operator-8", "refuses the certificate in .*operator-8, which has expired by the clock there"),
         (
             "daemon",
-            own / "operator-9",
+            certificates / "operator-9",
             "refuses the certificate in .*operator-9, which is not from the authority there",
         ),
-        ("daemon-8", own / "operator", "the certificate of the daemon .* has expired"),
+        ("daemon-8", certificates / "operator", "the certificate of the daemon .* has expired"),
     ):
-        with open_session(listen=["tls/127.0.0.1:0"], certificate=own / daemon) as session:
+        with open_session(listen=["tls/127.0.0.1:0"], certificate=certificates / daemon) as session:
             for timeout_s in (0.3, None):  # with None, other errors are waited for
                 with pytest.raises(CertificateError, match=words):
                     open_session(connect=endpoints(session), certificate=client or "", timeout_s=timeout_s)
@@ -239,10 +239,10 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
             ):
                 open_session(connect=[plain], certificate=client or "", timeout_s=0.3)
     with (
-        open_session(listen=["tls/127.0.0.2:0"], certificate=own / "daemon") as session,
+        open_session(listen=["tls/127.0.0.2:0"], certificate=certificates / "daemon") as session,
         pytest.raises(CertificateError, match=r"the certificate of the daemon .* is not for this address"),
     ):
-        open_session(connect=endpoints(session), certificate=own / "operator", timeout_s=0.3)
+        open_session(connect=endpoints(session), certificate=certificates / "operator", timeout_s=0.3)
 
 
 def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
@@ -259,14 +259,14 @@ def test_a_daemon_and_its_commands_by_certificates(
 ) -> None:
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\n'
     with launched(tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
-        at = ("--connect", service.endpoint)
+        connect = ("--connect", service.endpoint)
         assert service.endpoint.startswith("tls/127.0.0.1:")
         monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
-        succeeded("hold", *at)
-        from_shell = thirdhand("status", *at)
+        succeeded("hold", *connect)
+        from_shell = thirdhand("status", *connect)
         assert from_shell.returncode == 0, from_shell.stderr
         monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "observer"))
-        assert_refused(1, "nobody answers", "resume", *at)
+        assert_refused(1, "nobody answers", "resume", *connect)
         with (
             open_session(connect=[service.endpoint], certificate=secrets / "tracker") as tracking,
             open_session(connect=[service.endpoint], certificate=secrets / "operator") as operating,

@@ -44,16 +44,16 @@ state = "{{state}}"
 @pytest.mark.one_case
 def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.Session, ends: str) -> None:
     """Stopped while it moves, and with a loop that fails for good while it moves."""
-    (at,) = endpoints(router)
-    (tmp_path / "driven.toml").write_text(CONFIGURATION.format(router=at, state=tmp_path))
+    (endpoint,) = endpoints(router)
+    (tmp_path / "driven.toml").write_text(CONFIGURATION.format(router=endpoint, state=tmp_path))
     positions, ways = list[Any](), list[Any]()
     topics = {FORWARD: ("std_msgs/msg/Float64MultiArray", positions.append)}
     topics |= {TRAJECTORY: ("trajectory_msgs/msg/JointTrajectory", ways.append)}
     heard = [
-        ROS2Subscriber(topic, callback=take, **typed(kind), **port(at, DOMAIN))
+        ROS2Subscriber(topic, callback=take, **typed(kind), **port(endpoint, DOMAIN))
         for topic, (kind, take) in topics.items()
     ]
-    states = ROS2Publisher(STATES, **typed("sensor_msgs/msg/JointState"), **port(at, DOMAIN))
+    states = ROS2Publisher(STATES, **typed("sensor_msgs/msg/JointState"), **port(endpoint, DOMAIN))
 
     def as_the_arm(*_: Any) -> bool:
         """Stands where the newest command has it, and says so."""
@@ -88,7 +88,7 @@ def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.S
     until(lambda: not ways[-1].points[0].velocities.any(), "the last command moves")
     time.sleep(0.2)
     np.testing.assert_allclose(positions[-1].data, ways[-1].points[0].positions)
-    steps = np.abs(np.diff([one.data for one in positions[-40:]], axis=0))
+    steps = np.abs(np.diff([message.data for message in positions[-40:]], axis=0))
     assert steps.max() < 3 * 1.6 / RATE_HZ  # without a jump; a busy machine loses one message or two
-    for one in (*heard, states):
-        one.close()
+    for node in (*heard, states):
+        node.close()

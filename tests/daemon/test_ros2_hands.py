@@ -79,8 +79,8 @@ class Wrists:
             for _ in range(self.times):
                 self.session.put(KEY, cdr.encode_transforms(now_ns, OTHERS))
             self.session.put(KEY, cdr.encode_transforms(now_ns, [*OTHERS[:24], of_left(), *OTHERS[24:]]))
-            at = transform(vector(*(1000.0 * value for value in RIGHT)), quaternion(*STRAIGHT))
-            self.node.publish(transforms=[stamped(header(types, "mocap"), "right_wrist", at)])
+            pose = transform(vector(*(1000.0 * value for value in RIGHT)), quaternion(*STRAIGHT))
+            self.node.publish(transforms=[stamped(header(types, "mocap"), "right_wrist", pose)])
 
     def __enter__(self) -> Wrists:
         return self
@@ -115,10 +115,10 @@ MALFORMED = (
 
 @pytest.mark.thorough
 def test_frames_are_hands_amid_many_others_and_bad_ones_are_refused(tmp_path: Path, router: zenoh.Session) -> None:
-    (at,) = endpoints(router)
-    (tmp_path / "tf.toml").write_text(CELL.format(router=at, state=tmp_path))
+    (endpoint,) = endpoints(router)
+    (tmp_path / "tf.toml").write_text(CELL.format(router=endpoint, state=tmp_path))
     serve = ("--config", str(tmp_path / "tf.toml"), "--record", str(tmp_path / "records"))
-    with serving(tmp_path, *serve) as daemon, Wrists(at) as wrists:
+    with serving(tmp_path, *serve) as daemon, Wrists(endpoint) as wrists:
 
         def is_followed(now: dict[str, Any]) -> bool:
             return bool(now["mode"] == "follow" and all(now["sources"][side]["fresh"] for side in ("left", "right")))
@@ -171,8 +171,8 @@ def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
             return not captured.missing and len(captured.malformed) == 3
 
         until(is_complete, "the frames were not heard")
-        found = {key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES}
-        assert [(one.stamp_ns, one.frame_id, one.position) for one in found.values()] == [
+        poses = {key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES}
+        assert [(pose.stamp_ns, pose.frame_id, pose.position) for pose in poses.values()] == [
             (1, "world", of_left().translation),
             (1, "mocap", (1.0, 2.0, 3.0)),
             (1, "base", tool),

@@ -49,7 +49,7 @@ POSTURE = np.array(Settings().arm.posture) + 0.05
 def key(topic: str) -> str:
     """The Zenoh key of a topic that the settings name."""
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml").ros2
-    return ros2.key(DOMAIN, next(one for one in ros2.of_settings(settings) if one.name == topic))
+    return ros2.key(DOMAIN, next(candidate for candidate in ros2.of_settings(settings) if candidate.name == topic))
 
 
 class LikeRmw:
@@ -69,16 +69,16 @@ class LikeRmw:
 
 @pytest.mark.thorough
 def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path, router: zenoh.Session) -> None:
-    (at,) = endpoints(router)
-    (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=at, state=tmp_path))
+    (endpoint,) = endpoints(router)
+    (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=endpoint, state=tmp_path))
     latched = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
     heard: dict[str, list[Any]] = {}
 
     def listen(topic: str, kind: str, **more: Any) -> ROS2Subscriber:
         take = heard.setdefault(topic, []).append
-        return ROS2Subscriber(topic, callback=take, **typed(kind), **port(at, DOMAIN), **more)
+        return ROS2Subscriber(topic, callback=take, **typed(kind), **port(endpoint, DOMAIN), **more)
 
-    with open_session(connect=[at]) as node:
+    with open_session(connect=[endpoint]) as node:
         early = {topic: LikeRmw(node, topic) for topic in ("/robot_description", "/tf_static")}
         arguments = ("--config", str(tmp_path / "viewed.toml"))
         with serving(tmp_path, *arguments) as daemon:
@@ -97,7 +97,7 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
             ]
             late = {topic: LikeRmw(node, topic) for topic in early}
             until(lambda: as_the_arm() and heard["/diagnostics"] and len(heard["/tf"]) > 5, "nothing was said")
-            until(lambda: all(one.told for one in (*early.values(), *late.values())), "what is latched was not told")
+            until(lambda: all(subscriber.told for subscriber in (*early.values(), *late.values())), "what is latched was not told")
             began, count = time.monotonic(), len(heard["/tf"])
             until(lambda: as_the_arm() and len(heard["/tf"]) >= count + 10, "frames ended")
             assert time.monotonic() - began > 0.5  # ten a second: the loop shares the interpreter
@@ -114,9 +114,9 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
             assert [
                 TYPES.deserialize_cdr(raw, "std_msgs/msg/String").data for raw in late["/robot_description"].told
             ] == [robot_description(Settings())]
-            assert all(one.told == late[topic].told for topic, one in early.items())
-            for one in listening:
-                one.close()
+            assert all(subscriber.told == late[topic].told for topic, subscriber in early.items())
+            for subscriber in listening:
+                subscriber.close()
     assert (held.level, held.name, held.message[:15]) == (1, "thirdhand: thirdhand", "hold (no_hands)")
     assert heard["/diagnostics"][-1].status[0].message.startswith("fault (arm_")
     values = {pair.key: pair.value for pair in held.values}
@@ -124,24 +124,24 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
     assert float(values["lateness_us.p99"]) >= 0
     assert int(values["missed"]) >= 0
     transforms = [*heard["/tf_static"][0].transforms, *frames]
-    assert len({one.child_frame_id for one in transforms}) == len(transforms)
-    tool = placed([as_told(one) for one in transforms], "tool")
+    assert len({transform.child_frame_id for transform in transforms}) == len(transforms)
+    tool = placed([as_told(transform) for transform in transforms], "tool")
     np.testing.assert_allclose(tool, kinematics(Settings(), POSTURE), atol=1e-9)
 
 
 def as_told(one: Any) -> Transform:
     """A `TransformStamped`."""
-    at, q = one.transform.translation, one.transform.rotation
-    return Transform(one.header.frame_id, one.child_frame_id, (at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
+    position, q = one.transform.translation, one.transform.rotation
+    return Transform(one.header.frame_id, one.child_frame_id, (position.x, position.y, position.z), (q.x, q.y, q.z, q.w))
 
 
 def placed(transforms: list[Transform], frame: str, root: str = "base") -> np.ndarray:
     """Where a frame is in frame `base`, as a 4 x 4 matrix, along the parents."""
-    at, above = pin.SE3.Identity(), {one.child: one for one in transforms}
+    placement, above = pin.SE3.Identity(), {transform.child: transform for transform in transforms}
     while frame != root:
-        one = above[frame]
-        at, frame = pin.SE3(pin.Quaternion(np.array(one.rotation)).matrix(), np.array(one.translation)) * at, one.parent
-    return np.array(at.homogeneous)
+        transform = above[frame]
+        placement, frame = pin.SE3(pin.Quaternion(np.array(transform.rotation)).matrix(), np.array(transform.translation)) * placement, transform.parent
+    return np.array(placement.homogeneous)
 
 
 def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
@@ -163,9 +163,9 @@ def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: 
     with sessions as (daemon, observer, tracker):
         domain = Ros2Domain(daemon, settings, topics, failed=failures.append)
         with contextlib.closing(domain):
-            seen, unseen = (
-                [LikeRmw(one, topic) for topic in ("/robot_description", "/tf_static")] for one in (observer, tracker)
+            admitted, unseen = (
+                [LikeRmw(session, topic) for topic in ("/robot_description", "/tf_static")] for session in (observer, tracker)
             )
-            until(lambda: all(one.told for one in seen), "an observer was not told")
-            assert not any(one.told for one in unseen)
+            until(lambda: all(subscriber.told for subscriber in admitted), "an observer was not told")
+            assert not any(subscriber.told for subscriber in unseen)
         assert failures == []

@@ -102,15 +102,15 @@ def another_arm(folder: Path, change: tuple[str, str]) -> Settings:
     text = WAM.read_text()
     assert change[0] in text
     urdf.write_text(text.replace(*change))
-    own = Settings()
-    joints = {name: list(getattr(own.joints, name)) for name in ("lower", "upper", "acceleration", "jerk")}
-    given = {
+    shipped = Settings()
+    joints = {name: list(getattr(shipped.joints, name)) for name in ("lower", "upper", "acceleration", "jerk")}
+    values = {
         "cell": "lab/bench2",
         "files": {"state": str(folder)},
-        "arm": {"urdf": str(urdf), "plate": own.arm.plate, "posture": list(own.arm.posture)},
+        "arm": {"urdf": str(urdf), "plate": shipped.arm.plate, "posture": list(shipped.arm.posture)},
         "joints": joints,
     }
-    return converted(given, origin="another arm")
+    return converted(values, origin="another arm")
 
 
 def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
@@ -146,9 +146,9 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
             assert f"{name!r} by {distance_m:.3f} m" in caplog.text
         if out:
             aside = Path(re.findall(r"via-points add --file (\S+)", caplog.text)[0])
-            kept = added_in(aside)
-            assert kept.points == tuple(point for point in POINTS if point.name in out)
-            assert kept.tolerance == 0.03
+            added = added_in(aside)
+            assert added.points == tuple(point for point in POINTS if point.name in out)
+            assert added.tolerance == 0.03
             assert stat.S_IMODE(aside.stat().st_mode) == 0o600
         caplog.clear()
     assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3  # none replaced another
@@ -175,7 +175,7 @@ def test_it_is_kept_for_its_skill_and_for_a_while(settings: Settings, skill: Ski
         saved.keep(loaded, ("handover", "glass"), 0.9)
         assert SavedSegment(settings).read(loaded) == "handover"
     file = tmp_path / "lab/bench2/segment.json"
-    assert [one.name for one in file.parent.iterdir()] == [file.name]
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
     old = file.stat().st_mtime - MAX_RESTART_S - 1.0
     os.utime(file, (old, old))
     assert saved.read(skill) == ""
@@ -249,8 +249,8 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
     with serving(tmp_path, "--joints", "assumed") as daemon:
         assert "cannot be used" not in daemon.log.read_text()
         assert daemon.until(lambda now: bool(now["segment"]))["segment"] == ["glass", "soldering"]
-        said = daemon.log.read_text()
-        assert said.count("the task continues at via-point glass, which an earlier run had reached") == 1
+        second_log = daemon.log.read_text()
+        assert second_log.count("the task continues at via-point glass, which an earlier run had reached") == 1
         assert daemon.end() == 0
         assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")
 

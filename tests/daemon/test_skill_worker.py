@@ -47,8 +47,8 @@ def assert_same_bits(one: Skill, other: Skill) -> None:
     hands, velocities, accelerations = (random.normal((0.8, 0.0, 0.2), 0.1, (2, 3)) for _ in range(3))
     assert one.digest == other.digest
     assert one.file == other.file
-    found, wanted = (bits(skill.predict(hands, velocities, accelerations)) for skill in (one, other))
-    assert found == wanted
+    predicted, expected = (bits(skill.predict(hands, velocities, accelerations)) for skill in (one, other))
+    assert predicted == expected
 
 
 def bits(value: object) -> bytes:
@@ -62,10 +62,10 @@ def bits(value: object) -> bytes:
 def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     skill_worker: SkillWorker, skill: Skill, count: int
 ) -> None:
-    there = skill_worker.adapt(skill, PLACES[:count], tolerance=0.05)
-    assert_same_bits(there, adapted(skill, PLACES[:count], tolerance=0.05))
-    assert there.via_points == PLACES[:count]
-    assert in_force(there) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
+    remote = skill_worker.adapt(skill, PLACES[:count], tolerance=0.05)
+    assert_same_bits(remote, adapted(skill, PLACES[:count], tolerance=0.05))
+    assert remote.via_points == PLACES[:count]
+    assert in_force(remote) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
 
 
 def test_errors_come_back_with_their_words_and_do_not_end_the_process(
@@ -99,14 +99,14 @@ def test_a_killed_process_is_replaced_at_the_next_request(skill_worker: SkillWor
 def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Skill) -> None:
     skill_worker = SkillWorker()
     skill_worker.close()
-    there = skill_worker.adapt(skill, PLACES, tolerance=0.05)
+    remote = skill_worker.adapt(skill, PLACES, tolerance=0.05)
     started = process_of(skill_worker)
     skill_worker.close()
     skill_worker.close()
     assert not is_there(started)
-    assert_same_bits(there, adapted(skill, PLACES, tolerance=0.05))
+    assert_same_bits(remote, adapted(skill, PLACES, tolerance=0.05))
     with pytest.raises(ValueError, match="read-only"):
-        there.model.primitive.inputs[0, 0] = 1.0
+        remote.model.primitive.inputs[0, 0] = 1.0
 
 
 def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, monkeypatch: pytest.MonkeyPatch) -> None:

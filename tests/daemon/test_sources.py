@@ -66,11 +66,11 @@ class Cell:
 
     def status(self, now_s: float, *, failure: str = "") -> Status:
         state = self.controller.state
-        told = dict(self.sources.update(self.controller, state, now_s))
-        self.log += self.sources.news(told, now_s)
+        sources = dict(self.sources.update(self.controller, state, now_s))
+        self.log += self.sources.news(sources, now_s)
         none = Percentiles()
         more = {"rate_hz": 500.0, "missed": 0, "realtime": True, "memory_locked": True, "scribe": {}, "endpoints": ()}
-        cell = CellStatus(self.frame, self.controller, state, told, self.settings, failure)
+        cell = CellStatus(self.frame, self.controller, state, sources, self.settings, failure)
         return cell.status(**more, version="", lateness_us=none, work_us=none, latency_ms=none)
 
 
@@ -122,13 +122,13 @@ def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: in
     cell, told_of = Cell(skill), set()
     for k in range(2500):
         cell.tell(("arm", joints(k + 1)), *resting_hands(k + 1) * (k % (500 // rate_hz) == 0))
-        told = cell.status(k / 500)
-        if k > 1000 and told.reason == "stale_hand":
-            told_of.add(told.because)
+        status = cell.status(k / 500)
+        if k > 1000 and status.reason == "stale_hand":
+            told_of.add(status.because)
             for side in ("left", "right"):
-                assert re.search(rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", told.because)
+                assert re.search(rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", status.because)
             assert (
-                told.remedy
+                status.remedy
                 == "publish hands more often, or raise [hands] stale_ms; or [hands] stale_max_ms if they come in bursts"
             )
     assert told_of
@@ -141,9 +141,9 @@ def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(skill: Skill,
     for k in range(1, 100):
         state = joints(k, (*POSTURE, 1.0), (*JOINT_NAMES, named_twice))
         cell.tell(("arm", state), *resting_hands(k))
-        told = cell.status(k / 500)
-    assert (told.mode, told.reason) == ("hold", "arm_not_ready")
-    assert f"['{named_twice}'] named more than once among 8; one position each needed" in told.because
+        status = cell.status(k / 500)
+    assert (status.mode, status.reason) == ("hold", "arm_not_ready")
+    assert f"['{named_twice}'] named more than once among 8; one position each needed" in status.because
     part = joints(1, POSTURE[:3], (*JOINT_NAMES[:2], JOINT_NAMES[1]))
     with pytest.raises(WireError, match="named more than once among 3"):
         JointStates(JOINT_NAMES, 0.1).take(part, 0.0)
@@ -166,9 +166,9 @@ class Clock:
 @pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # of the publisher's clock from the daemon's
 def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Skill, apart_s: int) -> None:
     held, stepped = Clock(skill), Clock(skill)
-    for one in (held, stepped):
+    for clock in (held, stepped):
         for _ in range(50):
-            one.tell(one.now_ns + apart_s * S - 5_000_000)
+            clock.tell(clock.now_ns + apart_s * S - 5_000_000)
     for k in range(300):  # a network that delivers nothing for 3 s, then one old sample, then the newest
         held.cell.tell()
         held.now_ns += 2_000_000 if k else 2 * S
@@ -188,13 +188,13 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
 @pytest.mark.parametrize("set_back_s", [0.3, 3600, 10 * 365 * 86_400])
 def test_a_clock_that_was_set_back_is_told_from_a_second_source(skill: Skill, set_back_s: float) -> None:
     set_back, second = Clock(skill), Clock(skill)
-    for one in (set_back, second):
+    for clock in (set_back, second):
         for _ in range(50):
-            one.tell(one.now_ns)
+            clock.tell(clock.now_ns)
     for k in range(6):
         set_back.tell(set_back.now_ns - round(set_back_s * S))
         second.tell(second.now_ns - round(set_back_s * S) * (k % 2))
-    told_back, told_second = (one.cell.status(1.0).sources["right"] for one in (set_back, second))
+    told_back, told_second = (clock.cell.status(1.0).sources["right"] for clock in (set_back, second))
     assert (told_back.cause, told_second.cause) == ("older", "older")
     assert told_back.refused.endswith(" before the newest accepted one: its clock was set back")
     assert told_back.advice.startswith("correct the publisher's clock; samples are accepted again after")
@@ -228,14 +228,14 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     cell.tell(*resting_hands(S), ("left", pose(1, (900.0, 0.0, 0.0))))
     assert cell.status(1.0).sources["left"].cause == "out_of_range"
     for k in range(1500):
-        seen = (("left", pose(S + 1 + k, LEFT)),) if k < 1200 else ()
-        cell.tell(("right", pose(S + 1 + k, RIGHT)), ("arm", joints(k + 1)), *seen)
+        left_samples = (("left", pose(S + 1 + k, LEFT)),) if k < 1200 else ()
+        cell.tell(("right", pose(S + 1 + k, RIGHT)), ("arm", joints(k + 1)), *left_samples)
         if k % 50 == 0:
-            told = cell.status(1.0 + k / 500)
-    assert told.reason == "stale_hand"
-    assert told.because == "the left hand was last seen 502 ms ago"
-    assert told.remedy.startswith("look at the tracker; if a counter")
-    assert told.rejected == {"out_of_range": 1}
+            status = cell.status(1.0 + k / 500)
+    assert status.reason == "stale_hand"
+    assert status.because == "the left hand was last seen 502 ms ago"
+    assert status.remedy.startswith("look at the tracker; if a counter")
+    assert status.rejected == {"out_of_range": 1}
 
 
 def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
@@ -244,23 +244,23 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     for k in range(200):
         cell.tell(("right", pose(k + 1, RIGHT)), ("left", pose(k + 1, frame="camera")), ("arm", joints(k + 1)))
         if k % 50 == 0:
-            told = cell.status(k / 500)
-    told = cell.status(0.4)
-    assert (told.mode, told.reason) == ("hold", "no_hands")
-    assert told.because == (
+            status = cell.status(k / 500)
+    status = cell.status(0.4)
+    assert (status.mode, status.reason) == ("hold", "no_hands")
+    assert status.because == (
         "the left hand has not been seen yet, as what arrives is rejected as wrong_frame: "
         "frame 'camera'; 'base', 'optitrack' or none accepted"
     )
-    assert told.remedy.startswith("find [hands] frame and base_from_tracker by thirdhand calibrate, also after the")
-    assert told.frames == ("base", "optitrack", "")
-    assert told.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
-    assert (told.sources["right"].fresh, told.sources["left"].fresh) == (True, False)
-    assert told.rejected == {"wrong_frame": 200}
+    assert status.remedy.startswith("find [hands] frame and base_from_tracker by thirdhand calibrate, also after the")
+    assert status.frames == ("base", "optitrack", "")
+    assert status.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
+    assert (status.sources["right"].fresh, status.sources["left"].fresh) == (True, False)
+    assert status.rejected == {"wrong_frame": 200}
     for _ in range(100):
         cell.tell(("arm", joints(1000 + next(cell.ticks))))
-    told = cell.status(0.6)
-    assert "the right hand was last seen" in told.because
-    assert not told.sources["right"].fresh
+    status = cell.status(0.6)
+    assert "the right hand was last seen" in status.because
+    assert not status.sources["right"].fresh
 
 
 @pytest.mark.parametrize(("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")])
@@ -276,17 +276,17 @@ def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
         ]
         cell.tell(*hands, ("arm", joints(1 + k)))
         cell.status(k / 500)
-    told = cell.status(0.2)
-    assert told.mode == "hold"
-    assert f"look like {reported}," in told.because or f"which looks like {reported}; " in told.because
-    assert {source.unit for name, source in told.sources.items() if name != "arm"} == {reported}
+    status = cell.status(0.2)
+    assert status.mode == "hold"
+    assert f"look like {reported}," in status.because or f"which looks like {reported}; " in status.because
+    assert {source.unit for name, source in status.sources.items() if name != "arm"} == {reported}
 
 
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
 def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill, batch_ticks: int) -> None:
     cell, period_ns = Cell(skill), S // 500
     waiting: list[tuple[str, PoseStamped]] = []
-    told = cell.status(0.0)
+    status = cell.status(0.0)
     for k in range(5 * batch_ticks):
         stamp_ns = 1 + k * period_ns
         if k % 7 == 0:
@@ -295,11 +295,11 @@ def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill
         cell.tell(("arm", joints(stamp_ns)), *(waiting[-8:] if is_sent else ()), at_ns=stamp_ns)
         if is_sent:
             waiting.clear()
-        told = cell.status(k / 500)
+        status = cell.status(k / 500)
         if k % batch_ticks == batch_ticks - 2 and k > 4 * batch_ticks:
-            assert (told.mode, told.reason) == ("hold", "stale_hand")
-            assert f"arrives in batches, {1000 * batch_ticks // 500} ms apart" in told.because
-            assert "raise [hands] stale_max_ms" in told.remedy
+            assert (status.mode, status.reason) == ("hold", "stale_hand")
+            assert f"arrives in batches, {1000 * batch_ticks // 500} ms apart" in status.because
+            assert "raise [hands] stale_max_ms" in status.remedy
 
 
 def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
@@ -309,9 +309,9 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
     assert "what arrives from the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
     cell.tell(("arm", joints(2)))
-    told = cell.status(0.2)
-    assert told.because == "the arm has not rested in one posture for long enough"
-    assert told.remedy == "wait: the service begins by itself once the arm has rested within its limits for 0.1 s"
+    status = cell.status(0.2)
+    assert status.because == "the arm has not rested in one posture for long enough"
+    assert status.remedy == "wait: the service begins by itself once the arm has rested within its limits for 0.1 s"
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))
@@ -325,9 +325,9 @@ def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:
     cell = Cell(skill)
     for k in range(10):
         cell.tell(("left", pose(S + k)), late_ns=-5 * S)
-        told = cell.status(k / 10)
-    assert told.sources["left"].clock_ms == pytest.approx(-5000.0)
-    assert told.sources["right"].clock_ms is None
+        status = cell.status(k / 10)
+    assert status.sources["left"].clock_ms == pytest.approx(-5000.0)
+    assert status.sources["right"].clock_ms is None
 
 
 @pytest.mark.parametrize("rate_hz", [1, 8])
@@ -335,8 +335,8 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
     cell = Cell(skill)
     for k in range(1500):
         cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
-        told = cell.status(k / 500)
+        status = cell.status(k / 500)
         if k > 1000:
-            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", told.because)
-            assert told.remedy == "publish joints/state more often, or raise [arm] silent_ms"
-    assert told.reason == "arm_not_ready"
+            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", status.because)
+            assert status.remedy == "publish joints/state more often, or raise [arm] silent_ms"
+    assert status.reason == "arm_not_ready"

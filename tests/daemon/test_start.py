@@ -61,20 +61,20 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:
         client = Client(session, "lab/bench")
-        said: list[str] = []
+        reports: list[str] = []
         modules = [f"begun_{i}" for i in range(8)]
 
         def go_on() -> None:
             for name in modules:
                 sleeping.wait(0.25)
                 sys.modules[name] = sys  # one more that is imported
-            said.append("all")
+            reports.append("all")
 
         thread = threading.Thread(target=go_on)
         thread.start()
         with pytest.raises(StartingError):
             client.wait_until_ready(timeout_s=1.0)
-        assert said  # 2 s, of which each went on
+        assert reports  # 2 s, of which each went on
         thread.join()
         for name in modules:
             del sys.modules[name]
@@ -84,20 +84,20 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
 def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "START_STALL_S", 16.0)
     before = "import time\nfrom thirdhand.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
-    said: list[str] = []
+    reports: list[str] = []
     stuck = r"no progress for 16 s.*last report: loading compiled functions, \d+ of \d+ functions"
-    with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=said.append):
+    with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=reports.append):
         raise AssertionError("it was ready")
-    assert said[0].startswith("  starting: importing")
+    assert reports[0].startswith("  starting: importing")
 
 
 @pytest.mark.parametrize(
     "command", ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"]
 )
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
-    at = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
+    arguments = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = (
-        f"import sys\nfrom thirdhand.command_line import main\ncode = main({at})\nassert 'numpy' not in sys.modules\n"
+        f"import sys\nfrom thirdhand.command_line import main\ncode = main({arguments})\nassert 'numpy' not in sys.modules\n"
     )
     done = python(f"{code}sys.exit(code)")
     assert done.returncode == 1

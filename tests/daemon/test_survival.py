@@ -135,13 +135,13 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
         assert daemon.process.wait(30) == 0
         ended.set()
         asking.join(20)
-        said = daemon.log.read_text()
-        assert "Traceback" not in said
-        assert "did not come to rest" not in said  # the time-out of the stop
+        log = daemon.log.read_text()
+        assert "Traceback" not in log
+        assert "did not come to rest" not in log  # the time-out of the stop
     (recording,) = records.glob("*.mcap")
-    last = said.splitlines()[-1]
+    last = log.splitlines()[-1]
     assert last.endswith(f" ended: the daemon of cell thirdhand; its newest recording is {recording}")
-    assert "operator" not in said  # its own stop is nobody's hold, which `resume` would end
+    assert "operator" not in log  # its own stop is nobody's hold, which `resume` would end
     result = replay(recording)
     assert result.exact, result.text()
 
@@ -162,8 +162,8 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     free once its daemon has ended or was killed: test_taught_places_survive_a_restart.
     """
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        at = ("serve", "--joints", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
-        refused = thirdhand(*at, env=os.environ | {"HOME": str(tmp_path / "home")})
+        arguments = ("serve", "--joints", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
+        refused = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path / "home")})
         assert refused.returncode == 1
         assert "cell thirdhand is already served" in refused.stderr
         assert f"listening on {daemon.endpoint}" in refused.stderr
@@ -246,11 +246,11 @@ def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path
             time.sleep(0.5)
             assert (status.mode, Client(session).status().reason) == ("hold", "no_hands")
         running.terminate()
-        said, _ = running.communicate(timeout=30)
-        assert running.returncode == 0, said
-        assert "Traceback" not in said
+        output, _ = running.communicate(timeout=30)
+        assert running.returncode == 0, output
+        assert "Traceback" not in output
         if streams == "> /dev/full":
-            assert f"listening on {endpoint} as cell thirdhand (standard output: No space left on device" in said
+            assert f"listening on {endpoint} as cell thirdhand (standard output: No space left on device" in output
     finally:
         running.kill()
         running.wait()

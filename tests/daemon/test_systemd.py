@@ -45,24 +45,24 @@ class Manager:
 
     def heard(self, seconds: float, until: str = "\n") -> list[str]:
         """The assignments that arrive within this time, or until one of them arrives."""
-        found, end = list[str](), time.monotonic() + seconds
-        while until not in found and (left := end - time.monotonic()) > 0:
+        assignments, end = list[str](), time.monotonic() + seconds
+        while until not in assignments and (left := end - time.monotonic()) > 0:
             self.socket.settimeout(left)
             try:
-                found += self.socket.recv(4096).decode().splitlines()
+                assignments += self.socket.recv(4096).decode().splitlines()
             except TimeoutError:
                 break
-        return found
+        return assignments
 
 
 @pytest.fixture
 def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
     """The manager of the daemons that the test starts."""
-    found = Manager(tmp_path / "notify")
+    systemd = Manager(tmp_path / "notify")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
-    with found.socket:
-        yield found
+    with systemd.socket:
+        yield systemd
 
 
 @pytest.mark.thorough
@@ -74,7 +74,7 @@ def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(manag
         started = manager.heard(30, "READY=1")
         assert started[-1] == "READY=1"
         assert "STATUS=starting: importing" in started[0]
-        assert any(one.startswith("EXTEND_TIMEOUT_USEC=") for one in started)
+        assert any(line.startswith("EXTEND_TIMEOUT_USEC=") for line in started)
         for _ in range(3):
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
 
@@ -154,7 +154,7 @@ def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
     ]
     assert options["ExecStart"].hold
     assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")  # it does not see the check's exit code
-    assert {str(one.config) for one in options.values()} == {"/etc/thirdhand/%i.toml"}
+    assert {str(parsed.config) for parsed in options.values()} == {"/etc/thirdhand/%i.toml"}
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")

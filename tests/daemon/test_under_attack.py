@@ -204,8 +204,8 @@ BUSY = "while True: pass"
 @pytest.mark.parametrize("kind", ["list", "add", "status", "resume", "hold", "nonsense"])
 def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kind: str) -> None:
     begin, before = time.monotonic(), len(daemon.log.read_text().splitlines())
-    with attack(FLOOD, daemon, kind) as said:
-        assert said == "begun"
+    with attack(FLOOD, daemon, kind) as report:
+        assert report == "begun"
         assert holds_s(daemon)[-1] < SOON_S
     daemon.client.ask("hold")
     noted = len(daemon.log.read_text().splitlines()) - before
@@ -213,27 +213,27 @@ def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kin
 
 
 def test_hold_does_not_wait_for_a_client_that_asks_on_and_reads_no_answer(daemon: Daemon) -> None:
-    with attack(NOTHING_READ, daemon) as said:
-        assert said == "begun"
+    with attack(NOTHING_READ, daemon) as report:
+        assert report == "begun"
         took = holds_s(daemon, 4.0)
     assert took[len(took) // 2] < USUAL_S
     assert took[-1] < SOON_S
 
 
 def test_hold_is_in_force_at_once_while_hands_come_at_5_khz(daemon: Daemon) -> None:
-    with attack(HANDS, daemon) as said:
-        assert said == "begun"
+    with attack(HANDS, daemon) as report:
+        assert report == "begun"
         assert holds_s(daemon)[-1] < SOON_S
 
 
 def network_threads(pid: int) -> dict[int, int]:
     """The niceness of each thread that Zenoh started in a process."""
-    found = {}
+    niceness = {}
     for task in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(OSError):
             if re.fullmatch(r"(app|net|acc|tx|rx)-\d+", (task / "comm").read_text().strip()):
-                found[int(task.name)] = os.getpriority(os.PRIO_PROCESS, int(task.name))
-    return found
+                niceness[int(task.name)] = os.getpriority(os.PRIO_PROCESS, int(task.name))
+    return niceness
 
 
 def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Daemon) -> None:
@@ -291,15 +291,15 @@ def test_requests_beyond_the_bound_are_refused_at_once(daemon: Daemon) -> None:
 
 
 def test_idle_connections_shut_nobody_out_for_long(daemon: Daemon) -> None:
-    with attack(IDLE_CONNECTIONS, daemon) as said:
-        assert said == "done"
+    with attack(IDLE_CONNECTIONS, daemon) as report:
+        assert report == "done"
         assert holds_s(daemon)[-1] < SOON_S
         assert is_welcome(daemon)
 
 
 def test_sessions_are_bounded_and_who_is_in_is_served(daemon: Daemon) -> None:
-    with attack(IDLE_SESSIONS, daemon) as said:
-        assert 0 < int(said) < MAX_SESSIONS
+    with attack(IDLE_SESSIONS, daemon) as report:
+        assert 0 < int(report) < MAX_SESSIONS
         assert holds_s(daemon)[-1] < SOON_S
         with pytest.raises(UnreachableError, match="not overloaded"):
             open_session(connect=[daemon.endpoint], timeout_s=0.5)
@@ -308,8 +308,8 @@ def test_sessions_are_bounded_and_who_is_in_is_served(daemon: Daemon) -> None:
 
 def test_large_messages_are_not_taken_in(daemon: Daemon) -> None:
     before = peak_mib(daemon.process.pid)
-    with attack(LARGE_MESSAGES, daemon) as said:
-        assert said == "0"
+    with attack(LARGE_MESSAGES, daemon) as report:
+        assert report == "0"
         assert holds_s(daemon)[-1] < SOON_S
     assert peak_mib(daemon.process.pid) - before < 32
     assert daemon.client.status().rejected.get("malformed hands/left") is None
@@ -320,8 +320,8 @@ def test_commands_come_on_while_a_large_message_is_sent(daemon: Daemon) -> None:
     heard: list[float] = []
     daemon.until(lambda status: status["tick"] > 0)
     listening = daemon.session.declare_subscriber("thirdhand/joints/command", lambda _: heard.append(time.monotonic()))
-    with attack(ONE_LARGE_MESSAGE, daemon) as said:
-        times = [float(at) for at in said.split()]
+    with attack(ONE_LARGE_MESSAGE, daemon) as report:
+        times = [float(stamp_s) for stamp_s in report.split()]
     listening.undeclare()  # type: ignore[no-untyped-call]
     pairs = list(itertools.pairwise(heard))
     spans = zip(times[::2], times[1::2], strict=True)

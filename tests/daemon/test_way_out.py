@@ -28,6 +28,6 @@ def test_an_arm_that_is_stuck_says_so_and_comes_out(tmp_path: Path) -> None:
         assert stuck["remedy"]
         leaving = daemon.until(lambda status: "on its way out" in status["because"], 30.0)
         assert (leaving["mode"], leaving["reason"]) == ("hold", "blocked")
-        there = daemon.until(lambda status: status["mode"] == "follow" and not status["because"], 30.0)
-        assert not there["flags"] or "stuck" not in there["flags"]
+        following = daemon.until(lambda status: status["mode"] == "follow" and not status["because"], 30.0)
+        assert not following["flags"] or "stuck" not in following["flags"]
     assert "a way out of" in daemon.log.read_text()

@@ -44,12 +44,12 @@ def frames(whole: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[int, 
 
 def records(data: bytes) -> list[tuple[int, int, int]]:
     """Opcode, first byte and end of every record."""
-    found, at = [], 8
-    while at < len(data) - 8:
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        found.append((opcode, at, at + 9 + length))
-        at += 9 + length
-    return found
+    spans, offset = [], 8
+    while offset < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        spans.append((opcode, offset, offset + 9 + length))
+        offset += 9 + length
+    return spans
 
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
@@ -78,9 +78,9 @@ def test_what_follows_a_damaged_chunk_is_read(
     assert not recording.truncated
     assert len(recording.faults) >= 1
     assert all("damage at byte" in str(fault) for fault in recording.faults)
-    kept = [step.tick for step in steps if step.frame is not None]
+    read_ticks = [step.tick for step in steps if step.frame is not None]
     assert all(encode(step.frame) == frames[step.tick] for step in steps if step.frame is not None)
-    missing = sorted(set(range(COUNT)) - set(kept))
+    missing = sorted(set(range(COUNT)) - set(read_ticks))
     assert missing == (list(range(missing[0], missing[-1] + 1)) if missing else [])
     assert missing or at in (1, 17, 28)  # what is wrong there, only the checksum over all data knows
     assert len(missing) <= 60
@@ -93,14 +93,14 @@ def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
     random = np.random.default_rng(3)
     refused: list[str] = []
     starts = [start for _, start, _ in records(whole)]
-    for at in [*random.integers(8, len(whole), 40).tolist(), *(start + 3 for start in starts[:60:4]), len(whole) - 4]:
+    for offset in [*random.integers(8, len(whole), 40).tolist(), *(start + 3 for start in starts[:60:4]), len(whole) - 4]:
         try:
-            recording, steps = read(tmp_path / "a.mcap", flipped(whole, at, 0x10))
+            recording, steps = read(tmp_path / "a.mcap", flipped(whole, offset, 0x10))
         except RecordingError as error:
             refused.append(str(error))
             continue
-        assert recording.faults, f"byte {at}"
-        assert not recording.truncated, f"byte {at}"
+        assert recording.faults, f"byte {offset}"
+        assert not recording.truncated, f"byte {offset}"
         assert len(steps) > COUNT * 0.8
     assert refused
     assert all("lacks its settings: " in error for error in refused)
@@ -123,8 +123,8 @@ def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whol
 
 def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "a.mcap"
-    for at in (whole.index(b"skill.npz") + 300, whole.index(b"arm.urdf") + 300):
-        path.write_bytes(flipped(whole, at))
+    for offset in (whole.index(b"skill.npz") + 300, whole.index(b"arm.urdf") + 300):
+        path.write_bytes(flipped(whole, offset))
         for use in (replay, lambda path: convert(path, tmp_path / "a.rrd")):
             with pytest.raises(RecordingError, match=r"lacks its (skill|arm); .*an attachment's checksum is wrong"):
                 use(path)
@@ -151,7 +151,7 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])
 def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path: Path, whole: bytes, kind: str) -> None:
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, remarks = tmp_path / "a.mcap", list[str]()
     start, end = chunks(whole)[5]
     if kind == "lost":
         with Recorder(path, settings=CELL, skill=SKILL) as recorder:
@@ -161,21 +161,21 @@ def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path:
                     recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, lost=lost)
     else:
         path.write_bytes(flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2])
-    shown = convert(path, tmp_path / "a.rrd", say=said.append)
+    tick_count = convert(path, tmp_path / "a.rrd", say=remarks.append)
     recording = Recording.open(path)
     steps = [step for step in recording.steps() if step.frame is not None]
-    assert shown == len(steps) > 0
-    assert said[-1] == f"the other {shown} ticks are shown"
+    assert tick_count == len(steps) > 0
+    assert remarks[-1] == f"the other {tick_count} ticks are shown"
     gaps = [step for step in steps if step.lost or step.damage]
-    assert len(said) == len(gaps) + 1 + (kind == "cut")
+    assert len(remarks) == len(gaps) + 1 + (kind == "cut")
     expected = {
         "damaged": f"before tick {gaps[0].tick if gaps else ''}: damage at byte {start}",
         "cut": f"cut at byte {start}: the end is missing",
         "lost": "gap after tick 9, before tick 15: 5 ticks not recorded",
     }[kind]
-    assert expected in said[0]
+    assert expected in remarks[0]
     if kind != "lost":  # the same words; nothing here replays, for its frames are made up
         faults = [str(fault) for fault in recording.faults]
-        assert all(any(fault in line for line in said) for fault in faults)
+        assert all(any(fault in line for line in remarks) for fault in faults)
     logged = [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"] if row.get("TextLog:text")]
-    assert set(said[:-1]) <= set(logged)
+    assert set(remarks[:-1]) <= set(logged)

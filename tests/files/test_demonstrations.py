@@ -47,11 +47,11 @@ def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Pat
     stamps, path = START_NS + np.arange(50) * 10_000_000, tmp_path / "a.mcap"
     left, right, tool = _swaying(50)
     quarter = Rotation.from_euler("z", 90, degrees=True)
-    seen = []
+    tracker_poses = []
     for poses in (left, right):
         turned = quarter.inv() * Rotation.from_quat(poses[:, 3:])
-        seen.append(np.hstack([1000 * quarter.inv().apply(poses[:, :3] - [0.1, 0, 0]), turned.as_quat()]))
-    streams = {"/x/hands/left": seen[0], "/x/hands/right": seen[1], "/x/tool/pose": tool}
+        tracker_poses.append(np.hstack([1000 * quarter.inv().apply(poses[:, :3] - [0.1, 0, 0]), turned.as_quat()]))
+    streams = {"/x/hands/left": tracker_poses[0], "/x/hands/right": tracker_poses[1], "/x/tool/pose": tool}
     _streams(path, {name: (stamps, poses) for name, poses in streams.items()}, frame="mocap")
     mocap = TrackerSettings(unit="mm", base_from_tracker=(0.1, 0.0, 0.0, *quarter.as_quat().tolist()))
     remarks: list[str] = []
@@ -148,6 +148,6 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
         read_demonstration(tmp_path / "a.mcap")
     with pytest.raises(ValueError, match=r"hands/right: shape \(4, 7\) given"):
         write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, good[1], good[1][:4], good[1]))
-    for wrong, what in ((stamps * 1e-9, "float64 from 0 on"), (stamps - 1, "int64 from -1 on")):
-        with pytest.raises(ValueError, match=rf"stamps_ns: {what} given, integers \[ns\] from 0 on needed"):
+    for wrong, words in ((stamps * 1e-9, "float64 from 0 on"), (stamps - 1, "int64 from -1 on")):
+        with pytest.raises(ValueError, match=rf"stamps_ns: {words} given, integers \[ns\] from 0 on needed"):
             write_demonstration(tmp_path / "b.mcap", Demonstration(wrong, *[good[1]] * 3))

@@ -36,13 +36,13 @@ def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
     taken: Demonstration, tmp_path: Path
 ) -> None:
     vise = msgspec.structs.replace(taken.places[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none")
-    found = listed(taken._replace(places=(*taken.places, vise)), tmp_path / "a.mcap")
+    listing = listed(taken._replace(places=(*taken.places, vise)), tmp_path / "a.mcap")
     least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
-    (remark,) = found.remarks
+    (remark,) = listing.remarks
     assert remark == (
         f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} mm, 100 mm needed"
     )
-    assert remark in table(found)
+    assert remark in table(listing)
 
 
 def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstration) -> None:
@@ -64,8 +64,8 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
 
 @pytest.mark.parametrize("end", ["begins", "ends"])
 def test_a_take_that_begins_or_ends_in_motion_is_warned_of(end: str, taken: Demonstration, tmp_path: Path) -> None:
-    at = int(np.argmax(np.linalg.norm(np.gradient(taken.right[:, :3], axis=0), axis=1)))
-    rows = slice(at, None) if end == "begins" else slice(None, at)
+    index = int(np.argmax(np.linalg.norm(np.gradient(taken.right[:, :3], axis=0), axis=1)))
+    rows = slice(index, None) if end == "begins" else slice(None, index)
     cut = Demonstration._make(part[rows] if isinstance(part, np.ndarray) else part for part in taken)
     (remark,) = [line for line in listed(cut, tmp_path / "a.mcap").remarks if "in motion" in line]
     assert remark.startswith(f"it {end} in motion: ")

@@ -30,11 +30,11 @@ def test_one_to_three_samples_that_are_off_cost_no_others(length: int, far_m: fl
     for seed in range(8):
         whole, random = track(seed), np.random.default_rng([seed, length])
         poses = whole.poses.copy()
-        way = random.normal(size=3)
+        direction = random.normal(size=3)
         begin = int(random.integers(20, len(poses) - 40))
         rows = slice(begin, begin + length)
-        poses[rows, :3] += far_m * way / np.linalg.norm(way) * np.linspace(0.5, 1.0, length)[:, None]
-        (found,) = checked([whole._replace(poses=poses)], Settings(), longest_s=0.25)
-        assert found.poses - len(found.track.poses) <= length + 1
-        assert not found.stretches
-        assert found.rejected <= length + 1
+        poses[rows, :3] += far_m * direction / np.linalg.norm(direction) * np.linspace(0.5, 1.0, length)[:, None]
+        (result,) = checked([whole._replace(poses=poses)], Settings(), longest_s=0.25)
+        assert result.poses - len(result.track.poses) <= length + 1
+        assert not result.stretches
+        assert result.rejected <= length + 1

@@ -114,13 +114,13 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
 
 
 def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstration, tmp_path: Path) -> None:
-    path, said = motive(tmp_path / "a.csv", take), list[str]()
-    got = read_demonstration(path, settings=CAPTURE, say=said.append)
+    path, remarks = motive(tmp_path / "a.csv", take), list[str]()
+    got = read_demonstration(path, settings=CAPTURE, say=remarks.append)
     assert got.begins == (200,)
     left_in = np.r_[0:200, 260 : len(take.tool)]
     same(got, take._replace(**{side: getattr(take, side)[left_in] for side in NAMES}))
-    assert "left is LeftHand; right is RightHand; tool is Tool" in " ".join(said)
-    assert "hands/left 3.98 to 5.20 s: not seen" in " ".join(said)
+    assert "left is LeftHand; right is RightHand; tool is Tool" in " ".join(remarks)
+    assert "hands/left 3.98 to 5.20 s: not seen" in " ".join(remarks)
     with pytest.raises(RecordingError, match=r"frame 'motion capture': 'base' needed, or a configuration"):
         read_demonstration(path)
     for wrong, words in (
@@ -167,8 +167,8 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
     assert (got.begins, len(got.tool)) == ((), len(take.tool))
     np.testing.assert_allclose(got.hands, take.hands, atol=0.01)
     np.testing.assert_allclose(got.tool[:, 3:], np.tile([0.0, 0.0, 0.0, 1.0], (len(take.tool), 1)))
-    one = read_demonstration(tmp_path / "a.c3d", settings=CAPTURE, topics={"left": PoseTopic("RightHand")})
-    assert one.conducts == "right"
+    one_handed = read_demonstration(tmp_path / "a.c3d", settings=CAPTURE, topics={"left": PoseTopic("RightHand")})
+    assert one_handed.conducts == "right"
 
 
 def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demonstration, tmp_path: Path) -> None:
@@ -250,8 +250,8 @@ def test_the_lines_of_the_page_make_a_take(tmp_path: Path, monkeypatch: pytest.M
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "arrays.md").read_text(encoding="utf-8"), re.S)
     assert len(block.split("\n\n")[1].splitlines()) + len(block.split("\n\n")[2].splitlines()) <= 10
     monkeypatch.chdir(tmp_path)
-    found: dict[str, Any] = {}
-    exec(block, found)
-    made, got = SimpleNamespace(**found), read_demonstration(tmp_path / "take-1.mcap")
-    np.testing.assert_array_equal(got.left, made.left)
-    np.testing.assert_array_equal(got.stamps_ns, made.take.stamps_ns)
+    namespace: dict[str, Any] = {}
+    exec(block, namespace)
+    variables, got = SimpleNamespace(**namespace), read_demonstration(tmp_path / "take-1.mcap")
+    np.testing.assert_array_equal(got.left, variables.left)
+    np.testing.assert_array_equal(got.stamps_ns, variables.take.stamps_ns)

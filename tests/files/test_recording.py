@@ -26,14 +26,14 @@ from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 
 
 def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    told = write(tmp_path / "a.mcap")
+    written = write(tmp_path / "a.mcap")
     recording = Recording.open(tmp_path / "a.mcap")
     first, *steps = recording.steps()
     assert (recording.settings, recording.skill, recording.truncated) == (CELL, SKILL, False)
     assert first.frame is None
     assert encode(first.state) == encode(state_after(-1))
-    assert len(steps) == len(told)
-    for step, (tick, frame, timing) in zip(steps, told, strict=True):
+    assert len(steps) == len(written)
+    for step, (tick, frame, timing) in zip(steps, written, strict=True):
         assert step.tick == tick.index
         assert step.events == tuple((event.kind, event.payload) for event in tick.inbox)
         assert encode(step.frame) == encode(frame)
@@ -64,14 +64,14 @@ def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_an
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
 def test_a_cut_recording_is_read_up_to_the_cut_and_says_so(tmp_path: Path, share: float) -> None:
-    told = write(tmp_path / "a.mcap", 600)
+    written = write(tmp_path / "a.mcap", 600)
     data = (tmp_path / "a.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * share)])
     recording = Recording.open(tmp_path / "cut.mcap")
     assert recording.truncated
     steps = list(recording.steps())[1:]
     assert share * 600 * 0.5 < len(steps) < 600
-    assert all(encode(step.frame) == encode(frame) for step, (_, frame, _) in zip(steps, told, strict=False))
+    assert all(encode(step.frame) == encode(frame) for step, (_, frame, _) in zip(steps, written, strict=False))
 
 
 def test_what_was_flushed_survives_when_nothing_is_closed(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_an_event_of_a_kind_that_nobody_knows_is_refused_with_its_tick(tmp_path:
 
 
 def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
-    told = write(tmp_path / "a.mcap", 120)
+    written = write(tmp_path / "a.mcap", 120)
     with (tmp_path / "a.mcap").open("rb") as stream:
         decoded = [
             (channel.topic, message)
@@ -137,7 +137,7 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
     always = [channel.key for channel in channels.CHANNELS if channel.recorded and channel.key not in now_and_then]
     assert {channels.topic("hall/bench-1", key) for key in always} == topics
     frames = [message for topic, message in decoded if topic == "/hall/bench-1/frame"]
-    assert list(frames[-1].joints) == told[-1][1]["joints"].tolist()
+    assert list(frames[-1].joints) == written[-1][1]["joints"].tolist()
     assert frames[-1].mode == 1
     with warnings.catch_warnings(), AnyReader([tmp_path / "a.mcap"]) as reader:
         read = [
@@ -147,5 +147,5 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
     assert len(read) == len(decoded)
     assert (
         next(message.position.tolist() for topic, message in reversed(read) if topic.endswith("joints/command"))
-        == told[-1][1]["joints"].tolist()
+        == written[-1][1]["joints"].tolist()
     )

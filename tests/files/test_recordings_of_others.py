@@ -42,9 +42,9 @@ def header(stamp_ns: int, frame: str) -> Any:
 
 
 def pose(x: float, y: float, z: float) -> Any:
-    at = made("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    position = made("geometry_msgs/msg/Point", x=x, y=y, z=z)
     turn = made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    return made("geometry_msgs/msg/Pose", position=at, orientation=turn)
+    return made("geometry_msgs/msg/Pose", position=position, orientation=turn)
 
 
 def stamped(stamp_ns: int, frame: str, *at: float) -> Any:
@@ -52,27 +52,27 @@ def stamped(stamp_ns: int, frame: str, *at: float) -> Any:
 
 
 def array(stamp_ns: int, frame: str, *places: tuple[float, float, float]) -> Any:
-    return made("geometry_msgs/msg/PoseArray", header=header(stamp_ns, frame), poses=[pose(*at) for at in places])
+    return made("geometry_msgs/msg/PoseArray", header=header(stamp_ns, frame), poses=[pose(*place) for place in places])
 
 
 def tree(stamp_ns: int, frame: str, **places: tuple[float, float, float]) -> Any:
-    found = []
-    for child, at in places.items():
-        x, y, z = at
-        one = made(
+    transforms = []
+    for child, place in places.items():
+        x, y, z = place
+        transform = made(
             "geometry_msgs/msg/Transform",
             translation=made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=pose(*at).orientation,
+            rotation=pose(*place).orientation,
         )
-        found.append(
+        transforms.append(
             made(
                 "geometry_msgs/msg/TransformStamped",
                 header=header(stamp_ns, frame),
                 child_frame_id=child,
-                transform=one,
+                transform=transform,
             )
         )
-    return made("tf2_msgs/msg/TFMessage", transforms=found)
+    return made("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
@@ -90,7 +90,7 @@ def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = Sto
 
 def moving(make: Any, *arguments: Any) -> list[Any]:
     """A message for each of STAMPS, made of its stamp and how far the way has gone."""
-    return [make(stamp, *arguments, way) for stamp, way in zip(STAMPS.tolist(), WAY.tolist(), strict=True)]
+    return [make(stamp, *arguments, distance_m) for stamp, distance_m in zip(STAMPS.tolist(), WAY.tolist(), strict=True)]
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
@@ -117,7 +117,7 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         for path in (killed, killed / file.name):
             assert len(read_demonstration(path, topics=sources).stamps_ns) == 20
         path = file
-    for given, words in (
+    for selection, words in (
         ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
         ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
         (
@@ -130,7 +130,7 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         ),
     ):
         with pytest.raises(RecordingError, match=words):
-            read_demonstration(path, topics=given)
+            read_demonstration(path, topics=selection)
 
 
 def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
@@ -160,9 +160,9 @@ def test_hands_of_a_type_that_is_not_read_are_refused_with_it_and_with_the_types
         for topic in TAKE_KEYS.values():
             writer.add_message(writer.register_channel(topic, encoding, schema), 0, b"", 0)
         writer.finish()
-    given = kind if encoding == "cdr" else f"{kind} in {encoding}"
+    type_text = kind if encoding == "cdr" else f"{kind} in {encoding}"
     accepted = POSE.type if read is hand_samples else ", ".join(POSE_TYPES)
-    with pytest.raises(RecordingError, match=re.escape(f"hands/left ({given})")) as refusal:
+    with pytest.raises(RecordingError, match=re.escape(f"hands/left ({type_text})")) as refusal:
         read(tmp_path / "a.mcap")
     assert accepted in str(refusal.value)
 
@@ -181,14 +181,14 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
     tool = moving(lambda stamp, way: stamped(stamp, "base", 0.5, way, 0.2))
     path = bag(tmp_path / "bag", {"/tf": frames, "/tf_elbows": elbows, "/arm/tcp": tool})
     hands = HandSettings(frame="mocap", unit="mm", base_from_tracker=(1.0, 0.0, 0.0, *y_up.as_quat().tolist()))
-    said: list[str] = []
-    got = read_demonstration(path, settings=Settings(hands=hands), say=said.append)
-    wanted = y_up.apply(np.column_stack([WAY, np.zeros(40), np.full(40, -300.0)])) / 1000 + [1.0, 0.0, 0.0]
-    np.testing.assert_allclose(got.left[:, :3], wanted, atol=1e-12)
+    remarks: list[str] = []
+    got = read_demonstration(path, settings=Settings(hands=hands), say=remarks.append)
+    expected_m = y_up.apply(np.column_stack([WAY, np.zeros(40), np.full(40, -300.0)])) / 1000 + [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(got.left[:, :3], expected_m, atol=1e-12)
     np.testing.assert_allclose(got.left[:, 3:], np.tile(y_up.as_quat(), (40, 1)), atol=1e-12)
     np.testing.assert_allclose(got.tool[:, 1], WAY)
-    assert "left is /tf:LeftWrist; right is /tf:RightWrist; tool is /arm/tcp" in said[0]
-    assert "hands/left, hands/right transformed to frame base" in said[0]
+    assert "left is /tf:LeftWrist; right is /tf:RightWrist; tool is /arm/tcp" in remarks[0]
+    assert "hands/left, hands/right transformed to frame base" in remarks[0]
     with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
         read_demonstration(path)
     with pytest.raises(RecordingError, match=r"tool.*; /arm/tcp, /hand/gripper could be it"):
@@ -215,16 +215,16 @@ def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count
         "/cell/hands/right": moving(stamped, "", -0.3, 0.0),
         "/joint_states": moving(state),
     }
-    said: list[str] = []
-    got = read_demonstration(bag(tmp_path / "bag", topics), say=said.append)
-    assert "tool is computed from /joint_states by the arm's URDF" in said[0]
-    assert "stamps come from different clocks" in said[1]
-    assert "tool/pose by -1.001 s" in said[1]
+    remarks: list[str] = []
+    got = read_demonstration(bag(tmp_path / "bag", topics), say=remarks.append)
+    assert "tool is computed from /joint_states by the arm's URDF" in remarks[0]
+    assert "stamps come from different clocks" in remarks[1]
+    assert "tool/pose by -1.001 s" in remarks[1]
     np.testing.assert_array_equal(got.stamps_ns, STAMPS + 1_000_000)
     np.testing.assert_allclose(got.left[:, 2], WAY)
     assert np.ptp(got.tool[:, :3], axis=0).max() > 0.05
     assert np.abs(got.tool[0, :3] - [0.45, 0.0, 0.3]).max() < 0.5
-    foreign = [dataclasses.replace(one, name=["a", *one.name[1:]]) for one in topics["/joint_states"]]
+    foreign = [dataclasses.replace(message, name=["a", *message.name[1:]]) for message in topics["/joint_states"]]
     with pytest.raises(RecordingError, match=r"no topic ending in tool/pose .* or joints/state of the arm's joints"):
         read_demonstration(bag(tmp_path / "foreign", {**topics, "/joint_states": foreign}))
 
@@ -238,12 +238,12 @@ def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
 
 def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None:
     """The golden session: with a dropout, spoilt samples, and no `tool/pose`."""
-    said: list[str] = []
-    got = read_demonstration(RECORDINGS / "golden.mcap", say=said.append)
+    remarks: list[str] = []
+    got = read_demonstration(RECORDINGS / "golden.mcap", say=remarks.append)
     assert re.search(
-        r"tool is computed from .*joints/state by the arm's URDF; \d+ of \d+ poses are invalid or farther", said[0]
+        r"tool is computed from .*joints/state by the arm's URDF; \d+ of \d+ poses are invalid or farther", remarks[0]
     )
-    assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in said)
+    assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in remarks)
     assert got.seconds[got.begins[0]] - got.seconds[got.begins[0] - 1] == pytest.approx(0.51)
     assert len(got.stamps_ns) > 1800
     assert np.abs(got.tool[:, :3]).max() < 1.0

@@ -199,11 +199,11 @@ def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
     done = told("replay", str(checked), "--exact", "--output", str(output))
     assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
     assert replay(output).exact
-    kept, whole, were = (
+    sparse, whole, were = (
         [step.frame for step in Recording.open(path).steps(whole=False)][1:] for path in (checked, output, recorded)
     )
     assert [frame.tobytes() for frame in whole] == [frame.tobytes() for frame in were]
-    assert [tick for tick, frame in enumerate(kept) if frame is not None] == [0, 500]
+    assert [tick for tick, frame in enumerate(sparse) if frame is not None] == [0, 500]
     assert_refused(1, "a file other than the recording", "replay", str(output), "--output", str(output))
     assert replay(output).exact
 

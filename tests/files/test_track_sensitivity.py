@@ -55,17 +55,17 @@ def tracked(take: Demonstration, noise_m: float, seed: int) -> Demonstration:
     """The take with a tracker's white noise on hands and tool."""
     random = np.random.default_rng(seed)
     noise = [np.pad(noise_m * random.normal(size=(len(take.tool), 3)), ((0, 0), (0, 4))) for _ in NAMES]
-    left, right, tool = (getattr(take, name) + one for name, one in zip(NAMES, noise, strict=True))
+    left, right, tool = (getattr(take, name) + stream_noise for name, stream_noise in zip(NAMES, noise, strict=True))
     return take._replace(left=left, right=right, tool=tool)
 
 
 def clean_takes() -> list[Demonstration]:
     """Takes at 25 to 240 Hz: of hands that circle, by a script, and of modelled people."""
-    made = [tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed) for seed, hz in ((1, 30), (2, 240))]
+    simulated = [tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed) for seed, hz in ((1, 30), (2, 240))]
     shipped = [f"demonstration-{i}" for i in (1,)] + [f"people/demonstration-{i}" for i in (3, 6, 9)]
     return [
         circling(1, apart_m=0.03),
-        *made,
+        *simulated,
         *(tracked(read_demonstration(RECORDINGS / f"{name}.mcap"), 3e-4, 7) for name in shipped),
     ]
 
@@ -77,8 +77,8 @@ def checked(streams: Streams) -> Iterator[tuple[str, np.ndarray]]:
         for name in NAMES
     ]
     for group in (tracks[:2], tracks[2:]):
-        for track, found in zip(group, track_check.checked(group, SETTINGS, longest_s=0.5), strict=True):
-            yield track.source, np.isin(track.stamps_ns, found.track.stamps_ns)
+        for track, result in zip(group, track_check.checked(group, SETTINGS, longest_s=0.5), strict=True):
+            yield track.source, np.isin(track.stamps_ns, result.track.stamps_ns)
 
 
 def spoilt(take: Demonstration, spoil: Spoil, seed: int) -> tuple[Streams, str]:
@@ -123,14 +123,14 @@ def clean() -> list[Demonstration]:
 def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
     take = tracked(demonstrate(Scene(), seed=3, rate_hz=rate_hz), 5e-4, rate_hz)
     assert all(retained.all() for _, retained in checked(streams_of(take)))
-    found = []
+    hits = []
     for seed in range(20):
         streams, name = spoilt(take, spoiled.slight_jump, seed)
         retained = dict(checked(streams))
         wrong = is_bad(take, streams, name)
-        found.append(not retained[name][wrong].any())
-        assert not found[-1] or all(retained[one][~is_bad(take, streams, one)].all() for one in NAMES)
-    assert np.mean(found) >= 0.9
+        hits.append(not retained[name][wrong].any())
+        assert not hits[-1] or all(retained[stream_name][~is_bad(take, streams, stream_name)].all() for stream_name in NAMES)
+    assert np.mean(hits) >= 0.9
 
 
 @pytest.mark.timeout(600)
@@ -144,13 +144,13 @@ def test_each_constant_matters_and_none_is_better_halved_or_doubled(
         for number, take in enumerate(clean)
         for seed in range(SEEDS)
     ]
-    whole, known = getattr(track_check, INTAKE), {}
+    whole, cache = getattr(track_check, INTAKE), {}
 
     def remembered(tracks: list[Track], settings: Settings) -> object:
         key = tuple((track.stamps_ns.tobytes(), track.poses.tobytes()) for track in tracks)
-        if key not in known:
-            known[key] = whole(tracks, settings)
-        return known[key]
+        if key not in cache:
+            cache[key] = whole(tracks, settings)
+        return cache[key]
 
     monkeypatch.setattr(track_check, INTAKE, remembered)
     now = shares(cases, clean)
@@ -164,9 +164,9 @@ def test_each_constant_matters_and_none_is_better_halved_or_doubled(
                     patch.setattr(module, name, other)
                     others.append(shares(cases, clean))
                 lines.append(f"{module.__name__}.{name} = {other:g}: {others[-1]}")
-            if all(np.abs(np.subtract(one, now)).max() < 2e-4 for one in others):
+            if all(np.abs(np.subtract(candidate, now)).max() < 2e-4 for candidate in others):
                 idle.append(name)
-            better += [name for one in others if one.removed <= now.removed and one.missed < now.missed - 0.01]
+            better += [name for candidate in others if candidate.removed <= now.removed and candidate.missed < now.missed - 0.01]
     print("\n".join(lines))
     assert (idle, better) == ([], [])
     assert now.missed < 0.02

@@ -50,8 +50,8 @@ def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     assert np.array_equal(together.inner.changes.replaced, shuffled.inner.changes.replaced)
     np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-8)
-    found, wanted = shuffled.predict(queries).covariance, together.predict(queries).covariance
-    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    covariance, expected = shuffled.predict(queries).covariance, together.predict(queries).covariance
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-7)
     assert same_bits(singly, together, queries)
     assert primitive.adapt(*via(0, 0), tolerance=1) is together.base is primitive
 
@@ -65,9 +65,9 @@ def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance
     fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, **lambdas)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
-    found, wanted = adapted.predict(queries).covariance, fitted.predict(queries).covariance
+    covariance, expected = adapted.predict(queries).covariance, fitted.predict(queries).covariance
     of_base = len(adapted.base.inputs) / len(fitted.inputs)  # N stays the base's
-    np.testing.assert_allclose(found, wanted * of_base, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(covariance, expected * of_base, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
@@ -81,9 +81,9 @@ def test_teaching_elsewhere_keeps_covariance(representation):
     assert len(adapted.inputs) == 110
     queries = np.concatenate([inputs[:5], np.full((1, 4), -50.0)])
     before = primitive.predict(queries).covariance
-    for again in (adapted, named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted.refitted(reference)):
-        np.testing.assert_allclose(again.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(again.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
+    for variant in (adapted, named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted.refitted(reference)):
+        np.testing.assert_allclose(variant.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(variant.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
 
 
 def test_missed_via_point_is_named():
@@ -92,16 +92,16 @@ def test_missed_via_point_is_named():
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0], [0, 3.0, 0, 0]])
     points = Gaussians.of([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], deviation=0.01)
     says = r"missed .*: 0 by 0\.1\d* \(1\d\.?\d* deviations\), 1 by .* larger ell"
-    with pytest.warns(ViaPointMissed, match=says) as told:
+    with pytest.warns(ViaPointMissed, match=says) as caught:
         adapted = primitive.adapt(near, points, tolerance=0)
-    assert told[0].filename == __file__
+    assert caught[0].filename == __file__
     miss = np.linalg.norm(adapted.mean(near) - points.mean, axis=1)
-    assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(told[0].message)
+    assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(caught[0].message)
 
 
 def test_small_miss_is_not_named():
     """A via-point that may be missed, or is missed by less than a millimetre, is not named."""
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
-    for apart, std in ((0.3, 0.2), (0.0015, 1e-5)):
-        points = Gaussians.of([[0.0, 0, 0], [apart, 0, 0]], deviation=std)
+    for offset, std in ((0.3, 0.2), (0.0015, 1e-5)):
+        points = Gaussians.of([[0.0, 0, 0], [offset, 0, 0]], deviation=std)
         skill().adapt(near, points, tolerance=0)

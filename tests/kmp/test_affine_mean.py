@@ -30,13 +30,13 @@ def both(kernel, representation, how):
     points = Functionals.checked(s, along if how == "directions" else None)
     moved, parameters = at(prior, points), {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 3.0}
     parameters |= {"representation": representation, "directions": points.directions}
-    one = KMP.fit(s, Gaussians(reference.mean + moved, reference.covariance), prior_mean=prior, **parameters)
-    rest = KMP.fit(s, reference, **parameters)
+    primitive = KMP.fit(s, Gaussians(reference.mean + moved, reference.covariance), prior_mean=prior, **parameters)
+    remainder = KMP.fit(s, reference, **parameters)
     if how == "adapted":
         via, desired = s[20:22] + 0.01, Gaussians(reference.mean[20:22] + 0.05, reference.covariance[20:22])
         shifted = Gaussians(desired.mean + at(prior, Functionals(via)), desired.covariance)
-        one, rest = one.adapt(via, shifted, tolerance=0.02), rest.adapt(via, desired, tolerance=0.02)
-    return prior, one, rest
+        primitive, remainder = primitive.adapt(via, shifted, tolerance=0.02), remainder.adapt(via, desired, tolerance=0.02)
+    return prior, primitive, remainder
 
 
 @pytest.mark.parametrize("how", ["fitted", "adapted", "directions"])
@@ -44,17 +44,17 @@ def both(kernel, representation, how):
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_equals_learning_the_remainder(kernel, representation, how):
     """The result equals learning from the remaining data."""
-    prior, one, rest = both(kernel, representation, how)
-    queries = np.random.default_rng(1).normal(size=(5, one.inputs.shape[1]))
-    close = {"rtol": 0, "atol": 1e-8 * np.abs(one.weights).max()}
-    np.testing.assert_allclose(one.mean(queries), rest.mean(queries) + at(prior, Functionals(queries)), **close)
-    np.testing.assert_allclose(one.jacobians(queries), rest.jacobians(queries) + prior.matrix, **close)
-    np.testing.assert_array_equal(one.predict(queries).covariance, rest.predict(queries).covariance)
+    prior, primitive, remainder = both(kernel, representation, how)
+    queries = np.random.default_rng(1).normal(size=(5, primitive.inputs.shape[1]))
+    close = {"rtol": 0, "atol": 1e-8 * np.abs(primitive.weights).max()}
+    np.testing.assert_allclose(primitive.mean(queries), remainder.mean(queries) + at(prior, Functionals(queries)), **close)
+    np.testing.assert_allclose(primitive.jacobians(queries), remainder.jacobians(queries) + prior.matrix, **close)
+    np.testing.assert_array_equal(primitive.predict(queries).covariance, remainder.predict(queries).covariance)
     for s in queries:
         v, a = np.random.default_rng(2).normal(size=(2, len(s)))
         for motion, left in (
-            (one.predict_motion(s, v, a), rest.predict_motion(s, v, a)),  # compiled, where Numba is
-            (one.inner.query.motion(s, v, a, covariance=True), rest.inner.query.motion(s, v, a, covariance=True)),
+            (primitive.predict_motion(s, v, a), remainder.predict_motion(s, v, a)),  # compiled, where Numba is
+            (primitive.inner.query.motion(s, v, a, covariance=True), remainder.inner.query.motion(s, v, a, covariance=True)),
         ):
             np.testing.assert_allclose(motion.mean, left.mean + prior.matrix @ s + prior.offset, **close)
             np.testing.assert_allclose(motion.velocity, left.velocity + prior.matrix @ v, **close)
@@ -63,21 +63,21 @@ def test_equals_learning_the_remainder(kernel, representation, how):
             np.testing.assert_allclose(motion.covariance, left.covariance, rtol=0, atol=1e-9)
 
     slopes = Functionals(queries, np.ones_like(queries))
-    expected = mean_of(rest.inner.solution, slopes) + slopes.along @ prior.matrix.T
-    np.testing.assert_allclose(mean_of(one.inner.solution, slopes), expected, **close)
+    expected = mean_of(remainder.inner.solution, slopes) + slopes.along @ prior.matrix.T
+    np.testing.assert_allclose(mean_of(primitive.inner.solution, slopes), expected, **close)
 
 
 def test_via_points_and_constraints_hold():
     """Via-points and their velocities are met, and constraints are satisfied."""
-    _, one, _ = both("a length an input", "dense", "fitted")
-    where, wanted = one.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
-    exact = Gaussians.of(wanted, deviation=1e-4)
-    through = one.adapt(where, exact, tolerance=0.0, directions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    np.testing.assert_allclose(through.mean(where[:1])[0], wanted[0], atol=1e-3)
-    np.testing.assert_allclose(through.jacobian(where[0])[:, 0], wanted[1], atol=1e-3)
-    above = LinearConstraints(one.inputs, np.tile([1.0, 0.0], (60, 1)), np.zeros(60))
-    assert one.mean(one.inputs)[:, 0].min() < -0.1
-    assert one.constrained(above).mean(one.inputs)[:, 0].min() > -1e-9
+    _, primitive, _ = both("a length an input", "dense", "fitted")
+    where, desired = primitive.inputs[[10, 10]] + 0.3, np.array([[9.0, -9.0], [0.5, 0.7]])
+    exact = Gaussians.of(desired, deviation=1e-4)
+    through = primitive.adapt(where, exact, tolerance=0.0, directions=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(through.mean(where[:1])[0], desired[0], atol=1e-3)
+    np.testing.assert_allclose(through.jacobian(where[0])[:, 0], desired[1], atol=1e-3)
+    above = LinearConstraints(primitive.inputs, np.tile([1.0, 0.0], (60, 1)), np.zeros(60))
+    assert primitive.mean(primitive.inputs)[:, 0].min() < -0.1
+    assert primitive.constrained(above).mean(primitive.inputs)[:, 0].min() > -1e-9
 
 
 @pytest.mark.parametrize(

@@ -68,10 +68,10 @@ print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex
 @pytest.mark.thorough
 def test_bits_are_those_of_a_plain_cpu():
     """Not rounded: the golden session, whose states are, is replayed so at length."""
-    here = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
     command = [sys.executable, "-c", OPERATIONS]
     native, generic = (
-        subprocess.run(command, env=here | more, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        subprocess.run(command, env=environment | more, cwd=ROOT, capture_output=True, text=True, check=True).stdout
         for more in ({}, {"NUMBA_CPU_NAME": "generic"})
     )
     assert len(native) > 1000
@@ -102,11 +102,11 @@ def test_first_compilation_is_announced_once(tmp_path):
 def test_exponentials_are_exact_to_one_unit():
     """Exponentials are right to a unit in the last place."""
     values = np.concatenate([np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]])
-    found = values.copy()
-    exponentials(found, 0.5, np.empty_like(values))
-    wanted = np.exp(np.longdouble(-0.5) * values).astype(np.float64)
-    assert np.all(np.abs(found - wanted)[:-2] <= np.spacing(wanted)[:-2])
-    assert found[-3:].tolist() == [1.0, 0.0, 0.0]
+    result = values.copy()
+    exponentials(result, 0.5, np.empty_like(values))
+    expected = np.exp(np.longdouble(-0.5) * values).astype(np.float64)
+    assert np.all(np.abs(result - expected)[:-2] <= np.spacing(expected)[:-2])
+    assert result[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
 LISTENS = r"from numba.core import (dispatcher, )?event"  # to compilations, of which a start reports
@@ -116,9 +116,9 @@ def test_nothing_is_compiled_otherwise():
     for room in ("kmp", "service", "sim"):
         for path in sorted((ROOT / room).rglob("*.py")):
             text = re.sub(LISTENS, "", path.read_text(encoding="utf-8"))
-            found = re.findall(r"^.*\b(?:numba|njit)\b.*$", text, re.MULTILINE)
+            lines = re.findall(r"^.*\b(?:numba|njit)\b.*$", text, re.MULTILINE)
             assert (
-                not found
+                not lines
                 or path.name in {"compiled.py", "compiled_cache.py"}
-                or not any("import" in line for line in found)
+                or not any("import" in line for line in lines)
             ), path

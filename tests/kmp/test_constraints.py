@@ -37,9 +37,9 @@ def test_constraints_are_obeyed():
     assert violation(skill) < 1e-9
     alone = np.array([skill.mean(s[None])[0] for s in WHERE])
     assert alone[:, 1].min() > -0.2 - 1e-9
-    both = skill.constrained(SIDE)
-    assert violation(both) < 1e-9
-    assert violation(both, SIDE) < 1e-9
+    confined = skill.constrained(SIDE)
+    assert violation(confined) < 1e-9
+    assert violation(confined, SIDE) < 1e-9
     for queries in (T, T[9:10]):
         np.testing.assert_allclose(skill.predict(queries).covariance, base().predict(queries).covariance, atol=1e-12)
 
@@ -62,10 +62,10 @@ def test_mean_has_least_cost():
 
     obeyed = {"type": "ineq", "fun": lambda w: (k @ w)[len(t) :] + 0.2, "jac": lambda w: k[len(t) :]}
     start = np.zeros(len(points))
-    found = minimize(cost, start, jac=slope, constraints=[obeyed], method="SLSQP", options={"maxiter": 500})
-    np.testing.assert_allclose(skill.mean(points)[:, 1], k @ found.x, atol=2e-3)
+    optimum = minimize(cost, start, jac=slope, constraints=[obeyed], method="SLSQP", options={"maxiter": 500})
+    np.testing.assert_allclose(skill.mean(points)[:, 1], k @ optimum.x, atol=2e-3)
     found_by_us = np.linalg.solve(k, skill.mean(points)[:, 1])
-    assert cost(found_by_us) <= cost(found.x) * (1 + 1e-3)
+    assert cost(found_by_us) <= cost(optimum.x) * (1 + 1e-3)
 
 
 def test_speed_and_rates_can_be_limited():
@@ -75,30 +75,30 @@ def test_speed_and_rates_can_be_limited():
     assert base().jacobians(WHERE)[:, 0, 0].max() > 2.9
     assert skill.jacobians(WHERE)[:, 0, 0].max() < 1.5 + 1e-9
     rates = Gaussians.of(np.hstack([PATH[:, :1], 3 * np.cos(3 * T)]), deviation=0.03)
-    one = KMP.fit(T, rates, kernel=VelocityKernel(5.0), lambda_mean=1.0)
+    primitive = KMP.fit(T, rates, kernel=VelocityKernel(5.0), lambda_mean=1.0)
     limits = LinearConstraints(WHERE, np.tile([0.0, -1.0], (41, 1)), np.full(41, -2.0))
-    assert violation(one, limits) > 0.9
-    assert violation(one.constrained(limits), limits) < 1e-9
+    assert violation(primitive, limits) > 0.9
+    assert violation(primitive.constrained(limits), limits) < 1e-9
 
 
 def test_via_points_and_constraints_in_any_order():
     """Via-points and constraints are met together, in any order."""
     via = Gaussians.of([[0.5, 0.1]], deviation=1e-4)
     first = base().constrained(LOW).adapt([[1.3]], via, tolerance=0.03)
-    then = base().adapt([[1.3]], via, tolerance=0.03).constrained(LOW)
-    for skill in (first, then):
+    second = base().adapt([[1.3]], via, tolerance=0.03).constrained(LOW)
+    for skill in (first, second):
         np.testing.assert_allclose(skill.mean([[1.3]]), via.mean, atol=1e-4)
         assert violation(skill) < 1e-9
-    np.testing.assert_allclose(first.mean(T), then.mean(T), atol=1e-9)
+    np.testing.assert_allclose(first.mean(T), second.mean(T), atol=1e-9)
     assert violation(first.base) > 0.3
-    moved = then.refitted(Gaussians(PATH - 0.1, REFERENCE.covariance))
+    moved = second.refitted(Gaussians(PATH - 0.1, REFERENCE.covariance))
     assert violation(moved) < 1e-9
 
 
 def test_low_rank_is_solved_anew():
     """A low-rank primitive is solved densely for constraints."""
     via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
-    dense, low = (base(one).adapt(*via, tolerance=0) for one in ("dense", "low_rank"))
+    dense, low = (base(representation).adapt(*via, tolerance=0) for representation in ("dense", "low_rank"))
     assert low.representation == "low_rank"
     constrained = low.constrained(LOW)
     assert violation(constrained) < 1e-9

@@ -35,21 +35,21 @@ def roughness(path):
 def test_neutral_correlation_changes_nothing(representation):
     """The neutral correlation changes nothing."""
     primitive = letter(representation)
-    same = basis().applied(primitive)
-    assert same.representation == representation
-    np.testing.assert_allclose(same.mean(T), primitive.mean(T), atol=1e-12)
-    np.testing.assert_array_equal(same.via_inputs, primitive.via_inputs)
+    unchanged = basis().applied(primitive)
+    assert unchanged.representation == representation
+    np.testing.assert_allclose(unchanged.mean(T), primitive.mean(T), atol=1e-12)
+    np.testing.assert_array_equal(unchanged.via_inputs, primitive.via_inputs)
 
 
 def test_covariances_are_those_of_equation_11():
     """The covariances are those of equation 11."""
     correlation = Correlation(basis().centres, 0.3, np.random.default_rng(0).uniform(0.5, 2, size=(5, 2)))
     primitive = letter()
-    found = correlation.applied(primitive).base.reference.covariance
+    covariances = correlation.applied(primitive).base.reference.covariance
     for n in (0, 20, 59):
         phi = np.exp(-0.5 * (T[n] - correlation.centres[:, 0]) ** 2 / 0.3**2)
         factor = np.diag(phi / phi.sum() @ correlation.theta)
-        np.testing.assert_allclose(found[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9)
+        np.testing.assert_allclose(covariances[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9)
 
 
 def test_negative_factor_flips_signs():
@@ -57,11 +57,11 @@ def test_negative_factor_flips_signs():
     primitive = letter()
     before = primitive.base.reference.covariance
     for factor in (-2.0, -0.05, -0.02, 0.0, 0.02, 0.05, 2.0):
-        found = Correlation([[1.0]], 1.0, [[1.0, factor]]).applied(primitive).base.reference.covariance
-        assert np.linalg.eigvalsh(found).min() > 1e-3 * 0.05**2 * before.max()
-        deviation = np.sqrt(found[:, 1, 1] / before[:, 1, 1])
+        covariances = Correlation([[1.0]], 1.0, [[1.0, factor]]).applied(primitive).base.reference.covariance
+        assert np.linalg.eigvalsh(covariances).min() > 1e-3 * 0.05**2 * before.max()
+        deviation = np.sqrt(covariances[:, 1, 1] / before[:, 1, 1])
         np.testing.assert_allclose(deviation, max(abs(factor), 0.05), rtol=1e-12)
-        coefficient = found[:, 0, 1] / np.sqrt(found[:, 0, 0] * found[:, 1, 1])
+        coefficient = covariances[:, 0, 1] / np.sqrt(covariances[:, 0, 0] * covariances[:, 1, 1])
         np.testing.assert_allclose(coefficient, 0.95 * np.clip(factor / 0.05, -1, 1), atol=1e-12)
 
 
@@ -69,11 +69,11 @@ def test_negative_factor_flips_signs():
 def test_rewards_grow_and_via_point_is_met(seed):
     """Rewards grow and the via-point is still met."""
     primitive = letter()
-    found = improve(primitive, roughness, T, correlation=basis(), exploration=0.3, updates=15, rollouts=8, seed=seed)
-    assert found.rewards[-1] > 1.03 * found.rewards[0]
-    assert roughness(found.primitive.mean(T)) >= found.rewards.max()
-    np.testing.assert_allclose(found.primitive.mean([[1.0]]), [[1.4, -1.2]], atol=1e-3)
-    assert len(found.rewards) == 16
+    result = improve(primitive, roughness, T, correlation=basis(), exploration=0.3, updates=15, rollouts=8, seed=seed)
+    assert result.rewards[-1] > 1.03 * result.rewards[0]
+    assert roughness(result.primitive.mean(T)) >= result.rewards.max()
+    np.testing.assert_allclose(result.primitive.mean([[1.0]]), [[1.4, -1.2]], atol=1e-3)
+    assert len(result.rewards) == 16
 
 
 def test_nearest_basis_function_rules_far_away():

@@ -21,13 +21,13 @@ RATIOS = np.array([0.01, 0.3])
 def test_residuals_are_those_without_the_group():
     assert squared_distances(POINTS) == pytest.approx(((POINTS[:, None] - POINTS) ** 2).sum(axis=2), abs=1e-12)
     shifted = {number: TARGETS - number for number in range(4)}
-    found = held_out_residuals(KERNEL, RATIOS, GROUP, shifted.__getitem__)
-    for ratio, residuals in zip(RATIOS, found, strict=True):
+    by_ratio = held_out_residuals(KERNEL, RATIOS, GROUP, shifted.__getitem__)
+    for ratio, residuals in zip(RATIOS, by_ratio, strict=True):
         for number in range(4):
-            rest = number != GROUP
-            mine = ~rest
-            noisy = KERNEL[np.ix_(rest, rest)] + ratio * np.eye(rest.sum())
-            mean = KERNEL[np.ix_(mine, rest)] @ np.linalg.solve(noisy, shifted[number][rest])
+            training = number != GROUP
+            mine = ~training
+            noisy = KERNEL[np.ix_(training, training)] + ratio * np.eye(training.sum())
+            mean = KERNEL[np.ix_(mine, training)] @ np.linalg.solve(noisy, shifted[number][training])
             np.testing.assert_allclose(residuals[mine], shifted[number][mine] - mean, atol=1e-9)
 
 
@@ -35,15 +35,15 @@ def test_covariances_are_those_without_the_group():
     """Covariances are those without the group and without a point's own noise."""
     roots = 0.3 * RANDOM.normal(size=(20, 3, 3)) + np.eye(3)
     scatter = roots @ roots.transpose(0, 2, 1)
-    found = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)
-    for ratio, covariances in zip(RATIOS, found, strict=True):
+    by_ratio = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)
+    for ratio, covariances in zip(RATIOS, by_ratio, strict=True):
         for i in range(20):
             own_group = GROUP[i]
-            rest = own_group != GROUP
-            noisy = np.kron(KERNEL[np.ix_(rest, rest)], np.eye(3))
-            for j, own in enumerate(scatter[rest]):
-                noisy[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] += ratio * own
-            across = np.kron(KERNEL[i, rest][None], np.eye(3))
+            training = own_group != GROUP
+            noisy = np.kron(KERNEL[np.ix_(training, training)], np.eye(3))
+            for j, block in enumerate(scatter[training]):
+                noisy[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] += ratio * block
+            across = np.kron(KERNEL[i, training][None], np.eye(3))
             expected = np.eye(3) - across @ np.linalg.solve(noisy, across.T)
             np.testing.assert_allclose(covariances[i], expected, atol=1e-9)
 

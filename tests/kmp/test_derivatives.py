@@ -50,13 +50,13 @@ def test_kernel_of_derivatives(name):
     once_a, once_b = (at(h, 0) - at(-h, 0)) / (2 * h), (at(0, h) - at(0, -h)) / (2 * h)
     twice = (at(h, h) - at(h, -h) - at(-h, h) + at(-h, -h)) / (4 * h * h)
     is_a, is_b = u.any(axis=1)[:, None, None, None], v.any(axis=1)[None, None, :, None]
-    wanted = np.where(is_a & is_b, twice, np.where(is_a, once_a, np.where(is_b, once_b, at(0, 0))))
-    one, other = Functionals(a, u), Functionals(b, v)
-    found = between(kernel, one, other)
-    np.testing.assert_allclose(found.reshape(5, c, 4, c), wanted, atol=3e-5)
-    np.testing.assert_allclose(between(kernel, other, one), found.T, atol=1e-12)
-    np.testing.assert_allclose(variances(kernel, one).ravel(), np.diagonal(between(kernel, one, one)), rtol=1e-9)
-    whole = Functionals.concatenated([one, other])
+    expected = np.where(is_a & is_b, twice, np.where(is_a, once_a, np.where(is_b, once_b, at(0, 0))))
+    first, other = Functionals(a, u), Functionals(b, v)
+    gram = between(kernel, first, other)
+    np.testing.assert_allclose(gram.reshape(5, c, 4, c), expected, atol=3e-5)
+    np.testing.assert_allclose(between(kernel, other, first), gram.T, atol=1e-12)
+    np.testing.assert_allclose(variances(kernel, first).ravel(), np.diagonal(between(kernel, first, first)), rtol=1e-9)
+    whole = Functionals.concatenated([first, other])
     assert np.linalg.eigvalsh(between(kernel, whole, whole))[0] > -1e-9
 
 
@@ -64,12 +64,12 @@ def test_kernel_of_derivatives(name):
 @pytest.mark.parametrize("kernel", ["one length", "a length an input"])
 def test_taught_jacobian_is_met(representation, kernel):
     """A taught Jacobian is the one at its input, and the via-point is still met."""
-    one = taught(base(representation, kernel))
-    np.testing.assert_allclose(one.jacobian(PLACE[0]), FOLLOW[0], atol=1e-5)
-    np.testing.assert_allclose(one.mean(PLACE), TRUTH(S[:1]), atol=1e-5)
+    primitive = taught(base(representation, kernel))
+    np.testing.assert_allclose(primitive.jacobian(PLACE[0]), FOLLOW[0], atol=1e-5)
+    np.testing.assert_allclose(primitive.mean(PLACE), TRUTH(S[:1]), atol=1e-5)
     step = 0.01 * RANDOM.normal(size=(5, 4))
     follows = TRUTH(S[:1]) + step @ FOLLOW[0].T
-    np.testing.assert_allclose(one.mean(PLACE + step), follows, atol=1e-3)
+    np.testing.assert_allclose(primitive.mean(PLACE + step), follows, atol=1e-3)
     bare = placed(base(representation, kernel))
     assert np.abs(bare.mean(PLACE + step) - follows).max() > 4e-3
 
@@ -77,25 +77,25 @@ def test_taught_jacobian_is_met(representation, kernel):
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_mean_and_covariance_are_naive_ones(representation):
     """Mean and covariance are those of the naive solution."""
-    one = taught(base(representation), deviation=0.1)
+    primitive = taught(base(representation), deviation=0.1)
     queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
-    mean, joint = naive(one, queries)
+    mean, joint = naive(primitive, queries)
     covariance = np.array([joint[n, :, n] for n in range(len(queries))])
-    found = one.predict(queries)
-    np.testing.assert_allclose(found.mean, mean, atol=1e-8)
-    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-8)
-    for query, wanted in zip(queries, covariance, strict=True):
-        np.testing.assert_allclose(one.predict(query[None]).covariance[0], wanted, rtol=1e-5, atol=1e-8)
-        moving = one.predict_motion(query, np.ones(4), np.zeros(4))
-        np.testing.assert_allclose(moving.covariance, wanted, rtol=1e-5, atol=1e-8)
+    prediction = primitive.predict(queries)
+    np.testing.assert_allclose(prediction.mean, mean, atol=1e-8)
+    np.testing.assert_allclose(prediction.covariance, covariance, rtol=1e-5, atol=1e-8)
+    for query, expected in zip(queries, covariance, strict=True):
+        np.testing.assert_allclose(primitive.predict(query[None]).covariance[0], expected, rtol=1e-5, atol=1e-8)
+        moving = primitive.predict_motion(query, np.ones(4), np.zeros(4))
+        np.testing.assert_allclose(moving.covariance, expected, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_velocity_is_taught_and_replaces_no_point(representation):
-    v, wanted = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
-    one = base(representation).adapt(PLACE, wanted, tolerance=9.0, directions=v)
-    np.testing.assert_allclose(one.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, wanted.mean[0], atol=1e-5)
-    assert len(one.inputs) == 61  # no reference point gave way
+    v, desired = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
+    primitive = base(representation).adapt(PLACE, desired, tolerance=9.0, directions=v)
+    np.testing.assert_allclose(primitive.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, desired.mean[0], atol=1e-5)
+    assert len(primitive.inputs) == 61  # no reference point gave way
 
 
 @pytest.mark.parametrize("kernel", ["periodic", "velocity"])
@@ -105,11 +105,11 @@ def test_derivative_over_time_is_met(kernel):
     w = 2 * np.pi / 2.5
     mean = np.hstack([np.sin(w * t), w * np.cos(w * t)])
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 1e-2]), (50, 1, 1)))
-    one = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
-    wanted = Gaussians.of([[5.0, 2.0]], deviation=1e-4)
-    adapted, h = one.adapt([[0.6]], wanted, tolerance=0, directions=[[1.0]]), 1e-5
+    primitive = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
+    desired = Gaussians.of([[5.0, 2.0]], deviation=1e-4)
+    adapted, h = primitive.adapt([[0.6]], desired, tolerance=0, directions=[[1.0]]), 1e-5
     ahead, behind = adapted.mean([[0.6 + h]]), adapted.mean([[0.6 - h]])
-    np.testing.assert_allclose((ahead - behind) / (2 * h), wanted.mean, atol=1e-3)
+    np.testing.assert_allclose((ahead - behind) / (2 * h), desired.mean, atol=1e-3)
     np.testing.assert_allclose(adapted.jacobian([0.6])[:, 0], [5.0, 2.0], atol=1e-3)
     bend = (adapted.jacobian([0.9 + h]) - adapted.jacobian([0.9 - h]))[:, 0] / (2 * h)
     np.testing.assert_allclose(adapted.curvature([0.9], [1.0]), bend, rtol=1e-4, atol=1e-4)
@@ -117,8 +117,8 @@ def test_derivative_over_time_is_met(kernel):
 
 def test_jacobians_that_contradict_are_named():
     twice = np.concatenate([PLACE, PLACE])
-    with pytest.warns(ViaPointMissed, match=r"0 by .* deviations") as told:
-        one = base().adapt_jacobian(twice, np.concatenate([FOLLOW, -FOLLOW]), deviation=1e-2)
-    assert told[0].filename == __file__
-    np.testing.assert_array_equal(one.via_directions, np.tile(np.eye(4), (2, 1)))
+    with pytest.warns(ViaPointMissed, match=r"0 by .* deviations") as caught:
+        primitive = base().adapt_jacobian(twice, np.concatenate([FOLLOW, -FOLLOW]), deviation=1e-2)
+    assert caught[0].filename == __file__
+    np.testing.assert_array_equal(primitive.via_directions, np.tile(np.eye(4), (2, 1)))
     assert base().via_directions.shape == (0, 4)

@@ -72,14 +72,14 @@ def test_predicts_the_same_without_numba(wheel, tmp_path):
     command = [sys.executable, "-I", "-S", "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    where, compiled, *found = json.loads(done.stdout)
+    where, compiled, *printed = json.loads(done.stdout)
     assert where.startswith(str(tmp_path))
     assert not compiled
     s = np.linspace(0, 2, 40)[:, None] * [1.0, -0.5]
     reference = Gaussians(np.sin(s), np.tile(1e-3 * np.eye(2), (40, 1, 1)))
-    one = KMP.fit(s, reference, kernel=GaussianKernel(2.0), lambda_mean=1)
-    one = one.adapt_jacobian(s[5:6], [np.eye(2)], deviation=0.1)
-    wanted = one.predict_motion([0.3, 0.2], [1.0, 0.5], [0.0, 0.1])
+    primitive = KMP.fit(s, reference, kernel=GaussianKernel(2.0), lambda_mean=1)
+    primitive = primitive.adapt_jacobian(s[5:6], [np.eye(2)], deviation=0.1)
+    expected = primitive.predict_motion([0.3, 0.2], [1.0, 0.5], [0.0, 0.1])
     assert kmp.__file__ != where
-    for a, b in zip(found, wanted, strict=True):
+    for a, b in zip(printed, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)

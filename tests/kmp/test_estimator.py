@@ -27,13 +27,13 @@ def test_scikit_learns_own_checks_pass(components):
 def test_learns_any_unit_with_deviation():
     """The regressor learns outputs of any unit, with their uncertainty."""
     noisy = Y + [0.02, 1.0] * RANDOM.normal(size=Y.shape)
-    one = KMPRegressor().fit(X[:120], noisy[:120])
-    assert one.score(X[120:], Y[120:]) > 0.95
-    mean, deviation = one.predict(np.array([X[0], [9.0, 9.0]]), return_std=True)
+    regressor = KMPRegressor().fit(X[:120], noisy[:120])
+    assert regressor.score(X[120:], Y[120:]) > 0.95
+    mean, deviation = regressor.predict(np.array([X[0], [9.0, 9.0]]), return_std=True)
     assert mean.shape == deviation.shape == (2, 2)
     assert (deviation[1] > 3 * deviation[0]).all()
     np.testing.assert_allclose(mean[1], noisy[:120].mean(axis=0), rtol=1e-3, atol=1e-3)
-    assert one.primitive_.jacobian(X[0]).shape == (2, 2)
+    assert regressor.primitive_.jacobian(X[0]).shape == (2, 2)
 
 
 def test_works_in_pipelines_and_searches():

@@ -52,8 +52,8 @@ def used(representation, kernel=K, inputs=S, reference=R):
     options = {"kernel": kernel, "lambda_mean": 1.0, "lambda_covariance": 2.0, "representation": representation}
     fitted = KMP.fit(inputs, reference, **options)
     adapted = fitted.adapt(inputs[:1] + 0.3, reference[:1], tolerance=0.0)
-    for one in (fitted, adapted):
-        one.predict(inputs), one.predict(inputs[:1]), one.uncertainty(inputs), one.jacobian(inputs[0]), one.error_bound
+    for primitive in (fitted, adapted):
+        primitive.predict(inputs), primitive.predict(inputs[:1]), primitive.uncertainty(inputs), primitive.jacobian(inputs[0]), primitive.error_bound
     return adapted
 
 
@@ -84,7 +84,7 @@ def same(a, b):
         return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
     if hasattr(a, "__dataclass_fields__"):
         return type(a) is type(b) and all(
-            same(getattr(a, n), getattr(b, n)) for n in (one.name for one in dataclasses.fields(a))
+            same(getattr(a, n), getattr(b, n)) for n in (field.name for field in dataclasses.fields(a))
         )
     return a == b
 
@@ -116,19 +116,19 @@ IMMUTABLE = [value for value in VALUES if isinstance(value, Immutable)]
 @pytest.mark.parametrize("value", IMMUTABLE, ids=lambda value: type(value).__name__)
 def test_arrays_are_read_only_in_every_copy(value):
     """Every array is read-only, also after pickling and copying."""
-    for one in (value, pickle.loads(pickle.dumps(value)), copy.copy(value), copy.deepcopy(value)):
-        assert [array.shape for array in arrays(one) if array.flags.writeable] == []
+    for instance in (value, pickle.loads(pickle.dumps(value)), copy.copy(value), copy.deepcopy(value)):
+        assert [array.shape for array in arrays(instance) if array.flags.writeable] == []
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_pickle_leaves_factors_out(representation):
     """A pickle leaves out the factors and the copy makes them again."""
-    one = used(representation)
-    again = pickle.loads(pickle.dumps(one))
+    primitive = used(representation)
+    restored = pickle.loads(pickle.dumps(primitive))
     dropped = {"mean_factor", "covariance_factor"}
-    assert dropped & vars(one.base.inner.solution).keys()
-    assert not dropped & vars(again.base.inner.solution).keys()
-    assert same(again.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0), one.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0))
+    assert dropped & vars(primitive.base.inner.solution).keys()
+    assert not dropped & vars(restored.base.inner.solution).keys()
+    assert same(restored.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0), primitive.adapt(S[3:4] + 0.7, R[3:4], tolerance=0.0))
 
 
 def test_every_public_type_is_tested():

@@ -40,9 +40,9 @@ def test_errors_and_likelihoods_are_those_of_a_fit(held, kernel):
     for penalty, rmse, likelihood in zip(penalties, rmses, likelihoods, strict=True):
         miss = (held.fitted(kernel, penalty, None).mean(held.held_inputs) - held.held_outputs)[:, :outputs]
         assert rmse == pytest.approx(np.sqrt((miss**2).sum(axis=1).mean()), rel=1e-7)
-        found = held.fitted(kernel, 0.3, penalty).predict(held.held_inputs)
-        residual, log_densities = (held.held_outputs - found.mean)[:, :outputs], []
-        for r, covariance in zip(residual, found.covariance[:, :outputs, :outputs], strict=True):
+        prediction = held.fitted(kernel, 0.3, penalty).predict(held.held_inputs)
+        residual, log_densities = (held.held_outputs - prediction.mean)[:, :outputs], []
+        for r, covariance in zip(residual, prediction.covariance[:, :outputs, :outputs], strict=True):
             log_det = np.linalg.slogdet(2 * np.pi * covariance)[1]
             log_densities.append(-0.5 * (log_det + r @ np.linalg.solve(covariance, r)))
         assert likelihood == pytest.approx(-np.mean(log_densities), rel=1e-6)

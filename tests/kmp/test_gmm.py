@@ -34,11 +34,11 @@ def test_em_finds_two_clusters():
     """EM finds two clusters."""
     random = np.random.default_rng(0)
     samples = np.concatenate([random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))])
-    found = GaussianMixture.fit(samples, components=2, seed=0)
-    left, right = np.argsort(found.means[:, 0])
-    np.testing.assert_allclose(found.means[[left, right]], [[0, 0], [5, 1]], atol=0.1)
-    np.testing.assert_allclose(found.weights[[left, right]], [0.75, 0.25], atol=1e-3)
-    np.testing.assert_allclose(found.covariances[right], np.diag([0.09, 0.01]), atol=0.03)
+    model = GaussianMixture.fit(samples, components=2, seed=0)
+    left, right = np.argsort(model.means[:, 0])
+    np.testing.assert_allclose(model.means[[left, right]], [[0, 0], [5, 1]], atol=0.1)
+    np.testing.assert_allclose(model.weights[[left, right]], [0.75, 0.25], atol=1e-3)
+    np.testing.assert_allclose(model.covariances[right], np.diag([0.09, 0.01]), atol=0.03)
 
 
 def test_the_same_seed_gives_the_same_bits():

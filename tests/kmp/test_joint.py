@@ -16,10 +16,10 @@ def fitted(kernel="gaussian", representation="dense", adapted=False):
     root = 0.05 * np.random.default_rng(0).normal(size=(40, 2, 2))
     reference = Gaussians(mean, root @ root.swapaxes(1, 2) + 1e-3 * np.eye(2))
     options = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "representation": representation}
-    one = KMP.fit(T, reference, kernel=KERNELS[kernel], **options)
+    primitive = KMP.fit(T, reference, kernel=KERNELS[kernel], **options)
     if not adapted:
-        return one
-    return one.adapt(
+        return primitive
+    return primitive.adapt(
         [[0.5], [1.51]], Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))), tolerance=0.02
     )
 
@@ -49,9 +49,9 @@ def test_trajectories_have_mean_and_covariance():
 
 
 def test_jacobians_are_those_of_one_by_one(skill):
-    found = skill.jacobians(QUERIES)
-    assert found.shape == (6, 2, 1)
-    np.testing.assert_allclose(found, [skill.jacobian(s) for s in QUERIES], atol=1e-9)
+    jacobians = skill.jacobians(QUERIES)
+    assert jacobians.shape == (6, 2, 1)
+    np.testing.assert_allclose(jacobians, [skill.jacobian(s) for s in QUERIES], atol=1e-9)
     assert skill.jacobians(QUERIES[:0]).shape == (0, 2, 1)
 
 
@@ -61,11 +61,11 @@ def test_a_rhythmic_skill_has_no_seam(representation):
     mean = np.hstack([np.sin(phase), np.cos(2 * phase)])
     reference = Gaussians.of(mean, deviation=0.01)
     kernel = PeriodicKernel(1.0, 2 * np.pi)
-    one = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
-    via = one.adapt([[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06)
+    primitive = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
+    via = primitive.adapt([[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06)
     assert list(via.inner.changes.replaced) == [0]  # the nearest round the circle
     a, b = np.zeros((1, 1)), np.full((1, 1), 2 * np.pi)
-    for skill in (one, via):
+    for skill in (primitive, via):
         assert np.array_equal(skill.mean(a), skill.mean(b))
         assert np.array_equal(skill.predict(a).covariance, skill.predict(b).covariance)
         assert np.array_equal(skill.jacobian(a[0]), skill.jacobian(b[0]))
@@ -74,5 +74,5 @@ def test_a_rhythmic_skill_has_no_seam(representation):
         np.testing.assert_allclose(skill.mean(many + 4 * np.pi), skill.mean(many), atol=1e-9)
         just = np.array([[2 * np.pi - 1e-9], [1e-9]])
         np.testing.assert_allclose(*skill.mean(just), atol=1e-7)
-    np.testing.assert_allclose(one.mean(phase), mean, atol=1e-2)
+    np.testing.assert_allclose(primitive.mean(phase), mean, atol=1e-2)
     np.testing.assert_allclose(via.mean([[2 * np.pi - 0.02]]), [[0.2, 0.9]], atol=1e-4)

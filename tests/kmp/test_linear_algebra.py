@@ -17,11 +17,11 @@ def test_nearest_positive_semidefinite(count):
     values, vectors = np.linalg.eigh(good)
     bad = good.copy()
     bad[-1] = symmetric((vectors[-1] * [-0.5, *values[-1, 1:]]) @ vectors[-1].T)
-    found = nearest_positive_semidefinite(bad)
-    assert np.array_equal(found[:-1], good[:-1])
-    np.linalg.cholesky(found)
+    nearest = nearest_positive_semidefinite(bad)
+    assert np.array_equal(nearest[:-1], good[:-1])
+    np.linalg.cholesky(nearest)
     raised = (vectors[-1] * [0, *values[-1, 1:]]) @ vectors[-1].T
-    np.testing.assert_allclose(found[-1], raised, atol=1e-12)
+    np.testing.assert_allclose(nearest[-1], raised, atol=1e-12)
 
 
 @pytest.mark.parametrize(("n", "copies"), [(1, 3), (3, 2), (21, 3), (40, 1)])
@@ -35,8 +35,8 @@ def test_products_with_inverse_factor(n, copies, channels):
     inverse = InverseCholeskyFactor.of(factor, copies)
     many = inverse.times_many(x, channels)
     for m, columns in enumerate(np.split(x, 4, axis=1)):
-        wanted = np.linalg.solve(factor, np.kron(columns, np.eye(copies)))
-        np.testing.assert_allclose(inverse.times_one(columns), wanted.T, atol=1e-12)
-        np.testing.assert_allclose(many[m], wanted, atol=1e-12)
+        expected = np.linalg.solve(factor, np.kron(columns, np.eye(copies)))
+        np.testing.assert_allclose(inverse.times_one(columns), expected.T, atol=1e-12)
+        np.testing.assert_allclose(many[m], expected, atol=1e-12)
     if channels == 1:
         assert np.array_equal(inverse.times_one(x[:, 0]), inverse.times_one(x[:, :1]))

@@ -52,9 +52,9 @@ def agree(dense, low, queries, within=1e-6):
     np.testing.assert_allclose(b.covariance, a.covariance, atol=1e-5 * scale)
     np.testing.assert_allclose(low.predict(queries[:1]).covariance[0], b.covariance[0], atol=1e-9 * scale)
     assert np.array_equal(b.mean, low.mean(queries))
-    one, v = queries[0], np.ones(queries.shape[1])
-    np.testing.assert_allclose(low.jacobian(one), dense.jacobian(one), atol=100 * within)
-    np.testing.assert_allclose(low.curvature(one, v), dense.curvature(one, v), atol=1e4 * within)
+    query, v = queries[0], np.ones(queries.shape[1])
+    np.testing.assert_allclose(low.jacobian(query), dense.jacobian(query), atol=100 * within)
+    np.testing.assert_allclose(low.curvature(query, v), dense.curvature(query, v), atol=1e4 * within)
 
 
 @properties
@@ -74,7 +74,7 @@ def test_adapted_equals_dense_adapted(seed, tolerance, spread, lambda_covariance
     """An adapted low-rank primitive equals the adapted dense one."""
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     inputs, desired = points(seed, 3, std=1e-3, spread=spread)
-    dense, low = (one.adapt(inputs, desired, tolerance=tolerance) for one in (dense, low))
+    dense, low = (primitive.adapt(inputs, desired, tolerance=tolerance) for primitive in (dense, low))
     assert np.array_equal(dense.inputs, low.inputs)
     assert np.array_equal(dense.reference.mean, low.reference.mean)
     agree(dense, low, np.concatenate([dense.inputs[:20], inputs]), within=5e-6)
@@ -92,11 +92,11 @@ def test_hidden_covariance_is_refused(variance, representation):
     if representation == "low_rank":
         with pytest.raises(ValueError, match=r"at point 0 would be lost .* a lambda_mean of at least"):
             KMP.fit(inputs, hidden, lambda_mean=1.0, lambda_covariance=1e9, **options)
-    one, point = KMP.fit(inputs, reference, lambda_mean=1.0, **options), hidden[:1]
+    primitive, point = KMP.fit(inputs, reference, lambda_mean=1.0, **options), hidden[:1]
     with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding: .* a lambda_\w+ of at least"):
-        one.adapt(inputs[:1] + 0.1, point, tolerance=0.0)
+        primitive.adapt(inputs[:1] + 0.1, point, tolerance=0.0)
     with pytest.raises(ValueError, match=r"at point 599 would be lost in rounding"):
-        one.adapt(inputs[:1], point, tolerance=0.001)
+        primitive.adapt(inputs[:1], point, tolerance=0.001)
     with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding"):
         KMP.fit(inputs, reference, lambda_mean=1e6, lambda_covariance=1.0, **options).adapt(
             inputs[:1] + 0.1, point, tolerance=0.0
@@ -122,9 +122,9 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
     t, reference = correlated(outputs, 150, outputs, spread)
     dense, low = of_both(t, reference, kernel=one, lambda_mean=10.0)
     backward = Gaussians(reference.mean[::-1], reference.covariance[::-1])
-    again, _ = of_both(t[::-1], backward, kernel=one, lambda_mean=10.0)
+    reordered, _ = of_both(t[::-1], backward, kernel=one, lambda_mean=10.0)
     via = t[50:51] + 0.004, Gaussians(reference.mean[50:51] + 0.01, reference.covariance[70:71])
-    for a, b, c in ((dense, low, again), (each.adapt(*via, tolerance=0.02) for each in (dense, low, again))):
+    for a, b, c in ((dense, low, reordered), (primitive.adapt(*via, tolerance=0.02) for primitive in (dense, low, reordered))):
         error = np.linalg.norm(b.mean(t) - a.mean(t), axis=1).max()
         # The same points in another order differ by what rounding does to the dense solution.
         rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
@@ -138,11 +138,11 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
 def test_rank_decides_over_time(one):
     """Over time, the rank decides on the representation, not the number of points alone."""
     t, reference = correlated(0, 240, 4, 3.0)
-    found = KMP.fit(t, reference, kernel=one, lambda_mean=10.0)
+    automatic = KMP.fit(t, reference, kernel=one, lambda_mean=10.0)
     dense = KMP.fit(t, reference, kernel=one, lambda_mean=10.0, representation="dense")
-    assert found.representation == "low_rank"
-    assert len(found.weights) < 40
-    np.testing.assert_allclose(found.mean(t), dense.mean(t), atol=1e-9)
+    assert automatic.representation == "low_rank"
+    assert len(automatic.weights) < 40
+    np.testing.assert_allclose(automatic.mean(t), dense.mean(t), atol=1e-9)
     short = replace(one, ell=4000.0)
     assert KMP.fit(t, reference, kernel=short, lambda_mean=10.0).representation == "dense"
     assert KMP.fit(t[:50], reference[:50], kernel=one, lambda_mean=10.0).representation == "dense"
@@ -164,12 +164,12 @@ def test_reached_rank_is_reported_with_error_bound(rank):
     inputs, reference = tube(0, 300)
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
     says = rf"rank: {rank} features leave up to .* 4e-12 is required: .* Raise the rank"
-    with pytest.warns(RankReached, match=says) as said:
+    with pytest.warns(RankReached, match=says) as caught:
         low = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank)
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
     assert 1e-6 < error < low.error_bound_at_points
-    assert f"{low.error_bound_at_points:.2g} [unit" in str(said[0].message)
-    assert said[0].filename == __file__
+    assert f"{low.error_bound_at_points:.2g} [unit" in str(caught[0].message)
+    assert caught[0].filename == __file__
 
 
 @properties
@@ -178,7 +178,7 @@ def test_the_error_bound_holds(seed, left, adapted):
     dense, low = both(seed, rank_tolerance=left)
     if adapted:
         inputs, desired = points(seed, 1)
-        dense, low = (one.adapt(inputs, desired, tolerance=0.02) for one in (dense, low))
+        dense, low = (primitive.adapt(inputs, desired, tolerance=0.02) for primitive in (dense, low))
     data = dense.inputs[:300]
     assert np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= low.error_bound_at_points
     elsewhere = np.concatenate([dense.inputs, 0.5 * np.random.default_rng(seed).normal(size=(500, 6))])
@@ -201,10 +201,10 @@ def test_derivatives_are_features_too(count, ell):
     queries = np.linspace(-1, 3, 301)[:, None]
     assert np.abs(low.mean(queries) - dense.mean(queries)).max() <= low.error_bound
     np.testing.assert_allclose(low.mean(t), dense.mean(t), atol=1e-9)
-    again = named_arrays.from_arrays(named_arrays.to_arrays(low))
-    assert np.array_equal(again.mean(queries), low.mean(queries))
+    restored = named_arrays.from_arrays(named_arrays.to_arrays(low))
+    assert np.array_equal(restored.mean(queries), low.mean(queries))
     via = [[0.77]], Gaussians.of([[2.0, 0.0]], deviation=0.03)
-    a, b = (one.adapt(*via, tolerance=0.0, directions=[[1.0]]) for one in (dense, low))
+    a, b = (primitive.adapt(*via, tolerance=0.0, directions=[[1.0]]) for primitive in (dense, low))
     np.testing.assert_allclose(b.mean(t), a.mean(t), atol=1e-5)
 
 
@@ -216,5 +216,5 @@ def test_many_via_points_are_solved_anew():
     dense, low = of_both(t, reference, kernel=VelocityKernel(200.0), lambda_mean=0.1)
     s = np.linspace(0.05, 1.95, 240)[:, None]
     wish = Gaussians.of(np.hstack([np.sin(3 * s), 3 * np.cos(3 * s)]), deviation=0.03)
-    dense, low = (one.adapt(s, wish, tolerance=0.0) for one in (dense, low))
+    dense, low = (primitive.adapt(s, wish, tolerance=0.0) for primitive in (dense, low))
     np.testing.assert_allclose(low.mean(s), dense.mean(s), atol=1e-6)

@@ -35,8 +35,8 @@ def test_log_is_half_the_rotation_vector(seed):
 @pytest.mark.parametrize("angle", [0, 1e-12, 1e-8, 1e-5, 1e-4, 2e-4, 1.0])
 def test_small_angles_lose_no_digits(angle):
     zeta = np.array([[angle, 0, 0]])
-    found = orientation.log(orientation.exp(zeta, np.array([0, 0, 0, 1.0])), [0, 0, 0, 1])
-    np.testing.assert_allclose(found, zeta, rtol=1e-9, atol=1e-300)
+    recovered = orientation.log(orientation.exp(zeta, np.array([0, 0, 0, 1.0])), [0, 0, 0, 1])
+    np.testing.assert_allclose(recovered, zeta, rtol=1e-9, atol=1e-300)
 
 
 @properties
@@ -55,10 +55,10 @@ def test_signs_are_continuous():
     t = np.linspace(0, 4, 50)
     q = Rotation.from_rotvec(np.outer(t, [0.3, 0.9, 0.1])).as_quat()
     flipped = q * np.random.default_rng(0).choice([-1, 1], size=(50, 1))
-    found = orientation.continuous(flipped)
-    assert ((found[1:] * found[:-1]).sum(axis=1) > 0.9).all()
-    same(found, q)
-    assert np.linalg.norm(np.diff(orientation.log(found, found[25]), axis=0), axis=1).max() < 0.1
+    aligned = orientation.continuous(flipped)
+    assert ((aligned[1:] * aligned[:-1]).sum(axis=1) > 0.9).all()
+    same(aligned, q)
+    assert np.linalg.norm(np.diff(orientation.log(aligned, aligned[25]), axis=0), axis=1).max() < 0.1
 
 
 def path(t):
@@ -81,66 +81,66 @@ def skill(velocity):
 @pytest.mark.parametrize("velocity", [False, True])
 def test_skill_has_orientation_and_angular_velocity(velocity):
     """A skill reproduces orientations and their angular velocity."""
-    one, t, h = skill(velocity), np.linspace(0.1, 1.4, 20), 1e-5
-    q = one.mean(t[:, None])
+    primitive, t, h = skill(velocity), np.linspace(0.1, 1.4, 20), 1e-5
+    q = primitive.mean(t[:, None])
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
     same(q, path(t).as_quat(), atol=1e-4)
     for now in t:
-        ahead, behind = (Rotation.from_quat(one.mean([[now + d]])[0]) for d in (h, -h))
+        ahead, behind = (Rotation.from_quat(primitive.mean([[now + d]])[0]) for d in (h, -h))
         omega = (ahead * behind.inv()).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(one.angular_velocity([now], [1.0]), omega, atol=1e-5)
-        np.testing.assert_allclose(one.angular_velocity([now], [-2.0]), -2 * omega, atol=1e-5)
+        np.testing.assert_allclose(primitive.angular_velocity([now], [1.0]), omega, atol=1e-5)
+        np.testing.assert_allclose(primitive.angular_velocity([now], [-2.0]), -2 * omega, atol=1e-5)
 
 
 def test_via_points_of_either_sign_are_met():
     """Via-points of orientation are met, whatever the quaternion's sign."""
-    one = skill(velocity=False)
-    wanted = (Rotation.from_rotvec([0.3, -0.2, 0.1]) * path(np.array([0.7]))).as_quat()
+    primitive = skill(velocity=False)
+    desired = (Rotation.from_rotvec([0.3, -0.2, 0.1]) * path(np.array([0.7]))).as_quat()
     for sign in (1, -1):
-        adapted = one.adapt([[0.7]], sign * wanted, 1e-8 * np.eye(3), tolerance=0.02)
-        same(adapted.mean([[0.7]]), wanted)
-    np.testing.assert_allclose(one.mean([[0.7]]), skill(velocity=False).mean([[0.7]]))
+        adapted = primitive.adapt([[0.7]], sign * desired, 1e-8 * np.eye(3), tolerance=0.02)
+        same(adapted.mean([[0.7]]), desired)
+    np.testing.assert_allclose(primitive.mean([[0.7]]), skill(velocity=False).mean([[0.7]]))
 
 
 def test_via_point_may_fix_angular_velocity():
     """A via-point can fix the angular velocity or leave it free."""
-    one, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
-    wanted = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
-    free = one.adapt([[0.7]], wanted, 1e-8 * np.eye(3), tolerance=0.02)
-    same(free.mean([[0.7]]), wanted)
-    fixed = one.adapt(
+    primitive, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
+    desired = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
+    free = primitive.adapt([[0.7]], desired, 1e-8 * np.eye(3), tolerance=0.02)
+    same(free.mean([[0.7]]), desired)
+    fixed = primitive.adapt(
         [[0.7]],
-        wanted,
+        desired,
         1e-8 * np.eye(3),
         tolerance=0.02,
         angular_velocities=omega,
         velocity_covariance=1e-8 * np.eye(3),
     )
-    same(fixed.mean([[0.7]]), wanted)
+    same(fixed.mean([[0.7]]), desired)
     np.testing.assert_allclose(fixed.angular_velocity([0.7], [1.0]), omega[0], atol=1e-3)
 
 
 def test_covariance_is_of_world_rotations():
     """The covariance is of small rotations in the world."""
-    one = skill(velocity=False)
-    q, covariance = one.predict([[0.7], [0.9]])
-    same(q, one.mean([[0.7], [0.9]]))
-    zeta = one.primitive.predict([[0.7], [0.9]])
+    model = skill(velocity=False)
+    q, covariance = model.predict([[0.7], [0.9]])
+    same(q, model.mean([[0.7], [0.9]]))
+    zeta = model.primitive.predict([[0.7], [0.9]])
     draws = np.random.default_rng(0).multivariate_normal(zeta.mean[0], 1e-6 * zeta.covariance[0], size=20_000)
-    turns = (Rotation.from_quat(orientation.exp(draws, one.auxiliary)) * Rotation.from_quat(q[0]).inv()).as_rotvec()
+    turns = (Rotation.from_quat(orientation.exp(draws, model.auxiliary)) * Rotation.from_quat(q[0]).inv()).as_rotvec()
     scale = np.abs(covariance[0]).max()
     np.testing.assert_allclose(np.cov(turns.T) / 1e-6, covariance[0], atol=0.03 * scale)
 
 
 def test_impossible_orientations_are_refused():
     """Impossible requests are refused, with what is possible."""
-    one = skill(velocity=False)
+    model = skill(velocity=False)
     q = drawn(0, 1)
     for call, says in (
         (lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]), r"quaternions\[0\] has norm 2, and must have 1"),
         (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
         (
-            lambda: one.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
+            lambda: model.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
             "the skill has no rates; fit it with a VelocityKernel",
         ),
     ):

@@ -26,24 +26,24 @@ def _closed():
 
 def drawn(axes, label):
     """What has that label in the legend."""
-    return next(one for one in axes.get_children() if one.get_label() == label)
+    return next(artist for artist in axes.get_children() if artist.get_label() == label)
 
 
 def test_plot_over_input():
     """Over its input a primitive is drawn with its deviations and references."""
     axes = PLAIN.plot(input_unit="s", output_unit="m", outputs=["x", "y"])
-    assert [one.get_ylabel() for one in axes] == ["x [m]", "y [m]"]
+    assert [panel.get_ylabel() for panel in axes] == ["x [m]", "y [m]"]
     assert axes[1].get_xlabel() == "input [s]"
     queries = np.linspace(0, 2, 200)[:, None]
-    found = PLAIN.predict(queries)
-    for i, one in enumerate(axes):
-        np.testing.assert_array_equal(drawn(one, "mean").get_xydata(), np.hstack([queries, found.mean[:, i, None]]))
-        np.testing.assert_array_equal(drawn(one, "reference").get_xydata(), np.hstack([T, REFERENCE.mean[:, i, None]]))
+    prediction = PLAIN.predict(queries)
+    for i, panel in enumerate(axes):
+        np.testing.assert_array_equal(drawn(panel, "mean").get_xydata(), np.hstack([queries, prediction.mean[:, i, None]]))
+        np.testing.assert_array_equal(drawn(panel, "reference").get_xydata(), np.hstack([T, REFERENCE.mean[:, i, None]]))
         for times, label in ((1, "1 deviation"), (2, "2 deviations")):
-            [path] = drawn(one, label).get_paths()
-            far = times * np.sqrt(found.covariance[:, i, i])
+            [path] = drawn(panel, label).get_paths()
+            far = times * np.sqrt(prediction.covariance[:, i, i])
             for sign in (-1, 1):
-                edge = found.mean[:, i] + sign * far
+                edge = prediction.mean[:, i] + sign * far
                 assert {*edge} <= {*path.vertices[:, 1]}
     texts = [text.get_text() for text in axes[0].get_legend().get_texts()]
     assert texts == ["mean", "2 deviations", "1 deviation", "reference"]
@@ -52,28 +52,28 @@ def test_plot_over_input():
 def test_via_points_replace_references():
     """Via-points are drawn with two standard deviations, without the points that they replace."""
     axes = ADAPTED.plot()
-    for i, one in enumerate(axes):
-        [bars] = [bars for bars in one.containers if bars.get_label() == "via-point"]
+    for i, panel in enumerate(axes):
+        [bars] = [bars for bars in panel.containers if bars.get_label() == "via-point"]
         points, _, [lines] = bars
         np.testing.assert_array_equal(points.get_xydata(), [[1.0, (0.8, 0.5)[i]]])
         np.testing.assert_allclose(lines.get_segments()[0][:, 1], (0.8, 0.5)[i] + np.array([-2, 2]) * (0.01, 0.02)[i])
-        assert len(drawn(one, "reference").get_xdata()) == 39 - (len(T) - len(ADAPTED.inputs))
-        assert not (np.abs(drawn(one, "reference").get_xdata() - 1.0) < 0.02).any()
+        assert len(drawn(panel, "reference").get_xdata()) == 39 - (len(T) - len(ADAPTED.inputs))
+        assert not (np.abs(drawn(panel, "reference").get_xdata() - 1.0) < 0.02).any()
 
 
 def test_region_in_a_plane():
     """In a plane the region is that of the ellipses."""
     [axes] = ADAPTED.plot(T, plane=(1, 0), output_unit="m")
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("output 1 [m]", "output 0 [m]")
-    found = ADAPTED.predict(T)
-    np.testing.assert_array_equal(drawn(axes, "mean").get_xydata(), found.mean[:, ::-1])
+    prediction = ADAPTED.predict(T)
+    np.testing.assert_array_equal(drawn(axes, "mean").get_xydata(), prediction.mean[:, ::-1])
     np.testing.assert_array_equal(drawn(axes, "via-point").get_xydata(), [[0.5, 0.8]])
     for times, label in ((1, "1 deviation"), (2, "2 deviations")):
         rings = drawn(axes, label).get_path().to_polygons(closed_only=False)
         assert len(rings) == len(T)
-        for ring, mean, covariance in zip(rings, found.mean, found.covariance, strict=True):
-            apart = ring[:, ::-1] - mean
-            squares = np.einsum("no,op,np->n", apart, np.linalg.inv(covariance), apart)
+        for ring, mean, covariance in zip(rings, prediction.mean, prediction.covariance, strict=True):
+            offsets = ring[:, ::-1] - mean
+            squares = np.einsum("no,op,np->n", offsets, np.linalg.inv(covariance), offsets)
             np.testing.assert_allclose(squares, times**2, rtol=1e-6)
             turned = ring - ring.mean(axis=0)
             assert (

@@ -24,19 +24,19 @@ def test_mean_and_covariance_are_naive_ones(seed, outputs, lambda_covariance, ad
     mean, joint = naive(primitive, queries)
     for n, query in enumerate(queries):
         alone = primitive.predict(query[None])
-        for found in (together.mean[n], alone.mean[0], primitive.mean(queries)[n]):
-            np.testing.assert_allclose(found, mean[n], atol=1e-8)
-        for found in (together.covariance[n], alone.covariance[0]):
-            np.testing.assert_allclose(found, joint[n, :, n], rtol=1e-6, atol=1e-7)
+        for predicted_mean in (together.mean[n], alone.mean[0], primitive.mean(queries)[n]):
+            np.testing.assert_allclose(predicted_mean, mean[n], atol=1e-8)
+        for predicted_covariance in (together.covariance[n], alone.covariance[0]):
+            np.testing.assert_allclose(predicted_covariance, joint[n, :, n], rtol=1e-6, atol=1e-7)
 
 
 def test_batches_equal_single_queries():
     """Many queries are predicted in batches as in one."""
     queries = np.random.default_rng(0).normal(size=(600, 4))
     primitive = skill()
-    found = primitive.predict(queries)
+    prediction = primitive.predict(queries)
     for n in (0, 255, 256, 511, 512, 599):
-        np.testing.assert_allclose(found.covariance[n], primitive.predict(queries[n : n + 1]).covariance[0], rtol=1e-9)
+        np.testing.assert_allclose(prediction.covariance[n], primitive.predict(queries[n : n + 1]).covariance[0], rtol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
@@ -49,8 +49,8 @@ def test_covariance_is_positive_definite(seed, spread, representation):
     exact = Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1)))
     primitive = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation=representation)
     adapted = primitive.adapt(inputs[:3] + 0.01, exact[:3], tolerance=0.1)
-    for one in (primitive, adapted):
-        for prediction in (one.predict(inputs), *(one.predict(s[None]) for s in inputs)):
+    for variant in (primitive, adapted):
+        for prediction in (variant.predict(inputs), *(variant.predict(s[None]) for s in inputs)):
             covariance = prediction.covariance
             assert np.array_equal(covariance, covariance.swapaxes(1, 2))
             assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -61,12 +61,12 @@ def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
     """A covariance that rounding would hide is refused and the remedy works."""
     inputs, reference = database()
     sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
-    one = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance)
-    assert one.predict(inputs).covariance.shape == (30, 3, 3)
+    primitive = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance)
+    assert primitive.predict(inputs).covariance.shape == (30, 3, 3)
     points = via(0, 1, std=1e-8)
     says = rf"point 30 .* lambda Sigma is {1e-16 * lambda_covariance:.3g} .* lambda_covariance of at least 1e\+05"
     with pytest.raises(ValueError, match=says):
-        one.adapt(*points, tolerance=0)
+        primitive.adapt(*points, tolerance=0)
     remedied = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=1e5)
     np.testing.assert_allclose(remedied.adapt(*points, tolerance=0).mean(points[0]), points[1].mean, atol=1e-6)
 
@@ -75,8 +75,8 @@ def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
 def test_far_away_is_the_prior(representation):
     """Far from the data, mean and covariance are those of the prior."""
     far = np.full((1, 4), 50.0)
-    one = skill(prior_mean=[1, 2, 3], representation=representation)
-    for primitive in (one, one.adapt(*via(0, 1), tolerance=0.1)):
+    base = skill(prior_mean=[1, 2, 3], representation=representation)
+    for primitive in (base, base.adapt(*via(0, 1), tolerance=0.1)):
         prediction = primitive.predict(far)
         np.testing.assert_array_equal(prediction.mean, [[1, 2, 3]])
         np.testing.assert_allclose(prediction.covariance[0], 30 / 2.0 * np.eye(3))
@@ -90,9 +90,9 @@ def test_refitted_to_own_reference_is_the_same(count):
     queries = np.random.default_rng(2).normal(size=(3, 4))
     assert same_bits(primitive.refitted(primitive.base.reference), primitive, queries)
     other = Gaussians(primitive.base.reference.mean + 1, primitive.base.reference.covariance)
-    again = primitive.refitted(other)
-    assert np.array_equal(again.via_inputs, primitive.via_inputs)
-    assert np.array_equal(again.base.reference.mean, other.mean)
+    refitted = primitive.refitted(other)
+    assert np.array_equal(refitted.via_inputs, primitive.via_inputs)
+    assert np.array_equal(refitted.base.reference.mean, other.mean)
     with pytest.raises(ValueError, match="29 normals over 3 outputs given for 30 inputs"):
         primitive.refitted(other.take(slice(0, 29)))
 
@@ -103,7 +103,7 @@ def test_other_units_change_nothing(seed, c, representation):
     inputs, reference = database(seed)
     points, desired = via(seed, 2, std=0.01)
     queries = np.random.default_rng(seed + 1).normal(size=(4, 4))
-    one, other = (
+    unscaled, other = (
         KMP.fit(
             f * inputs,
             Gaussians(f * reference.mean, f**2 * reference.covariance),
@@ -115,8 +115,8 @@ def test_other_units_change_nothing(seed, c, representation):
         .predict(f * queries)
         for f in (1.0, c)
     )
-    np.testing.assert_allclose(other.mean / c, one.mean, atol=1e-6)
-    np.testing.assert_allclose(other.covariance / c**2, one.covariance, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(other.mean / c, unscaled.mean, atol=1e-6)
+    np.testing.assert_allclose(other.covariance / c**2, unscaled.covariance, rtol=1e-5, atol=1e-6)
 
 
 @properties
@@ -144,8 +144,8 @@ def test_threads_may_share_a_primitive(representation, points):
     )
     queries = np.random.default_rng(2).normal(size=(64, 1, 4))
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(primitive.predict, queries))
-    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(found, queries, strict=True))
+        predictions = list(pool.map(primitive.predict, queries))
+    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(predictions, queries, strict=True))
 
 
 INPUTS, REFERENCE = database(count=3)
@@ -199,8 +199,8 @@ def solved(matrix, right):
             x[j] = (x[j] - factor[j + 1 :, j] @ x[j + 1 :]) / factor[j, j]
         return x
 
-    found = once(right)
-    return found + once(right - matrix @ found)
+    solution = once(right)
+    return solution + once(right - matrix @ solution)
 
 
 def blocks(kernel, a, b):
@@ -221,8 +221,8 @@ def exact(primitive, queries):
     right = (primitive.reference.mean - primitive.prior_mean).astype(wide).ravel()
     mean = (rows @ solved(k + wide(primitive.lambda_mean) * sigma, right)).reshape(-1, o) + primitive.prior_mean
     gain = solved(k + wide(primitive.lambda_covariance) * sigma, rows.T)
-    each = [unit - rows[i : i + o] @ gain[:, i : i + o] for i in range(0, len(rows), o)]
-    return mean, np.array(each) * n / wide(primitive.lambda_covariance)
+    covariances = [unit - rows[i : i + o] @ gain[:, i : i + o] for i in range(0, len(rows), o)]
+    return mean, np.array(covariances) * n / wide(primitive.lambda_covariance)
 
 
 def hands(seed=0, count=70):
@@ -263,10 +263,10 @@ def check(primitive, queries):
     mean, covariance = exact(primitive, queries)
     together = primitive.predict(queries)
     singly = [primitive.predict(query[None]) for query in queries]
-    for found in (together.mean, np.concatenate([one.mean for one in singly])):
-        assert np.linalg.norm((found - mean).astype(float)) <= 1e-9 * np.linalg.norm(mean.astype(float))
-    for found in (together.covariance, np.concatenate([one.covariance for one in singly])):
-        assert np.linalg.norm((found - covariance).astype(float)) <= 1e-9 * np.linalg.norm(covariance.astype(float))
+    for predicted_mean in (together.mean, np.concatenate([prediction.mean for prediction in singly])):
+        assert np.linalg.norm((predicted_mean - mean).astype(float)) <= 1e-9 * np.linalg.norm(mean.astype(float))
+    for predicted_covariance in (together.covariance, np.concatenate([prediction.covariance for prediction in singly])):
+        assert np.linalg.norm((predicted_covariance - covariance).astype(float)) <= 1e-9 * np.linalg.norm(covariance.astype(float))
     near = slice(0, -3)  # and where the covariance is small, in its own right
     error = np.linalg.norm((together.covariance - covariance)[near].astype(float))
     assert error <= 1e-9 * np.linalg.norm(covariance[near].astype(float))

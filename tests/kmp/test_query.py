@@ -12,14 +12,14 @@ def primitive(kernel, representation, changed):
     inputs, reference = curve(KERNELS[kernel])
     prior = [0.3, 0.2, 0, 0][: reference.outputs]
     options = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "prior_mean": prior, "representation": representation}
-    one = KMP.fit(inputs, reference, kernel=KERNELS[kernel], **options)
+    model = KMP.fit(inputs, reference, kernel=KERNELS[kernel], **options)
     if changed != "fitted":
         via = Gaussians.of(reference.mean[20:22] + 0.05, deviation=0.03)
-        one = one.adapt(inputs[20:22] + 0.01, via, tolerance=0.02)
+        model = model.adapt(inputs[20:22] + 0.01, via, tolerance=0.02)
     if changed == "with a Jacobian":
         place = inputs[31:32] + 0.01
-        one = one.adapt_jacobian(place, one.jacobians(place) + 0.1, deviation=0.1)
-    return one
+        model = model.adapt_jacobian(place, model.jacobians(place) + 0.1, deviation=0.1)
+    return model
 
 
 CHANGES = ("fitted", "adapted", "with a Jacobian")
@@ -41,29 +41,29 @@ def test_one_call_equals_the_others(skill, monkeypatch):
     """One call gives the results of the separate calls, bit for bit."""
     monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as where Numba is not installed
     s, v, a = moving(skill)
-    found, one = skill.predict_motion(s, v, a), skill.predict(s[None])
-    assert np.array_equal(found.mean, skill.mean(s[None])[0])
-    assert np.array_equal(found.mean, one.mean[0])
-    assert np.array_equal(found.covariance, one.covariance[0])
-    assert np.array_equal(found.jacobian, skill.jacobian(s))
-    assert np.array_equal(found.curvature, skill.curvature(s, v))
-    assert np.array_equal(found.velocity, found.jacobian @ v)
-    assert np.array_equal(found.acceleration, found.jacobian @ a + found.curvature)
+    prediction, batch = skill.predict_motion(s, v, a), skill.predict(s[None])
+    assert np.array_equal(prediction.mean, skill.mean(s[None])[0])
+    assert np.array_equal(prediction.mean, batch.mean[0])
+    assert np.array_equal(prediction.covariance, batch.covariance[0])
+    assert np.array_equal(prediction.jacobian, skill.jacobian(s))
+    assert np.array_equal(prediction.curvature, skill.curvature(s, v))
+    assert np.array_equal(prediction.velocity, prediction.jacobian @ v)
+    assert np.array_equal(prediction.acceleration, prediction.jacobian @ a + prediction.curvature)
     bare = skill.predict_motion(s, v, a, covariance=False)
     assert bare.covariance is None
-    assert np.array_equal(bare.acceleration, found.acceleration)
+    assert np.array_equal(bare.acceleration, prediction.acceleration)
 
 
 def test_compiled_loops_equal_plain_ones(skill):
     """Compiled loops give the same but for rounding."""
     motion = moving(skill)
-    found, plain = skill.predict_motion(*motion), skill.inner.query.motion(*motion, covariance=True)
+    prediction, plain = skill.predict_motion(*motion), skill.inner.query.motion(*motion, covariance=True)
     assert (skill.inner.compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
     for name in plain._fields[:3] + plain._fields[4:]:
         size = np.abs(getattr(plain, name)).max()
-        np.testing.assert_allclose(getattr(found, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
-    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=0, atol=1e-9)
-    np.linalg.cholesky(found.covariance)
+        np.testing.assert_allclose(getattr(prediction, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
+    np.testing.assert_allclose(prediction.covariance, plain.covariance, rtol=0, atol=1e-9)
+    np.linalg.cholesky(prediction.covariance)
 
 
 def test_jacobian_and_curvature_are_derivatives(skill):
@@ -79,7 +79,7 @@ def test_jacobian_and_curvature_are_derivatives(skill):
 def test_motion_is_the_derivative_along_path(skill):
     """Velocity and acceleration agree with finite differences along the motion."""
     (s, v, a), h = moving(skill), 1e-4
-    behind, here, ahead = skill.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
-    found = skill.predict_motion(s, v, a)
-    np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(found.acceleration, (ahead - 2 * here + behind) / h**2, rtol=1e-3, atol=1e-3)
+    behind, center, ahead = skill.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
+    prediction = skill.predict_motion(s, v, a)
+    np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(prediction.acceleration, (ahead - 2 * center + behind) / h**2, rtol=1e-3, atol=1e-3)

@@ -25,10 +25,10 @@ def some(seed, count=6, outputs=2):
 def test_superposition_is_a_product():
     """Superposition is the product of the covariances over their priorities."""
     a, b, g = some(0), some(1), [0.3, 0.7]
-    found = superposed([a, b], g)
+    superposition = superposed([a, b], g)
     product = Gaussians(a.mean, a.covariance / g[0]).product(Gaussians(b.mean, b.covariance / g[1]))
-    np.testing.assert_allclose(found.mean, product.mean, rtol=1e-9)
-    np.testing.assert_allclose(found.covariance, product.covariance, rtol=1e-9)
+    np.testing.assert_allclose(superposition.mean, product.mean, rtol=1e-9)
+    np.testing.assert_allclose(superposition.covariance, product.covariance, rtol=1e-9)
 
 
 def reaching(random, start, goal, t):
@@ -42,7 +42,7 @@ def learned(velocity=False):
     paths = [reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + ends), t) for _ in range(6)]
     frames = [CoordinateFrame.start_and_goal(path) for path in paths]
     if velocity:
-        frames = [[frame.with_velocity() for frame in one] for one in frames]
+        frames = [[frame.with_velocity() for frame in pair] for pair in frames]
         paths = [np.hstack([path, np.gradient(path, t, axis=0)]) for path in paths]
     skill = LocalKMP.learn(
         [(t[:, None], path) for path in paths],
@@ -88,9 +88,9 @@ def test_turned_frames_turn_predictions():
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     straight = skill.predict(t)
     turned = skill.placed([CoordinateFrame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]).predict(t)
-    both = np.kron(np.eye(2), turn)
-    np.testing.assert_allclose(turned.mean, straight.mean @ both.T, atol=1e-7)
-    np.testing.assert_allclose(turned.covariance, both @ straight.covariance @ both.T, atol=1e-7)
+    block_turn = np.kron(np.eye(2), turn)
+    np.testing.assert_allclose(turned.mean, straight.mean @ block_turn.T, atol=1e-7)
+    np.testing.assert_allclose(turned.covariance, block_turn @ straight.covariance @ block_turn.T, atol=1e-7)
 
 
 def test_frames_that_do_not_fit_are_refused():
@@ -119,11 +119,11 @@ def judged(offset):
     """Errors and shares (S, 2) at a demonstration that was left out: the process, the mixture."""
     errors, shares = [], []
     for seed in SEEDS:
-        *shown, (hands, tool) = two_hands(seed, offset=offset)
-        mixture = GaussianMixture.fit(np.vstack([np.hstack(one) for one in shown]), components=10, seed=seed)
-        both = gaussian_process_reference(shown, hands, count=200), mixture.regress(hands)
-        errors.append([off(one.mean, tool) for one in both])
-        shares.append([within(one, tool) for one in both])
+        *takes, (hands, tool) = two_hands(seed, offset=offset)
+        mixture = GaussianMixture.fit(np.vstack([np.hstack(take) for take in takes]), components=10, seed=seed)
+        predictions = gaussian_process_reference(takes, hands, count=200), mixture.regress(hands)
+        errors.append([off(prediction.mean, tool) for prediction in predictions])
+        shares.append([within(prediction, tool) for prediction in predictions])
     return np.array(errors), np.array(shares)
 
 
@@ -138,27 +138,27 @@ def test_process_knows_common_offsets():
 def test_common_offsets_are_correlated():
     """Outputs that are off together are correlated."""
     random, t = np.random.default_rng(0), np.linspace(0, 1, 50)[:, None]
-    shown = []
+    takes = []
     for _ in range(6):
         shift = 0.2 * random.normal(size=2)
-        shown.append((t, np.sin(3 * t) + [shift[0], shift[0], shift[1]] + 0.02 * random.normal(size=(50, 3))))
-    found = gaussian_process_reference(shown, t[::10], count=90)
-    deviation = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    correlation = found.covariance / deviation[:, :, None] / deviation[:, None, :]
+        takes.append((t, np.sin(3 * t) + [shift[0], shift[0], shift[1]] + 0.02 * random.normal(size=(50, 3))))
+    reference = gaussian_process_reference(takes, t[::10], count=90)
+    deviation = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))
+    correlation = reference.covariance / deviation[:, :, None] / deviation[:, None, :]
     assert (correlation[:, 0, 1] > 0.95).all()
     assert (np.abs(correlation[:, 0, 2]) < 0.7).all()
-    spread = np.std([path.mean(axis=0) for _, path in shown], axis=0, ddof=1)
+    spread = np.std([path.mean(axis=0) for _, path in takes], axis=0, ddof=1)
     np.testing.assert_allclose(deviation[2], spread, rtol=0.5)
 
 
 def test_reference_follows_units():
     """The same demonstrations give the same reference in any unit."""
-    shown = [(hands[::5], tool[::5]) for hands, tool in two_hands(1, demonstrations=3)]
-    hands = shown[0][0][:5]
-    found = gaussian_process_reference(shown, hands, regularization=1e-12)
-    again = gaussian_process_reference(shown, hands, regularization=1e-12)
-    np.testing.assert_array_equal(found.covariance, again.covariance)
-    millimetres = [(1000 * s, 1000 * y) for s, y in shown]
+    takes = [(hands[::5], tool[::5]) for hands, tool in two_hands(1, demonstrations=3)]
+    hands = takes[0][0][:5]
+    reference = gaussian_process_reference(takes, hands, regularization=1e-12)
+    repetition = gaussian_process_reference(takes, hands, regularization=1e-12)
+    np.testing.assert_array_equal(reference.covariance, repetition.covariance)
+    millimetres = [(1000 * s, 1000 * y) for s, y in takes]
     other = gaussian_process_reference(millimetres, 1000 * hands, regularization=1e-6)
-    np.testing.assert_allclose(other.mean / 1e3, found.mean, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(other.covariance / 1e6, found.covariance, rtol=0.05, atol=1e-7)
+    np.testing.assert_allclose(other.mean / 1e3, reference.mean, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(other.covariance / 1e6, reference.covariance, rtol=0.05, atol=1e-7)

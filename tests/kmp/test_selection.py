@@ -70,14 +70,14 @@ def test_reach_is_where_a_tenth_moves():
 )
 def test_the_choice_follows_the_units(criterion, ells, ell_within, lambda_within):
     c = 100.0
-    one = chosen(criterion=criterion)
+    choice = chosen(criterion=criterion)
     other = chosen([(c * s, c * xi) for s, xi in driven_by_hands()], regularization=1e-6 * c**2, criterion=criterion)
-    before, after = one.primitive, other.primitive
+    before, after = choice.primitive, other.primitive
     np.testing.assert_allclose(c**2 * after.kernel.ell[:ells], before.kernel.ell[:ells], rtol=ell_within)
     np.testing.assert_allclose(c**2 * after.lambda_mean, before.lambda_mean, rtol=lambda_within)
-    for large, small in zip(other.scores[:1], one.scores[:1], strict=True):
+    for large, small in zip(other.scores[:1], choice.scores[:1], strict=True):
         np.testing.assert_allclose(large.rmse, c * small.rmse, rtol=1e-3)
-        np.testing.assert_allclose(other.reach, c * one.reach, rtol=1e-2)
+        np.testing.assert_allclose(other.reach, c * choice.reach, rtol=1e-2)
 
 
 @pytest.mark.parametrize("criterion", ["left-out", "likelihood"])
@@ -104,14 +104,14 @@ def test_reference_over_time_is_even(velocity):
 
 def test_impossible_choices_are_refused():
     """Impossible requests are refused, with what is possible."""
-    one = driven_by_hands(count=1)
+    takes = driven_by_hands(count=1)
     says = r"1 demonstration given: at least 2 needed to choose .* Give kernel, lambda_mean"
     with pytest.raises(ValueError, match=says):
-        chosen(one)
+        chosen(takes)
     with pytest.raises(ValueError, match="demonstrations: none given"):
         kmp.learn([], components=1, seed=0)
     with pytest.raises(ValueError, match=r"demonstrations\[1\] outputs: shape \(80, 3\) given, \(80, 2\) needed"):
-        chosen([*one, (np.zeros((80, 2)), np.zeros((80, 3)))])
+        chosen([*takes, (np.zeros((80, 2)), np.zeros((80, 3)))])
     for scale, begin, words in (
         (1e9, 1.76e18, "give seconds"),
         (1.0, 1.76e18, "subtract"),
@@ -122,19 +122,19 @@ def test_impossible_choices_are_refused():
             chosen([(times, outputs) for _, outputs in driven_by_hands(count=3)])
     with pytest.raises(ValueError, match="160 samples given for 1000 components"):
         chosen(driven_by_hands(count=2), components=1000)
-    alone = chosen(one, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
+    alone = chosen(takes, kernel=GaussianKernel(3.0), lambda_mean=1, lambda_covariance=1)
     assert np.isnan(alone.regression_rmse)
 
 
 def test_shown_points_where_they_predict_better():
     """With many inputs, demonstrated samples become reference points where they predict better."""
-    *shown, (hands, tool) = two_hands(0, demonstrations=6)
-    learned = {points: chosen(shown, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
-    misses = {points: off(one.primitive.mean(hands), tool) for points, one in learned.items()}
+    *takes, (hands, tool) = two_hands(0, demonstrations=6)
+    learned = {points: chosen(takes, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
+    misses = {points: off(choice.primitive.mean(hands), tool) for points, choice in learned.items()}
     assert misses["shown"] < 0.8 * misses["drawn"]
-    rmses = {points: one.scores[0].rmse for points, one in learned.items()}
+    rmses = {points: choice.scores[0].rmse for points, choice in learned.items()}
     assert rmses["auto"] == min(rmses.values())
-    samples = np.concatenate([s for s, _ in shown])
+    samples = np.concatenate([s for s, _ in takes])
     for points in ("shown", "auto"):
         assert all((samples == s).all(axis=1).any() for s in learned[points].primitive.inputs)
     assert not (samples == learned["drawn"].primitive.inputs[0]).all(axis=1).any()
@@ -174,9 +174,9 @@ def test_the_gradient_is_the_differences(points, kernel):
         of = GaussianKernel(scaled) if isinstance(kernel, GaussianKernel) else VelocityKernel(scaled)
         return negative_log_likelihood(points, prior, of, float(np.exp(logs[-1])))[0]
 
-    at, step = np.log([*ell, 0.7]), 1e-5
+    log_point, step = np.log([*ell, 0.7]), 1e-5
     gradient = negative_log_likelihood(points, prior, kernel, 0.7)[1]
-    differences = [(value(at + step * e) - value(at - step * e)) / (2 * step) for e in np.eye(len(at))]
+    differences = [(value(log_point + step * e) - value(log_point - step * e)) / (2 * step) for e in np.eye(len(log_point))]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6)
 
 
@@ -185,8 +185,8 @@ def test_likelihood_is_that_of_scipy():
     points, kernel = CASES[0]
     value, _, signal = negative_log_likelihood(points, np.zeros(2), kernel, 0.7)
     total = np.kron(kernel(points.inputs, points.inputs), np.eye(2))
-    for n, one in enumerate(points.reference.covariance):
-        total[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += 0.7 * one
+    for n, covariance in enumerate(points.reference.covariance):
+        total[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += 0.7 * covariance
     densities = [
         multivariate_normal(cov=s * total).logpdf(points.reference.mean.ravel()) for s in (signal, 0.9 * signal)
     ]
@@ -197,20 +197,20 @@ def test_likelihood_is_that_of_scipy():
 def test_likelihood_finds_irrelevant_input():
     """An uninformative input is detected, and the prediction improves without it."""
     options = {"components": 16, "seed": 0, "count": 80, "criterion": "likelihood"}
-    each, one = (kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one"))
+    separate, shared = (kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one"))
     variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
-    relevance, alike = (np.asarray(learned.primitive.kernel.ell) * variances for learned in (each, one))
+    relevance, alike = (np.asarray(learned.primitive.kernel.ell) * variances for learned in (separate, shared))
     assert relevance[1] < 0.1 * relevance[0]
     assert alike[1] == pytest.approx(alike[0], rel=0.3)
-    assert unseen_rmse(each) < 0.9 * unseen_rmse(one)
+    assert unseen_rmse(separate) < 0.9 * unseen_rmse(shared)
 
 
 @pytest.mark.parametrize("velocity", [False, True])
 def test_one_demonstration_is_enough(velocity):
-    shown, options = over_time(velocity), {"components": 8, "seed": 0, "count": 60, "velocity": velocity}
-    learned = kmp.learn(shown[:1], criterion="likelihood", **options)
+    takes, options = over_time(velocity), {"components": 8, "seed": 0, "count": 60, "velocity": velocity}
+    learned = kmp.learn(takes[:1], criterion="likelihood", **options)
     assert isinstance(learned.primitive.kernel, VelocityKernel if velocity else GaussianKernel)
-    miss = learned.primitive.mean(shown[0][0]) - shown[0][1]
+    miss = learned.primitive.mean(takes[0][0]) - takes[0][1]
     assert np.sqrt(np.mean(miss[:, :2] ** 2)) < 0.03
     assert learned.scores == ()
     assert np.isnan(learned.regression_rmse)

@@ -24,8 +24,8 @@ MANY = S[:38] + 0.01, REFERENCE.take(slice(0, 38))
 
 
 def fitted(representation, via=None):
-    one = KMP.fit(S, REFERENCE, kernel=GaussianKernel(0.05), lambda_mean=1.0, representation=representation)
-    return one.adapt(*via, tolerance=0.1) if via else one
+    model = KMP.fit(S, REFERENCE, kernel=GaussianKernel(0.05), lambda_mean=1.0, representation=representation)
+    return model.adapt(*via, tolerance=0.1) if via else model
 
 
 SOLUTIONS = {
@@ -46,9 +46,9 @@ def test_solution_is_stored_with_base(primitive):
     """Each is stored with what its base needs."""
     assert set(primitive.inner.solution.to_arrays()) == set(primitive.base.inner.solution.to_arrays())
     assert primitive.representation == primitive.base.representation
-    again = named_arrays.from_arrays(named_arrays.to_arrays(primitive))
-    assert type(again.inner.solution) is type(primitive.inner.solution)
-    assert np.array_equal(again.mean(S), primitive.mean(S))
+    restored = named_arrays.from_arrays(named_arrays.to_arrays(primitive))
+    assert type(restored.inner.solution) is type(primitive.inner.solution)
+    assert np.array_equal(restored.mean(S), primitive.mean(S))
 
 
 @pytest.mark.parametrize("name", ["information", "features"])
@@ -83,19 +83,19 @@ def via(count, outputs):
 @pytest.mark.parametrize("first", ["alike", "apart"])
 def test_outputs_solved_as_one_change(first):
     """Adapting changes whether outputs are solved as one."""
-    alike, apart = np.tile(0.01 * np.eye(2), (3, 1, 1)), leaning(3)
-    mixed = Gaussians(REFERENCE.mean, np.concatenate([alike[:1].repeat(37, axis=0), apart]))
+    alike, tilted = np.tile(0.01 * np.eye(2), (3, 1, 1)), leaning(3)
+    mixed = Gaussians(REFERENCE.mean, np.concatenate([alike[:1].repeat(37, axis=0), tilted]))
     options = {"kernel": GaussianKernel(0.05), "lambda_mean": 1.0, "representation": "dense"}
     base = KMP.fit(S, REFERENCE if first == "alike" else mixed, **options)
-    points = Gaussians(np.ones((3, 2)), apart if first == "alike" else alike)
+    points = Gaussians(np.ones((3, 2)), tilted if first == "alike" else alike)
     where = S[:3] + 0.01 if first == "alike" else S[37:]  # in the place of those that tell them apart
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
     assert (base.inner.solution.distinct, adapted.inner.solution.distinct) == ((1, 2) if first == "alike" else (2, 1))
     anew = KMP.fit(adapted.inputs, adapted.reference, **options)
     assert adapted.inner.solution.same > 0
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
-    one, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
-    np.testing.assert_allclose(one, other, atol=1e-10)
+    covariance, other = (x.predict(S).covariance / n for x, n in ((adapted, len(base.inputs)), (anew, len(anew.inputs))))
+    np.testing.assert_allclose(covariance, other, atol=1e-10)
 
 
 def test_lost_point_is_refused_where_replaced():
@@ -156,11 +156,11 @@ def test_extended_is_fit_of_all_points(case):
     place = Gaussians(0 * reference.mean[:1], 0.5 * np.eye(reference.outputs)[None])
     via = inputs[3:4] + 1e-3, place
     adapted = first.adapt(*via, tolerance=0.01).extended(inputs[40:], reference[40:])
-    wanted = whole.adapt(*via, tolerance=0.01)
-    assert np.array_equal(adapted.inner.changes.replaced, wanted.inner.changes.replaced)
-    assert_same(adapted, wanted, queries)
+    expected = whole.adapt(*via, tolerance=0.01)
+    assert np.array_equal(adapted.inner.changes.replaced, expected.inner.changes.replaced)
+    assert_same(adapted, expected, queries)
     assert_same(
-        adapted.adapt(queries[:1], place, tolerance=0.0), wanted.adapt(queries[:1], place, tolerance=0.0), queries
+        adapted.adapt(queries[:1], place, tolerance=0.0), expected.adapt(queries[:1], place, tolerance=0.0), queries
     )
     assert_same(adapted.base, whole, queries)
     assert_same(named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted, queries)

@@ -30,17 +30,17 @@ def with_rates(**options):
 
 def test_normals_of_means_and_deviations():
     for deviation in (0.1, [0.1, 0.1], np.full((80, 2), 0.1)):
-        found = Gaussians.of(VALUES, deviation=deviation)
-        assert np.array_equal(found.mean, VALUES)
-        np.testing.assert_allclose(found.covariance, np.tile(0.01 * np.eye(2), (80, 1, 1)))
-    one = Gaussians.of([1.0, 2.0], deviation=[0.1, 0.2])
-    assert (len(one), one.outputs) == (1, 2)
-    np.testing.assert_allclose(one.covariance, [np.diag([0.01, 0.04])])
-    assert not one.exact.any()
+        normals = Gaussians.of(VALUES, deviation=deviation)
+        assert np.array_equal(normals.mean, VALUES)
+        np.testing.assert_allclose(normals.covariance, np.tile(0.01 * np.eye(2), (80, 1, 1)))
+    normal = Gaussians.of([1.0, 2.0], deviation=[0.1, 0.2])
+    assert (len(normal), normal.outputs) == (1, 2)
+    np.testing.assert_allclose(normal.covariance, [np.diag([0.01, 0.04])])
+    assert not normal.exact.any()
     mixed = Gaussians.of(VALUES, deviation=[0.0, 0.1])
     assert mixed.exact[5].tolist() == [True, False]
-    again = Gaussians(mixed.mean, mixed.covariance)
-    assert np.array_equal(again.exact, mixed.exact)
+    rebuilt = Gaussians(mixed.mean, mixed.covariance)
+    assert np.array_equal(rebuilt.exact, mixed.exact)
     with pytest.raises(ValueError, match="not positive definite"):
         Gaussians([[0.0, 0.0]], [[[1.0, 1e-3], [1e-3, 1e-200]]])
 
@@ -67,11 +67,11 @@ def test_named_least_variance_is_accepted(representation, rates, lambda_covarian
     with pytest.raises(ValueError, match="variance of at least") as refused:
         skill.adapt([[1.0]], Gaussians.of(place, deviation=1e-9))
     named = [
-        float(one)
-        for one in re.findall(
+        float(number)
+        for number in re.findall(
             r"at least (\S+?)(?: of the values)?(?: and (\S+) of their rates)? \(", str(refused.value)
         )[0]
-        if one
+        if number
     ]
     assert len(named) == 1 + rates
     deviation = np.repeat(np.sqrt(named), 2)
@@ -89,8 +89,8 @@ def test_default_tolerance_replaces_nearest():
     assert skill.spacing == pytest.approx(2 / 79)
     for t in (0.0, 0.5003, 1.01, 2.0):
         through = skill.adapt([[t]], Gaussians.of([0.0, 0.0], deviation=0.3))
-        [gone] = through.inner.changes.replaced
-        assert abs(T[gone, 0] - t) <= skill.spacing / 2
+        [index] = through.inner.changes.replaced
+        assert abs(T[index, 0] - t) <= skill.spacing / 2
     assert len(skill.adapt([[2.1]], Gaussians.of([0.0, 0.0], deviation=0.3)).inner.changes.replaced) == 0
 
 
@@ -100,19 +100,19 @@ def test_other_lambda_keeps_the_mean(representation, changed):
     """Changing lambda_covariance equals fitting with it, and keeps the mean."""
 
     def made(**options):
-        one = fitted(representation, **options)
+        skill = fitted(representation, **options)
         if changed != "as fitted":
-            one = one.adapt([[1.0]], Gaussians.of([0.3, 0.3], deviation=0.03))
+            skill = skill.adapt([[1.0]], Gaussians.of([0.3, 0.3], deviation=0.03))
         above = LinearConstraints(T, np.tile([0.0, 1.0], (80, 1)), np.full(80, -0.5))
-        return one.constrained(above) if changed == "constrained" else one
+        return skill.constrained(above) if changed == "constrained" else skill
 
-    one, wanted = made().with_lambda_covariance(7.0), made(lambda_covariance=7.0)
-    assert one.lambda_covariance == 7.0
-    assert np.array_equal(one.mean(T), made().mean(T))
-    np.testing.assert_allclose(one.predict(T).covariance, wanted.predict(T).covariance, rtol=1e-6, atol=1e-9)
+    updated, expected = made().with_lambda_covariance(7.0), made(lambda_covariance=7.0)
+    assert updated.lambda_covariance == 7.0
+    assert np.array_equal(updated.mean(T), made().mean(T))
+    np.testing.assert_allclose(updated.predict(T).covariance, expected.predict(T).covariance, rtol=1e-6, atol=1e-9)
     place = [[0.5]], Gaussians.of([0.2, 0.2], deviation=0.03)
-    np.testing.assert_allclose(one.adapt(*place).mean(T), wanted.adapt(*place).mean(T), atol=1e-7)
-    assert one.base.lambda_covariance == 7.0
+    np.testing.assert_allclose(updated.adapt(*place).mean(T), expected.adapt(*place).mean(T), atol=1e-7)
+    assert updated.base.lambda_covariance == 7.0
 
 
 def test_estimator_is_loaded_when_needed():

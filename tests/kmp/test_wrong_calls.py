@@ -55,8 +55,8 @@ IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts":
 
 def regressor(*, ell, lambda_mean, lambda_covariance, noise, components, random_state):
     """scikit-learn has a parameter checked where it is used."""
-    given = locals()
-    return kmp.KMPRegressor(**given).fit(S, S).predict(S, return_std=True)
+    arguments = locals()
+    return kmp.KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
 
 
 # What each public callable is rightly called with.
@@ -227,7 +227,7 @@ def wrong_values(name, right):
     if name in WHOLE:
         return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
     if name == "tolerance":
-        return [one for one in NO_SCALARS if one is not None and one is not np.inf], [1e308, np.inf, 0, True]
+        return [value for value in NO_SCALARS if value is not None and value is not np.inf], [1e308, np.inf, 0, True]
     if isinstance(right, float):
         return [*NO_SCALARS, 0.0], [1e308, 1e200, 1e-308, True, np.array(1.0), 1e-160]
     if isinstance(right, np.ndarray):
@@ -235,18 +235,18 @@ def wrong_values(name, right):
     objects = [*NO_NUMBERS, 1.0, -1, True, np.nan, S, [S], [], [None], R[:0], GaussianKernel, KMP]
     if isinstance(right, Gaussians):
         others = [R[:1], ZETA, ZETA[:1], [R], Gaussians.concatenated([R, R])]
-        return [one for one in objects if not isinstance(one, Gaussians)], [*others, R[:0]]
+        return [value for value in objects if not isinstance(value, Gaussians)], [*others, R[:0]]
     if name == "kernel":
         return [*objects, GaussianKernel([1.0, 2.0, 3.0]), VelocityKernel(1.0), PeriodicKernel(1.0, 1.0), R], []
     if name in {"path", "input_unit", "output_unit", "label"}:
-        return [one for one in objects if not isinstance(one, (str, bytes))], []
+        return [value for value in objects if not isinstance(value, (str, bytes))], []
     if name == "value":
         return [*NO_NUMBERS, 1.0, True, S, [], [ONE], KMP], []
     if name == "arrays":
         return [*objects, [("ell", 1.0)]], []
     if name == "reward":
         bad = (None, "text", np.nan, np.inf, 1j, S, [1.0, 2.0], object())
-        return [one for one in objects if not callable(one)] + [lambda path, one=one: one for one in bad], []
+        return [value for value in objects if not callable(value)] + [lambda path, one=value: one for value in bad], []
     return [
         *objects,
         np.zeros((2, 6, 2)),
@@ -267,45 +267,45 @@ def calls():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
             must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame  # which names its matrix
-            for one in wrong:
-                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(one, float):
+            for candidate in wrong:
+                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(candidate, float):
                     continue  # one for all inputs
-                if function is regressor and name == "components" and one is None:
+                if function is regressor and name == "components" and candidate is None:
                     continue  # each sample is a point
-                if one is None and (
+                if candidate is None and (
                     (name in OPTIONAL and function != ONE.with_lambda_covariance)
                     or function == ONE.plot
                     or (function is kmp.learn and name in {"kernel", "lambda_mean"})
                 ):
                     continue
-                if name == "velocity" and one is True:
+                if name == "velocity" and candidate is True:
                     continue
-                yield function, name, right, one, True
-            for place, one in enumerate(other):
-                yield function, name, right, one, must_fail and place in WRONG_COLUMNS
+                yield function, name, right, candidate, True
+            for place, candidate in enumerate(other):
+                yield function, name, right, candidate, must_fail and place in WRONG_COLUMNS
 
 
 def fault(function, name, right, value, must_fail):
     """What is wrong with how this call ends; None if nothing."""
-    what = f"{getattr(function, '__qualname__', function)}({name}={str(value)[:60]!r})"
+    call = f"{getattr(function, '__qualname__', function)}({name}={str(value)[:60]!r})"
     try:
         function(**(right | {name: value}))
     except ValueError as error:
-        said = str(error)
+        message = str(error)
         near = [*right, "lost in rounding", "to working precision"]  # what only shows with all else
-        named = any(re.search(rf"\b{one}\b", said) for one in ([name] if must_fail else near))
+        named = any(re.search(rf"\b{word}\b", message) for word in ([name] if must_fail else near))
         if not named:
-            return f"{what} does not name it: {said[:150]}"
-        if len(said) > LONGEST:
-            return f"{what} says {len(said)} characters: {said[:150]}"
-        if not ACCEPTED.search(said):
-            return f"{what} does not say what is accepted: {said[:150]}"
-        return f"{what} speaks NumPy: {said[:150]}" if NUMPYS.search(said) else None
+            return f"{call} does not name it: {message[:150]}"
+        if len(message) > LONGEST:
+            return f"{call} says {len(message)} characters: {message[:150]}"
+        if not ACCEPTED.search(message):
+            return f"{call} does not say what is accepted: {message[:150]}"
+        return f"{call} speaks NumPy: {message[:150]}" if NUMPYS.search(message) else None
     except OSError:
-        return None if name == "path" else f"{what} ends in an OSError"
+        return None if name == "path" else f"{call} ends in an OSError"
     except Exception as error:
-        return f"{what} ends in {type(error).__name__}: {str(error)[:150]}"
-    return f"{what} works" if must_fail else None
+        return f"{call} ends in {type(error).__name__}: {str(error)[:150]}"
+    return f"{call} works" if must_fail else None
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -313,10 +313,10 @@ def test_wrong_call_names_its_argument(tmp_path, monkeypatch):
     """Every wrong call raises a ValueError that names the argument."""
     monkeypatch.chdir(tmp_path)
     kmp.save("skill.npz", ONE, input_unit="m", output_unit="m")
-    made = list(calls())
-    assert len(made) > 4000
-    faults = [said for one in made if (said := fault(*one))]
-    assert not faults, f"{len(faults)} of {len(made)}:\n" + "\n".join(faults)
+    wrong_calls = list(calls())
+    assert len(wrong_calls) > 4000
+    faults = [said for call in wrong_calls if (said := fault(*call))]
+    assert not faults, f"{len(faults)} of {len(wrong_calls)}:\n" + "\n".join(faults)
 
 
 def test_each_right_call_works(tmp_path, monkeypatch):
@@ -329,28 +329,28 @@ def test_each_right_call_works(tmp_path, monkeypatch):
 def public():
     """Each public callable of the package, by type and name, and its parameters."""
     for name in kmp.__all__:
-        one = getattr(kmp, name)
-        if not inspect.isclass(one):
-            yield "", name, inspect.signature(one).parameters
-        elif not issubclass(one, Warning):
+        member = getattr(kmp, name)
+        if not inspect.isclass(member):
+            yield "", name, inspect.signature(member).parameters
+        elif not issubclass(member, Warning):
             if name not in MADE_BY_THE_PACKAGE:
-                yield name, name, inspect.signature(one).parameters
-            for part, value in inspect.getmembers(one, callable):
+                yield name, name, inspect.signature(member).parameters
+            for part, value in inspect.getmembers(member, callable):
                 if not part.startswith("_") and not (name.endswith("Kernel") and part in OF_THE_KERNEL):
                     yield name, part, inspect.signature(value).parameters
-    for name, one in inspect.getmembers(orientation, inspect.isfunction):
-        if not name.startswith("_") and one.__module__ == orientation.__name__:
-            yield "", name, inspect.signature(one).parameters
+    for name, member in inspect.getmembers(orientation, inspect.isfunction):
+        if not name.startswith("_") and member.__module__ == orientation.__name__:
+            yield "", name, inspect.signature(member).parameters
 
 
 def test_every_public_argument_is_tested():
     """Every argument of every public callable is among them."""
-    given = {(one.__name__, name) for one, right in RIGHT.items() for name in right}
+    tested = {(function.__name__, name) for function, right in RIGHT.items() for name in right}
     lacking = [
         (of, name, parameter)
         for of, name, parameters in public()
         for parameter in parameters
-        if parameter != "self" and not of.startswith(("Motion", "Stored")) and (name, parameter) not in given | LEFT_OUT
+        if parameter != "self" and not of.startswith(("Motion", "Stored")) and (name, parameter) not in tested | LEFT_OUT
     ]
     assert lacking == []
 
@@ -371,7 +371,7 @@ def test_every_array_that_is_spoilt_is_named(primitive):
             array[None, None],
         ]:
             may_work = np.ndim(array) == 0 and value is not None and np.size(value) == 1 and np.any(value == 1e200)
-            made = lambda **given: named_arrays.from_arrays(arrays | given)  # noqa: E731
-            said = fault(made, name, {name: array}, value, not may_work)
-            faults += [said] if said else []
+            loader = lambda **given: named_arrays.from_arrays(arrays | given)  # noqa: E731
+            finding = fault(loader, name, {name: array}, value, not may_work)
+            faults += [finding] if finding else []
     assert not faults, "\n".join(faults)

@@ -27,9 +27,9 @@ def test_tracker_noise_is_found(noise_m: float, every: int) -> None:
 
 def test_fine_motion_is_legal_if_tracked_well() -> None:
     """Fine motion is accepted only where the tracker can resolve it."""
-    found = judged([fine(seed, 0.0005) for seed in range(4)])
-    assert (found.unsafe, found.ambiguous) == ((), 0.0)
-    assert found.all.error_mm < 10
+    figures = judged([fine(seed, 0.0005) for seed in range(4)])
+    assert (figures.unsafe, figures.ambiguous) == ((), 0.0)
+    assert figures.all.error_mm < 10
     noisy = judged([fine(seed, 0.003) for seed in range(4)])
     assert any("contradict others" in text for text in noisy.residual)
 
@@ -37,13 +37,13 @@ def test_fine_motion_is_legal_if_tracked_well() -> None:
 @pytest.mark.parametrize("noise_m", [0.0, 0.0005])
 def test_opposite_ways_are_refused(noise_m: float) -> None:
     """Takes that go opposite ways are refused however good the tracker."""
-    found = judged([fine(seed, noise_m, way) for seed, way in enumerate((1.0, -1.0, 1.0, -1.0))])
-    assert found.ambiguous > 30
-    assert any("contradict others" in text for text in found.unsafe)
+    figures = judged([fine(seed, noise_m, sign) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))])
+    assert figures.ambiguous > 30
+    assert any("contradict others" in text for text in figures.unsafe)
 
 
 def test_turns_of_fine_motion() -> None:
     """Turns along with fine motion are accepted, alternating ones are not."""
     assert judged([fine(seed, 0.0005, turned=True) for seed in range(4)]).unsafe == ()
-    both = judged([fine(seed, 0.0005, way, turned=True) for seed, way in enumerate((1.0, -1.0, 1.0, -1.0))])
-    assert any("contradicts itself" in text for text in both.unsafe)
+    figures = judged([fine(seed, 0.0005, sign, turned=True) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))])
+    assert any("contradicts itself" in text for text in figures.unsafe)

@@ -48,11 +48,11 @@ def test_residuals_are_those_of_left_out_fits(choice: DirectSelection, ridge_m: 
 
 def test_choice_is_the_best_tried(choice: DirectSelection) -> None:
     """The choice is as good as any that was tried."""
-    found = choice.parameters()
+    parameters = choice.parameters()
     errors = {
         (ell, noise): rms(choice.residuals(ell, noise))
         for ell in POSITION_SCALES.ells
         for noise in 10.0 ** np.arange(-3.0, 0.1, 0.5)
     }
-    assert errors[found.ell, found.noise] == min(errors.values())
+    assert errors[parameters.ell, parameters.noise] == min(errors.values())
     assert choice.parameters(8.0).ell == 8.0

@@ -23,7 +23,7 @@ def along_a_line(number: int) -> Demonstration:
     """Hands that go exactly from place to place, each time at another speed, and the tool along."""
     t = np.arange(0.0, 6.0, 0.02)
     share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
-    ways = (np.array(one) for one in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True))
+    ways = (np.array(ends) for ends in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True))
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     poses = [np.hstack([begin + share * (end - begin), turn]) for begin, end in ways]
     return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, places=PLACES)
@@ -35,18 +35,18 @@ def test_gate_is_above_noise() -> None:
     assert skill.threshold >= FLOOR_M
     random = np.random.default_rng(1)
     hands = along_a_line(0).hands[::10].reshape(-1, 2, 3)
-    noisy = [at_rest(skill, at + NOISE_M * random.normal(size=(2, 3))).gate_m for at in hands]
+    noisy = [at_rest(skill, pair + NOISE_M * random.normal(size=(2, 3))).gate_m for pair in hands]
     assert max(noisy) < skill.threshold
-    said = figures_of(skill).warnings
-    assert any("less noise than any tracker" in one for one in said)
+    warnings = figures_of(skill).warnings
+    assert any("less noise than any tracker" in warning for warning in warnings)
 
 
 def test_covariance_is_above_noise() -> None:
     """A covariance is never less than the tracker's noise."""
-    made = [one._replace(tool=(one.left + one.right) / 2) for one in (circling(seed, noise_m=0.0) for seed in range(4))]
-    figures = figures_of(learn(made, points=80))
+    takes = [take._replace(tool=(take.left + take.right) / 2) for take in (circling(seed, noise_m=0.0) for seed in range(4))]
+    figures = figures_of(learn(takes, points=80))
     assert figures.all.error_mm < 1.0 < figures.all.predicted_mm
     assert figures.gate_mm > 1.0
-    said = "; ".join(figures.warnings)
-    assert "less noise than any tracker" in said
-    assert "a simpler prediction is better" not in said
+    text = "; ".join(figures.warnings)
+    assert "less noise than any tracker" in text
+    assert "a simpler prediction is better" not in text

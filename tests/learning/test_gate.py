@@ -16,13 +16,13 @@ from thirdhand.workbench.learning.learn import learn
 
 @pytest.fixture(scope="module")
 def skill_of_five() -> Skill:
-    return learn([one.every(4) for one in demonstrated(5)], ell=8.0)
+    return learn([take.every(4) for take in demonstrated(5)], ell=8.0)
 
 
 @pytest.fixture(scope="module")
 def unseen() -> list[Demonstration]:
     """Demonstrations that no skill here knows."""
-    return [one.every(20) for one in demonstrated(12)[6:]]
+    return [take.every(20) for take in demonstrated(12)[6:]]
 
 
 def unrelated(one: Demonstration) -> Demonstration:
@@ -33,7 +33,7 @@ def unrelated(one: Demonstration) -> Demonstration:
         (0.7 + 0.2 * np.cos(6 * u), 0.3 + 0.2 * np.sin(4 * u), 0.4 + 0.1 * np.cos(3 * u)),
         (0.5 + 0.1 * np.sin(11 * u), 0.3 * np.cos(13 * u), 0.4 + 0.1 * np.sin(5 * u)),
     )
-    parts = [np.hstack([np.stack(way, axis=1), pose[:, 3:]]) for way, pose in zip(ways, one[1:4], strict=True)]
+    parts = [np.hstack([np.stack(path, axis=1), pose[:, 3:]]) for path, pose in zip(ways, one[1:4], strict=True)]
     return one._replace(left=parts[0], right=parts[1], tool=parts[2])
 
 
@@ -45,24 +45,24 @@ def test_unseen_people_pass_and_nonsense_is_held(
     are 9 cm from where they would be, and nothing tells.
     """
     skill = adapted(skill_of_five, places, tolerance=0.05)
-    hands = np.concatenate([one.hands for one in unseen])
+    hands = np.concatenate([take.hands for take in unseen])
     assert (deviations(skill, hands) > skill.threshold).mean() <= 0.02
-    swapped, beside, _ = nonsense(hands[::2])
+    swapped, shifted, _ = nonsense(hands[::2])
     swapped = swapped[np.linalg.norm(swapped[:, :3] - swapped[:, 3:], axis=1) > 0.2]
-    other = np.concatenate([unrelated(one).hands for one in unseen[:2]])
-    for wrong in (swapped, beside, other):
+    other = np.concatenate([unrelated(take).hands for take in unseen[:2]])
+    for wrong in (swapped, shifted, other):
         assert (deviations(skill, wrong) > skill.threshold).mean() >= 0.95
 
 
 def test_gate_is_near_demonstrations(skill_of_five: Skill, unseen: list[Demonstration]) -> None:
     """The gate is near the largest distance of the demonstrations."""
-    reached = max(deviations(skill_of_five, one.hands).max() for one in unseen)
+    reached = max(deviations(skill_of_five, take.hands).max() for take in unseen)
     assert reached < skill_of_five.threshold < 1.5 * HELD_OUT_TIMES * reached
 
 
 @pytest.mark.parametrize("components", [None, 5])
 def test_unrelated_tasks_do_not_open_gate(components: int | None) -> None:
     """Two unrelated tasks do not open the gate."""
-    one = demonstrated(1)[0].every(8)
-    skill = learn([one, unrelated(one)], components=components, points=60)
+    take = demonstrated(1)[0].every(8)
+    skill = learn([take, unrelated(take)], components=components, points=60)
     assert skill.threshold <= (HIGHEST_GATE_M if components else CEILING_M)

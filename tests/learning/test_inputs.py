@@ -44,8 +44,8 @@ def shown(seed: int, kind: str, person: str = "") -> Demonstration:
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(TIMES), 1))
     turns = (turned.as_quat(), still, still)
     poses = (
-        np.hstack([at + NOISE_M * random.standard_normal(at.shape), turn])
-        for at, turn in zip((left, right, ways[kind]), turns, strict=True)
+        np.hstack([path + NOISE_M * random.standard_normal(path.shape), turn])
+        for path, turn in zip((left, right, ways[kind]), turns, strict=True)
     )
     return Demonstration((1e9 * (1.0 + TIMES)).astype(np.int64), *poses, person=person)
 
@@ -58,26 +58,26 @@ def carried() -> StoredSkill:
 def test_both_hands_where_both_tell() -> None:
     """If both hands are informative, the tool depends on both."""
     skill = learn([shown(seed, "both") for seed in range(5)], points=120)
-    found = figures_of(skill)
+    figures = figures_of(skill)
     assert skill.conductor is None
-    assert found.taken == "positions"
-    assert set(found.tried_mm) == {
+    assert figures.taken == "positions"
+    assert set(figures.tried_mm) == {
         f"{kind.name}{of}"
         for kind in KINDS
         if not kind.turned
         for of in ("", " of the left hand", " of the right hand")
     }
-    assert found.tried_mm["positions"] < 0.5 * found.tried_mm["positions of the left hand"]
-    assert "positions is taken:" in table(found)
+    assert figures.tried_mm["positions"] < 0.5 * figures.tried_mm["positions of the left hand"]
+    assert "positions is taken:" in table(figures)
 
 
 def test_one_hand_where_it_tells_as_much() -> None:
     """If one hand suffices, the other has no effect, and that is reported."""
     skill = learn([shown(seed, "left") for seed in range(5)], points=120)
-    found = figures_of(skill)
+    figures = figures_of(skill)
     assert skill.conductor == 0
-    assert found.taken == "positions of the left hand"
-    assert any("the left hand alone" in warning and "may be absent" in warning for warning in found.warnings)
+    assert figures.taken == "positions of the left hand"
+    assert any("the left hand alone" in warning and "may be absent" in warning for warning in figures.warnings)
     hands = shown(9, "left").hands[40].reshape(2, 3)
     away = np.stack([hands[0], [3.0, 3.0, 3.0]])
     np.testing.assert_array_equal(at_rest(skill, hands).position, at_rest(skill, away).position)
@@ -85,8 +85,8 @@ def test_one_hand_where_it_tells_as_much() -> None:
 
 def test_turned_hand_predicts_fixed_tool(carried: StoredSkill) -> None:
     """A tool that is fixed to a turned hand is predicted by how that is turned."""
-    found = figures_of(carried)
-    assert found.taken == "orientations of the left hand"
+    figures = figures_of(carried)
+    assert figures.taken == "orientations of the left hand"
     assert isinstance(carried.model, HandsKMP)
     assert carried.model.turned
     takes = [left_out("", "", shown(seed, "carried")) for seed in range(20, 23)]
@@ -102,10 +102,10 @@ def test_persons_are_left_out_together() -> None:
     """Takes of a person are left out together where two are named."""
     takes = [shown(seed, "both", person) for seed, person in enumerate(("Ada", "Ada", "Bo", "Bo"))]
     assert persons(takes) == [0, 0, 1, 1]
-    assert persons([one._replace(person="Ada") for one in takes]) == [0, 1, 2, 3]
+    assert persons([take._replace(person="Ada") for take in takes]) == [0, 1, 2, 3]
     assert persons([takes[0], takes[2], takes[0]._replace(person="")]) == [0, 1, 2]
     by_person, alone = (
-        figures_of(learn(some, points=120)) for some in (takes, [one._replace(person="") for one in takes])
+        figures_of(learn(variant, points=120)) for variant in (takes, [take._replace(person="") for take in takes])
     )
     assert table(by_person).startswith("held out by person")
     assert not table(alone).startswith("held out by")

@@ -24,7 +24,7 @@ def judged(demonstrations: list[Demonstration], **options: object) -> Figures:
 
 @pytest.fixture(scope="module")
 def good() -> list[Demonstration]:
-    return [one.every(8) for one in demonstrated(4)]
+    return [take.every(8) for take in demonstrated(4)]
 
 
 def with_tool(one: Demonstration, tool: np.ndarray) -> Demonstration:
@@ -33,29 +33,29 @@ def with_tool(one: Demonstration, tool: np.ndarray) -> Demonstration:
 
 def test_good_demonstrations_are_safe(good: list[Demonstration]) -> None:
     """Good demonstrations are judged safe and their errors told one by one."""
-    found = judged(good, names=["a", "b", "c", "d"])
-    assert found.unsafe == ()
-    assert [row.name for row in found.demonstrations] == ["a", "b", "c", "d"]
-    assert all(5 < row.error_mm < 45 for row in found.demonstrations)
-    assert found.all.error_mm == pytest.approx(found.all.predicted_mm, rel=0.6)
-    assert (found.ambiguous, found.beyond_reach) == (0, 0)
-    assert min(found.swapped, found.beside) > 95
+    figures = judged(good, names=["a", "b", "c", "d"])
+    assert figures.unsafe == ()
+    assert [row.name for row in figures.demonstrations] == ["a", "b", "c", "d"]
+    assert all(5 < row.error_mm < 45 for row in figures.demonstrations)
+    assert figures.all.error_mm == pytest.approx(figures.all.predicted_mm, rel=0.6)
+    assert (figures.ambiguous, figures.beyond_reach) == (0, 0)
+    assert min(figures.swapped, figures.beside) > 95
 
 
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda d: [*d[:2], *(with_tool(one, one.tool[:, :3] * (1, -1, 1)) for one in d[:2])], "contradict others"),
-        (lambda d: [with_tool(one, 3 * one.tool[:, :3]) for one in d], "out of the arm's reach"),
+        (lambda d: [*d[:2], *(with_tool(take, take.tool[:, :3] * (1, -1, 1)) for take in d[:2])], "contradict others"),
+        (lambda d: [with_tool(take, 3 * take.tool[:, :3]) for take in d], "out of the arm's reach"),
         (lambda d: [*d[:3], d[3]._replace(frame="camera")], "different frames: 'base', 'camera'"),
-        (lambda d: [one._replace(tool=np.roll(one.tool, 80 * i, axis=0)) for i, one in enumerate(d)], "too little of"),
+        (lambda d: [take._replace(tool=np.roll(take.tool, 80 * i, axis=0)) for i, take in enumerate(d)], "too little of"),
     ],
     ids=["same hands, other tool", "not in metres", "frames", "all out of step"],
 )
 def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, says: str) -> None:
-    found = judged(spoil(good))  # type: ignore[operator]
-    assert any(says in text for text in found.unsafe), found
-    assert f"unsafe: {found.unsafe[0]}" in table(found)
+    figures = judged(spoil(good))  # type: ignore[operator]
+    assert any(says in text for text in figures.unsafe), figures
+    assert f"unsafe: {figures.unsafe[0]}" in table(figures)
 
 
 @pytest.mark.parametrize(
@@ -63,15 +63,15 @@ def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, 
     [
         (lambda d: [d[0], d[0], *d[1:]], "demonstration 2 repeats demonstration 1, and is left out"),
         (lambda d: [d[0], d[0].every(2), *d[1:]], "demonstration 2 repeats demonstration 1"),
-        (lambda d: [one._replace(frame="camera") for one in d], "in frame 'camera': it is taken to be 'base'"),
+        (lambda d: [take._replace(frame="camera") for take in d], "in frame 'camera': it is taken to be 'base'"),
         (lambda d: d[:2], "5 or more advised"),
     ],
     ids=["repeated", "repeated at another rate", "another frame", "two"],
 )
 def test_what_is_doubtful_is_warned_of(good: list[Demonstration], spoil: object, says: str) -> None:
-    found = judged(spoil(good))  # type: ignore[operator]
-    assert found.unsafe == ()
-    assert any(says in text for text in found.warnings), found.warnings
+    figures = judged(spoil(good))  # type: ignore[operator]
+    assert figures.unsafe == ()
+    assert any(says in text for text in figures.warnings), figures.warnings
 
 
 def test_a_demonstration_given_twice_is_one(good: list[Demonstration]) -> None:
@@ -80,8 +80,8 @@ def test_a_demonstration_given_twice_is_one(good: list[Demonstration]) -> None:
 
 
 def test_the_picture_is_one(good: list[Demonstration], tmp_path: Path) -> None:
-    seen: list[Evidence] = []
-    learn(good, points=80, show=seen.append)
-    draw(seen[0], tmp_path / "skill.png")
+    evidence: list[Evidence] = []
+    learn(good, points=80, show=evidence.append)
+    draw(evidence[0], tmp_path / "skill.png")
     assert (tmp_path / "skill.png").read_bytes().startswith(b"\x89PNG")
-    assert not [axes for axes in drawn(seen[0]).axes if "segment" in axes.get_title()]
+    assert not [axes for axes in drawn(evidence[0]).axes if "segment" in axes.get_title()]

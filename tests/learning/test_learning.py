@@ -25,9 +25,9 @@ def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstration]) -
 
 def test_gate_passes_demonstrations_only(aimed: Skill, taught: list[Demonstration]) -> None:
     """The gate lets demonstrations through and nothing far from them."""
-    for one in taught:
-        assert deviations(aimed, one.hands[::20]).max() <= aimed.threshold
-        assert deviations(aimed, one.hands[::20] + np.array([0.0, 0.0, 0.5] * 2)).min() > aimed.threshold
+    for take in taught:
+        assert deviations(aimed, take.hands[::20]).max() <= aimed.threshold
+        assert deviations(aimed, take.hands[::20] + np.array([0.0, 0.0, 0.5] * 2)).min() > aimed.threshold
 
 
 def test_mean_orientation_ignores_signs() -> None:
@@ -41,26 +41,26 @@ def test_mean_orientation_ignores_signs() -> None:
 
 def test_unusable_demonstrations_are_refused(taught: list[Demonstration]) -> None:
     """Demonstrations that cannot be learned from are refused."""
-    one = taught[0]
-    turned = one.tool.copy()
+    take = taught[0]
+    turned = take.tool.copy()
     turned[:, 3:] *= 2
     for wrong, message in (
         ([], "no demonstrations given, at least 1 needed"),
-        ([one.every(400)], "3 samples is too short"),
-        ([one._replace(stamps_ns=one.stamps_ns * 0)], "too short"),
-        ([one._replace(tool=np.full_like(one.tool, np.nan))], "not finite"),
-        ([one._replace(tool=turned)], "not quaternions of norm 1"),
-        ([one._replace(left=1000 * one.left)], "is it in metres"),
-        ([one._replace(left=one.left[:500])], "500 left"),
-        ([one], r"1 demonstration given \(demonstration 1\): at least 2 needed"),
+        ([take.every(400)], "3 samples is too short"),
+        ([take._replace(stamps_ns=take.stamps_ns * 0)], "too short"),
+        ([take._replace(tool=np.full_like(take.tool, np.nan))], "not finite"),
+        ([take._replace(tool=turned)], "not quaternions of norm 1"),
+        ([take._replace(left=1000 * take.left)], "is it in metres"),
+        ([take._replace(left=take.left[:500])], "500 left"),
+        ([take], r"1 demonstration given \(demonstration 1\): at least 2 needed"),
     ):
         with pytest.raises(SkillError, match=message):
             learn(wrong)
-    still = [one._replace(tool=np.tile(at, (len(one.tool), 1))) for at in one.tool[[0, -1]]]
+    still = [take._replace(tool=np.tile(pose, (len(take.tool), 1))) for pose in take.tool[[0, -1]]]
     with pytest.raises(SkillError, match=r"^demonstrations in which hands or tool move by less than 10 mm"):
         learn(still)
     with pytest.raises(SkillError, match=r"^take-2: .*not finite"):
-        learn([one, one._replace(tool=np.full_like(one.tool, np.nan))], names=["take-1", "take-2"])
+        learn([take, take._replace(tool=np.full_like(take.tool, np.nan))], names=["take-1", "take-2"])
 
 
 def test_resting_take_is_learned_with_others(taught: list[Demonstration]) -> None:
@@ -69,5 +69,5 @@ def test_resting_take_is_learned_with_others(taught: list[Demonstration]) -> Non
     resting = resting._replace(
         left=np.tile(resting.left[0], (len(resting.left), 1)), right=np.tile(resting.right[0], (len(resting.left), 1))
     )
-    skill = learn([*(one.every(4) for one in taught[:2]), resting], points=60)
+    skill = learn([*(take.every(4) for take in taught[:2]), resting], points=60)
     assert len(figures_of(skill).demonstrations) == 3

@@ -23,9 +23,9 @@ APART_M = 0.15  # the takes, from each other: a constant mean holds the tool bac
 
 @pytest.fixture(scope="module")
 def evidence() -> Evidence:
-    seen: list[Evidence] = []
-    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, ell=0.5, show=seen.append)
-    return seen[0]
+    results: list[Evidence] = []
+    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, ell=0.5, show=results.append)
+    return results[0]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def skill(evidence: Evidence) -> StoredSkill:
 
 @pytest.fixture(scope="module")
 def choice(evidence: Evidence) -> DirectSelection:
-    return selection_of([(one.take.hands, one.take.position) for one in evidence.held_out], 120)
+    return selection_of([(fold.take.hands, fold.take.position) for fold in evidence.held_out], 120)
 
 
 def mean_of(skill: StoredSkill) -> AffineMean:
@@ -49,23 +49,23 @@ def test_linear_mean_predicts_better(evidence: Evidence, choice: DirectSelection
     line.
     """
     assert mean_of(evidence.skill).matrix.shape == (3, 6)
-    error = rms(np.concatenate([one.errors for one in evidence.held_out]))
+    error = rms(np.concatenate([fold.errors for fold in evidence.held_out]))
     constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
     over_constant = [
-        one.take.position - choice.primitive(constant, residuals, without=h).mean(one.take.hands)
-        for h, one in enumerate(evidence.held_out)
+        fold.take.position - choice.primitive(constant, residuals, without=h).mean(fold.take.hands)
+        for h, fold in enumerate(evidence.held_out)
     ]
     assert error < 0.010
     assert error < 0.6 * rms(np.concatenate(over_constant))
-    assert error < 0.75 * rms(np.concatenate(held_out_errors([one.take for one in evidence.held_out], linear)))
+    assert error < 0.75 * rms(np.concatenate(held_out_errors([fold.take for fold in evidence.held_out], linear)))
 
 
 def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Evidence) -> None:
     """Gate holds where the mean extrapolates."""
-    some = np.concatenate([one.take.hands[::20] for one in evidence.held_out])
+    hands = np.concatenate([fold.take.hands[::20] for fold in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
-        assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
-        assert (skill.model.gates_m(some + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
+        assert (skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
+        assert (skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
 
 
 def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
@@ -82,15 +82,15 @@ def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
 
 def test_file_serves_what_was_learned(skill: StoredSkill) -> None:
     """It is stored and served as it was learned."""
-    again = decoded(skill.file, origin="a file")
+    restored = decoded(skill.file, origin="a file")
     hands = skill.hands[::10] + 0.01
-    np.testing.assert_array_equal(again.mean(hands), skill.mean(hands))
+    np.testing.assert_array_equal(restored.mean(hands), skill.mean(hands))
     step, velocity = 1e-4, np.random.default_rng(0).normal(size=(2, 3))
-    for at in hands:
-        found = again.predict(at.reshape(2, 3), velocity, np.zeros((2, 3)))
-        np.testing.assert_allclose(found.position, skill.mean(at[None])[0], atol=2e-6)
-        ahead, behind = skill.mean(np.stack([at + step * velocity.ravel(), at - step * velocity.ravel()]))
-        np.testing.assert_allclose(found.velocity, (ahead - behind) / (2 * step), atol=1e-4)
+    for positions in hands:
+        prediction = restored.predict(positions.reshape(2, 3), velocity, np.zeros((2, 3)))
+        np.testing.assert_allclose(prediction.position, skill.mean(positions[None])[0], atol=2e-6)
+        ahead, behind = skill.mean(np.stack([positions + step * velocity.ravel(), positions - step * velocity.ravel()]))
+        np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * step), atol=1e-4)
 
 
 def test_a_task_between_places_has_none() -> None:

@@ -33,11 +33,11 @@ FAR: Point = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
 
 def led(seed: int, who: Hands = "left") -> Demonstration:
     """A take in which the tool goes with one hand."""
-    one = circling(seed, apart_m=0.03)
-    tool = one.tool.copy()
-    off = 0.005 * np.random.default_rng(seed).normal(size=3)  # as people are
-    tool[:, :3] = one.left[:, :3] * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25] + off
-    return one._replace(right=one.left, tool=tool, conducts=who)
+    take = circling(seed, apart_m=0.03)
+    tool = take.tool.copy()
+    offset_m = 0.005 * np.random.default_rng(seed).normal(size=3)  # as people are
+    tool[:, :3] = take.left[:, :3] * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25] + offset_m
+    return take._replace(right=take.left, tool=tool, conducts=who)
 
 
 @pytest.fixture(scope="module", params=["left", "right"])
@@ -52,50 +52,50 @@ def conducting(skill: StoredSkill, at: tuple[float, ...], other: tuple[float, ..
 
 def test_take_of_one_hand_through_a_file(tmp_path: Path) -> None:
     """A take of one hand goes to a file without the other and back."""
-    for who in ("left", "right"):
-        write_demonstration(tmp_path / f"{who}.mcap", led(0, who)._replace(person="Ada"))  # type: ignore[arg-type]
-        said: list[str] = []
-        got = read_demonstration(tmp_path / f"{who}.mcap", say=said.append)
-        assert (got.conducts, got.person) == (who, "Ada")
+    for side in ("left", "right"):
+        write_demonstration(tmp_path / f"{side}.mcap", led(0, side)._replace(person="Ada"))  # type: ignore[arg-type]
+        lines: list[str] = []
+        got = read_demonstration(tmp_path / f"{side}.mcap", say=lines.append)
+        assert (got.conducts, got.person) == (side, "Ada")
         np.testing.assert_array_equal(got.hands, led(0).hands)
         np.testing.assert_array_equal(got.tool, led(0).tool)
-        assert f"the {who} hand leads alone" in said[0]
-        assert [one.name for one in summary(tmp_path / f"{who}.mcap").streams] == [who, "tool"]
+        assert f"the {side} hand leads alone" in lines[0]
+        assert [stream.name for stream in summary(tmp_path / f"{side}.mcap").streams] == [side, "tool"]
 
 
 def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
     """The other hand makes no difference and the skill is judged without it."""
-    found = figures_of(skill)
-    assert found.unsafe == ()
-    assert found.all.error_mm < min(found.all.other_mm.values())
-    assert found.beside > 80
-    assert f"in wrong samples: {found.beside:.0f} % of the hand 30 cm beside\n" in table(found)
-    assert "swapped" not in table(found)
-    again = decoded(skill.file, origin="a file")
-    assert again.conductor == skill.conductor
-    told = []
+    figures = figures_of(skill)
+    assert figures.unsafe == ()
+    assert figures.all.error_mm < min(figures.all.other_mm.values())
+    assert figures.beside > 80
+    assert f"in wrong samples: {figures.beside:.0f} % of the hand 30 cm beside\n" in table(figures)
+    assert "swapped" not in table(figures)
+    restored = decoded(skill.file, origin="a file")
+    assert restored.conductor == skill.conductor
+    predictions = []
     for other in ((0.5, -0.2, 0.3), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0)):
-        at = conducting(skill, AT, other)
+        hands = conducting(skill, AT, other)
         moving = np.stack([[0.1, 0.0, 0.0], [3.0, 3.0, 3.0]])[:: 1 if skill.conductor == 0 else -1]
-        found_there = again.predict(at.reshape(2, 3), moving, STILL)
-        told.append(np.concatenate([*found_there[:3], found_there.covariance.ravel(), again.mean(at[None])[0]]))
-    np.testing.assert_array_equal(told, [told[0]] * 3)
-    assert np.linalg.norm(told[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25])) < 0.02
-    off = at_rest(again, conducting(skill, (1.1, 0.2, 0.3), AT))
-    assert off.gate_m > skill.threshold
+        found_there = restored.predict(hands.reshape(2, 3), moving, STILL)
+        predictions.append(np.concatenate([*found_there[:3], found_there.covariance.ravel(), restored.mean(hands[None])[0]]))
+    np.testing.assert_array_equal(predictions, [predictions[0]] * 3)
+    assert np.linalg.norm(predictions[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25])) < 0.02
+    prediction = at_rest(restored, conducting(skill, (1.1, 0.2, 0.3), AT))
+    assert prediction.gate_m > skill.threshold
 
 
 def test_takes_with_places_of_one_hand() -> None:
     """Takes of one hand that name their places are learned between these."""
-    shown = []
+    takes = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
-        shown.append(take._replace(right=take.left, conducts="left"))
-    learnt = learn(shown)
+        takes.append(take._replace(right=take.left, conducts="left"))
+    learnt = learn(takes)
     assert isinstance(learnt.model, SegmentedKMP)
     assert learnt.conductor == 0
-    aimed = adapted(learnt, shown[0].places, tolerance=0.05)
-    for point in shown[0].places:
+    aimed = adapted(learnt, takes[0].places, tolerance=0.05)
+    for point in takes[0].places:
         for other in (point.right, (2.0, 2.0, 2.0)):
             hands = np.array([[*point.left, *other]])
             np.testing.assert_allclose(aimed.mean(hands, [point.name])[0], point.tool, atol=2e-3)
@@ -117,13 +117,13 @@ def streams_of_one(side: str, take: Demonstration) -> Streams:
 def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
     """It has no topic, no sample, or is never seen; and the other hand is given as both."""
     take, other = circling(0), "right" if side == "left" else "left"
-    path, said, whole = tmp_path / "a.mcap", list[str](), streams_of(take)
+    path, lines, whole = tmp_path / "a.mcap", list[str](), streams_of(take)
     never = whole[other]._replace(poses=np.full_like(whole[other].poses, np.nan))
     for streams in (streams_of_one(side, take), whole | {other: never}):
-        got = read_demonstration(write_streams(path, streams), say=said.append)
+        got = read_demonstration(write_streams(path, streams), say=lines.append)
         assert got.conducts == side
         np.testing.assert_array_equal(got.hands, np.tile(getattr(take, side)[:, :3], 2))
-        assert any(f"the {side} hand leads alone" in line for line in said)
+        assert any(f"the {side} hand leads alone" in line for line in lines)
     write_streams(path, streams_of_one(side, take))
     for topics in (
         {other: PoseTopic(f"cell/hands/{side}")},
@@ -140,19 +140,19 @@ def test_one_stream_for_both_hands_is_refused(tmp_path: Path) -> None:
     """One stream for both hands whose name says neither is refused."""
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
-    both = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
+    topics = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
     with pytest.raises(RecordingError, match=r"cell/tool/pose is given as left and as right; another topic needed"):
-        read_demonstration(path, topics=both)
+        read_demonstration(path, topics=topics)
 
 
 def served(
     skill: StoredSkill, other_from: int, other_to: int, one_to: int = 10_000, *, count: int = 1200, at: Point = FAR
 ) -> Records:
     """The frame of each tick, the other hand seen for some, the one until another."""
-    one, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
+    side, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
     ticks = []
     for k in range(count):
-        events = [hand(one, AT, k + 1)] if k % 5 == 0 and k < one_to else []
+        events = [hand(side, AT, k + 1)] if k % 5 == 0 and k < one_to else []
         events += [hand(other, at, k + 1)] if k % 5 == 0 and other_from <= k < other_to else []
         ticks.append(Tick(k, tuple(events)))
     return followed(skill, ticks)
@@ -160,8 +160,8 @@ def served(
 
 def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200) -> list[tuple[int, int]]:
     """Mode and reason of each tick of `served`."""
-    seen = served(skill, *hands, one_to, count=count)
-    return list(zip(seen["mode"].tolist(), seen["reason"].tolist(), strict=True))
+    records = served(skill, *hands, one_to, count=count)
+    return list(zip(records["mode"].tolist(), records["reason"].tolist(), strict=True))
 
 
 def test_served_without_absent_hand(
@@ -176,19 +176,19 @@ def test_served_without_absent_hand(
     assert set(lost[10:840]) == {follow}  # and both are seen
     assert set(lost[860:3090]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(lost[3100:]) == {follow}  # 5 s after it was seen last
-    again = modes(skill, 300, 600, one_to=3150, count=3300)
-    assert set(again[3210:]) == {(Mode.HOLD, Reason.STALE_HAND)}
+    vanished = modes(skill, 300, 600, one_to=3150, count=3300)
+    assert set(vanished[3210:]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(modes(skill, 0, 0, one_to=600)[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(modes(skill, 0, 1200, one_to=0)) == {(Mode.HOLD, Reason.NO_HANDS)}
 
 
 def test_arm_keeps_away_from_vanished_hand(skill: StoredSkill) -> None:
     """The arm keeps its distance from where a lost hand was last seen."""
-    there = (0.5, 0.21, 0.4)  # where the tool is to go
-    seen = served(skill, 0, 50, count=3500, at=there)
-    assert set(seen["mode"][2600:].tolist()) == {Mode.FOLLOW}
-    assert seen["hand_distance"].min() > ASSUMED.people.distance - 0.001
+    goal_m = (0.5, 0.21, 0.4)  # where the tool is to go
+    records = served(skill, 0, 50, count=3500, at=goal_m)
+    assert set(records["mode"][2600:].tolist()) == {Mode.FOLLOW}
+    assert records["hand_distance"].min() > ASSUMED.people.distance - 0.001
     free = served(skill, 0, 0, count=3500)
-    near, away = (np.linalg.norm(found["tool"][-1] - there) for found in (free, seen))
+    near, away = (np.linalg.norm(run["tool"][-1] - goal_m) for run in (free, records))
     assert near < 0.03
     assert away > 0.05

@@ -22,13 +22,13 @@ def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
 @pytest.mark.parametrize("named", [True, False])
 def test_order_of_files_makes_no_difference(named: bool) -> None:
     """The order of the files makes no difference."""
-    demonstrations = [one if named else one._replace(places=()) for one in shown()]
+    demonstrations = [take if named else take._replace(places=()) for take in shown()]
     names = [f"take {number}" for number in range(len(demonstrations))]
     first = learn(demonstrations, names=names)
     for seed in range(2):
         order = Random(seed).sample(range(len(names)), len(names))
-        again = learn([demonstrations[i] for i in order], names=[names[i] for i in order])
-        assert again.file == first.file
+        relearned = learn([demonstrations[i] for i in order], names=[names[i] for i in order])
+        assert relearned.file == first.file
 
 
 def test_sitting_is_held_out_together() -> None:
@@ -59,4 +59,4 @@ def test_take_with_exchanged_hands_is_left_out() -> None:
 def test_a_delay_that_is_given_is_taken() -> None:
     assert figures_of(learn(shown(), delay_s=0.35)).delay_s == 0.35
     with pytest.raises(SkillError, match=r"a delay goes with via-points"):
-        learn([one._replace(places=()) for one in shown()], delay_s=0.1)
+        learn([take._replace(places=()) for take in shown()], delay_s=0.1)

@@ -37,7 +37,7 @@ def turning(one: Demonstration, whole: Vector) -> Demonstration:
 @pytest.fixture(scope="module")
 def shown() -> list[Demonstration]:
     """Three demonstrations that turn the tool and tell of the gripper."""
-    return [turning(one.every(2), TURN) for one in demonstrations(SCENE, count=3, seed=1, gripper=True)]
+    return [turning(take.every(2), TURN) for take in demonstrations(SCENE, count=3, seed=1, gripper=True)]
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +47,8 @@ def posed(shown: list[Demonstration]) -> Skill:
 
 def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]) -> float:
     """Between what is predicted for hands (6,) at rest, and an orientation."""
-    found = at_rest(skill, hands).turn.orientation
-    return float(np.degrees((Rotation.from_quat(found) * Rotation.from_quat(orientation).inv()).magnitude()))
+    prediction = at_rest(skill, hands).turn.orientation
+    return float(np.degrees((Rotation.from_quat(prediction) * Rotation.from_quat(orientation).inv()).magnitude()))
 
 
 def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
@@ -57,28 +57,28 @@ def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]
     assert not any("orientation" in text for text in (*figures.unsafe, *figures.warnings))
     assert figures.orientation_error_deg < 5
     for row in (0, -1):
-        one = shown[0]
-        assert angle_deg(posed, one.hands[row], one.tool[row, 3:]) < 15  # smoothed, not averaged: that would be 60
+        take = shown[0]
+        assert angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15  # smoothed, not averaged: that would be 60
     assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(np.radians(120))
 
 
 def test_pose_comes_back_from_file(posed: Skill) -> None:
     """A skill with orientation and gripper comes back from its file."""
     back = decoded(posed.file, origin="x.npz")
-    one, other = (at_rest(skill, with_hands(PLACES[2])) for skill in (posed, back))
-    assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
-    assert one.turn.covariance.tobytes() == other.turn.covariance.tobytes()
-    assert one.closure == other.closure
+    original, other = (at_rest(skill, with_hands(PLACES[2])) for skill in (posed, back))
+    assert original.turn.orientation.tobytes() == other.turn.orientation.tobytes()
+    assert original.turn.covariance.tobytes() == other.turn.covariance.tobytes()
+    assert original.closure == other.closure
     assert back.digest == posed.digest
 
 
 def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) -> None:
     """Via-points store orientation and gripper, and return them."""
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
-    told = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
-    hands = with_hands(told)
-    for one in (posed, skill, shipped_skill()):  # the last is between places
-        taught = adapted(one, (*PLACES[:2], told), tolerance=0.05)
+    via_point = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
+    hands = with_hands(via_point)
+    for base in (posed, skill, shipped_skill()):  # the last is between places
+        taught = adapted(base, (*PLACES[:2], via_point), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad
         assert missed is not None
@@ -86,7 +86,7 @@ def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) ->
         assert at_rest(taught, hands).closure < 0.1
         assert decoded(taught.file, origin="x").digest == taught.digest
         cleared = adapted(taught, (), tolerance=0.05)
-        assert (cleared.turn is None, cleared.gripper is None) == (one.turn is None, one.gripper is None)
+        assert (cleared.turn is None, cleared.gripper is None) == (base.turn is None, base.gripper is None)
 
 
 def test_contradicting_via_points_are_refused(skill: Skill) -> None:
@@ -102,7 +102,7 @@ def test_contradicting_via_points_are_refused(skill: Skill) -> None:
 
 def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
     """A gripper that reports millimetres is refused."""
-    spoilt = [one._replace(gripper=80.0 * np.asarray(one.gripper)) for one in shown]
+    spoilt = [take._replace(gripper=80.0 * np.asarray(take.gripper)) for take in shown]
     with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
         learn(spoilt, components=5, points=60)
 
@@ -110,26 +110,26 @@ def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
 @pytest.mark.parametrize("turn_deg", [200, 300, 400, 480])
 def test_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
     """By each take alike, whichever signs its quaternions have."""
-    found = figures_of(learn([spinning(seed, turn_deg) for seed in range(4)], points=60))
-    assert found.orientation_error_deg < 15
-    assert found.unsafe == ()
+    figures = figures_of(learn([spinning(seed, turn_deg) for seed in range(4)], points=60))
+    assert figures.orientation_error_deg < 15
+    assert figures.unsafe == ()
 
 
 def test_wrongly_learned_turns_are_unsafe() -> None:
     """A tool whose turns are learned wrongly is unsafe."""
-    found = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
-    assert any("up to 60° accepted: it turns by up to" in line for line in found.unsafe)
+    figures = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
+    assert any("up to 60° accepted: it turns by up to" in line for line in figures.unsafe)
 
 
 def spinning(seed: int, turn_deg: float) -> Demonstration:
     """A take in which the tool turns as the hands go, some degrees otherwise in each."""
     random, t = np.random.default_rng(seed), np.arange(0.0, 8.0, 0.04)
-    way = 0.5 - 0.5 * np.cos(np.pi * t / 8)
+    progress = 0.5 - 0.5 * np.cos(np.pi * t / 8)
     ones, unturned = np.ones_like(t), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    left = np.stack([0.4 + 0.5 * way, 0.3 * ones, 0.3 + 0.05 * np.sin(3 * way)], axis=1) + 0.01 * random.normal(size=3)
-    right = np.stack([0.5 + 0.4 * way, -0.3 * ones, 0.3 * ones], axis=1) + 0.01 * random.normal(size=3)
-    turn = Rotation.from_rotvec(np.radians(turn_deg * way + 2 * random.normal())[:, None] * [0.0, 0.0, 1.0]).as_quat()
+    left = np.stack([0.4 + 0.5 * progress, 0.3 * ones, 0.3 + 0.05 * np.sin(3 * progress)], axis=1) + 0.01 * random.normal(size=3)
+    right = np.stack([0.5 + 0.4 * progress, -0.3 * ones, 0.3 * ones], axis=1) + 0.01 * random.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(turn_deg * progress + 2 * random.normal())[:, None] * [0.0, 0.0, 1.0]).as_quat()
     tool = 0.5 * (left + right) + [0.0, 0.0, 0.2]
-    seen = [at + 1e-3 * random.normal(size=at.shape) for at in (left, right, tool)]
+    positions = [position + 1e-3 * random.normal(size=position.shape) for position in (left, right, tool)]
     turns = (unturned, unturned, turn * random.choice([-1.0, 1.0]))
-    return Demonstration(np.round(1e9 * t).astype(np.int64), *map(np.hstack, zip(seen, turns, strict=True)))
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *map(np.hstack, zip(positions, turns, strict=True)))

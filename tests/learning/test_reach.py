@@ -48,8 +48,8 @@ def test_unreachable_place_has_its_distance(arm: str, tmp_path: Path) -> None:
         outward = random.normal(size=3)
         outward /= np.linalg.norm(outward)
         away_m = random.uniform(0.3, 0.8)
-        (found,) = beyond_m(cell, (shoulder + (length + away_m) * outward)[None])
-        assert away_m - 0.1 < found < away_m + 0.5  # an arm reaches less far in some directions
+        (distance_m,) = beyond_m(cell, (shoulder + (length + away_m) * outward)[None])
+        assert away_m - 0.1 < distance_m < away_m + 0.5  # an arm reaches less far in some directions
 
 
 def test_distance_from_reach_is_exact() -> None:
@@ -81,11 +81,11 @@ def test_skill_out_of_reach_is_refused(
     """The via-points of a task have names, and may be taught anew."""
     judged = shipped_skill() if is_named else skill
     assert bool(judged.model.names) is is_named
-    found = out_of_reach(judged, np.array(distances), Settings())
-    assert found.is_refused is is_refused
+    finding = out_of_reach(judged, np.array(distances), Settings())
+    assert finding.is_refused is is_refused
     number = sum(distance > 0.0 for distance in distances)
-    assert bool(found.text) is bool(number)
+    assert bool(finding.text) is bool(number)
     if number:
-        assert f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach" in found.text
-        assert f"the farthest by {max(distances):.3f} m" in found.text
-        assert ("Learn a skill" in found.text) is is_refused
+        assert f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach" in finding.text
+        assert f"the farthest by {max(distances):.3f} m" in finding.text
+        assert ("Learn a skill" in finding.text) is is_refused

@@ -34,44 +34,44 @@ def missed_mm(skill: StoredSkill, one: Demonstration) -> float:
 @pytest.fixture(scope="module")
 def others() -> StoredSkill:
     """A skill of four takes, as read from its file."""
-    shown = [circling(seed).every(4) for seed in range(4)]
+    takes = [circling(seed).every(4) for seed in range(4)]
     names = [f"take-{i}" for i in range(4)]
-    return decoded(learn(shown, name="others", names=names, points=80).file, origin="others.npz")
+    return decoded(learn(takes, name="others", names=names, points=80).file, origin="others.npz")
 
 
 def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
     """Takes of the skill's user refine it."""
     mine = [circling(seed).every(4) for seed in range(10, 14)]
-    mine = [one._replace(tool=one.tool + np.concatenate([HABIT_M, np.zeros(4)])) for one in mine]
+    mine = [take._replace(tool=take.tool + np.concatenate([HABIT_M, np.zeros(4)])) for take in mine]
     refined = learn(mine[:3], name="mine", names=["a", "b", "c"], points=80, refined=others)
-    found = figures_of(refined)
-    assert [row.name for row in found.demonstrations] == ["a", "b", "c"]
-    assert list(found.weights_mm) == ["1", "4", "16", "64", "yours alone"]
-    assert found.weights_mm[found.weight] == min(found.weights_mm.values()) < found.weights_mm["1"]
-    assert f"{found.weight} is taken:" in table(found)
+    figures = figures_of(refined)
+    assert [row.name for row in figures.demonstrations] == ["a", "b", "c"]
+    assert list(figures.weights_mm) == ["1", "4", "16", "64", "yours alone"]
+    assert figures.weights_mm[figures.weight] == min(figures.weights_mm.values()) < figures.weights_mm["1"]
+    assert f"{figures.weight} is taken:" in table(figures)
     assert missed_mm(refined, mine[3]) < 0.5 * missed_mm(others, mine[3])
     # The file suffices for the next one; takes of unnamed persons are then those of others.
-    kept = stored_demonstrations(decoded(refined.file, origin="mine.npz"))
-    assert sorted(one.name for one in kept) == ["a", "b", "c", "take-0", "take-1", "take-2", "take-3"]
+    stored = stored_demonstrations(decoded(refined.file, origin="mine.npz"))
+    assert sorted(entry.name for entry in stored) == ["a", "b", "c", "take-0", "take-1", "take-2", "take-3"]
 
 
 @pytest.mark.thorough
 def test_earlier_takes_of_a_person_count() -> None:
     """Takes of a task refine it; earlier ones of the same person count as that person's."""
-    shown = [one.every(3) for one in made("three", range(3))]
-    shown = [one._replace(person=f"person {i // 2}") for i, one in enumerate(shown)]
-    skill = learn(shown, name="others")
-    mine = [with_habit(one.every(3)) for one in made("three", [7], each=4)]
-    mine = [one._replace(person="me") for one in mine]
+    takes = [take.every(3) for take in made("three", range(3))]
+    takes = [take._replace(person=f"person {i // 2}") for i, take in enumerate(takes)]
+    skill = learn(takes, name="others")
+    mine = [with_habit(take.every(3)) for take in made("three", [7], each=4)]
+    mine = [take._replace(person="me") for take in mine]
     first = learn(mine[:2], name="first", names=["a", "b"], refined=skill)
-    both = figures_of(learn(mine[2:], name="both", names=["c", "d"], refined=first))
-    assert sorted(row.name for row in both.demonstrations) == ["a", "b", "c", "d"]
-    assert both.weights_mm[both.weight] < both.weights_mm["1"]
-    assert both.delay_s is not None
+    figures = figures_of(learn(mine[2:], name="both", names=["c", "d"], refined=first))
+    assert sorted(row.name for row in figures.demonstrations) == ["a", "b", "c", "d"]
+    assert figures.weights_mm[figures.weight] < figures.weights_mm["1"]
+    assert figures.delay_s is not None
     with pytest.raises(
         SkillError, match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the"
     ):
-        learn([one._replace(places=()) for one in mine[:2]], refined=skill)
+        learn([take._replace(places=()) for take in mine[:2]], refined=skill)
 
 
 def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
@@ -87,17 +87,17 @@ def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
     with pytest.raises(SkillError, match=r"1 demonstration given .*again repeats take-0, and is left out"):
         learn([mine[0], stored_demonstrations(others)[0].demonstration], names=["mine", "again"], refined=others)
     with pytest.raises(SkillError, match="all demonstrations repeat those of the skill that is refined"):
-        learn([one.demonstration for one in stored_demonstrations(others)], refined=others)
+        learn([entry.demonstration for entry in stored_demonstrations(others)], refined=others)
 
 
 def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
-    given = made("three", [0], each=1)[0]
-    closure = np.linspace(0.0, 1.0, len(given.stamps_ns))
-    given = given._replace(person="Ada", gripper=closure, begins=(200,), conducts="left")
-    one, other = (NamedDemonstration(name, part) for name, part in (("a", given), ("b", given.every(2))))
-    first, second = stored_demonstrations(replace(others, demonstrations=packed([one, other])))
-    step = max(1, int(1.0 / (KEPT_HZ * given.period_s) + 1e-6))
-    expected = given.every(step)
+    take = made("three", [0], each=1)[0]
+    closure = np.linspace(0.0, 1.0, len(take.stamps_ns))
+    take = take._replace(person="Ada", gripper=closure, begins=(200,), conducts="left")
+    entry, other = (NamedDemonstration(name, part) for name, part in (("a", take), ("b", take.every(2))))
+    first, second = stored_demonstrations(replace(others, demonstrations=packed([entry, other])))
+    step = max(1, int(1.0 / (KEPT_HZ * take.period_s) + 1e-6))
+    expected = take.every(step)
     assert (first.name, second.name) == ("a", "b")
     for name in ("frame", "places", "conducts", "person", "begins"):
         assert getattr(first.demonstration, name) == getattr(expected, name), name

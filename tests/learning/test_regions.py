@@ -42,10 +42,10 @@ def test_regions_hold_on_other_people(count: int) -> None:
         rng = np.random.default_rng([seed, count])
         regions = calibrated([apart(rng) for _ in range(count)], np.arange(count))
         held.append(np.mean([apart(rng).inside(regions) for _ in range(40)], axis=0))
-    found = dict(zip(LEVELS, np.mean(held, axis=0), strict=True))
-    assert found[0.5] == pytest.approx(0.5, abs=0.05)
-    assert found[0.95] == pytest.approx(0.95, abs=0.02)
-    assert found[0.99] > 0.97
+    shares = dict(zip(LEVELS, np.mean(held, axis=0), strict=True))
+    assert shares[0.5] == pytest.approx(0.5, abs=0.05)
+    assert shares[0.95] == pytest.approx(0.95, abs=0.02)
+    assert shares[0.99] > 0.97
     assert regions.radii[LEVELS.index(0.95)] == pytest.approx(REGION_95)
     assert regions.std_s == pytest.approx(0.07, abs=0.05), "in units of a covariance that is too small"
 
@@ -64,12 +64,12 @@ def test_unsure_where_wrong() -> None:
     rng = np.random.default_rng(4)
     regions = calibrated([places(rng) for _ in range(12)], np.arange(12))
     asked = [places(rng) for _ in range(40)]
-    wrong = np.concatenate([one.is_wrong for one in asked])
-    found = np.concatenate([one.probabilities(regions) for one in asked])
-    assert found.mean() == pytest.approx(wrong.mean(), abs=0.02)
-    assert (found > regions.alarm)[wrong].mean() > 0.9
-    assert (found > regions.alarm)[~wrong].mean() < 0.15
-    assert found[wrong].mean() > 5 * found[~wrong].mean()
+    wrong = np.concatenate([case.is_wrong for case in asked])
+    probabilities = np.concatenate([case.probabilities(regions) for case in asked])
+    assert probabilities.mean() == pytest.approx(wrong.mean(), abs=0.02)
+    assert (probabilities > regions.alarm)[wrong].mean() > 0.9
+    assert (probabilities > regions.alarm)[~wrong].mean() < 0.15
+    assert probabilities[wrong].mean() > 5 * probabilities[~wrong].mean()
 
 
 def test_own_region_has_no_part_in_judgement() -> None:
@@ -90,10 +90,10 @@ def test_covariance_is_scaled_along_motion() -> None:
     rng, out = np.random.default_rng(3), np.empty((3, 3))
     for _ in range(50):
         root, velocity = 0.05 * rng.normal(size=(3, 3)), rng.normal(size=3)
-        wanted = 2.5 * (root @ root.T + 0.3**2 * np.outer(velocity, velocity))
+        expected = 2.5 * (root @ root.T + 0.3**2 * np.outer(velocity, velocity))
         reach_m = calibrate(root @ root.T, velocity, 2.5, 0.3, out)
-        np.testing.assert_allclose(out, wanted, rtol=0, atol=1e-10)
-        assert reach_m == pytest.approx(np.sqrt(REGION_95 * np.linalg.eigvalsh(wanted)[-1]), rel=1e-6)
+        np.testing.assert_allclose(out, expected, rtol=0, atol=1e-10)
+        assert reach_m == pytest.approx(np.sqrt(REGION_95 * np.linalg.eigvalsh(expected)[-1]), rel=1e-6)
     assert calibrate(1e-4 * np.eye(3), np.zeros(3), 1.0, 0.0, out) == pytest.approx(0.01 * np.sqrt(REGION_95))
 
 
@@ -120,7 +120,7 @@ def test_unsure_flag_does_not_flicker() -> None:
 @pytest.fixture(scope="module")
 def learned() -> StoredSkill:
     """A skill of six people, the fifth of whom is quick, at a task whose teacher reacts late."""
-    return learn([one.every(4) for one in made("path", range(6), each=1)])
+    return learn([take.every(4) for take in made("path", range(6), each=1)])
 
 
 def test_learned_regions_hold(learned: StoredSkill) -> None:

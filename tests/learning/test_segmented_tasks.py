@@ -71,16 +71,16 @@ def test_tool_goes_to_told_places(between: Skill, shown: list[Demonstration]) ->
         for place in places:
             near = aimed.mean(hands_at(place, 0.02))[0] - (0.02 if place.follow == "left" else 0.0)
             assert np.linalg.norm(near - place.tool) < 0.015
-        far, near = (aimed.model.gates_m(hands_at(places[2], off))[0] for off in (0.3, 0.0))
+        far, near = (aimed.model.gates_m(hands_at(places[2], offset_m))[0] for offset_m in (0.3, 0.0))
         assert far > aimed.threshold > near
 
 
 def test_unusable_places_are_explained(shown: list[Demonstration]) -> None:
     """Takes that cannot be learned between via-points are refused with a reason."""
-    assert task_of([one._replace(places=()) for one in shown]) == (None, "")
+    assert task_of([take._replace(places=()) for take in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
-    assert "1 named via-points: 2 to 65" in task_of([one._replace(places=one.places[:1]) for one in shown])[1]
+    assert "1 named via-points: 2 to 65" in task_of([take._replace(places=take.places[:1]) for take in shown])[1]
 
 
 def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
@@ -89,9 +89,9 @@ def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
     task, _ = task_of(shown)
     assert task is not None
     assert via_points_never_reached(task, shown, names) == []
-    wrong = [one._replace(places=moved(one.places, {"glass": (0.0, 0.4, 0.3)})) for one in shown]
-    (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
-    assert re.fullmatch(r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said)
+    wrong = [take._replace(places=moved(take.places, {"glass": (0.0, 0.4, 0.3)})) for take in shown]
+    (message,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
+    assert re.fullmatch(r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", message)
     with pytest.raises(
         SkillError, match=r"via-point 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"
     ):
@@ -124,10 +124,10 @@ def rms_mm(kind: str, skill: Skill) -> float:
     """The error at the moment in four takes of other people, through the core."""
     total, count = 0.0, 0
     for demonstration in made(kind, (6, 7)):
-        seen = left_out("", "", demonstration)
+        take = left_out("", "", demonstration)
         aimed = adapted(skill, demonstration.places, tolerance=0.05)
-        one = judged(seen, predicted(aimed, seen))
-        total, count = total + one.squares, count + one.samples
+        score = judged(take, predicted(aimed, take))
+        total, count = total + score.squares, count + score.samples
     return 1000.0 * float(np.sqrt(total / count))
 
 
@@ -142,9 +142,9 @@ def test_place_is_visited_twice(cyclic: Skill) -> None:
     assert rms_mm("cyclic", cyclic) < 50.0  # a Gaussian process with 2 s of memory: 51, one without: 101
     places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
     aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
-    one, again = places["left out"], places["left out again"]
-    assert np.allclose(one.left, again.left)
-    assert np.linalg.norm(np.subtract(one.tool, again.tool)) > 0.1
+    visit, revisit = places["left out"], places["left out again"]
+    assert np.allclose(visit.left, revisit.left)
+    assert np.linalg.norm(np.subtract(visit.tool, revisit.tool)) > 0.1
     assert max(point.missed_by_m for point in in_force(aimed)) < 0.005
 
 
@@ -185,11 +185,11 @@ def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
 @pytest.mark.thorough
 def test_leading_hand(on_path: list[Demonstration]) -> None:
     """Unless somebody shows it, the tool waits for the other hand."""
-    free = [without_follow(one) for one in on_path]
+    free = [without_follow(take) for take in on_path]
     leads, figures = lead_of(free)
     assert leads == NONE
     assert "positions, shares of the left hand alone" not in figures.tried_mm
-    leads, figures = lead_of([*free[4:], *(late_right(one, 4.0) for one in free[:4])])
+    leads, figures = lead_of([*free[4:], *(late_right(take, 4.0) for take in free[:4])])
     assert "positions, shares of the left hand alone" in figures.tried_mm
     assert leads == LEFT
 
@@ -197,15 +197,15 @@ def test_leading_hand(on_path: list[Demonstration]) -> None:
 def test_where_it_waits_it_waits_to_the_end() -> None:
     skill = learn(made("three", range(3)), name="three")
     places = made("three", [0], each=1)[0].places
-    there = adapted(skill, places, tolerance=0.05)
+    aimed = adapted(skill, places, tolerance=0.05)
     left_alone = np.array([[*places[1].left, *places[0].right]])
-    assert np.linalg.norm(there.mean(left_alone)[0] - places[0].tool) < 0.03
+    assert np.linalg.norm(aimed.mean(left_alone)[0] - places[0].tool) < 0.03
 
 
 @pytest.fixture(scope="module")
 def carried() -> StoredSkill:
     """The tool is fixed to what the left hand carries."""
-    return learn([without_follow(one) for one in made("heading", range(4))])
+    return learn([without_follow(take) for take in made("heading", range(4))])
 
 
 @pytest.mark.thorough
@@ -217,9 +217,9 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
     assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
     assert rms_mm("heading", carried) < 22.0  # without the orientation: 39; a Gaussian process told the places: 80
-    again = decoded(carried.file, origin="a file")
-    assert again.model.own_arrays()["levers"].tobytes() == carried.model.own_arrays()["levers"].tobytes()
-    assert with_file(replace(again, file=b"")).file == carried.file
+    restored = decoded(carried.file, origin="a file")
+    assert restored.model.own_arrays()["levers"].tobytes() == carried.model.own_arrays()["levers"].tobytes()
+    assert with_file(replace(restored, file=b"")).file == carried.file
 
 
 @pytest.mark.thorough

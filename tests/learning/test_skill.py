@@ -21,7 +21,7 @@ def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:
 def test_prediction_has_derivatives_of_motion(aimed: Skill, t: float) -> None:
     """Velocity and acceleration are those of the predicted motion."""
     script, h = HandScript(SCENE, seed=11), 1e-3
-    before, now, after = (aimed.mean(stacked(script.truth(at))[0].reshape(1, 6))[0] for at in (t - h, t, t + h))
+    before, now, after = (aimed.mean(stacked(script.truth(time_s))[0].reshape(1, 6))[0] for time_s in (t - h, t, t + h))
     prediction = aimed.predict(*stacked(script.truth(t)))
     np.testing.assert_allclose(prediction.position, now, atol=1e-6)
     np.testing.assert_allclose(prediction.velocity, (after - before) / (2 * h), atol=1e-5)

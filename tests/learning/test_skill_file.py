@@ -41,8 +41,8 @@ def test_file_returns_same_bits(learned: Skill, places: tuple[ViaPoint, ...], ta
         sent.threshold,
     )
     queries = taught[5].hands[::50]
-    for one, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
-        assert one.tobytes() == other.tobytes()
+    for array, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
+        assert array.tobytes() == other.tobytes()
     assert adapted(back, PLACES[:2], tolerance=0.05).file == adapted(learned, PLACES[:2], tolerance=0.05).file
 
 
@@ -112,7 +112,7 @@ def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message:
 @pytest.mark.parametrize("begin", [b"", b"PK\x01\x02"], ids=["anywhere", "in the directory"])
 def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -> None:
     random, whole = np.random.default_rng(8), aimed.file
-    same = 0
+    unchanged = 0
     for _ in range(400):
         damaged = bytearray(whole)
         damaged[random.integers(whole.index(begin), len(whole))] ^= 1 << int(random.integers(8))
@@ -120,9 +120,9 @@ def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, 
             back = decoded(bytes(damaged), origin="x.npz")
         except SkillError:
             continue
-        same += 1
+        unchanged += 1
         assert with_file(replace(back, file=b"")).file == whole
-    assert same < 40
+    assert unchanged < 40
 
 
 def test_large_archive_is_not_unpacked(skill: Skill) -> None:

@@ -39,9 +39,9 @@ def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None
 
 def moved(point: ViaPoint, name: str, *, hands: float, tool: float, **more: Any) -> ViaPoint:
     """A via-point whose left hand and tool are elsewhere [m]."""
-    left, at = point.left, point.tool
+    left, tool_m = point.left, point.tool
     return msgspec.structs.replace(
-        point, name=name, left=(left[0] + hands, left[1], left[2]), tool=(at[0], at[1] + tool, at[2]), **more
+        point, name=name, left=(left[0] + hands, left[1], left[2]), tool=(tool_m[0], tool_m[1] + tool, tool_m[2]), **more
     )
 
 
@@ -56,17 +56,17 @@ def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> Non
         adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
     assert f"at most {steep:.4f} m accepted, 4 times the hands' distance" in str(caught.value)
     allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
-    here = np.array([*EXACT.left, *EXACT.right])
-    assert np.linalg.norm(allowed.model.primitive.jacobian(here), 2) < 10.0
+    query = np.array([*EXACT.left, *EXACT.right])
+    assert np.linalg.norm(allowed.model.primitive.jacobian(query), 2) < 10.0
 
 
 def test_loose_via_points_contradict_less(skill: Skill) -> None:
     """Places that are not exact contradict less and neighbourhoods more."""
     adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
-    apart = moved(EXACT, "twin", hands=0.05, tool=0.12)
-    adapted(skill, (EXACT, apart), tolerance=0.05)
+    twin = moved(EXACT, "twin", hands=0.05, tool=0.12)
+    adapted(skill, (EXACT, twin), tolerance=0.05)
     with pytest.raises(SkillError, match="contradict each other"):
-        adapted(skill, (EXACT, msgspec.structs.replace(apart, radius=0.025)), tolerance=0.05)
+        adapted(skill, (EXACT, msgspec.structs.replace(twin, radius=0.025)), tolerance=0.05)
 
 
 def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
@@ -79,5 +79,5 @@ def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
 
     soft = moved(HANDOVER, "soft", hands=0.0, tool=0.0, radius=0.0, std=0.02)
     first = adapted(aimed, (soft,), tolerance=0.05)
-    then = adapted(aimed, (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)), tolerance=0.05)
-    assert any("via-point 'soft' is moved by" in text for text in warnings_of(first, then))
+    second = adapted(aimed, (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)), tolerance=0.05)
+    assert any("via-point 'soft' is moved by" in text for text in warnings_of(first, second))

@@ -35,7 +35,7 @@ def found(frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float =
     gate = GATE._replace(capped=change.pop("capped", False))
     figures = msgspec.structs.replace(FIGURES, demonstrations=(row,) * takes, all=row, **change)
     subject = Subject(figures, gate, frames, "a and b", row.error_mm, scatter_mm=250.0)
-    return {one.text: one.severity for one in verdicts(subject)}
+    return {verdict.text: verdict.severity for verdict in verdicts(subject)}
 
 
 def test_good_figures_have_no_remarks() -> None:

@@ -111,12 +111,12 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
         "status": ["--connect", nobody],
         "play": [GOLDEN, "--connect", nobody],
     }[name]
-    said = tmp_path / "said"
-    process = begun([name, *arguments], said)
+    output = tmp_path / "said"
+    process = begun([name, *arguments], output)
     time.sleep(delay_s)
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 130
-    text = said.read_text()
+    text = output.read_text()
     assert text.splitlines()[-1] == SAID
     assert text.count(SAID) == 1
     assert "Traceback" not in text
@@ -124,33 +124,33 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
 
 @pytest.mark.thorough
 def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
-    said, skill = tmp_path / "said", tmp_path / "skill.npz"
-    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
-    wait_for(lambda: "choosing parameters" in said.read_text())
+    output, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
+    wait_for(lambda: "choosing parameters" in output.read_text())
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 130
-    assert said.read_text().splitlines()[-1] == SAID
+    assert output.read_text().splitlines()[-1] == SAID
     assert not skill.exists()
 
 
 @pytest.mark.thorough
 def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
-    said, skill = tmp_path / "said", tmp_path / "skill.npz"
-    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], said)
+    output, skill = tmp_path / "said", tmp_path / "skill.npz"
+    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
     wait_for(skill.exists)
     while process.poll() is None:  # also while the interpreter takes itself down
         process.send_signal(signal.SIGINT)
         time.sleep(0.001)
     assert process.returncode in (0, 130)
-    assert "Traceback" not in said.read_text()
+    assert "Traceback" not in output.read_text()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
 @pytest.mark.thorough
 def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals) -> None:
-    said = tmp_path / "said"
-    process = begun(["demo", "--output", str(tmp_path / "demo")], said)
-    wait_for(lambda: "commands arrive" in said.read_text(), 100)
+    output = tmp_path / "said"
+    process = begun(["demo", "--output", str(tmp_path / "demo")], output)
+    wait_for(lambda: "commands arrive" in output.read_text(), 100)
 
     def services() -> list[bytes]:
         lines = subprocess.run(["ps", "-ewwo", "args"], capture_output=True, check=True).stdout.splitlines()
@@ -161,18 +161,18 @@ def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: s
     assert process.wait(60) == (130 if number == signal.SIGINT else -number)
     if number == signal.SIGINT:
         assert services() == []
-        assert said.read_text().splitlines()[-1] == SAID
+        assert output.read_text().splitlines()[-1] == SAID
     wait_for(lambda: not services())
-    assert "Traceback" not in said.read_text()
+    assert "Traceback" not in output.read_text()
 
 
 def test_a_bench_that_says_nothing_ends_with_the_process_that_runs_it(tmp_path: Path) -> None:
     """A bench that prints would end with the pipe that nobody reads any more."""
-    said = tmp_path / "said"
+    output = tmp_path / "said"
     with subprocess.Popen(["sleep", "600"]) as runs_it:
-        bench = begun(["sim", "--listen", "tcp/127.0.0.1:0", "--end-with", str(runs_it.pid)], said)
+        bench = begun(["sim", "--listen", "tcp/127.0.0.1:0", "--end-with", str(runs_it.pid)], output)
         try:
-            wait_for(lambda: "listening on" in said.read_text(), 100)
+            wait_for(lambda: "listening on" in output.read_text(), 100)
             assert bench.poll() is None
             runs_it.kill()
             runs_it.wait()
@@ -192,8 +192,8 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     assert process.stdout.readline() == "putting away\n"
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=10)
-    assert (process.returncode, said) == (130, f"{SAID}\n")
+    _, error_text = process.communicate(timeout=10)
+    assert (process.returncode, error_text) == (130, f"{SAID}\n")
 
 
 def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:

@@ -13,13 +13,13 @@ from thirdhand.process.progress import progress, steps
 
 def until_said(capsys: pytest.CaptureFixture[str], words: str) -> str:
     """What was said on standard error until the words were."""
-    said, wait = "", threading.Event()
+    text, wait = "", threading.Event()
     for _ in range(500):
-        said += capsys.readouterr().err
-        if words in said:
-            return said
+        text += capsys.readouterr().err
+        if words in text:
+            return text
         wait.wait(0.01)
-    raise AssertionError(said)
+    raise AssertionError(text)
 
 
 def test_what_is_quick_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:

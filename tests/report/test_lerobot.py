@@ -57,11 +57,11 @@ def test_rows_are_what_was_seen_and_commanded_at_their_times(data_set: Path, gol
     last = table.filter(episode == 2).to_pydict()
     steps = [step for step in Recording.open(golden).steps() if step.frame is not None]
     ready = [step for step in steps if step.frame["commanded"] and (step.frame["hand_ages"] >= 0).all()]
-    told, frames = None, {}
+    measured, frames = None, {}
     for step in steps:
         for kind, payload in step.events:
-            told = cdr.decode_joints(payload).position if kind == "joints/state" else told
-        frames[step.tick] = (told, step.frame["hands"].ravel(), step.frame["joints"])
+            measured = cdr.decode_joints(payload).position if kind == "joints/state" else measured
+        frames[step.tick] = (measured, step.frame["hands"].ravel(), step.frame["joints"])
     assert len(last["index"]) == (steps[-1].tick - ready[0].tick) * 30 // 500 + 1 > 590
     for row in (0, 1, 7, 200, 400, len(last["index"]) - 1):
         newest = max(step.tick for step in ready if (step.tick - ready[0].tick) / 500 <= row / 30 + 1e-9)
@@ -76,16 +76,16 @@ def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
     assert table["index"].to_pylist() == list(range(len(table)))
     assert set(table["task_index"].to_pylist()) == {0}
     rows = about.to_pylist()
-    assert [one["episode_index"] for one in rows] == [0, 1, 2]
-    assert [one["dataset_from_index"] for one in rows[1:]] == [one["dataset_to_index"] for one in rows[:-1]]
+    assert [episode["episode_index"] for episode in rows] == [0, 1, 2]
+    assert [episode["dataset_from_index"] for episode in rows[1:]] == [episode["dataset_to_index"] for episode in rows[:-1]]
     assert 170 < rows[0]["length"] < 180  # from when both hands had been seen
-    for one in rows:
-        part = table.slice(one["dataset_from_index"], one["length"])
-        assert set(part["episode_index"].to_pylist()) == {one["episode_index"]}
-        assert part["frame_index"].to_pylist() == list(range(one["length"]))
-        assert one["tasks"] == ["Hold the board."]
-        assert {one[f"{of}/{kind}_index"] for of in ("data", "meta/episodes") for kind in ("chunk", "file")} == {0}
-        assert one["stats/action/count"] == [one["length"]]
+    for episode in rows:
+        part = table.slice(episode["dataset_from_index"], episode["length"])
+        assert set(part["episode_index"].to_pylist()) == {episode["episode_index"]}
+        assert part["frame_index"].to_pylist() == list(range(episode["length"]))
+        assert episode["tasks"] == ["Hold the board."]
+        assert {episode[f"{of}/{kind}_index"] for of in ("data", "meta/episodes") for kind in ("chunk", "file")} == {0}
+        assert episode["stats/action/count"] == [episode["length"]]
     assert parquet.ParquetFile(data_set / "data" / FIRST).num_row_groups == 3
 
 
@@ -149,15 +149,15 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.average_rate) == (feature["info"]["video.codec"], fps)
-        found = [
-            (float(one.pts * stream.time_base), one.to_ndarray(format="rgb24").mean())
-            for one in container.decode(stream)
+        pictures = [
+            (float(picture.pts * stream.time_base), picture.to_ndarray(format="rgb24").mean())
+            for picture in container.decode(stream)
         ]
-    assert len(found) == info["total_frames"] == len(rows["index"])
-    np.testing.assert_allclose([time_s for time_s, _ in found], np.arange(len(found)) / fps, atol=1e-4)
+    assert len(pictures) == info["total_frames"] == len(rows["index"])
+    np.testing.assert_allclose([time_s for time_s, _ in pictures], np.arange(len(pictures)) / fps, atol=1e-4)
     began = 3000 - 1 - round((first["length"] - 1) / fps * 500)  # the tick of the first row, up to half a row
     expected = [(began + row / fps * 500) // 50 * 2.5 for row in rows["frame_index"]]
-    assert np.abs(np.array([level for _, level in found]) - expected).max() < 5.0
+    assert np.abs(np.array([level for _, level in pictures]) - expected).max() < 5.0
     stats = json.loads((filmed / "meta" / "stats.json").read_text())[name]
     assert np.shape(stats["mean"]) == (3, 1, 1)
     assert stats["mean"][0][0][0] == pytest.approx(np.mean(expected) / 255, abs=0.02)
@@ -165,16 +165,16 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
 
 def test_lerobot_itself_loads_it(data_set: Path) -> None:
     loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot brings PyTorch: not installed")
-    found = loader.LeRobotDataset("local/thirdhand", root=data_set, delta_timestamps={"action": [0.0, 1 / 30]})
-    assert (found.num_episodes, found.fps) == (3, 30)
-    item = found[found.meta.episodes["dataset_to_index"][0]]
+    loaded = loader.LeRobotDataset("local/thirdhand", root=data_set, delta_timestamps={"action": [0.0, 1 / 30]})
+    assert (loaded.num_episodes, loaded.fps) == (3, 30)
+    item = loaded[loaded.meta.episodes["dataset_to_index"][0]]
     assert item["task"] == "Hold the board."
     assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (1, 0, (2, 7))
     rows = parquet.read_table(data_set / "data" / FIRST)
-    assert len(found) == len(rows)
-    for i in range(0, len(found), 50):
-        assert found[i]["action"][0].tolist() == rows["action"][i].as_py()
-        assert found[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
+    assert len(loaded) == len(rows)
+    for i in range(0, len(loaded), 50):
+        assert loaded[i]["action"][0].tolist() == rows["action"][i].as_py()
+        assert loaded[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
 def recorded(
@@ -191,8 +191,8 @@ def recorded(
         def keep(tick: Tick, frame: Frame) -> None:
             time_ns = tick.index * 2_000_000
             recorder.write(tick, frame, time_ns=time_ns)
-            for at, key, file in images:
-                if at == tick.index:
+            for index, key, file in images:
+                if index == tick.index:
                     recorder.image(key, encode_image(CompressedImage(time_ns, "lens", "png", file)), time_ns)
 
         run(controller, inputs, [keep])
@@ -251,7 +251,7 @@ def test_what_makes_no_data_set_is_said(
 ) -> None:
     folder = tmp_path / "data"
     try:
-        done = main(["report", str(gapped), *(one.format(folder) for one in options)])
+        done = main(["report", str(gapped), *(option.format(folder) for option in options)])
     except SystemExit as end:
         done = int(str(end.code))
     assert (done, says in capsys.readouterr().err, folder.exists()) == (code, True, False)

@@ -89,7 +89,7 @@ class Told:
 
     def first(self, reason: str, *, after: int = 0) -> Status:
         """The first status of a reason from a tick on."""
-        return next(one for one in self.said if one.reason == reason and one.tick >= after)
+        return next(status for status in self.said if status.reason == reason and status.tick >= after)
 
     def inbox(self, k: int) -> Iterable[Event]:
         late = k >= FAULT_AT
@@ -169,8 +169,8 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
 
 def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     frames = np.array([step.frame for step in Recording.open(session.path).steps() if step.frame is not None])
-    assert sum(one.samples for one in session.rejections) == int(frames[-1]["rejected"].sum())
-    assert all(BAD_S[0] <= one.first_s <= AWAY_S[1] + 0.1 for one in session.rejections)
+    assert sum(rejection.samples for rejection in session.rejections) == int(frames[-1]["rejected"].sum())
+    assert all(BAD_S[0] <= rejection.first_s <= AWAY_S[1] + 0.1 for rejection in session.rejections)
     for limit in session.limits:
         raised = (frames["flags"] & Flag[limit.name.upper()]) > 0
         assert limit.lasts_s == pytest.approx(raised.sum() * PERIOD_S)
@@ -179,20 +179,20 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
         str(flag.name).lower() for flag in Flag if (frames["flags"] & flag).any()
     }
     assert session.approach is not None
-    known = (frames["hand_ages"] >= 0).any(axis=1)
-    assert session.approach.distance_m == frames["hand_distance"][known].min()
+    is_hand_seen = (frames["hand_ages"] >= 0).any(axis=1)
+    assert session.approach.distance_m == frames["hand_distance"][is_hand_seen].min()
 
 
 def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
     by_name = [(place.name, place.start_s) for place in session.places]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
-    first, again = [place for place in session.places if place.name == "handover"]
+    first, second = [place for place in session.places if place.name == "handover"]
     assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
-    assert first.end_s == pytest.approx(again.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
+    assert first.end_s == pytest.approx(second.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
     assert first.best_m is not None
     assert first.best_m < 0.02
-    assert (again.visits, again.best_m) == ((), None)
-    assert again.hands_m > 0.03
+    assert (second.visits, second.best_m) == ((), None)
+    assert second.hands_m > 0.03
 
 
 def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:
@@ -225,56 +225,56 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
     skill: Skill, tmp_path: Path, what: str, reason: Reason, why: str, about: str, statuses: bool
 ) -> None:
     session = Told(skill, tmp_path / "a.mcap", what, statuses=statuses)
-    found = reported(tmp_path / "a.mcap")
-    fault = found.faults[0]
+    report = reported(tmp_path / "a.mcap")
+    fault = report.faults[0]
     assert fault.reason is reason
     assert FAULT_AT * PERIOD_S <= fault.start_s <= FAULT_AT * PERIOD_S + 0.2
     if statuses:
-        told = session.first(str(reason.name).lower())
-        assert (fault.why, fault.remedy) == (told.because, told.remedy)
+        status = session.first(str(reason.name).lower())
+        assert (fault.why, fault.remedy) == (status.because, status.remedy)
         assert why in fault.why
     else:
         assert fault.why.startswith(about)
-    assert re.search(rf"and {len(found.faults)} faults?; the worst was fault: \w+, for ", verdict(found))
+    assert re.search(rf"and {len(report.faults)} faults?; the worst was fault: \w+, for ", verdict(report))
     assert any(line.startswith("before it: it followed for 1.") for line in fault.before)
     assert fault.ended.startswith("ended by a `reset` after 0.")
-    missed = why_missed(found, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
+    missed = why_missed(report, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
     assert str(reason.name).lower() in missed
     assert fault.why in missed
 
 
 def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path: Path) -> None:
     Told(skill, tmp_path / "a.mcap", "stepped")
-    said = reported(tmp_path / "a.mcap").faults[0].before
+    lines = reported(tmp_path / "a.mcap").faults[0].before
     words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
-    assert words in said
+    assert words in lines
 
 
 def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
     def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
-        found, at_s = [], 0.0
+        timeline, at_s = [], 0.0
         for lasts_s, mode, reason in parts:
-            found.append(Span(at_s, lasts_s, mode, reason))
+            timeline.append(Span(at_s, lasts_s, mode, reason))
             at_s += lasts_s
-        return tuple(found)
+        return tuple(timeline)
 
     hold, follow, fault = Mode.HOLD, Mode.FOLLOW, Mode.FAULT
     waits, ends = (6.0, hold, Reason.NO_HANDS), [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
     moves, stops = (4.0, follow, Reason.NONE), (1.0, hold, Reason.STALE_HAND)
-    said = {
+    cases = {
         "a bench": (waits, moves, *ends),
         "a stop": (waits, moves, stops, moves, *ends),
         "a hold before it": (moves, (0.1, hold, Reason.STALE_HAND), (1.0, fault, Reason.ARM_SILENT)),
     }
-    found, one = {}, reported(golden)
-    for name, parts in said.items():
-        one.spans, one.lasts_s = spans(*parts), sum(part[0] for part in parts)
-        found[name] = verdict(one)
-    assert found["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
-    assert found["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
-    assert found["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
-    assert "with 1 hold and 1 fault; the worst was fault: arm_silent" in found["a hold before it"]
-    assert "It ended with" not in found["a hold before it"]
+    verdicts, report = {}, reported(golden)
+    for name, parts in cases.items():
+        report.spans, report.lasts_s = spans(*parts), sum(part[0] for part in parts)
+        verdicts[name] = verdict(report)
+    assert verdicts["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
+    assert verdicts["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
+    assert verdicts["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
+    assert "with 1 hold and 1 fault; the worst was fault: arm_silent" in verdicts["a hold before it"]
+    assert "It ended with" not in verdicts["a hold before it"]
 
 
 def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: Path) -> None:
@@ -294,17 +294,17 @@ def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_n
     skill: Skill, tmp_path: Path
 ) -> None:
     Told(skill, tmp_path / "a.mcap", lost_at=700)
-    found = reported(tmp_path / "a.mcap")
-    assert found.missed == 3
-    assert found.latency_ms is not None
-    assert found.latency_ms[:3] == pytest.approx((1.5, 1.5, 1.5))
-    assert found.latency_ms.samples == 220
-    assert found.lateness_us is not None
-    assert found.lateness_us.largest == 56.0
-    assert len(found.lacks) == 1
-    assert "100 ticks not recorded" in found.lacks[0]
-    assert sum(span.lasts_s for span in found.spans) == pytest.approx(1100 * PERIOD_S)
-    assert found.lasts_s == pytest.approx(1200 * PERIOD_S)
+    report = reported(tmp_path / "a.mcap")
+    assert report.missed == 3
+    assert report.latency_ms is not None
+    assert report.latency_ms[:3] == pytest.approx((1.5, 1.5, 1.5))
+    assert report.latency_ms.samples == 220
+    assert report.lateness_us is not None
+    assert report.lateness_us.largest == 56.0
+    assert len(report.lacks) == 1
+    assert "100 ticks not recorded" in report.lacks[0]
+    assert sum(span.lasts_s for span in report.spans) == pytest.approx(1100 * PERIOD_S)
+    assert report.lasts_s == pytest.approx(1200 * PERIOD_S)
 
 
 def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page(
@@ -314,10 +314,10 @@ def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page
     Told(decoded(wicked_skill(), origin="wicked"), path)
     html_path = tmp_path / "page.html"
     assert main(["report", str(path), "--html", str(html_path)]) == 0
-    shown, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
-    for text in (shown, page):
+    output, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
+    for text in (output, page):
         assert all(line.isprintable() for line in text.splitlines())
-    assert r"skill a\nb\x1b[31mred" in shown
+    assert r"skill a\nb\x1b[31mred" in output
     assert "<b>" not in page
     assert r"$\frac$ &lt;b&gt;\x1b[31m" in page
 

@@ -38,13 +38,13 @@ SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
 @contextmanager
 def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
     """A started scribe that is ended in any case."""
-    one = Scribe(settings, **where)
+    writer = Scribe(settings, **where)
     try:
-        one.start(skill=SKILL, state=state_after(-1))
-        assert one.ready(60.0) == bool(where)
-        yield one
+        writer.start(skill=SKILL, state=state_after(-1))
+        assert writer.ready(60.0) == bool(where)
+        yield writer
     finally:
-        one.close(10)
+        writer.close(10)
 
 
 def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
@@ -58,19 +58,19 @@ def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
 def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
     for tick, frame, timing in ticks(60):
         skills = [event.payload for event in tick.inbox if event.kind == "skill"] + [SKILL] * every["with_skill"]
-        told = unpack(pack(tick, frame, timing, lost=7, **every), skills, joints=7)
-        assert told.tick == Tick(tick.index, tuple(Event(event.kind, event.payload, None) for event in tick.inbox))
-        assert (encode(told.frame), encode(told.timing), told.lost) == (encode(frame), encode(timing), 7)
-        assert (told.state is None) == (every["state"] is None)
-        assert told.skill == (SKILL if every["with_skill"] else None)
+        message = unpack(pack(tick, frame, timing, lost=7, **every), skills, joints=7)
+        assert message.tick == Tick(tick.index, tuple(Event(event.kind, event.payload, None) for event in tick.inbox))
+        assert (encode(message.frame), encode(message.timing), message.lost) == (encode(frame), encode(timing), 7)
+        assert (message.state is None) == (every["state"] is None)
+        assert message.skill == (SKILL if every["with_skill"] else None)
 
 
 def test_what_is_told_is_recorded(tmp_path: Path) -> None:
     settings = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
-    with scribe(settings, folder=tmp_path) as one:
-        told = tell(one, 200)
-        one.note("requests", "via_points add handover", at_ns(20))
-        status = one.status()
+    with scribe(settings, folder=tmp_path) as writer:
+        sent = tell(writer, 200)
+        writer.note("requests", "via_points add handover", at_ns(20))
+        status = writer.status()
         assert (status["alive"], status["sent"], status["lost"], status["errors"]) == (True, 200, 0, [])
         assert status["free_mb"] == pytest.approx(shutil.disk_usage(tmp_path).free / 1e6, rel=0.2)
     recording = Recording.open(status["recording"])
@@ -78,9 +78,9 @@ def test_what_is_told_is_recorded(tmp_path: Path) -> None:
     assert Path(status["recording"]).name.startswith("hall-bench-1-2")
     assert (recording.settings, recording.skill, recording.truncated, first.tick) == (settings, SKILL, False, -1)
     assert [step.events for step in steps] == [
-        tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in told
+        tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in sent
     ]
-    assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in told]
+    assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in sent]
     assert [step.tick for step in steps if step.state is not None] == [49]  # the next one is due 10 s later
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
 
@@ -89,12 +89,12 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
     with_camera = RecordingSettings(also=("camera/front",))
     settings = Settings(cell="hall/bench-1", rate_hz=50, recording=with_camera)
     images = [CompressedImage(at_ns(i), "lens", "jpeg", grey(40 + i)) for i in range(0, 60, 20)]
-    with scribe(settings, folder=tmp_path) as one:
-        tell(one, 40)
+    with scribe(settings, folder=tmp_path) as writer:
+        tell(writer, 40)
         for i, image in enumerate(images):
-            one.image("camera/front", encode_image(image), at_ns(40 + i))
-        tell(one, 160, first=40)
-        status = one.status()
+            writer.image("camera/front", encode_image(image), at_ns(40 + i))
+        tell(writer, 160, first=40)
+        status = writer.status()
         assert status["lost"] == 0
     recording = Recording.open(status["recording"])
     assert [*recording.images()] == [("camera/front", image, at_ns(40 + i)) for i, image in enumerate(images)]
@@ -102,17 +102,17 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
 
 
 def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(tmp_path: Path) -> None:
-    with scribe(recording=tmp_path / "a.mcap") as one:
-        pid = one.status()["pid"]
+    with scribe(recording=tmp_path / "a.mcap") as writer:
+        pid = writer.status()["pid"]
         os.kill(pid, signal.SIGSTOP)
         durations = []
-        told = list(ticks(40))
+        cycle = list(ticks(40))
         for i in range(6000):
-            tick, frame, timing = told[i % 40]
+            tick, frame, timing = cycle[i % 40]
             began = time.perf_counter()
-            one.send(Tick(i, tick.inbox), frame, timing, state=lambda i=i: state_after(i), skill=b"another skill")
+            writer.send(Tick(i, tick.inbox), frame, timing, state=lambda i=i: state_after(i), skill=b"another skill")
             durations.append(time.perf_counter() - began)
-        lost = one.status()["lost"]
+        lost = writer.status()["lost"]
         assert lost > 100
         assert statistics.median(durations) < 5e-4
         os.kill(pid, signal.SIGCONT)
@@ -120,13 +120,13 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
 
         def told_again() -> bool:
             nonlocal index
-            lost = one.status()["lost"]
-            tell(one, 1, first=index, skill=b"another skill")
+            lost = writer.status()["lost"]
+            tell(writer, 1, first=index, skill=b"another skill")
             index += 1
-            return one.status()["lost"] == lost
+            return writer.status()["lost"] == lost
 
         until(told_again)
-        lost = one.status()["lost"]
+        lost = writer.status()["lost"]
     _, *steps = Recording.open(tmp_path / "a.mcap").steps()
     assert [(step.lost, step.skill) for step in steps if step.lost] == [(lost, b"another skill")]
     assert next(step for step in steps if step.lost).state is not None
@@ -134,15 +134,15 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
 
 
 def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp_path: Path) -> None:
-    with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as one:
-        tell(one, 20)
-        killed = one.status()["pid"]
+    with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as writer:
+        tell(writer, 20)
+        killed = writer.status()["pid"]
         os.kill(killed, signal.SIGKILL)
-        until(lambda: not one.status()["alive"])
-        one.supervise()
-        tell(one, 35, first=20, skill=b"another skill")
-        assert one.ready(60)
-        status = one.status()
+        until(lambda: not writer.status()["alive"])
+        writer.supervise()
+        tell(writer, 35, first=20, skill=b"another skill")
+        assert writer.ready(60)
+        status = writer.status()
         assert status["pid"] != killed
         assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)  # those not yet on disk
         assert status["errors"] == ["the scribe ended with code -9"]
@@ -157,61 +157,61 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp
 def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> None:
     """Also where the process that it is forked from has to import all again."""
     child.end_server()
-    one = Scribe(SETTINGS, folder=tmp_path)
+    writer = Scribe(SETTINGS, folder=tmp_path)
     began = time.perf_counter()
-    one.start(skill=SKILL, state=state_after(-1))
-    tell(one, 400)
+    writer.start(skill=SKILL, state=state_after(-1))
+    tell(writer, 400)
     assert time.perf_counter() - began < 0.5
-    assert not one.ready(0.0)
-    assert one.close(60) == ""
+    assert not writer.ready(0.0)
+    assert writer.close(60) == ""
     (path,) = tmp_path.glob("*.mcap")
     assert [step.tick for step in Recording.open(path).steps()] == list(range(-1, 400))
 
 
 def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Path) -> None:
-    with scribe(recording=tmp_path / "a.mcap") as one:
-        tell(one, 300)
-        pid = one.status()["pid"]
+    with scribe(recording=tmp_path / "a.mcap") as writer:
+        tell(writer, 300)
+        pid = writer.status()["pid"]
         os.kill(pid, signal.SIGINT)
         os.kill(pid, signal.SIGTERM)
-        assert one.close(10) == ""
-        assert one.status()["errors"] == []
-        tell(one, 1, first=300)
-        assert one.status()["lost"] == 1
+        assert writer.close(10) == ""
+        assert writer.status()["errors"] == []
+        tell(writer, 1, first=300)
+        assert writer.status()["lost"] == 1
     recording = Recording.open(tmp_path / "a.mcap")
     assert len(list(recording.steps())) == 301
     assert not recording.truncated
 
 
 def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_path: Path) -> None:
-    with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as one:
-        tell(one, 100)
+    with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as writer:
+        tell(writer, 100)
         time.sleep(1.2)  # two flushes
-        stopped = one.status()["pid"]
+        stopped = writer.status()["pid"]
         os.kill(stopped, signal.SIGSTOP)
-        told = 100
+        count = 100
 
         def replaced() -> bool:
-            nonlocal told
-            tell(one, 2, first=told)
-            told += 2
-            one.supervise()
+            nonlocal count
+            tell(writer, 2, first=count)
+            count += 2
+            writer.supervise()
             time.sleep(0.01)
-            status = one.status()
+            status = writer.status()
             return status["pid"] != stopped and status["sent"] > 300 and status["state"] == "recording"
 
         until(replaced)
-        status = one.status()
+        status = writer.status()
         assert "the scribe made no progress for 1 s, so it is replaced" in status["errors"]
         assert status["restarts"] == 1
         with pytest.raises(ProcessLookupError):
             os.kill(stopped, 0)
     first, second = (Recording.open(path) for path in sorted(tmp_path.glob("*.mcap")))
-    kept = [step.tick for step in first.steps() if step.frame is not None]
-    start, *rest = second.steps()
-    assert kept == list(range(100))
+    indices = [step.tick for step in first.steps() if step.frame is not None]
+    start, *steps = second.steps()
+    assert indices == list(range(100))
     assert start.lost == start.tick - 100 == status["lost"]
-    assert [step.tick for step in rest] == list(range(start.tick + 1, told))
+    assert [step.tick for step in steps] == list(range(start.tick + 1, count))
 
 
 @pytest.mark.thorough
@@ -223,17 +223,17 @@ def test_the_ticks_lost_at_the_end_of_a_scribe_that_is_behind_are_those_not_on_d
     One chunk may be on disk whose report a kill prevents.
     """
     count, chunk = 12_000, 60
-    with scribe(msgspec.structs.replace(SETTINGS, rate_hz=1000), folder=tmp_path) as one:
-        tell(one, count)
+    with scribe(msgspec.structs.replace(SETTINGS, rate_hz=1000), folder=tmp_path) as writer:
+        tell(writer, count)
         (path,) = tmp_path.glob("*.mcap")
         until(lambda: path.stat().st_size > 1_000_000)
         if is_killed:
-            os.kill(one.status()["pid"], signal.SIGKILL)
-        words = one.close(60)
-    kept = sum(step.frame is not None for step in Recording.open(path).steps())
-    assert (kept < count) is is_killed
+            os.kill(writer.status()["pid"], signal.SIGKILL)
+        words = writer.close(60)
+    recorded = sum(step.frame is not None for step in Recording.open(path).steps())
+    assert (recorded < count) is is_killed
     lost = int(words.split()[0]) if words else 0
-    assert count - kept <= lost <= count - kept + chunk * is_killed
+    assert count - recorded <= lost <= count - recorded + chunk * is_killed
 
 
 DAEMON = """
@@ -275,34 +275,34 @@ def _is_dead(pid: int) -> bool:
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
 def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(tmp_path: Path, place: str) -> None:
-    with scribe(recording=Path(place), live_port=0) as one:
-        tell(one, 100)
-        until(lambda: one.supervise() or one.status()["live"])
-        status = one.status()
+    with scribe(recording=Path(place), live_port=0) as writer:
+        tell(writer, 100)
+        until(lambda: writer.supervise() or writer.status()["live"])
+        status = writer.status()
     assert any(place in error and ("No space left" in error or "File exists" in error) for error in status["errors"])
     assert status["recording"] is None
     assert status["live"].startswith("rerun+http://127.0.0.1:")
 
 
 def test_without_anything_to_write_there_is_no_process_and_nothing_is_lost() -> None:
-    with scribe() as one:
-        tell(one, 5)
-        one.note("requests", "x", 0)
-        one.supervise()
-        status = one.status()
+    with scribe() as writer:
+        tell(writer, 5)
+        writer.note("requests", "x", 0)
+        writer.supervise()
+        status = writer.status()
     assert (status["pid"], status["alive"], status["lost"], status["errors"]) == (None, False, 0, [])
 
 
 def test_a_skill_larger_than_a_message_is_told_and_recorded(tmp_path: Path) -> None:
     large = bytes(range(256)) * 20_000
-    with scribe(recording=tmp_path / "a.mcap") as one:
+    with scribe(recording=tmp_path / "a.mcap") as writer:
         (_, frame, timing), *_ = ticks(1)
-        one.keep(large)
+        writer.keep(large)
         for i in range(8):
-            one.send(
+            writer.send(
                 Tick(i, (Event("skill", large[i:], None),)), frame, timing, state=lambda: state_after(0), skill=large
             )
-        assert one.status()["lost"] == 0
+        assert writer.status()["lost"] == 0
     _, *steps = Recording.open(tmp_path / "a.mcap").steps()
     assert [payload for step in steps for _, payload in step.events] == [large[i:] for i in range(8)]
 
@@ -333,10 +333,10 @@ def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
         return started[-1]
 
     yield begun
-    for one in started:
-        one.kill()
-        one.wait()
-        one.socket.close()
+    for process in started:
+        process.kill()
+        process.wait()
+        process.socket.close()
     server.close()
 
 

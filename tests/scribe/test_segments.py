@@ -47,20 +47,20 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
     folder = tmp_path_factory.mktemp("rotated")
     settings = msgspec.structs.replace(ASSUMED, files=SMALL)
     controller = Controller(settings, skill, urdf=URDF)
-    one = Scribe(settings, folder=folder)
+    scribe = Scribe(settings, folder=folder)
 
     def tell(tick: Tick, frame: Frame) -> None:
         timing = blank(TIMING)
         timing["tick"], timing["time_ns"] = tick.index, tick.index * 2_000_000
-        one.send(tick, frame, timing, state=lambda: controller.state, skill=skill.file)
+        scribe.send(tick, frame, timing, state=lambda: controller.state, skill=skill.file)
         if tick.index % 100 == 0:
             time.sleep(0.02)
 
     try:
-        one.start(skill=skill.file, state=controller.state)
+        scribe.start(skill=skill.file, state=controller.state)
         run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:COUNT], [tell])
     finally:
-        assert one.close(20) == ""
+        assert scribe.close(20) == ""
     return sorted(folder.glob("*.mcap"))
 
 
@@ -79,9 +79,9 @@ def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rota
 
 def test_a_recording_missing_in_a_row_is_a_gap(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(rotated[0]), str(rotated[2]), "--exact"]) == 1
-    said = capsys.readouterr().out
-    assert "gap after tick " in said
-    assert f"{rotated[2].name} does not continue the one before" in said
+    output = capsys.readouterr().out
+    assert "gap after tick " in output
+    assert f"{rotated[2].name} does not continue the one before" in output
     assert main(["replay", str(rotated[0]), str(rotated[2])]) == 0
 
 
@@ -153,8 +153,8 @@ class Session:
     def tell(self, count: int) -> None:
         for _ in range(count):
             tick, frame, timing = self._ticks[self.told % 40]
-            at = self.told
-            self.scribe.send(Tick(at, tick.inbox), frame, timing, state=lambda at=at: state_after(at), skill=SKILL)
+            index = self.told
+            self.scribe.send(Tick(index, tick.inbox), frame, timing, state=lambda at=index: state_after(at), skill=SKILL)
             self.told += 1
         self.scribe.supervise()
 
@@ -170,37 +170,37 @@ class Session:
 
 @contextlib.contextmanager
 def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
-    one = Session(settings, **where)
+    sender = Session(settings, **where)
     try:
-        one.scribe.start(skill=SKILL, state=state_after(-1))
-        assert one.scribe.ready(60)
-        yield one
+        sender.scribe.start(skill=SKILL, state=state_after(-1))
+        assert sender.scribe.ready(60)
+        yield sender
     finally:
-        one.missing = one.scribe.close(10)
+        sender.missing = sender.scribe.close(10)
 
 
 def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments, "MIN_GROWTH_S", 0.5)
     settings = msgspec.structs.replace(CELL, files=Files(segment_mb=0.3))
     paths = RecordingPaths(settings, str(tmp_path), None)
-    one = Segments(settings, paths, say=print)
-    one.begin(SKILL, state_after(-1))
-    one.flush()
-    assert one.mb_per_hour() is None
-    begin_s, before, told = time.monotonic(), sum(path.stat().st_size for path in tmp_path.iterdir()), list(ticks(40))
+    writer = Segments(settings, paths, say=print)
+    writer.begin(SKILL, state_after(-1))
+    writer.flush()
+    assert writer.mb_per_hour() is None
+    begin_s, before, cycle = time.monotonic(), sum(path.stat().st_size for path in tmp_path.iterdir()), list(ticks(40))
     for i in range(2000):
-        tick, frame, timing = told[i % 40]
+        tick, frame, timing = cycle[i % 40]
         state = state_after(i) if i % 50 == 49 else None
-        one.write(TickMessage(Tick(i, tick.inbox), frame, timing, state, None, 0))
+        writer.write(TickMessage(Tick(i, tick.inbox), frame, timing, state, None, 0))
         if i % 20 == 0:
             time.sleep(0.01)
-            one.flush()
-    one.flush()
+            writer.flush()
+    writer.flush()
     grown_mb = (sum(path.stat().st_size for path in tmp_path.iterdir()) - before) / 1e6
     assert len(list(tmp_path.iterdir())) > 2
-    assert one.mb_per_hour() == pytest.approx(grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1)
-    assert one.keep_mb_left is not None
-    one.close()
+    assert writer.mb_per_hour() == pytest.approx(grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1)
+    assert writer.keep_mb_left is not None
+    writer.close()
 
 
 def accounted(paths: list[Path], told: int) -> tuple[int, int]:
@@ -230,26 +230,26 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.thorough
 def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> None:
     ballast = small_disk / "ballast"
-    with session(folder=small_disk) as one:
-        one.until(lambda status: status["sent"] > 200)
+    with session(folder=small_disk) as sender:
+        sender.until(lambda status: status["sent"] > 200)
         with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
             while file.write(bytes(4096)):
                 pass
-        status = one.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
+        status = sender.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
         assert status["recording"] is None
-        assert one.scribe.newest_recording == str(*small_disk.glob("*.mcap"))
+        assert sender.scribe.newest_recording == str(*small_disk.glob("*.mcap"))
         full = [error for error in status["errors"] if error.startswith("recording to ")]
         assert len(full) == 1
         assert "No space left on device" in full[0]
         ballast.unlink()
-        one.until(lambda status: status["state"] == "recording")
-        sent = one.told
-        status = one.until(lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1])
+        sender.until(lambda status: status["state"] == "recording")
+        sent = sender.told
+        status = sender.until(lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1])
         assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
     recordings = sorted(small_disk.glob("*.mcap"))
-    kept, lost = accounted(recordings, one.told)
-    assert kept + lost == one.told
-    assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+    recorded, lost = accounted(recordings, sender.told)
+    assert recorded + lost == sender.told
+    assert sender.missing == f"{lost} of {sender.told} ticks are not recorded"
     result = [Recording.open(path) for path in recordings]
     assert [len(list(r.steps())) > 50 for r in result] == [True, True]
     assert [r.truncated for r in result] == [True, False]
@@ -257,35 +257,35 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
 
 @pytest.mark.timed
 def test_a_limit_on_files_interrupts_a_recording_until_it_is_lifted(tmp_path: Path) -> None:
-    with session(folder=tmp_path) as one:
-        one.until(lambda status: status["sent"] > 200)
-        pid = one.scribe.status()["pid"]
+    with session(folder=tmp_path) as sender:
+        sender.until(lambda status: status["sent"] > 200)
+        pid = sender.scribe.status()["pid"]
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
-        one.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
+        sender.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        one.until(lambda status: status["state"] == "recording")
-    kept, lost = accounted(sorted(tmp_path.glob("*.mcap")), one.told)
-    assert kept + lost == one.told
+        sender.until(lambda status: status["state"] == "recording")
+    recorded, lost = accounted(sorted(tmp_path.glob("*.mcap")), sender.told)
+    assert recorded + lost == sender.told
 
 
 def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(tmp_path: Path) -> None:
     folder = tmp_path / "records"
-    with session(folder=folder) as one:
-        one.until(lambda status: status["sent"] > 200)
+    with session(folder=folder) as sender:
+        sender.until(lambda status: status["sent"] > 200)
         shutil.rmtree(folder)
-        status = one.until(lambda status: status["lost"] > 0 and status["state"] == "recording" and folder.exists())
+        status = sender.until(lambda status: status["lost"] > 0 and status["state"] == "recording" and folder.exists())
         assert any("was removed while it was written" in error for error in status["errors"])
-    kept, lost = accounted(sorted(folder.glob("*.mcap")), one.told)
-    assert kept + lost == one.told
+    recorded, lost = accounted(sorted(folder.glob("*.mcap")), sender.told)
+    assert recorded + lost == sender.told
     assert lost > 200
-    assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+    assert sender.missing == f"{lost} of {sender.told} ticks are not recorded"
 
 
 def test_a_recording_that_is_moved_is_ended_where_it_is_and_nothing_is_lost(tmp_path: Path) -> None:
-    with session(folder=tmp_path) as one:
-        status = one.until(lambda status: status["sent"] > 200)
+    with session(folder=tmp_path) as sender:
+        status = sender.until(lambda status: status["sent"] > 200)
         first = Path(status["recording"])
         first.rename(tmp_path / "elsewhere.mcap")
-        status = one.until(lambda status: status["recording"] != str(first))
-    assert one.missing == ""
-    assert accounted([tmp_path / "elsewhere.mcap", Path(status["recording"])], one.told) == (one.told, 0)
+        status = sender.until(lambda status: status["recording"] != str(first))
+    assert sender.missing == ""
+    assert accounted([tmp_path / "elsewhere.mcap", Path(status["recording"])], sender.told) == (sender.told, 0)

@@ -35,9 +35,9 @@ def refusal(text: str) -> str:
 
 
 def test_limits_may_be_lowered() -> None:
-    given = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
-    assert given.joints.velocity[6] == 0.5
-    assert given.tool.max_speed == 0.3
+    settings = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
+    assert settings.joints.velocity[6] == 0.5
+    assert settings.tool.max_speed == 0.3
 
 
 @pytest.mark.parametrize(
@@ -240,10 +240,10 @@ def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float
     paths = list(leaves(usual))
     assert len(paths) > 100
     for path in paths:
-        given = copy.deepcopy(usual)
-        functools.reduce(lambda part, key: part[key], path[:-1], given)[path[-1]] = number
+        document = copy.deepcopy(usual)
+        functools.reduce(lambda part, key: part[key], path[:-1], document)[path[-1]] = number
         with pytest.raises(SettingsError, match=str(path[-1]) if isinstance(path[-1], str) else str(path[-2])):
-            converted(given, origin="cell.toml")
+            converted(document, origin="cell.toml")
 
 
 @pytest.mark.parametrize(
@@ -301,10 +301,10 @@ def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, m
     assert read.files.record == str(tmp_path / "records")
     assert read.files.skill == str(tmp_path / "my/mine.npz")
     assert read.files.state == "/home/me/state"
-    again = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
+    reparsed = parse(described(read), origin="of the demo's daemon", folder=tmp_path / "elsewhere")
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert again == msgspec.structs.replace(read, network=Network(), files=Files())
-    assert robot_description(again) == robot_description(read)
+    assert reparsed == msgspec.structs.replace(read, network=Network(), files=Files())
+    assert robot_description(reparsed) == robot_description(read)
 
 
 def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
@@ -374,9 +374,9 @@ def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_
     path = tmp_path / "lab.toml"
     path.write_text(LAB, encoding="utf-8")
     first, second, third = (cell_of(f"{path}:{name}") for name in ("bench1", "lab/bench2", "bench3"))
-    assert [one.cell for one in (first, second, third)] == ["bench1", "lab/bench2", "hall/bench3"]
-    assert [one.rate_hz for one in (first, second, third)] == [250, 500, 250]
-    assert [(one.tool.max_speed, one.tool.max_jerk) for one in (first, second)] == [(0.5, 200.0), (0.3, 200.0)]
+    assert [settings.cell for settings in (first, second, third)] == ["bench1", "lab/bench2", "hall/bench3"]
+    assert [settings.rate_hz for settings in (first, second, third)] == [250, 500, 250]
+    assert [(settings.tool.max_speed, settings.tool.max_jerk) for settings in (first, second)] == [(0.5, 200.0), (0.3, 200.0)]
     assert third.network.listen == ("tcp/127.0.0.1:7448",)
     assert first.network.listen == second.network.listen == ("tcp/127.0.0.1:0",)
 

@@ -57,20 +57,20 @@ def test_what_is_no_file_is_refused_with_the_cause(tmp_path: Path, kind: str) ->
 @pytest.mark.parametrize("size", [0, 1, LARGEST - 1, LARGEST, LARGEST + 1, 50 * LARGEST])
 @pytest.mark.parametrize("is_pipe", [True, False])
 def test_a_file_or_pipe_is_read_whole_up_to_what_is_accepted(tmp_path: Path, size: int, is_pipe: bool) -> None:
-    path, given = tmp_path / "file", os.urandom(size)
+    path, data = tmp_path / "file", os.urandom(size)
     if is_pipe:
         ends = os.pipe()
         path = Path(f"/dev/fd/{ends[0]}")
-        writer = threading.Thread(target=lambda: (os.write(ends[1], given), os.close(ends[1])))
+        writer = threading.Thread(target=lambda: (os.write(ends[1], data), os.close(ends[1])))
         writer.start()
     else:
-        path.write_bytes(given)
+        path.write_bytes(data)
     try:
         if size > LARGEST:
             with pytest.raises(UnusableError, match=f"{LARGEST}"):
                 content(path, LARGEST, accepts_pipes=True)
         else:
-            assert content(path, LARGEST, accepts_pipes=True) == given
+            assert content(path, LARGEST, accepts_pipes=True) == data
     finally:
         if is_pipe:
             writer.join()

@@ -31,9 +31,9 @@ Points = NDArray[np.float64]
 
 def outside(points: Points, ends: Points, radius: float) -> float:
     """How far the farthest of points (N, 3) is out of a capsule [m]."""
-    start, way = ends[0], ends[1] - ends[0]
-    share = np.clip((points - start) @ way / max(way @ way, 1e-18), 0.0, 1.0)
-    return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max() - radius)
+    start, span = ends[0], ends[1] - ends[0]
+    share = np.clip((points - start) @ span / max(span @ span, 1e-18), 0.0, 1.0)
+    return float(np.linalg.norm(points - start - share[:, None] * span, axis=1).max() - radius)
 
 
 def volume(ends: Points, radius: float) -> float:
@@ -43,7 +43,7 @@ def volume(ends: Points, radius: float) -> float:
 def stl(points: Points) -> bytes:
     """A binary STL file of the triangles around points."""
     triangles = np.asarray(points, "<f4")[ConvexHull(points).simplices]
-    body = b"".join(struct.pack("<12fH", 0, 0, 0, *one.ravel(), 0) for one in triangles)
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *triangle.ravel(), 0) for triangle in triangles)
     return bytes(80) + struct.pack("<I", len(triangles)) + body
 
 
@@ -55,8 +55,8 @@ def box(x: float, y: float, z: float) -> Points:
 @given(arrays(float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)))
 def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(points: Points) -> None:
     """Flat ones, and one alone, too."""
-    found = np.array(capsule_around(points))
-    ends, radius = found[:6].reshape(2, 3), float(found[6])
+    capsule = np.array(capsule_around(points))
+    ends, radius = capsule[:6].reshape(2, 3), float(capsule[6])
     assert outside(points, ends, radius) <= 1e-9
     widest = np.linalg.norm(points - points.mean(axis=0), axis=1).max() + 0.001
     assert volume(ends, radius) <= 1.05 * volume(np.zeros((2, 3)), widest)
@@ -99,28 +99,28 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
     urdf.write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
     if "linked" in file:
         (folder / "cell" / "arm.urdf").symlink_to(urdf)
-    own = Settings()
+    defaults = Settings()
     lines = f"""
         [arm]
         urdf = "arm.urdf"
-        plate = "{own.arm.plate}"
-        posture = {list(own.arm.posture)}
+        plate = "{defaults.arm.plate}"
+        posture = {list(defaults.arm.posture)}
         link_radius = 1.0
         packages = ["/nowhere", "{folder / packages}"]
         [joints]
-        acceleration = {list(own.joints.acceleration)}
-        jerk = {list(own.joints.jerk)}
+        acceleration = {list(defaults.joints.acceleration)}
+        jerk = {list(defaults.joints.jerk)}
     """
     cell = parse(lines, origin="cell.toml", folder=folder / "cell")
     text = robot_description(cell)
     assert "covered_by" not in description(urdf_path(cell), cover=False)
     (folder / file).unlink()
     assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording has all that it needs
-    shape = next(one for one in Urdf(text).shapes if one.link == "forearm")
-    at = points * 0.001 @ rotation(shape.rotation).T + shape.translation
+    shape = next(candidate for candidate in Urdf(text).shapes if candidate.link == "forearm")
+    points_m = points * 0.001 @ rotation(shape.rotation).T + shape.translation
     capsules = body_of(cell, text).capsules
-    mine = [one for one in capsules if outside(at, one["ends"], one["radius"]) <= 1e-9]
-    assert [round(float(one["radius"]), 2) for one in mine] == [0.04]
+    mine = [capsule for capsule in capsules if outside(points_m, capsule["ends"], capsule["radius"]) <= 1e-9]
+    assert [round(float(capsule["radius"]), 2) for capsule in mine] == [0.04]
     assert capsules["radius"].max() < 0.2  # none by `link_radius`
 
 
@@ -197,9 +197,9 @@ def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
 ) -> None:
     (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
     (tmp_path / "arm.urdf").write_text(described(name, scale))
-    shape = next(one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm")
-    at = expected @ rotation(shape.rotation).T + shape.translation
-    assert around(shape, at) <= 1e-5
+    shape = next(candidate for candidate in Urdf(description(tmp_path / "arm.urdf")).shapes if candidate.link == "forearm")
+    points_m = expected @ rotation(shape.rotation).T + shape.translation
+    assert around(shape, points_m) <= 1e-5
     ends = np.reshape(shape.size[:6], (2, 3))
     assert volume(ends, shape.size[6]) < 1.1 * plain(expected)
 
@@ -211,8 +211,8 @@ def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Pat
     text = described("a.stl").replace('<mesh filename="a.stl"/></geometry></collision>',
                                       f'<mesh filename="a.stl"/></geometry>{second}')  # fmt: skip
     (tmp_path / "arm.urdf").write_text(text)
-    shapes = [one for one in Urdf(description(tmp_path / "arm.urdf")).shapes if one.link == "forearm"]
-    assert [round(one.size[6], 2) for one in shapes] == [0.04, 0.04]
+    shapes = [shape for shape in Urdf(description(tmp_path / "arm.urdf")).shapes if shape.link == "forearm"]
+    assert [round(shape.size[6], 2) for shape in shapes] == [0.04, 0.04]
     assert around(shapes[1], LEG + np.array((0.2, 0.0, 0.0))) <= 1e-5
 
 
@@ -230,12 +230,12 @@ def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Pat
 def test_what_is_no_mesh_of_an_arm_is_refused(data: bytes, scale: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_bytes(data)
     (tmp_path / "arm.urdf").write_text(described("a.stl", scale))
-    own = Settings()
+    defaults = Settings()
     with pytest.raises(SettingsError, match=re.escape(said)) as error:
         converted(
             {
-                "arm": {"urdf": "arm.urdf", "plate": own.arm.plate, "posture": list(own.arm.posture)},
-                "joints": {"acceleration": list(own.joints.acceleration), "jerk": list(own.joints.jerk)},
+                "arm": {"urdf": "arm.urdf", "plate": defaults.arm.plate, "posture": list(defaults.arm.posture)},
+                "joints": {"acceleration": list(defaults.joints.acceleration), "jerk": list(defaults.joints.jerk)},
             },
             origin="cell.toml",
             folder=tmp_path,
@@ -256,14 +256,14 @@ def test_capsules_are_kept_and_found_anew_where_they_are_spoilt(
         return description(urdf)
 
     first = found()
-    (kept,) = (tmp_path / "home" / ".cache" / "thirdhand" / "capsules").iterdir()
-    right = kept.read_text()
-    kept.write_text(right.replace(right.split()[6], "0.5"))
+    (cache,) = (tmp_path / "home" / ".cache" / "thirdhand" / "capsules").iterdir()
+    right = cache.read_text()
+    cache.write_text(right.replace(right.split()[6], "0.5"))
     assert found() != first  # it is what is taken
     for spoilt in ("", "nan " * 7, "1 2 3", "1 2 3 4 5 6 -7", "\udcff"):
-        kept.write_bytes(spoilt.encode(errors="surrogateescape"))
+        cache.write_bytes(spoilt.encode(errors="surrogateescape"))
         assert found() == first
-        assert kept.read_text() == right
+        assert cache.read_text() == right
     (tmp_path / "a.stl").write_bytes(stl(LEG * 0.5))
     assert found() != first
     monkeypatch.setenv("HOME", "/dev/null")

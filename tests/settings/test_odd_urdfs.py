@@ -60,8 +60,8 @@ def tried(folder: Path, text: str | bytes) -> Settings:
         assert time.process_time() - start < BOUND_S
     robot = robot_description(cell)
     arm, body = Arm(cell, robot), body_of(cell, robot)
-    here = arm.at(np.array(cell.arm.posture))
-    for numbers in (here.position, here.jacobian, body.frames, body.axes, body.capsules["ends"]):
+    pose = arm.at(np.array(cell.arm.posture))
+    for numbers in (pose.position, pose.jacobian, body.frames, body.axes, body.capsules["ends"]):
         assert np.isfinite(numbers).all()
     assert np.isfinite([*cell.reach.centre, cell.reach.inner, cell.reach.outer]).all()
     np.testing.assert_allclose(np.linalg.norm(body.axes, axis=1), 1.0, atol=1e-9)
@@ -186,12 +186,12 @@ def test_what_others_accept_moves_as_the_plain_one(text: str | bytes, tmp_path: 
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
-    for path, said in (
+    for path, message in (
         (Path("/dev/zero"), "is not a file; a URDF"),
         (tmp_path, "a directory"),
         (tmp_path / "x", "cannot read"),
     ):
-        with pytest.raises(SettingsError, match=said):
+        with pytest.raises(SettingsError, match=message):
             description(path)
     with (tmp_path / "large.urdf").open("wb") as file:
         file.truncate(1_000_000_000)

@@ -43,22 +43,22 @@ def reached(cell: Settings, points: NDArray[np.float64]) -> float:
     """
     arm = Arm(cell, robot_description(cell))
     lower, upper = np.maximum(cell.joints.lower, -math.pi), np.minimum(cell.joints.upper, math.pi)
-    random, found = np.random.default_rng(3), 0
+    random, count = np.random.default_rng(3), 0
     for point in points:
         for _ in range(25):
             q, damping = random.uniform(lower, upper), 1e-3
             for _ in range(60):
-                here = arm.at(q)
-                error = point - here.position
+                pose = arm.at(q)
+                error = point - pose.position
                 if (distance := float(np.linalg.norm(error))) < 0.01:
                     break
-                jacobian = here.jacobian[:3]
+                jacobian = pose.jacobian[:3]
                 step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(3), error)
                 q = np.clip(q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-9)), lower, upper)
             if distance < 0.01:
-                found += 1
+                count += 1
                 break
-    return found / len(points)
+    return count / len(points)
 
 
 def targets(cell: Settings, count: int) -> NDArray[np.float64]:
@@ -66,8 +66,8 @@ def targets(cell: Settings, count: int) -> NDArray[np.float64]:
     reach, random = cell.reach, np.random.default_rng(1)
     points = np.array(reach.centre) + reach.outer * random.uniform(-1.0, 1.0, (50 * count, 3))
     away = np.linalg.norm(points - reach.centre, axis=1)
-    kept = (away >= reach.inner) & (away <= reach.outer) & (points[:, 0] >= reach.min_x) & (points[:, 2] >= reach.min_z)
-    return points[kept][:count]
+    is_inside = (away >= reach.inner) & (away <= reach.outer) & (points[:, 0] >= reach.min_x) & (points[:, 2] >= reach.min_z)
+    return points[is_inside][:count]
 
 
 @pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
@@ -85,9 +85,9 @@ def test_the_shipped_cells_have_a_reach_about_as_their_kinematics_give(arm: str)
     joints, reach = cell.joints, cell.reach
     chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
     workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
-    found = workspace.shell(reach.min_x, reach.min_z)
-    assert found.centre == pytest.approx(reach.centre, abs=0.001)
-    assert found.outer == pytest.approx(reach.outer, abs=0.07)
+    shell = workspace.shell(reach.min_x, reach.min_z)
+    assert shell.centre == pytest.approx(reach.centre, abs=0.001)
+    assert shell.outer == pytest.approx(reach.outer, abs=0.07)
     assert workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z) > 0.99
 
 

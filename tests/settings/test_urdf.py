@@ -94,8 +94,8 @@ def test_quaternions_limits_and_rates_of_newer_urdfs_are_those_of_every_reader(q
     np.testing.assert_allclose(placed, Rotation.from_quat(turn).as_matrix(), atol=1e-8)
     assert (joint.lower, joint.upper, joint.acceleration, joint.jerk) == (-1.0, 1.5, 5.0, 9.0)
     assert rates(text, [joint])[:2] == ([5.0], [9.0])
-    given = completed({"arm": {"plate": "tool_plate", "posture": [0.0]}}, Urdf(text))["joints"]
-    assert (given["lower"], given["acceleration"], given["jerk"]) == ([-1.0], [5.0], [9.0])
+    joints = completed({"arm": {"plate": "tool_plate", "posture": [0.0]}}, Urdf(text))["joints"]
+    assert (joints["lower"], joints["acceleration"], joints["jerk"]) == ([-1.0], [5.0], [9.0])
 
 
 @pytest.mark.parametrize(
@@ -133,8 +133,8 @@ def test_what_cannot_be_used_is_refused_in_words(text: str, message: str) -> Non
 def test_names_limits_and_reach_come_from_the_description(name: str) -> None:
     cell = cell_of(name)
     arm = Arm(cell, robot_description(cell))
-    here = arm.at(np.array(cell.arm.posture))
-    position, rotation = here.position, here.rotation
+    pose = arm.at(np.array(cell.arm.posture))
+    position, rotation = pose.position, pose.rotation
     assert position == pytest.approx(Scene().robot_start, abs=0.03)
     assert rotation[:, 2] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)], abs=0.01)
     assert len(cell.joints.names) == len(cell.joints.lower) == len(cell.arm.posture)

@@ -41,8 +41,8 @@ def test_a_failure_leaves_nothing_and_names_the_path(kind: str, error: BaseExcep
         with pytest.raises(type(error)) as raised, whole(tmp_path / name) as part:
             _write_half(part if kind == "file" else part / "inside", error)
         if isinstance(error, OSError):
-            found = OSError(28, os.strerror(28), str(tmp_path / name))
-            assert str(raised.value) == str(found)
+            expected = OSError(28, os.strerror(28), str(tmp_path / name))
+            assert str(raised.value) == str(expected)
     assert [path.name for path in tmp_path.iterdir()] == ["earlier"]
     assert (tmp_path / "earlier").read_text() == "before"
 

@@ -106,7 +106,7 @@ def test_ur5_needs_half_of_its_torque() -> None:
 def published(name: str) -> Path:
     """A file of `example-robot-data`; who asks is skipped where that is not installed."""
     try:
-        return next(Path(str(one.locate())) for one in files("example-robot-data") or () if str(one).endswith(name))
+        return next(Path(str(file.locate())) for file in files("example-robot-data") or () if str(file).endswith(name))
     except PackageNotFoundError:
         pytest.skip("example-robot-data, whose descriptions ours are compared with, is not installed")
 
@@ -139,14 +139,14 @@ def test_shipped_arm_moves_as_published(
     names = cell.joints.names
     postures = np.random.default_rng(0).uniform(cell.joints.lower, cell.joints.upper, (20, len(names)))
     ours = tips(robot_description(cell), names, cell.arm.plate, postures)
-    for one, other in zip(ours, tips(published(file).read_text(), theirs or names, tip, postures), strict=True):
-        np.testing.assert_allclose(one.translation, other.translation + stand, atol=1e-4)
-        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-4)
+    for pose, other in zip(ours, tips(published(file).read_text(), theirs or names, tip, postures), strict=True):
+        np.testing.assert_allclose(pose.translation, other.translation + stand, atol=1e-4)
+        np.testing.assert_allclose(pose.rotation, other.rotation, atol=1e-4)
 
 
 FR3_MESHES = {f"fr3_link{i}": f"panda_description/meshes/collision/link{i}.stl" for i in range(8)}
 UR5_LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-UR5_MESHES = {f"{one}_link": f"ur5/collision/{one.replace('_', '')}.stl" for one in UR5_LINKS}
+UR5_MESHES = {f"{link}_link": f"ur5/collision/{link.replace('_', '')}.stl" for link in UR5_LINKS}
 
 
 @pytest.mark.parametrize(
@@ -188,8 +188,8 @@ def test_places_are_moved_into_reach() -> None:
     for arm in ARMS:
         assert SCENE.in_reach(cell_of(arm).reach) == (SCENE, ())
     short = Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.6)
-    moved, said = SCENE.in_reach(short)
-    assert said == ("handover moved by 2 cm into the arm's reach", "glass moved by 5 cm into the arm's reach",
+    moved, notes = SCENE.in_reach(short)
+    assert notes == ("handover moved by 2 cm into the arm's reach", "glass moved by 5 cm into the arm's reach",
                     "soldering moved by 3 cm into the arm's reach")  # fmt: skip
     for tool in (moved.offer, moved.glass, moved.carry):
         assert np.linalg.norm(np.subtract(tool, short.centre)) <= short.outer

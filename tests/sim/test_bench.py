@@ -77,8 +77,8 @@ def test_opening_fingers_let_go() -> None:
 
 def test_learned_gripper_does_the_task() -> None:
     """A learned gripper hands the board over and grasps the glass."""
-    shown = [one.every(2) for one in demonstrations(SCENE, count=3, seed=1, gripper=True)]
-    taught = adapted(learn(shown, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05)
+    takes = [take.every(2) for take in demonstrations(SCENE, count=3, seed=1, gripper=True)]
+    taught = adapted(learn(takes, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05)
     run = rehearse(HandScript(SCENE, seed=31), lambda bench: taught, rate_hz=100, keep=True)
     assert run.events.success
     changes = np.flatnonzero(np.diff(run.frames["gripper"].astype(int)))
@@ -97,10 +97,10 @@ def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
     for _ in range(750):
         bench.step(*follower.command(teacher.truth(0.0).position))
     bench.begin()
-    seen = []
+    observations = []
     while not bench.finished:
-        seen.append(bench.step(*follower.command(teacher.truth(bench.time_s).position + aside)))
-    return seen
+        observations.append(bench.step(*follower.command(teacher.truth(bench.time_s).position + aside)))
+    return observations
 
 
 @pytest.mark.quick
@@ -132,7 +132,7 @@ def test_same_commands_give_same_run() -> None:
     traces = []
     for _ in range(2):
         with Bench(HandScript(SCENE, seed=2)) as bench:
-            traces.append([(seen.joints, seen.tool) for seen in play(bench)[::50]])
+            traces.append([(observation.joints, observation.tool) for observation in play(bench)[::50]])
     assert traces[0] == traces[1]
 
 
@@ -147,9 +147,9 @@ def test_arm_brakes_without_commands(bench: Bench) -> None:
         bench.step()
     assert bench.observe().joint_velocities[0] == pytest.approx(0.8, abs=0.01)
     for _ in range(20):
-        seen = bench.step()
-    assert np.abs(seen.joint_velocities).max() < 0.02
-    assert seen.joints[0] - joints[0] < 0.8 * 0.025
+        observation = bench.step()
+    assert np.abs(observation.joint_velocities).max() < 0.02
+    assert observation.joints[0] - joints[0] < 0.8 * 0.025
 
 
 def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
@@ -158,10 +158,10 @@ def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
     speed, speeds = np.array([0.8, 0, 0, 0, 0, 0, 0]), []
     for tick in range(400):
         joints = joints + (26 if tick == 100 else 1) * 0.002 * speed  # the bench had slept for 50 ms
-        seen = bench.step(tuple(joints), tuple(speed))
-        speeds.append(max(map(abs, seen.joint_velocities)))
+        observation = bench.step(tuple(joints), tuple(speed))
+        speeds.append(max(map(abs, observation.joint_velocities)))
     assert max(speeds) < 0.8 + 0.3
-    assert seen.joints[0] == pytest.approx(joints[0] + 0.002 * 0.8, abs=1e-3)
+    assert observation.joints[0] == pytest.approx(joints[0] + 0.002 * 0.8, abs=1e-3)
 
 
 def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
@@ -176,12 +176,12 @@ def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
     late = [(joints + 0.002 * k * speed, speed) for k in range(1, 60)]
     late.append((late[-1][0], 0 * speed))  # the service had stopped by then
     for position, velocity in late[::3] + late[-1:]:
-        seen = bench.step(tuple(position), tuple(velocity))
-        assert np.abs(np.array(seen.joints) - stood).max() < 2e-3
+        observation = bench.step(tuple(position), tuple(velocity))
+        assert np.abs(np.array(observation.joints) - stood).max() < 2e-3
     assert bench.refused == 21
     for k in range(100):  # who takes over begins where the arm stands
-        seen = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
-    assert seen.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
+        observation = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
+    assert observation.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
     assert bench.refused == 21
 
 
@@ -198,9 +198,9 @@ def test_hands_return_the_way_they_went() -> None:
         bench.turn_back()
         steps = 0
         while not bench.back:
-            seen, steps = bench.step(), steps + 1
-            assert min(np.linalg.norm(np.subtract(seen.hands.left.position, was)) for was in (start, *forth)) < 1e-9
-        np.testing.assert_array_equal(seen.hands.left.position, start)
+            observation, steps = bench.step(), steps + 1
+            assert min(np.linalg.norm(np.subtract(observation.hands.left.position, was)) for was in (start, *forth)) < 1e-9
+        np.testing.assert_array_equal(observation.hands.left.position, start)
         assert steps == np.ceil(bench.script.duration_s / 0.002)
 
 
@@ -279,15 +279,15 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     for _ in range(1000):
         joints, _ = follower.command(SCENE.offer)
     state = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, joints, STILL))
-    own, told, over = listening.declare_publisher("lab/joints/state"), list[str](), threading.Event()
+    publisher, keys, over = listening.declare_publisher("lab/joints/state"), list[str](), threading.Event()
     heard = [
-        listening.declare_subscriber(f"lab/{key}", lambda sample: told.append(str(sample.key_expr)))
+        listening.declare_subscriber(f"lab/{key}", lambda sample: keys.append(str(sample.key_expr)))
         for key in ("joints/state", "hands/left", "objects")
     ]
 
     def tell() -> None:
         while not over.wait(0.01):
-            own.put(state)
+            publisher.put(state)
 
     Service(listening, "lab")
     reports: list[RunReport] = []
@@ -295,7 +295,7 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
         with pytest.raises(BenchError, match="no joint states arrive on lab/joints/state"):
             run(bench, session, Live(cell="lab", wait_s=1.0), stop=threading.Event(), report=reports.append)
-        assert set(told) == {"lab/hands/left", "lab/objects"}
+        assert set(keys) == {"lab/hands/left", "lab/objects"}
         arm.start()
         try:
             run(bench, session, Live(cell="lab", once=True), stop=threading.Event(), report=reports.append)
@@ -335,8 +335,8 @@ def test_process_ends_on_signal_with_report(network: tuple[zenoh.Session, str], 
             if "the hands move back" in line:
                 process.send_signal(signal.SIGTERM)
                 break
-        rest = process.stderr.read()
-        assert process.wait(timeout=10) == 0, rest
+        stderr = process.stderr.read()
+        assert process.wait(timeout=10) == 0, stderr
     assert service.hands["left"]
     (line,) = target.read_text().splitlines()
     report = json.loads(line)

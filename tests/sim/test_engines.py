@@ -44,12 +44,12 @@ def test_engines_give_same_scores() -> None:
     """Both engines give the same scores and the arm goes the same way."""
     if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{ENGINES[missing[0]]} is not installed")
-    one, other = (played(name) for name in ENGINES)
-    assert one.events.success
+    result, other = (played(name) for name in ENGINES)
+    assert result.events.success
     assert other.events.success
-    assert max(*one.errors_mm, *other.errors_mm) < 3.0
-    assert np.abs(np.subtract(one.errors_mm, other.errors_mm)).max() < 0.1, (one.errors_mm, other.errors_mm)
-    apart_mm = 1000 * np.linalg.norm(one.tool - other.tool, axis=1)
+    assert max(*result.errors_mm, *other.errors_mm) < 3.0
+    assert np.abs(np.subtract(result.errors_mm, other.errors_mm)).max() < 0.1, (result.errors_mm, other.errors_mm)
+    apart_mm = 1000 * np.linalg.norm(result.tool - other.tool, axis=1)
     assert 0.0 < apart_mm.max() < 1.0, f"{apart_mm.max():.3f} mm"
 
 
@@ -60,10 +60,10 @@ def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
     for tick in range(1000):
         t = 0.002 * tick
         position, velocity = start + 0.2 * (1 - np.cos(2 * t)), np.full(7, 0.4 * np.sin(2 * t))
-        seen = bench.step(tuple(position), tuple(velocity))
+        observation = bench.step(tuple(position), tuple(velocity))
         # Velocity fed forward: a command is where the arm starts the period, and it ends it one
         # period on.
-        wrong.append(np.abs(np.array(seen.joints) - position - 0.002 * velocity).max())
+        wrong.append(np.abs(np.array(observation.joints) - position - 0.002 * velocity).max())
     assert max(wrong) < 1e-4  # [rad]
 
 

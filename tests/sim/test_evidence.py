@@ -38,21 +38,21 @@ class TestSeeds:
 
     def test_seeds_are_disjoint(self) -> None:
         """Nothing is evaluated on what it was tuned on or learned from."""
-        tuned = [stream for one in EXPERIMENTS.values() for stream in one.seeds.tuning.values()]
+        tuned = [stream for entry in EXPERIMENTS.values() for stream in entry.seeds.tuning.values()]
         assert tuned
         for name, experiment in EXPERIMENTS.items():
             others = [*tuned, *experiment.seeds.learned.values()]
-            for one, other in itertools.product(experiment.seeds.evaluation.values(), others):
-                assert not one.overlaps(other), f"{name}: {one} and {other}"
+            for evaluated, other in itertools.product(experiment.seeds.evaluation.values(), others):
+                assert not evaluated.overlaps(other), f"{name}: {evaluated} and {other}"
 
     def test_streams_overlap(self) -> None:
         """Streams overlap where they share a seed and a number."""
-        one = Stream("scene", 1, range(10))
-        assert one.overlaps(one._replace(numbers=range(9, 12)))
+        stream = Stream("scene", 1, range(10))
+        assert stream.overlaps(stream._replace(numbers=range(9, 12)))
         assert not any(
-            map(one.overlaps, (one._replace(numbers=range(10, 12)), one._replace(seed=2), one._replace(kind="x")))
+            map(stream.overlaps, (stream._replace(numbers=range(10, 12)), stream._replace(seed=2), stream._replace(kind="x")))
         )
-        assert (list(one.share(0.5)), list(one.share(0.01, least=2))) == ([0, 1, 2, 3, 4], [0, 1])
+        assert (list(stream.share(0.5)), list(stream.share(0.01, least=2))) == ([0, 1, 2, 3, 4], [0, 1])
 
 
 class TestDigests:
@@ -65,23 +65,23 @@ class TestDigests:
         paths = [tmp_path / name for name in ("first.mcap", "again.mcap", "slower.mcap")]
         for path, settings in zip(paths, (golden.settings, golden.settings, slower), strict=True):
             record(path, settings, shipped_skill(), inputs)
-        first, again, other = map(core_digest, paths)
-        assert first == again != other
+        first, second, other = map(core_digest, paths)
+        assert first == second != other
 
     def test_kmp_digest_changes_from_a_millionth_on(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """That of kmp changes from a millionth on."""
         compute: Callable[[], str] = kmp_digest.__wrapped__
         outputs, was = list(evidence.kmp_outputs()), compute()
-        for off, same in ((1e-12, True), (2e-6, False)):
-            monkeypatch.setattr(evidence, "kmp_outputs", lambda off=off: [*outputs[:-1], outputs[-1] + off])
-            assert (compute() == was) == same
+        for change, is_equal in ((1e-12, True), (2e-6, False)):
+            monkeypatch.setattr(evidence, "kmp_outputs", lambda off=change: [*outputs[:-1], outputs[-1] + off])
+            assert (compute() == was) == is_equal
 
     def test_learning_digest_is_that_of_shipped_skill(self, tmp_path: Path) -> None:
         """To six digits: CPUs differ in the last ones."""
-        again, takes = tmp_path / "soldering.npz", sorted((recordings() / "people").glob("*.mcap"))
-        done = thirdhand("learn", *map(str, takes), "--output", str(again))
+        path, takes = tmp_path / "soldering.npz", sorted((recordings() / "people").glob("*.mcap"))
+        done = thirdhand("learn", *map(str, takes), "--output", str(path))
         assert done.returncode == 0, done.stderr
-        with np.load(recordings() / "soldering.npz") as shipped, np.load(again) as learned:
+        with np.load(recordings() / "soldering.npz") as shipped, np.load(path) as learned:
             assert set(shipped) == set(learned)
             for name in set(shipped) - {"checksum", "figures"}:
                 if shipped[name].dtype.kind == "f":
@@ -93,29 +93,29 @@ class TestDigests:
 def test_result_names_its_origin(tmp_path: Path) -> None:
     """A result names its origin and a folder by its files."""
     np.savez(tmp_path / "a.npz", t=np.arange(3))
-    given = Options(data=tmp_path, hands=tmp_path, share=0.5)
-    found = origin("partners", given)
-    assert set(found) == NAMED
-    assert set(found["options"]) == {"share", "data"}  # it heeds no hands
-    assert set(found["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
-    assert found["seeds"] == EXPERIMENTS["partners"].seeds.named()
-    assert found["depends_on"] == tree()
-    before = found["options"]["data"]
+    options = Options(data=tmp_path, hands=tmp_path, share=0.5)
+    result = origin("partners", options)
+    assert set(result) == NAMED
+    assert set(result["options"]) == {"share", "data"}  # it heeds no hands
+    assert set(result["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
+    assert result["seeds"] == EXPERIMENTS["partners"].seeds.named()
+    assert result["depends_on"] == tree()
+    before = result["options"]["data"]
     assert before["files"] == 1
     np.savez(tmp_path / "a.npz", t=np.arange(3) + 1)
-    assert options_of("partners", given)["data"] != before
+    assert options_of("partners", options)["data"] != before
 
 
 def test_result_is_stale_where_dependency_changed() -> None:
     """A result is stale where what it depends on changed and only there."""
-    here = {"core": "1", "learning": "2", "kmp": "3"}
+    digests = {"core": "1", "learning": "2", "kmp": "3"}
     result = {"commit": "12ab", "depends_on": {"kmp": "3"}, "options": {"share": 1.0, "letters": {"files": 10}}}
-    assert staleness("letters", result, here | {"core": "other"}) == ""
-    assert staleness("letters", result, here | {"kmp": "other"}) == "kmp changed since 12ab"
-    assert staleness("letters", result | {"depends_on": {}}, here) == "kmp changed since 12ab"
-    assert "share 1.0" in staleness("letters", result, here, Options(share=0.1))
-    assert "unknown version" in staleness("letters", {"figures": []}, here)
-    assert staleness("letters", None, here)
+    assert staleness("letters", result, digests | {"core": "other"}) == ""
+    assert staleness("letters", result, digests | {"kmp": "other"}) == "kmp changed since 12ab"
+    assert staleness("letters", result | {"depends_on": {}}, digests) == "kmp changed since 12ab"
+    assert "share 1.0" in staleness("letters", result, digests, Options(share=0.1))
+    assert "unknown version" in staleness("letters", {"figures": []}, digests)
+    assert staleness("letters", None, digests)
 
 
 class TestAll:
@@ -124,18 +124,18 @@ class TestAll:
     @pytest.fixture(autouse=True)
     def runs(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         """How often each was run, and the error of the one that fails."""
-        seen: dict[str, Any] = {"letters": 0, "statistics": 0, "table": 0, "error": ExperimentError("no letters")}
+        counts: dict[str, Any] = {"letters": 0, "statistics": 0, "table": 0, "error": ExperimentError("no letters")}
 
         def module(name: str) -> ModuleType:
             def run(results: Any, options: Options) -> dict[str, Any]:
-                seen[name] += 1
-                if name == "statistics" and seen["error"]:
-                    raise seen["error"]
+                counts[name] += 1
+                if name == "statistics" and counts["error"]:
+                    raise counts["error"]
                 return {"found": 1}
 
-            one = ModuleType(name)
-            one.run = run  # type: ignore[attr-defined]
-            return one
+            stub = ModuleType(name)
+            stub.run = run  # type: ignore[attr-defined]
+            return stub
 
         few = {name: EXPERIMENTS[name] for name in ("letters", "statistics", "table")}
         for name in few:
@@ -143,7 +143,7 @@ class TestAll:
         monkeypatch.setattr(
             "thirdhand_sim.lab.__main__.EXPERIMENTS", {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]}
         )
-        return seen
+        return counts
 
     @pytest.mark.parametrize("error", [ExperimentError("no letters"), ValueError("of two kinds")])
     def test_goes_on_after_a_failure(

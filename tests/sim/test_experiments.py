@@ -41,7 +41,7 @@ def letters(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("letters")
     for name in "DG":
         np.savez(
-            folder / f"{name}.npz", **{f"demo{k:02d}": one[::2] for k, one in enumerate(write(name, count=6, seed=9))}
+            folder / f"{name}.npz", **{f"demo{k:02d}": letter[::2] for k, letter in enumerate(write(name, count=6, seed=9))}
         )
     return folder
 
@@ -57,11 +57,11 @@ def close_figures() -> Iterator[None]:
 def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
     """The JSON of an experiment at a tenth of its size, once its files are there."""
     assert main([name, "--output", str(folder), "--share", "0.1", "--workers", "1", "--quiet", *more]) == 0
-    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text())
-    assert found["figures"]
-    for figure in found["figures"]:
+    result: dict[str, Any] = json.loads((folder / f"{name}.json").read_text())
+    assert result["figures"]
+    for figure in result["figures"]:
         assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
-    return found
+    return result
 
 
 def follows_better(found: dict[str, Any]) -> bool:
@@ -93,13 +93,13 @@ def keeps_separation(found: dict[str, Any]) -> bool:
 def meets_points(found: dict[str, Any]) -> bool:
     """True if letters go through their desired points and stay as they were elsewhere."""
     summaries = found["model_summary"], found["recorded_summary"]
-    misses = [one["largest_miss_at_desired_points_cm"] for one in summaries]
-    return max(misses) < 0.01 and max(one["rms_deviation_elsewhere_cm"] for one in summaries) < 1.0
+    misses = [summary["largest_miss_at_desired_points_cm"] for summary in summaries]
+    return max(misses) < 0.01 and max(summary["rms_deviation_elsewhere_cm"] for summary in summaries) < 1.0
 
 
 def is_stable_only_with_places(found: dict[str, Any]) -> bool:
     """True if each method that is told its places reaches them, and regression alone does not."""
-    reached = {name: one["successes"] for name, one in found["methods"].items()}
+    reached = {name: method["successes"] for name, method in found["methods"].items()}
     return reached["ours"] == reached["look_up"] == found["scenes"] == 1 and reached["gmr"] == 0
 
 
@@ -107,7 +107,7 @@ CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's nu
     "motion": follows_better,
     "letters": meets_points,
     "separation": keeps_separation,
-    "table": lambda found: max(found["modelled"][who]["largest_miss_of_via_cm"] for who in ("kmp", "promp")) < 0.02,
+    "table": lambda found: max(found["modelled"][method]["largest_miss_of_via_cm"] for method in ("kmp", "promp")) < 0.02,
     "hands": lambda found: is_evidence(found["evidence_is_periods_skipped_at_most"]),
     "statistics": is_stable_only_with_places,
 }
@@ -127,9 +127,9 @@ def test_experiment_bears_out_its_claim(
         "separation": ("--share", "0.02"),
         "letters": ("--letters", str(letters)),
     }
-    found = numbers(name, tmp_path, *more.get(name, ()))
-    assert found["experiment"] == name
-    assert name not in CLAIMS or CLAIMS[name](found)
+    result = numbers(name, tmp_path, *more.get(name, ()))
+    assert result["experiment"] == name
+    assert name not in CLAIMS or CLAIMS[name](result)
 
 
 DRAWN = [
@@ -141,9 +141,9 @@ DRAWN = [
 
 def grey(path: Path) -> Array:
     """A picture's brightness (N, M), each the mean of 8 by 8 pixels: fonts differ a little."""
-    one = np.asarray(Image.open(path).convert("L"), float)
-    height, width = (8 * (side // 8) for side in one.shape)
-    return one[:height, :width].reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
+    pixels = np.asarray(Image.open(path).convert("L"), float)
+    height, width = (8 * (side // 8) for side in pixels.shape)
+    return pixels[:height, :width].reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
 
 
 @pytest.mark.parametrize("name", DRAWN)

@@ -69,10 +69,10 @@ def wanted(shown: Seen, taught: Skill) -> np.ndarray:
     """The service's frames, from what the trackers say in the order in which it comes."""
     inboxes: list[list[Event]] = [[] for _ in shown.times]
     for side, (stamps, samples) in zip(SIDES, shown.session.samples(), strict=True):
-        for stamp, at in zip(stamps, samples, strict=True):
+        for stamp, position in zip(stamps, samples, strict=True):
             arrives = int(np.ceil(stamp * RATE_HZ - 1e-9))
             if arrives < len(inboxes):
-                inboxes[arrives].append(sample(side, at.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp))))
+                inboxes[arrives].append(sample(side, position.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp))))
     ticks = [Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes)]
     return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ))
 
@@ -83,9 +83,9 @@ class TestPeople:
     def test_ours_is_what_the_controller_decides(self, shown: Seen, wanted: np.ndarray) -> None:
         """What is called ours is what the controller predicts and decides."""
         placed = LearnedByService(shipped_skill(), start=True).place(shown.session.told)
-        found = served(placed, shown)
+        frames = served(placed, shown)
         for name in (*PREDICTED, "mode", "reason", "setpoint", "tool"):
-            assert found[name].tobytes() == wanted[name].tobytes(), name
+            assert frames[name].tobytes() == wanted[name].tobytes(), name
         assert 0 < (wanted["mode"] == Mode.FOLLOW).sum() < len(wanted)
 
     def test_hands_are_those_of_the_controller(self, shown: Seen, wanted: np.ndarray) -> None:
@@ -98,30 +98,30 @@ def test_motion_follows_through_controller() -> None:
     """Motion follows through the controller."""
     skill = shipped_skill()
     hands = stops(skill.hands.mean(axis=0), numbers=(0,), rate_hz=30, noise=0.002)[0]
-    found = followers.ours(skill, Settings())(hands)
+    motion = followers.ours(skill, Settings())(hands)
     settle, period_s = followers.SETTLE_TICKS, followers.PERIOD_S
     arrives = np.ceil(hands.stamps / period_s - 1e-9).astype(int) + settle
     ticks = []
     for k in range(settle + len(hands.truth)):
         rows = [hands.samples[np.flatnonzero(arrives == k)[-1]]] if k in arrives else []
         rows = [hands.truth[0]] if k < settle and k % 5 == 0 and not rows else rows
-        said = [(side, part) for row in rows for side, part in zip(SIDES, (row[:3], row[3:]), strict=True)]
-        ticks.append(Tick(k, tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in said)))
-    wanted = of_the_service(replace(skill, threshold=np.inf), ticks, ASSUMED)[settle:]
-    for name, array in (("target", found.target), ("setpoint", found.setpoint), ("tool", found.tool)):
+        samples = [(side, part) for row in rows for side, part in zip(SIDES, (row[:3], row[3:]), strict=True)]
+        ticks.append(Tick(k, tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in samples)))
+    expected = of_the_service(replace(skill, threshold=np.inf), ticks, ASSUMED)[settle:]
+    for name, array in (("target", motion.target), ("setpoint", motion.setpoint), ("tool", motion.tool)):
         assert array is not None
-        assert array.tobytes() == wanted[name].tobytes(), name
+        assert array.tobytes() == expected[name].tobytes(), name
 
 
 @pytest.mark.parametrize("teach", [True, False])
 def test_rehearsal_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """`statistics`, `separation`, and `hands` in process."""
-    known: list[Tick] = []
+    consumed: list[Tick] = []
     run = rehearsal.run
 
     def kept(ticks: Iterable[Tick]) -> Iterator[Tick]:
         for tick in ticks:
-            known.append(tick)
+            consumed.append(tick)
             yield tick
 
     monkeypatch.setattr(rehearsal, "run", lambda controller, ticks, taps: run(controller, kept(ticks), taps))
@@ -129,6 +129,6 @@ def test_rehearsal_is_what_the_controller_does(teach: bool, monkeypatch: pytest.
     skill_for = ours(scene) if teach else lambda bench: skill
     done = rehearsal.rehearse(HandScript(scene, seed=3, speed=2.0), skill_for, rate_hz=125, keep=True)
     taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M) if teach else skill
-    wanted = of_the_service(taught, known, msgspec.structs.replace(Settings(), rate_hz=125))
-    assert done.frames.tobytes() == wanted.tobytes()
-    assert (wanted["mode"] == Mode.FOLLOW).mean() > 0.5
+    expected = of_the_service(taught, consumed, msgspec.structs.replace(Settings(), rate_hz=125))
+    assert done.frames.tobytes() == expected.tobytes()
+    assert (expected["mode"] == Mode.FOLLOW).mean() > 0.5

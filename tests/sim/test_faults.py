@@ -30,22 +30,22 @@ def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("faults")
     assert main(["faults", "--output", str(folder), "--share", "0.1", "--quiet"]) == 0
     assert (folder / "faults.png").read_bytes()[:4] == b"\x89PNG"
-    found: dict[str, Any] = json.loads((folder / "faults.json").read_text())
-    assert set(found["faults"]) >= set(SHORT) - {"cable pulled"}
-    return found
+    result: dict[str, Any] = json.loads((folder / "faults.json").read_text())
+    assert set(result["faults"]) >= set(SHORT) - {"cable pulled"}
+    return result
 
 
 @pytest.mark.parametrize("name", ["tracker frozen"])
 def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
     suffered: dict[str, Any], name: str
 ) -> None:
-    one = suffered["faults"][name]
-    assert one["reason"] == "stale_hand"
-    assert 80 <= one["hold_ms"] <= 120
-    assert one["rest_ms"] < 700
-    assert one["speed_at_the_end_m_per_s"] < 1e-3
-    assert one["travelled_mm"] == pytest.approx(one["commanded_mm"], abs=10)  # the arm did as it was told
-    assert one["lost_ticks"] == 0
+    fault = suffered["faults"][name]
+    assert fault["reason"] == "stale_hand"
+    assert 80 <= fault["hold_ms"] <= 120
+    assert fault["rest_ms"] < 700
+    assert fault["speed_at_the_end_m_per_s"] < 1e-3
+    assert fault["travelled_mm"] == pytest.approx(fault["commanded_mm"], abs=10)  # the arm did as it was told
+    assert fault["lost_ticks"] == 0
 
 
 @pytest.mark.parametrize("name", ["network to the arm silent", "cable pulled"])
@@ -54,35 +54,35 @@ def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it
 ) -> None:
     if name not in suffered["faults"]:
         pytest.skip("a network namespace is not allowed here")
-    one = suffered["faults"][name]
-    assert one["reason"] in ("arm_error", "arm_silent", *["stale_hand"] * (name == "cable pulled"))
-    assert one["hold_ms"] <= 120
-    assert one["travelled_mm"] < BRAKE_MM
-    assert one["speed_at_the_end_m_per_s"] < 1e-3
-    assert one["fastest_m_per_s"] < 1.0  # also when all comes that was held back
-    assert one["lost_ticks"] == 0
+    fault = suffered["faults"][name]
+    assert fault["reason"] in ("arm_error", "arm_silent", *["stale_hand"] * (name == "cable pulled"))
+    assert fault["hold_ms"] <= 120
+    assert fault["travelled_mm"] < BRAKE_MM
+    assert fault["speed_at_the_end_m_per_s"] < 1e-3
+    assert fault["fastest_m_per_s"] < 1.0  # also when all comes that was held back
+    assert fault["lost_ticks"] == 0
 
 
 def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whole(suffered: dict[str, Any]) -> None:
-    one = suffered["faults"]["service killed"]
-    assert one["travelled_mm"] < BRAKE_MM
-    assert one["speed_at_the_end_m_per_s"] < 1e-3
-    assert one["lost_ticks"] == 0
-    assert one["moves_again_ms"] > 0  # begun anew, it goes on by itself
+    fault = suffered["faults"]["service killed"]
+    assert fault["travelled_mm"] < BRAKE_MM
+    assert fault["speed_at_the_end_m_per_s"] < 1e-3
+    assert fault["lost_ticks"] == 0
+    assert fault["moves_again_ms"] > 0  # begun anew, it goes on by itself
 
 
 def test_a_router_that_is_killed_stops_the_arm_and_all_meet_again(suffered: dict[str, Any]) -> None:
-    one = suffered["faults"]["router killed"]
-    assert one["reason"] in ("stale_hand", "arm_error", "arm_silent")
-    assert one["hold_ms"] <= 120
-    assert one["travelled_mm"] < BRAKE_MM
-    assert one["moves_again_ms"] > 0
+    fault = suffered["faults"]["router killed"]
+    assert fault["reason"] in ("stale_hand", "arm_error", "arm_silent")
+    assert fault["hold_ms"] <= 120
+    assert fault["travelled_mm"] < BRAKE_MM
+    assert fault["moves_again_ms"] > 0
 
 
 def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(suffered: dict[str, Any]) -> None:
-    one = suffered["faults"]["scribe killed"]
-    assert one["lost_ticks"] > 0
-    assert one["command_mean_gap_ms"] < 1.5 * one["command_mean_gap_before_ms"]
+    fault = suffered["faults"]["scribe killed"]
+    assert fault["lost_ticks"] > 0
+    assert fault["command_mean_gap_ms"] < 1.5 * fault["command_mean_gap_before_ms"]
     assert suffered["unaccounted_ticks"] == 0  # what is neither recorded nor said to be lost
 
 

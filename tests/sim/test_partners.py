@@ -45,9 +45,9 @@ def rms_mm(said: list[Predicted], asked: list[LeftOut]) -> float:
 
 def test_core_predicts_as_the_skill(shown: list[LeftOut]) -> None:
     """The core predicts as the skill does where hands rest and each take anew."""
-    skill = learn([one.demonstration for one in shown])
-    first, again = (predicted(skill, shown[0]) for _ in range(2))
-    assert first.mean.tobytes() == again.mean.tobytes()
+    skill = learn([take.demonstration for take in shown])
+    first, second = (predicted(skill, shown[0]) for _ in range(2))
+    assert first.mean.tobytes() == second.mean.tobytes()
     asked = shown[0].hands[10:11]
     assert np.linalg.norm(first.mean[10] - skill.mean(asked)[0]) < 0.01
     assert first.covariance is not None
@@ -55,19 +55,19 @@ def test_core_predicts_as_the_skill(shown: list[LeftOut]) -> None:
 
 
 def test_coverage_is_what_a_covariance_says(asked: list[LeftOut]) -> None:
-    one, random = asked[0], np.random.default_rng(0)
-    long = one._replace(tool=np.zeros((20_000, 3)))
-    said = Predicted(0.02 * random.standard_normal((20_000, 3)), np.tile(4e-4 * np.eye(3), (20_000, 1, 1)))
-    found = judged(long, said)
-    assert found.inside is not None
-    assert np.array(found.inside) / found.samples == pytest.approx(LEVELS, abs=0.01)
+    take, random = asked[0], np.random.default_rng(0)
+    long = take._replace(tool=np.zeros((20_000, 3)))
+    prediction = Predicted(0.02 * random.standard_normal((20_000, 3)), np.tile(4e-4 * np.eye(3), (20_000, 1, 1)))
+    score = judged(long, prediction)
+    assert score.inside is not None
+    assert np.array(score.inside) / score.samples == pytest.approx(LEVELS, abs=0.01)
 
 
 def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut]) -> None:
-    told = {name: rms_mm(left_out_by(rival, shown, asked, told=True), asked) for name, rival in RIVALS.items()}
+    informed = {name: rms_mm(left_out_by(rival, shown, asked, told=True), asked) for name, rival in RIVALS.items()}
     untold = {name: rms_mm(left_out_by(RIVALS[name], shown, asked, told=False), asked) for name in ("linear", "mean")}
-    assert told["linear"] < untold["linear"] < untold["mean"]
-    assert max(told[name] for name in told if name not in ("mean", "same elapsed time")) < untold["linear"]
+    assert informed["linear"] < untold["linear"] < untold["mean"]
+    assert max(informed[name] for name in informed if name not in ("mean", "same elapsed time")) < untold["linear"]
     twice = of_kind("cyclic", range(4)), of_kind("cyclic", range(6, 8))
     by = {name: rms_mm(left_out_by(RIVALS[name], *twice, told=True), twice[1]) for name in RIVALS}
     assert by["HMM over demonstrations"] < 0.7 * by["Gaussian process"]
@@ -81,17 +81,17 @@ def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("thirdhand_sim.lab.partners.TASK_KINDS", ("three", "cyclic"))
     results = Results(tmp_path, "partners", said=False)
-    found = json.loads(results.numbers(run(results, Options(share=0.5))).read_text())
+    result = json.loads(results.numbers(run(results, Options(share=0.5))).read_text())
     assert (tmp_path / "partners.png").read_bytes()[:4] == b"\x89PNG"
-    assert found["recorded"] == {}
-    methods = found["made"]["three"]["methods"]
+    assert result["recorded"] == {}
+    methods = result["made"]["three"]["methods"]
     assert set(methods) == {f"{name}, told" for name in (*RIVALS, "service")}
     ours = methods["service, told"]
     assert ours["takes"] == 6
     assert ours["shifted_rms_mm"] < ours["rms_mm"] < methods["mean, told"]["rms_mm"]
     assert len(ours["coverage"]) == len(LEVELS)
     assert 0.0 <= ours["held"] <= 0.2
-    cyclic = found["made"]["cyclic"]["methods"]["service, told"]
+    cyclic = result["made"]["cyclic"]["methods"]["service, told"]
     # what it cannot learn or be told is refused with a reason, take by take or as a whole
     assert cyclic["takes"] + cyclic["refuses"] == 6
     assert bool(cyclic["reasons"]) == bool(cyclic["refuses"])
@@ -100,8 +100,8 @@ def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
     """The takes, with hands, tool and via-points moved along x."""
     moved, out = np.array([metres, 0, 0, 0, 0, 0, 0]), []
-    for one in takes_:
-        d = one.demonstration
+    for take in takes_:
+        d = take.demonstration
         places = tuple(
             msgspec.structs.replace(
                 p, **{part: tuple(np.add(getattr(p, part), moved[:3]).tolist()) for part in ("left", "right", "tool")}
@@ -109,7 +109,7 @@ def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
             for p in d.places
         )
         d = d._replace(left=d.left + moved, right=d.right + moved, tool=d.tool + moved, places=places)
-        out.append(left_out(one.name, one.group, d))
+        out.append(left_out(take.name, take.group, d))
     return out
 
 
@@ -119,19 +119,19 @@ def test_judged_and_refused_as_the_command_does(
 ) -> None:
     """A skill is judged and refused as the command does."""
     moved = beside(shown, metres)
-    files = [tmp_path / f"{one.name}.mcap" for one in moved]
-    for path, one in zip(files, moved, strict=True):
-        write_demonstration(path, one.demonstration)
+    files = [tmp_path / f"{take.name}.mcap" for take in moved]
+    for path, take in zip(files, moved, strict=True):
+        write_demonstration(path, take.demonstration)
     skill, refusals = as_command(moved, told=True)
     written = tmp_path / "skill.npz"
     assert command(["learn", *map(str, files), "--output", str(written)]) == bool(refusals) == (metres > 0)
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     assert written.exists() == (not refusals)
-    assert all(text in said for text in refusals)
+    assert all(text in stderr for text in refusals)
     assert skill is not None
     if not refusals:
-        same = decoded(written.read_bytes(), origin="skill.npz")
-        np.testing.assert_allclose(same.mean(skill.hands), skill.mean(skill.hands), atol=1e-6)
+        restored = decoded(written.read_bytes(), origin="skill.npz")
+        np.testing.assert_allclose(restored.mean(skill.hands), skill.mean(skill.hands), atol=1e-6)
     else:
         assert "arm's reach" in refusals[0]
 
@@ -140,21 +140,21 @@ def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut])
     """A refused fold is left out of the means, and its error is listed separately."""
 
     def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
-        said = left_out_by(RIVALS["mean"], takes_, tested, told=True)
-        rows = [judged(*pair) for pair in zip(tested, said, strict=True)]
+        predictions = left_out_by(RIVALS["mean"], takes_, tested, told=True)
+        rows = [judged(*pair) for pair in zip(tested, predictions, strict=True)]
         return Found(dict.fromkeys((f"{name}, told" for name in RIVALS), rows), {"service, told": fold(takes_, tested)})
 
     def fold(takes_: list[LeftOut], tested: list[LeftOut]) -> Fold:
         return served(takes_, tested, told=True)
 
     good, refused = found(shown, asked), found(beside(shown, 1.0), beside(asked, 1.0))
-    alone, both = (numbers_of(rows)["methods"]["service, told"] for rows in ([good], [good, refused]))
-    for one, folds, refuses in ((alone, 0, 0), (both, 1, len(asked))):
-        assert (one["folds_refused"], one["refuses"], one["takes"]) == (folds, refuses, len(asked))
-    assert both["rms_mm"] == alone["rms_mm"] < alone["beside_mm"]["mean"] == both["beside_mm"]["mean"]
+    alone, pooled = (numbers_of(rows)["methods"]["service, told"] for rows in ([good], [good, refused]))
+    for summary, folds, refuses in ((alone, 0, 0), (pooled, 1, len(asked))):
+        assert (summary["folds_refused"], summary["refuses"], summary["takes"]) == (folds, refuses, len(asked))
+    assert pooled["rms_mm"] == alone["rms_mm"] < alone["beside_mm"]["mean"] == pooled["beside_mm"]["mean"]
     assert alone["in_spite_of_refusal"] == {"takes": 0}
-    assert both["in_spite_of_refusal"]["takes"] == len(asked)
-    assert both["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)  # the same takes elsewhere
+    assert pooled["in_spite_of_refusal"]["takes"] == len(asked)
+    assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)  # the same takes elsewhere
     nothing = numbers_of([refused])["methods"]["service, told"]
     assert nothing["takes"] == 0
     assert "rms_mm" not in nothing

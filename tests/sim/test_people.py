@@ -47,22 +47,22 @@ def test_the_groups_share_nobody() -> None:
 def test_hands_come_to_their_places(mistake: str) -> None:
     """Hands move as hands do and come to their places."""
     for number in range(4):
-        who = person("tuning", number)
-        scene = session(who, 0, group="tuning")
-        one = played(who, 0, scene.places, scene.places, seed=(1, 2, number), mistake=mistake)
-        times = np.arange(0.0, one.lasts_s, 0.005)
-        hands = one.hands(times)
+        subject = person("tuning", number)
+        scene = session(subject, 0, group="tuning")
+        motion = played(subject, 0, scene.places, scene.places, seed=(1, 2, number), mistake=mistake)
+        times = np.arange(0.0, motion.lasts_s, 0.005)
+        hands = motion.hands(times)
         speed = np.linalg.norm(np.diff(hands.reshape(-1, 2, 3), axis=0), axis=2) / 0.005
         assert speed.max() < 1.2
         ends = (
-            np.concatenate([one.places.handover, [np.nan] * 3]),
-            frames(one.places)[2, :6],
-            frames(one.places)[3, :6],
+            np.concatenate([motion.places.handover, [np.nan] * 3]),
+            frames(motion.places)[2, :6],
+            frames(motion.places)[3, :6],
         )
-        for (begin, end), at in zip(one.windows, ends, strict=True):
+        for (begin, end), position_m in zip(motion.windows, ends, strict=True):
             inside = (times >= begin) & (times <= end)
             assert end - begin > 0.6
-            assert np.nanmax(np.abs(hands[inside] - at)) < 0.09
+            assert np.nanmax(np.abs(hands[inside] - position_m)) < 0.09
 
 
 class Still:
@@ -86,35 +86,35 @@ class TestJudging:
 
     def test_teacher_succeeds(self, as_seen: Seen) -> None:
         """The teacher succeeds and is on the way."""
-        found = judge(None, as_seen)
-        assert found.success
-        assert found.kept
-        assert found.falsely_followed == 0.0
-        assert found.path_mm < 15  # what the places are perceived off by
+        judgement = judge(None, as_seen)
+        assert judgement.success
+        assert judgement.kept
+        assert judgement.falsely_followed == 0.0
+        assert judgement.path_mm < 15  # what the places are perceived off by
 
     def test_still_tool_follows_falsely(self, as_seen: Seen) -> None:
         """A tool that stays reaches its place alone and follows falsely."""
-        found = judge(Still(as_seen.session.told.glass, far=False), as_seen)
-        assert [event.reached for event in found.events] == [False, True, False]
-        assert found.falsely_followed > 0.3
-        assert found.inside[-1] == 1.0
+        judgement = judge(Still(as_seen.session.told.glass, far=False), as_seen)
+        assert [event.reached for event in judgement.events] == [False, True, False]
+        assert judgement.falsely_followed > 0.3
+        assert judgement.inside[-1] == 1.0
 
     def test_skill_always_far_never_moves(self, as_seen: Seen) -> None:
         """A skill that is always far holds and never moves."""
-        found = judge(Still(as_seen.session.told.glass, far=True), as_seen)
-        assert found.held == 1.0
-        assert found.falsely_followed == 0.0
-        assert not any(event.reached for event in found.events)
-        assert all(event.held for event in found.events)
+        judgement = judge(Still(as_seen.session.told.glass, far=True), as_seen)
+        assert judgement.held == 1.0
+        assert judgement.falsely_followed == 0.0
+        assert not any(event.reached for event in judgement.events)
+        assert all(event.held for event in judgement.events)
         due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
-        assert found.falsely_held == pytest.approx(1.0 - due)  # stale and swapped hands are held for rightly
+        assert judgement.falsely_held == pytest.approx(1.0 - due)  # stale and swapped hands are held for rightly
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
         """By one that is not where the tracker says."""
         unseen = replace(as_seen, hands=np.hstack([as_seen.tool, as_seen.hands[:, 3:]]))
-        found = judge(None, unseen)
-        assert found.too_near
-        assert not found.success
+        judgement = judge(None, unseen)
+        assert judgement.too_near
+        assert not judgement.success
 
 
 @pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), Service()])
@@ -153,9 +153,9 @@ def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.Monk
     few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
     monkeypatch.setattr("thirdhand_sim.lab.people.comparison.METHODS", few)
     results = Results(tmp_path, "people", said=False)
-    found = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
-    mean = {name: {m: one[m]["mean"] for m in ("success", "path_rms_mm")} for name, one in found["methods"].items()}
-    assert found["people"] == 3
+    result = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
+    mean = {name: {m: method[m]["mean"] for m in ("success", "path_rms_mm")} for name, method in result["methods"].items()}
+    assert result["people"] == 3
     assert mean["teacher"]["success"] == 1.0
     assert mean["look_up"]["success"] >= mean["none"]["success"] > mean["gmr"]["success"]
     # what demonstrations buy is the way between the places

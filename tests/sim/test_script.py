@@ -52,10 +52,10 @@ def test_places_are_passed_without_scatter() -> None:
 
 def test_seed_repeats_every_sample() -> None:
     """The same seed repeats every sample and another does not."""
-    one, same, other = (HandScript(SCENE, seed=seed) for seed in (1, 1, 2))
+    script, twin, other = (HandScript(SCENE, seed=seed) for seed in (1, 1, 2))
     times = np.arange(0.0, 2.0, 0.01)
-    first = np.array([one.sample(t) for t in times])
-    np.testing.assert_array_equal(first, [same.sample(t) for t in times])
+    first = np.array([script.sample(t) for t in times])
+    np.testing.assert_array_equal(first, [twin.sample(t) for t in times])
     assert np.abs(first - [other.sample(t) for t in times]).max() > 0.001
 
 

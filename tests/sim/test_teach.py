@@ -19,10 +19,10 @@ from thirdhand_sim.scene import Scene
 def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
         assert teach.main(["--output", str(tmp_path / name), "--count", "2", "--seed", "3"]) == 0
-    one, two = ([path.read_bytes() for path in sorted((tmp_path / name).iterdir())] for name in ("one", "two"))
-    assert len(one) == 2
-    assert one == two
-    assert one[0] != one[1]
+    first, two = ([path.read_bytes() for path in sorted((tmp_path / name).iterdir())] for name in ("one", "two"))
+    assert len(first) == 2
+    assert first == two
+    assert first[0] != first[1]
 
 
 def test_file_of_a_demonstration(tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ def test_file_of_a_demonstration(tmp_path: Path) -> None:
     with (tmp_path / "demonstration-1.mcap").open("rb") as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == "ros2"
-        found: dict[str, list[messages.PoseStamped]] = {}
+        by_topic: dict[str, list[messages.PoseStamped]] = {}
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             assert (schema.name, schema.encoding, channel.message_encoding) == (
@@ -40,10 +40,10 @@ def test_file_of_a_demonstration(tmp_path: Path) -> None:
                 "ros2msg",
                 "cdr",
             )
-            found.setdefault(channel.topic, []).append(cdr.decode_pose(message.data))
-    assert set(found) == {"/lab/bench2/hands/left", "/lab/bench2/hands/right", "/lab/bench2/tool/pose"}
+            by_topic.setdefault(channel.topic, []).append(cdr.decode_pose(message.data))
+    assert set(by_topic) == {"/lab/bench2/hands/left", "/lab/bench2/hands/right", "/lab/bench2/tool/pose"}
     for topic, poses in (("hands/left", taught.left), ("hands/right", taught.right), ("tool/pose", taught.tool)):
-        messages = found[f"/lab/bench2/{topic}"]
+        messages = by_topic[f"/lab/bench2/{topic}"]
         assert {message.frame_id for message in messages} == {"base"}
         np.testing.assert_array_equal([message.stamp_ns for message in messages], taught.stamps_ns)
         np.testing.assert_array_equal([(*message.position, *message.orientation) for message in messages], poses)
@@ -63,12 +63,12 @@ def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
     """The tutorial's task visits the tray twice, and its via-points are stored."""
     file = tmp_path / "places.json"
     assert teach.main(["--visits", "--places", str(file)]) == 0
-    told = places_in(file)
-    assert [place.name for place in told] == ["start", "tray", "work", "tray again", "done"]
-    assert told[1].left == told[3].left
-    assert np.linalg.norm(np.subtract(told[1].tool, told[3].tool)) > 0.1
-    one, other = teach.visits(1), teach.visits(2)
-    for shown in (one, other):
-        for place in told:
-            assert off_via_point(shown, place, NONE).min() < 0.02
-    assert len(one.tool) != len(other.tool)
+    places = places_in(file)
+    assert [place.name for place in places] == ["start", "tray", "work", "tray again", "done"]
+    assert places[1].left == places[3].left
+    assert np.linalg.norm(np.subtract(places[1].tool, places[3].tool)) > 0.1
+    first, other = teach.visits(1), teach.visits(2)
+    for take in (first, other):
+        for place in places:
+            assert off_via_point(take, place, NONE).min() < 0.02
+    assert len(first.tool) != len(other.tool)

@@ -40,8 +40,8 @@ class Player:
             side, to = moving[0]
             share = min(1.0, SPEED_M_S * bench.period_s / math.dist(self._at[side], to))
             self._at[side] = tuple(a + share * (b - a) for a, b in zip(self._at[side], to, strict=True))  # type: ignore[assignment]
-        for side, at in self._at.items():
-            self._hands.receive(side, PoseStamped(1, BASE, at, HAND_ORIENTATION))
+        for side, position in self._at.items():
+            self._hands.receive(side, PoseStamped(1, BASE, position, HAND_ORIENTATION))
 
 
 def played(*, segments: int) -> tuple[TaskEvents, list[str], TrackedHands]:
@@ -59,10 +59,10 @@ def played(*, segments: int) -> tuple[TaskEvents, list[str], TrackedHands]:
 
 def test_hands_in_turn_play_the_whole_task() -> None:
     """One hand after the other plays the whole task."""
-    events, shown, hands = played(segments=5)
+    events, labels, hands = played(segments=5)
     assert events.success
     assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 5.0
-    assert shown == [f"{side} hand: {task}" for segment in hand_places(SCENE) for side, _, task in segment]
+    assert labels == [f"{side} hand: {task}" for segment in hand_places(SCENE) for side, _, task in segment]
     assert hands.places() == ()
     assert events.carry.time_s < hands.duration_s < TIMEOUT_S
 

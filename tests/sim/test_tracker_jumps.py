@@ -63,11 +63,11 @@ def off_mm(found: Array, true: Array) -> float:
 @pytest.mark.one_case
 def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
     for seed in range(2):
-        t, _, seen = hands(PATHS[name], tracker, seed)
-        found = repair(t, seen)
-        assert not found.wrong.any()
-        assert not found.exchanged.any()
-        np.testing.assert_array_equal(found.hands, seen)
+        t, _, tracked = hands(PATHS[name], tracker, seed)
+        repaired = repair(t, tracked)
+        assert not repaired.wrong.any()
+        assert not repaired.exchanged.any()
+        np.testing.assert_array_equal(repaired.hands, tracked)
 
 
 @pytest.mark.parametrize("tracker", TRACKERS)
@@ -76,26 +76,26 @@ def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
 @pytest.mark.one_case
 def test_jumps_are_taken_out_of_the_truth(name: str, tracker: str, offsets_mm: tuple[int, ...]) -> None:
     for seed, begin_s in enumerate((-0.1, 0.2)):
-        t, true, seen = hands(PATHS[name], tracker, seed)
-        begin, clean_mm = int(np.searchsorted(t, begin_s)), off_mm(seen, true)
+        t, true, tracked = hands(PATHS[name], tracker, seed)
+        begin, clean_mm = int(np.searchsorted(t, begin_s)), off_mm(tracked, true)
         run = slice(begin, begin + len(offsets_mm))
-        seen[run, :3] += np.array(offsets_mm)[:, None] / 1000 * np.array([0.0, -0.8, 0.6])
-        found = repair(t, seen)
+        tracked[run, :3] += np.array(offsets_mm)[:, None] / 1000 * np.array([0.0, -0.8, 0.6])
+        repaired = repair(t, tracked)
         wrong = np.zeros((len(t), 2), bool)
         wrong[run, 0] = True
-        np.testing.assert_array_equal(found.wrong, wrong)
+        np.testing.assert_array_equal(repaired.wrong, wrong)
         # A quarter of a second of a reach at 2 m/s that nobody has seen is known to 14 mm.
-        assert off_mm(found.hands, true) < clean_mm + (14 if t[run][-1] - t[run][0] > 0.12 else 5)
+        assert off_mm(repaired.hands, true) < clean_mm + (14 if t[run][-1] - t[run][0] > 0.12 else 5)
 
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("samples", [1, 3, 5, 15])
 def test_exchanged_hands_are_put_right(samples: int, tracker: str) -> None:
-    t, true, seen = hands(PATHS["reach at 2 m/s"], tracker, seed=5)
-    begin, clean_mm = int(np.searchsorted(t, 0.1)), off_mm(seen, true)
+    t, true, tracked = hands(PATHS["reach at 2 m/s"], tracker, seed=5)
+    begin, clean_mm = int(np.searchsorted(t, 0.1)), off_mm(tracked, true)
     run = slice(begin, begin + samples)
-    seen[run] = np.roll(seen[run], 3, axis=1)
-    found = repair(t, seen)
-    assert np.flatnonzero(found.exchanged).tolist() == list(range(len(t)))[run]
-    assert not found.wrong.any()
-    assert off_mm(found.hands, true) == pytest.approx(clean_mm)
+    tracked[run] = np.roll(tracked[run], 3, axis=1)
+    repaired = repair(t, tracked)
+    assert np.flatnonzero(repaired.exchanged).tolist() == list(range(len(t)))[run]
+    assert not repaired.wrong.any()
+    assert off_mm(repaired.hands, true) == pytest.approx(clean_mm)

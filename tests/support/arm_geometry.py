@@ -47,18 +47,18 @@ class ArmGeometry:
         """Ends of the capsules (T, N, 2, 3) and positions of the tool (T, 3) [m] at postures
         (T, J) [rad].
         """
-        turned, at = np.tile(np.eye(3), (len(postures), 1, 1)), np.zeros((len(postures), 3))
+        turned, origins = np.tile(np.eye(3), (len(postures), 1, 1)), np.zeros((len(postures), 3))
         capsules = np.empty((len(postures), len(self.links), 2, 3))
         capsules[:, self.links == 0] = self._ends[self.links == 0]
         for joint in self._chain:
-            at = at + turned @ np.array(joint.translation)
+            origins = origins + turned @ np.array(joint.translation)
             turned = turned @ Rotation.from_quat(joint.rotation).as_matrix()
             if joint.name in self._names:
                 number = self._names.index(joint.name)
                 turned = turned @ Rotation.from_rotvec(np.outer(postures[:, number], joint.axis)).as_matrix()
                 for k in np.flatnonzero(self.links == number + 1):
-                    capsules[:, k] = at[:, None] + self._ends[k] @ turned.transpose(0, 2, 1)
-        return capsules, at + turned @ self._tool
+                    capsules[:, k] = origins[:, None] + self._ends[k] @ turned.transpose(0, 2, 1)
+        return capsules, origins + turned @ self._tool
 
     def tool_speeds(self, postures: Vector, velocities: Vector) -> Vector:
         """Speeds (T,) [m/s] of the tool of joints that move so (T, J) [rad/s]."""

@@ -172,8 +172,8 @@ def joint_jerks_are_within_limits(session: Session) -> Vector:
 def joints_jump_only_at_rest_and_to_where_the_arm_is(session: Session) -> Vector:
     frames = session.frames
     speed = np.abs(frames["joint_velocities"][:-1]).max(axis=1)
-    off = np.abs(frames["joints"][1:] - session.measured[1:]).max(axis=1)
-    return _with_first(np.where(_jumps(session), np.maximum(speed, off - AS_MEASURED_RAD), 0.0))
+    error_rad = np.abs(frames["joints"][1:] - session.measured[1:]).max(axis=1)
+    return _with_first(np.where(_jumps(session), np.maximum(speed, error_rad - AS_MEASURED_RAD), 0.0))
 
 
 def joints_that_move_are_commanded(session: Session) -> Vector:
@@ -244,9 +244,9 @@ def setpoint_turning_acceleration_is_within_its_limit(session: Session) -> Vecto
 
 def _runs(session: Session) -> Iterator[slice]:
     """Frames in which it follows without a pause, and in the same workspace."""
-    same = np.concatenate([[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))])
+    is_unchanged = np.concatenate([[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))])
     following = _following(session)
-    begins = np.flatnonzero(following & ~(np.concatenate([[False], following[:-1]]) & same))
+    begins = np.flatnonzero(following & ~(np.concatenate([[False], following[:-1]]) & is_unchanged))
     ends = np.append(begins, len(following))[1:]
     for begin, end in zip(begins, ends, strict=True):
         pauses = np.flatnonzero(~following[begin:end])
@@ -257,9 +257,9 @@ def _outside(session: Session, point: str) -> Vector:
     """How far a point is outside of the workspace and of the planes of the reach (T,) [m]; negative
     inside.
     """
-    reach, at = session.settings.reach, session.frames[point]
+    reach, positions_m = session.settings.reach, session.frames[point]
     lower = np.maximum(session.boxes[:, 0], (reach.min_x, -np.inf, reach.min_z))
-    return np.maximum(lower - at, at - session.boxes[:, 1]).max(axis=1)
+    return np.maximum(lower - positions_m, positions_m - session.boxes[:, 1]).max(axis=1)
 
 
 def setpoint_stays_in_the_workspace(session: Session) -> Vector:
@@ -316,10 +316,10 @@ def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
 def service_causes_no_fault_of_its_own(session: Session) -> Vector:
     """Of a tool that is too fast, or of an arm that follows and is heard."""
     frames = session.frames
-    own = frames["reason"] == Reason.TOOL_SPEED
+    is_caused = frames["reason"] == Reason.TOOL_SPEED
     if session.deadlines_kept:
-        own |= np.isin(frames["reason"], (Reason.ARM_ERROR, Reason.ARM_SILENT))
-    return ((frames["mode"] == Mode.FAULT) & own & session.arm_follows).astype(float)
+        is_caused |= np.isin(frames["reason"], (Reason.ARM_ERROR, Reason.ARM_SILENT))
+    return ((frames["mode"] == Mode.FAULT) & is_caused & session.arm_follows).astype(float)
 
 
 # --- people ---
@@ -343,14 +343,14 @@ def _approaches(
     rested.
     """
     geometry, frames = session.geometry, session.frames
-    now, then = session.placed[:-1, capsule], session.placed_on[:, capsule]
+    now, later = session.placed[:-1, capsule], session.placed_on[:, capsule]
     radius = geometry.radii[capsule] + session.settings.people.radius
     half = 0.5 * geometry.forearm
     where = at_least(now, hands + half, float(np.linalg.norm(half))) < NEAR_M + radius
-    where &= _norms(then - now).max(axis=1) > MOVING_MPS * STEP_S
+    where &= _norms(later - now).max(axis=1) > MOVING_MPS * STEP_S
     k = np.flatnonzero(where & (frames["hand_ages"][1:, side] >= 0) & _pairs(_commanded(session)))
-    before, after = (between_segments(at[k], _forearms(session, hands[k])) for at in (now, then))
-    return k, then[k], before - radius, (before - after) / STEP_S, before
+    before, after = (between_segments(ends[k], _forearms(session, hands[k])) for ends in (now, later))
+    return k, later[k], before - radius, (before - after) / STEP_S, before
 
 
 def _forearms(session: Session, hands: Vector) -> Vector:
@@ -413,13 +413,13 @@ def _intrusion(session: Session, distances: Callable[[np.ndarray], Vector], clea
     distances (K,) [m] at frames (K,).
     """
     commanded = _commanded(session)
-    found = commanded & ~np.concatenate([[False], commanded[:-1] & ~_jumps(session)])
-    frames = np.unique(np.concatenate([np.arange(0, len(commanded), EVERY), np.flatnonzero(found)]))
+    is_start = commanded & ~np.concatenate([[False], commanded[:-1] & ~_jumps(session)])
+    frames = np.unique(np.concatenate([np.arange(0, len(commanded), EVERY), np.flatnonzero(is_start)]))
     frames = frames[commanded[frames]]
     excess = np.zeros(len(commanded))
     if len(frames):
         distance = distances(frames)
-        begin = distance[np.maximum.accumulate(np.where(found[frames], np.arange(len(frames)), 0))]
+        begin = distance[np.maximum.accumulate(np.where(is_start[frames], np.arange(len(frames)), 0))]
         excess[frames] = np.minimum(clearance - PASSED_M, begin - WORSE_M) - distance
     return excess
 
@@ -502,10 +502,10 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
     settled = _last(session, SETTLED_S)
     if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any() or not _is_target_steady(session):
         return _at_the_end(session, 0.0)
-    off = _norms(settled["tool"] - settled["target"])
-    if (off < THERE_M).all():
+    distance_m = _norms(settled["tool"] - settled["target"])
+    if (distance_m < THERE_M).all():
         allowed = AT_REST_RADPS2 if session.noise_m == 0.0 else AT_REST_NOISY_RADPS2
-    elif (off > THERE_M).all() and np.ptp(settled["tool"], axis=0).max() < NET_MOTION_M:
+    elif (distance_m > THERE_M).all() and np.ptp(settled["tool"], axis=0).max() < NET_MOTION_M:
         allowed = KEPT_BACK_RADPS2
     else:
         return _at_the_end(session, 0.0)

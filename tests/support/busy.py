@@ -40,14 +40,14 @@ def _reports(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.Tes
         return reports
     item.session._setupstate.teardown_exact(None)  # noqa: SLF001  # as a plug-in that runs tests again has to
     item._initrequest()  # type: ignore[attr-defined]  # noqa: SLF001
-    again = runtestprotocol(item, nextitem=nextitem, log=False)
+    rerun = runtestprotocol(item, nextitem=nextitem, log=False)
     words = f"its process waited for a processor {100 * share:.0f} % of the time that it could have run"
-    for report in again:
-        if any(other.failed for other in again):
+    for report in rerun:
+        if any(other.failed for other in rerun):
             report.sections.append((f"run twice, as {words}; the first failure", failures[0].longreprtext))
         else:
             report.user_properties.append((BUSY, f"{words}; it passed when it was run again"))
-    return again
+    return rerun
 
 
 def note(report: pytest.TestReport) -> str:

@@ -48,10 +48,10 @@ def told(*arguments: str) -> subprocess.CompletedProcess[str]:
 def until(what: Callable[[], Any], words: str = "it did not come to hold", *, within_s: float = 20.0) -> Any:
     """What a call returns, once that is true."""
     end = time.monotonic() + within_s
-    while not (found := what()):
+    while not (value := what()):
         assert time.monotonic() < end, words
         time.sleep(0.02)
-    return found
+    return value
 
 
 class Daemon:

@@ -53,15 +53,15 @@ class Tab:
                 assert left_s > 0, f"no answer to {method}"
                 assert select.select([self._source], [], [], left_s)[0], f"no answer to {method}"
                 self._rest += os.read(self._source, 1 << 20)
-            said, _, self._rest = self._rest.partition(b"\0")
-            answer = json.loads(said)
+            message, _, self._rest = self._rest.partition(b"\0")
+            answer = json.loads(message)
             if answer.get("id") == self._number:
                 return answer.get("result", {})  # nothing where the page is not there yet
 
     def ask(self, expression: str) -> Any:
         """The value of an expression of JavaScript in the page."""
-        found = self._call("Runtime.evaluate", {"expression": expression, "awaitPromise": True}, self._session)
-        return found.get("result", {}).get("value")
+        reply = self._call("Runtime.evaluate", {"expression": expression, "awaitPromise": True}, self._session)
+        return reply.get("result", {}).get("value")
 
     def until(self, expression: str) -> Any:
         """The first value of an expression that is true."""
@@ -97,8 +97,8 @@ class Tab:
 
     def picture(self, path: Path) -> None:
         """Saves what the page shows as PNG."""
-        found = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
-        path.write_bytes(base64.b64decode(found["data"]))
+        reply = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
+        path.write_bytes(base64.b64decode(reply["data"]))
 
 
 @contextlib.contextmanager
@@ -108,17 +108,17 @@ def opened(
     """A page of a browser of its own, whose files are in a folder; the script `before` runs ahead
     of the page's own, also when it is loaded again.
     """
-    (told, to), (source, tell) = os.pipe(), os.pipe()
+    (reader, to), (source, tell) = os.pipe(), os.pipe()
     arguments = [str(PROGRAM), str(folder / "profile")]
-    command = f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{told} 4>&{tell}'
+    command = f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{reader} 4>&{tell}'
     with (folder / "chromium.log").open("wb") as log:
         browser = subprocess.Popen(
             ["bash", "-c", command, *arguments],
-            pass_fds=(told, tell),
+            pass_fds=(reader, tell),
             stderr=log,
             stdout=log,
         )
-    os.close(told)
+    os.close(reader)
     os.close(tell)
     try:
         yield Tab(to, source, url, timeout_s, before)

@@ -28,5 +28,5 @@ def circling(seed: int, *, apart_m: float = 0.1, noise_m: float = 0.001, lift_m:
     tool = np.hstack(hands) @ GOES.T + [0.0, 0.0, 0.1] + 0.005 * random.normal(size=3)
     tool[:, 2] += lift_m * np.sin(2 * angle)
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    seen = [np.hstack([at + noise_m * random.normal(size=at.shape), turn]) for at in (*hands, tool)]
-    return Demonstration(np.round(1e9 * t).astype(np.int64), *seen)
+    poses = [np.hstack([positions + noise_m * random.normal(size=positions.shape), turn]) for positions in (*hands, tool)]
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *poses)

@@ -76,20 +76,20 @@ def played(settings: Settings, engine: str | None = None, *, bench_hz: int | Non
             inbox: list[Event] = []
             while bench.tick * bench.period_s <= index * period_s + 1e-9:
                 begin_when_settled(bench)
-                seen = led.step()[0]
+                observation = led.step()[0]
                 stamp_ns = START_NS + round(bench.tick * bench.period_s * 1e9)
                 if bench.tick % every == 0:
-                    for side, pose in zip(SIDES, bench.script.sample(seen.time_s), strict=True):
+                    for side, pose in zip(SIDES, bench.script.sample(observation.time_s), strict=True):
                         x, y, z, *orientation = pose.tolist()
                         inbox.append(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))  # type: ignore[arg-type]
-                inbox.append(joints_event(names, seen.joints, seen.joint_velocities, stamp_ns))
+                inbox.append(joints_event(names, observation.joints, observation.joint_velocities, stamp_ns))
             frame = controller.step(Tick(index, tuple(inbox)))
             tick_ns = START_NS + round(index * period_s * 1e9)
             for key, payload in outgoing(frame, tick_ns, names):
                 if key == "joints/command":
                     attachment = _Bytes(encode_attachment(Attachment(index, tick_ns, 0)))
                     commands.receive(_Sample(_Bytes(payload), attachment))  # type: ignore[arg-type]
-                    error_rad = max(error_rad, float(np.abs(frame["joints"] - seen.joints).max()))
+                    error_rad = max(error_rad, float(np.abs(frame["joints"] - observation.joints).max()))
             followed &= bool(bench.waiting or frame["mode"] == Mode.FOLLOW)
             index += 1
         return Played(bench.events(), error_rad, followed)

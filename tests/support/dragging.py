@@ -44,8 +44,8 @@ class Person:
         end = time.monotonic() + ARRIVE_S  # the page may still have events of the mouse to take in
         while math.dist(self.hand(side, "aim")[:2], to[:2]) > PIXEL_M and time.monotonic() < end:
             time.sleep(STEP_S)
-        here = self.pixel(self.hand(side, "aim"))
-        self.tab.mouse("Wheel", *here, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M)
+        pixel = self.pixel(self.hand(side, "aim"))
+        self.tab.mouse("Wheel", *pixel, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M)
 
     @staticmethod
     def along(start: tuple[float, float], end: tuple[float, float], mouse: Callable[..., None]) -> None:

@@ -40,8 +40,8 @@ class Surroundings:
 
     def place(self, scatter_m: float) -> Vector:
         """Somewhere near hands that the skill knows (2, 3)."""
-        known: Vector = self.known[self.random.integers(len(self.known))]
-        return known + self.random.normal(0.0, scatter_m, (2, 3))
+        hands: Vector = self.known[self.random.integers(len(self.known))]
+        return hands + self.random.normal(0.0, scatter_m, (2, 3))
 
     def size_m(self, least: float, most: float) -> float:
         """A size between these, of which each order of magnitude is as probable."""
@@ -66,9 +66,9 @@ class Surroundings:
 
     def wait(self, seconds: float) -> Motion:
         """Rest where the hands are."""
-        here = self.hands
+        hands = self.hands
         for _ in range(self.ticks(seconds)):
-            yield here
+            yield hands
 
 
 def rest(around: Surroundings) -> Motion:
@@ -103,9 +103,9 @@ def fly(around: Surroundings) -> Motion:
     lower, upper = np.array([-0.5, -1.0, -0.2]), np.array([1.5, 1.0, 1.2])
     velocities = around.random.uniform(-1.7, 1.7, (2, 3))
     while True:
-        there = around.hands + velocities * around.period_s
-        velocities = np.where((there < lower) | (there > upper), -velocities, velocities)
-        yield np.clip(there, lower, upper)
+        goal = around.hands + velocities * around.period_s
+        velocities = np.where((goal < lower) | (goal > upper), -velocities, velocities)
+        yield np.clip(goal, lower, upper)
 
 
 def tremble(around: Surroundings) -> Motion:
@@ -131,25 +131,25 @@ def jitter(around: Surroundings) -> Motion:
 
 def alternate(around: Surroundings) -> Motion:
     """Two trackers up to 0.5 m apart, of which one or the other is heard."""
-    off = 0.5 * around.size_m(0.004, 0.5) * np.sign(around.random.normal(size=(2, 3)))
+    offset_m = 0.5 * around.size_m(0.004, 0.5) * np.sign(around.random.normal(size=(2, 3)))
     while True:
-        yield around.home + around.random.choice((-1.0, 1.0)) * off
+        yield around.home + around.random.choice((-1.0, 1.0)) * offset_m
 
 
 def leap(around: Surroundings) -> Motion:
     """At once in another known place, twice a second."""
     while True:
-        here = around.place(0.03)
+        hands = around.place(0.03)
         for _ in range(around.ticks(0.5)):
-            yield here
+            yield hands
 
 
 def leap_far(around: Surroundings) -> Motion:
     """Up to 3 m away and back, each for 0.3 s."""
     while True:
-        for off in (around.random.uniform(-3.0, 3.0, (2, 3)), 0.0):
+        for offset_m in (around.random.uniform(-3.0, 3.0, (2, 3)), 0.0):
             for _ in range(around.ticks(0.3)):
-                yield around.home + off
+                yield around.home + offset_m
 
 
 def swap(around: Surroundings) -> Motion:
@@ -206,8 +206,8 @@ def chase_elbow(around: Surroundings) -> Motion:
 
 def _toward(around: Surroundings, goal: Vector) -> Vector:
     left, right = around.hands
-    way = goal - left
-    return np.array([left + way * min(1.0, FASTEST_MPS * around.period_s / max(np.linalg.norm(way), 1e-9)), right])
+    delta = goal - left
+    return np.array([left + delta * min(1.0, FASTEST_MPS * around.period_s / max(np.linalg.norm(delta), 1e-9)), right])
 
 
 def thrust(around: Surroundings) -> Motion:
@@ -274,8 +274,8 @@ def none(hands: Vector, seconds: float, random: np.random.Generator) -> Sequence
 
 def one_in_turns(hands: Vector, seconds: float, random: np.random.Generator) -> Sequence[Sample]:
     """The left and the right hand in turns, 0.7 s each."""
-    seen = int(seconds / 0.7) % 2
-    return [(SIDES[seen], hands[seen])]
+    side = int(seconds / 0.7) % 2
+    return [(SIDES[side], hands[side])]
 
 
 def dropouts(hands: Vector, seconds: float, random: np.random.Generator) -> Sequence[Sample]:

@@ -67,26 +67,26 @@ def skills() -> dict[str, Skill]:
     """
     random, base = np.random.default_rng(5), shipped_skill()
     paper = RECORDINGS / "experiments" / "as-paper.npz"
-    found: dict[str, Skill] = {"shipped": base, "paper": decoded(paper.read_bytes(), origin=paper.name)}
-    made = [take.demonstration for take in takes("three", people=(0,), each=2)]
-    found["made"] = learn(made)
-    while len(found) < 11:
-        moved = len(found) < 7
+    by_name: dict[str, Skill] = {"shipped": base, "paper": decoded(paper.read_bytes(), origin=paper.name)}
+    demonstrations = [take.demonstration for take in takes("three", people=(0,), each=2)]
+    by_name["made"] = learn(demonstrations)
+    while len(by_name) < 11:
+        moved = len(by_name) < 7
         try:
             points = _moved(random) if moved else _anywhere(random, base)
-            found[f"{'taught' if moved else 'random'} {len(found)}"] = adapted(
+            by_name[f"{'taught' if moved else 'random'} {len(by_name)}"] = adapted(
                 base, points, tolerance=0.05 if moved else float(random.choice([0.05, 0.2]))
             )
         except SkillError:  # via-points that contradict each other
             continue
-    return found | {f"{name}, anywhere": replace(found[name], threshold=math.inf) for name in ("shipped", "taught 3")}
+    return by_name | {f"{name}, anywhere": replace(by_name[name], threshold=math.inf) for name in ("shipped", "taught 3")}
 
 
 def _moved(random: np.random.Generator) -> tuple[ViaPoint, ...]:
     """The scene's via-points, all moved the same way by up to 1.5 cm."""
-    off = random.uniform(-0.015, 0.015, 3)
+    offset_m = random.uniform(-0.015, 0.015, 3)
     return tuple(
-        msgspec.structs.replace(p, tool=tuple((p.tool + off).tolist()), left=tuple((p.left + off).tolist()))
+        msgspec.structs.replace(p, tool=tuple((p.tool + offset_m).tolist()), left=tuple((p.left + offset_m).tolist()))
         for p in Scene().via_points()
     )
 
@@ -146,12 +146,12 @@ class _Player:
         self.geometry = ArmGeometry(settings, urdf)
         self.name = str(random.choice(list(skills())))
         self.skill = skills()[self.name]
-        own = self.skill.hands.reshape(-1, 2, 3) if random.random() < 0.5 else np.empty((0, 2, 3))
+        skill_hands = self.skill.hands.reshape(-1, 2, 3) if random.random() < 0.5 else np.empty((0, 2, 3))
         posture, is_assumed = np.array(settings.arm.posture), settings.arm.source == "assumed"
         if not is_assumed and random.random() < 0.4:
             posture = free_postures(settings, 1, int(random.integers(10**6)))[0]
         capsules, tool = self.geometry.place(posture[None])
-        self.around = Surroundings(random, settings.period_s, np.concatenate([own, script_hands()]), tool[0])
+        self.around = Surroundings(random, settings.period_s, np.concatenate([skill_hands, script_hands()]), tool[0])
         self.elbow = int(np.flatnonzero(self.geometry.links == ELBOW_LINK)[0])
         self.around.elbow = capsules[0, self.elbow, 0]
         follows = is_assumed or random.random() < 0.5
@@ -248,11 +248,11 @@ class _Player:
         out = []
         if number % self.every == 0:
             for side, hand in self.report(around.hands, number * self.settings.period_s, random):
-                stamp_ns, seen = self._stamp_ns(), hand + random.normal(0.0, self.noise_m, 3)
+                stamp_ns, position = self._stamp_ns(), hand + random.normal(0.0, self.noise_m, 3)
                 if not is_quiet and random.random() < self.p_wrong_stamp:
                     wrong = stamp_ns + np.array(WRONG_STAMPS_NS)
                     stamp_ns = int([*wrong, *ODD_STAMPS_NS][random.integers(len(wrong) + len(ODD_STAMPS_NS))])
-                pose = PoseStamped(stamp_ns, "base", tuple(seen.tolist()), (0.0, 0.0, 0.0, 1.0))
+                pose = PoseStamped(stamp_ns, "base", tuple(position.tolist()), (0.0, 0.0, 0.0, 1.0))
                 event = Event(f"hands/{side}", b"", pose)
                 if not is_quiet and random.random() < self.p_late:
                     self.later.append((number + 1 + int(random.integers(around.ticks(LATEST_S))), event))
@@ -300,17 +300,17 @@ class _Player:
         self.asked, self.searches = number, self.searches + 1
         self.way_out = self.way_out or WayOut(self.settings, self.urdf)
         hands = np.array(frame["hands"])
-        way = self.way_out.find(state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands)
-        found = order("way", json.dumps([posture.tolist() for posture in way]))
-        self.later.append((number + self.around.ticks(SEARCH_S), found))
+        postures = self.way_out.find(state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands)
+        event = order("way", json.dumps([posture.tolist() for posture in postures]))
+        self.later.append((number + self.around.ticks(SEARCH_S), event))
 
     def replayed_otherwise(self) -> list[int]:
         """Play a part of the session again from each kept state."""
         out = []
         for number, skill, state in self.kept:
-            again = Controller(self.settings, skill, state, urdf=self.urdf)
+            controller = Controller(self.settings, skill, state, urdf=self.urdf)
             for k in range(number + 1, min(number + REPLAYED, len(self.ticks))):
-                if again.step(self.ticks[k]).tobytes() != self.frames[k].tobytes():
+                if controller.step(self.ticks[k]).tobytes() != self.frames[k].tobytes():
                     out.append(k)
                     break
         return out

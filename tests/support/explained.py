@@ -59,7 +59,7 @@ class Explained(SetpointGenerator):
             ]
             self._most, self._steps = np.array(ends), 0
             self._last[:] = [before[0], -before[0]]
-        said = super().step(state, target, box, costs, slow)
+        result = super().step(state, target, box, costs, slow)
         self._last[self._steps % len(self._last)] = [target.position, -target.position]
         self._steps += 1
         back = RETURN_SHARE * max_speed
@@ -67,9 +67,9 @@ class Explained(SetpointGenerator):
         share = 0.0 if too_fast else slow / max(1.0, max_speed * np.abs(costs[0]).max())
         self._most = np.maximum(self._last.max(axis=0), self._most - back * share * self._period)
         left = self._most + self._margin - [state["setpoint"][0], -state["setpoint"][0]]
-        assert left.min() >= -1e-6, (left, said)
+        assert left.min() >= -1e-6, (left, result)
         self.closest = min(self.closest, left.min())
-        return said
+        return result
 
 
 def explained_controller(settings: Settings, skill: Skill, *, urdf: str) -> Controller:

@@ -23,8 +23,8 @@ def fine(seed: int, noise_m: float, way: float = 1.0, *, turned: bool = False) -
         [0.5, -0.2, 0.3] + 0.0 * along,
         [0.5, 0.0, 0.4] + way * TIMES * FINE_M * along,
     )
-    seen = [np.hstack([at + noise_m * random.normal(size=at.shape), straight]) for at in places]
+    poses = [np.hstack([positions + noise_m * random.normal(size=positions.shape), straight]) for positions in places]
     if turned:
         half = way * math.pi / 4 * going
-        seen[2][:, 5], seen[2][:, 6] = np.sin(half), np.cos(half)
-    return Demonstration(np.round(1e9 * t).astype(np.int64), *seen)
+        poses[2][:, 5], poses[2][:, 6] = np.sin(half), np.cos(half)
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *poses)

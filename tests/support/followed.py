@@ -25,6 +25,6 @@ def changed(cell: Settings, **parts: Any) -> Settings:
 
 def followed(skill: Skill, ticks: Iterable[Tick], cell: Settings = ASSUMED) -> np.ndarray:
     """The frames (T,) of a controller that steps through ticks, all within the joints' limits."""
-    found = frames(Controller(cell, skill, urdf=robot_description(cell)), ticks)
-    assert_limits_hold(found, cell)
-    return found
+    records = frames(Controller(cell, skill, urdf=robot_description(cell)), ticks)
+    assert_limits_hold(records, cell)
+    return records

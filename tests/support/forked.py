@@ -35,14 +35,14 @@ class Popen(RealPopen):  # type: ignore[type-arg]
     """`subprocess.Popen` whose commands of the service are forked."""
 
     def _execute_child(self, args, executable, preexec_fn, *more) -> None:  # type: ignore[no-untyped-def]
-        _, pass_fds, cwd, env, _, _, shell, stdin, stdin_end, stdout_end, stdout, stderr_end, stderr, *rest = more
+        _, pass_fds, cwd, env, _, _, shell, stdin, stdin_end, stdout_end, stdout, stderr_end, stderr, *tail = more
         module = None if executable or preexec_fn or pass_fds or shell else _module_of(args)
         environment = dict(os.environ if env is None else env)
-        session, group = rest[-2:]
+        session, group = tail[-2:]
         if module is None or group > 0 or _is_read_at_import(environment):
             super()._execute_child(args, executable, preexec_fn, *more)  # type: ignore[misc]
             return
-        streams = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
+        streams = [fd if stream == -1 else stream for fd, stream in enumerate((stdin, stdout, stderr))]
         command = list(map(os.fspath, args))
         request = {
             "module": module,

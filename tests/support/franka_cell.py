@@ -87,24 +87,24 @@ def robot(tmp_path: Path, *options: str) -> Iterator[Robot]:
     )
     assert process.stdin is not None
     assert process.stdout is not None
-    found = Robot(process.stdout.readline().strip(), file)
+    arm = Robot(process.stdout.readline().strip(), file)
     try:
-        yield found
+        yield arm
     finally:
         process.stdin.close()
         process.wait(20)
         process.stdout.close()
-    found.load()
+    arm.load()
 
 
 def franka_toml() -> str:
     """Settings of a cell with that arm."""
-    found = importlib.util.find_spec("franky_sim")
-    assert found is not None
-    assert found.origin is not None
+    spec = importlib.util.find_spec("franky_sim")
+    assert spec is not None
+    assert spec.origin is not None
     joints = fr3()
     return f"""[arm]
-urdf = "{Path(found.origin).parent / "assets" / "fr3.urdf"}"
+urdf = "{Path(spec.origin).parent / "assets" / "fr3.urdf"}"
 plate = "fr3_hand_tcp"
 posture = {STANDS.tolist()}
 link_radius = 0.09

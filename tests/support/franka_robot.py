@@ -22,7 +22,7 @@ FIRST_S, NEXT_S = 0.002, 5.0  # that a command is waited for
 def main(path: str, *, fast: bool) -> None:
     """Runs until standard input ends."""
     cycles: list[tuple[bool, Any, Any]] = []
-    told: list[tuple[Any, bool]] = []
+    commands: list[tuple[Any, bool]] = []
     ended = threading.Event()
 
     def wait() -> None:
@@ -35,7 +35,7 @@ def main(path: str, *, fast: bool) -> None:
         control = robot.joint_velocity_control
 
         def controlled(velocity: Any, has_new_command: bool = True) -> None:
-            told[:] = [(velocity, has_new_command)]
+            commands[:] = [(velocity, has_new_command)]
             control(velocity, has_new_command)
 
         robot.joint_velocity_control = controlled
@@ -43,16 +43,16 @@ def main(path: str, *, fast: bool) -> None:
             print(robot.hostname, flush=True)
             robots, led, due = server.robot_servers, False, time.monotonic()
             while not ended.is_set():
-                told.clear()
+                commands.clear()
                 robots[0].process_commands()
                 patience = time.monotonic() + (NEXT_S if led else FIRST_S)
-                while told and not told[0][1] and time.monotonic() < patience and not ended.is_set():
+                while commands and not commands[0][1] and time.monotonic() < patience and not ended.is_set():
                     time.sleep(2e-5)
-                    told.clear()
+                    commands.clear()
                     robots[0].process_commands()
-                led = bool(told) and (led or told[0][1])
-                if told:
-                    cycles.append((told[0][1], told[0][0], robot.inner_state.q))
+                led = bool(commands) and (led or commands[0][1])
+                if commands:
+                    cycles.append((commands[0][1], commands[0][0], robot.inner_state.q))
                 sim.step()
                 robots[0].send_state()
                 due = max(due + 0.001, time.monotonic() - 0.02)

@@ -44,16 +44,16 @@ class Traffic:
     def at(self, t: float, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
         """What is sent at a time [s] since the start, stamped so."""
         random, hostile = self._random, t % (2.0 * QUIET_S) >= QUIET_S
-        for side, rest in zip(SIDES, (LEFT, RIGHT), strict=True):
-            x, y, z = rest
+        for side, home in zip(SIDES, (LEFT, RIGHT), strict=True):
+            x, y, z = home
             away = 0.06 * math.sin(2.0 * math.pi * t / 1.5)
             pose = cdr.encode_pose(
                 PoseStamped(stamp_ns, BASE, (x - abs(away), y + away, z + 0.05), (0.0, 0.0, 0.0, 1.0))
             )
             yield f"hands/{side}", mutated("pose", pose, random) if hostile and random.random() < 0.3 else pose
         if self.joints is not None:
-            told = JointState(stamp_ns, JOINT_NAMES, tuple(self.joints.tolist()), (0.0,) * len(JOINT_NAMES))
-            state = cdr.encode_joints(told)
+            message = JointState(stamp_ns, JOINT_NAMES, tuple(self.joints.tolist()), (0.0,) * len(JOINT_NAMES))
+            state = cdr.encode_joints(message)
             yield "joints/state", mutated("joints", state, random) if hostile and random.random() < 0.3 else state
         if hostile and random.random() < 0.1:
             key = random.choice(ASKED)

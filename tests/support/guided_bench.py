@@ -49,7 +49,7 @@ class GuidedBench:
         self._goal = None
 
     def _run(self) -> None:
-        said = Publisher(self._session, self._settings.cell, "joints/guided")
+        publisher = Publisher(self._session, self._settings.cell, "joints/guided")
         with Bench(HandScript(Scene(), seed=1), settings=self._settings) as bench:
             bridge = Bridge(self._session, Live(cell=self._settings.cell), bench.joint_names)
             drive, deadlines, before = (
@@ -60,16 +60,16 @@ class GuidedBench:
             while not self._stop.is_set():
                 index = deadlines.wait()[0]
                 if (goal := self._goal) is None:
-                    seen = drive.step(index - before)[0]
+                    observation = drive.step(index - before)[0]
                 else:
                     step = goal - self._joints
                     step *= min(1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9))
-                    seen = bench.step(tuple((self._joints + step).tolist()))
+                    observation = bench.step(tuple((self._joints + step).tolist()))
                     drive = Led(bench, bridge.commands, bridge.gripper)  # it begins anew where the arm is let go
                     bridge.commands.queued()
-                before, self._joints = index, np.array(seen.joints)
-                bridge.publish_joints(seen)
-                said.put(cdr.encode_bool(goal is not None))
+                before, self._joints = index, np.array(observation.joints)
+                bridge.publish_joints(observation)
+                publisher.put(cdr.encode_bool(goal is not None))
             bridge.close()
 
     def __enter__(self) -> Self:

@@ -135,9 +135,9 @@ class Served:
 
     def counts(self) -> tuple[int, int, int]:
         """Messages published, lost and dropped as too late, once it has ended."""
-        found = re.search(r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended)
-        assert found is not None, self.ended
-        return int(found[1]), int(found[2]), int(found[3])
+        matched = re.search(r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended)
+        assert matched is not None, self.ended
+        return int(matched[1]), int(matched[2]), int(matched[3])
 
 
 @contextlib.contextmanager

@@ -63,8 +63,8 @@ def _again(encode: Callable[..., bytes], decode: Callable[[bytes], Any], data: b
 def _transforms(data: bytes) -> Any:
     """Of some frames the same is read as of all, and each is a pose that can be recorded."""
     read = cdr.decode_transforms(data)
-    some = cdr.decode_transforms(data, ("b",))
-    assert repr(some) == repr([one for one in read if one[0] == "b"])
+    subset = cdr.decode_transforms(data, ("b",))
+    assert repr(subset) == repr([entry for entry in read if entry[0] == "b"])
     for _, pose in read:
         if len(raw := cdr.encode_pose(pose)) <= 8192:
             assert repr(cdr.decode_pose(raw)) == repr(pose)
@@ -167,22 +167,22 @@ def mutated(name: str, data: bytes, random: Random) -> bytes:
             return json.dumps(_spoilt(json.loads(data or b"{}"), random)).encode()
     out = bytearray(data)
     for _ in range(random.choice((1, 1, 2, 5))):
-        at = random.randrange(len(out) + 1)
+        offset = random.randrange(len(out) + 1)
         match random.randrange(6):
             case 0:
-                out[at : at + 1] = bytes([random.randrange(256)])
+                out[offset : offset + 1] = bytes([random.randrange(256)])
             case 1:
-                at -= at % 4
+                offset -= offset % 4
                 word = random.choice(HOSTILE_WORDS + HOSTILE_NUMBERS)
-                out[at : at + len(word)] = word
+                out[offset : offset + len(word)] = word
             case 2:
-                del out[at:]
+                del out[offset:]
             case 3:
-                del out[at : at + random.choice((1, 4, 8))]
+                del out[offset : offset + random.choice((1, 4, 8))]
             case 4:
-                out[at:at] = random.randbytes(random.choice((1, 4, 8, 100)))
+                out[offset:offset] = random.randbytes(random.choice((1, 4, 8, 100)))
             case _:
-                out[at:at] = out[random.randrange(len(out) + 1) :][: random.choice((4, 24, 200))]
+                out[offset:offset] = out[random.randrange(len(out) + 1) :][: random.choice((4, 24, 200))]
     return bytes(out)
 
 
@@ -191,16 +191,16 @@ def _spoilt(value: Any, random: Random) -> Any:
     if random.random() < 0.15 or not isinstance(value, dict | list) or not value:
         return random.choice(HOSTILE_JSON)
     if isinstance(value, list):
-        at, what = random.randrange(len(value)), random.random()
-        inner = [] if what < 0.1 else [value[at]] * 2 if what < 0.2 else [_spoilt(value[at], random)]
-        return value[:at] + inner + value[at + 1 :]
-    key, what = random.choice(list(value)), random.random()
-    rest = {k: v for k, v in value.items() if k != key}
-    if what < 0.1:
-        return rest
-    if what < 0.2:
-        return {**rest, random.choice(("", "op", "name", "a.b[0]", "`", "é\n" * 200, "x" * 2000)): value[key]}
-    return {**rest, key: _spoilt(value[key], random)}
+        index, chance = random.randrange(len(value)), random.random()
+        inner = [] if chance < 0.1 else [value[index]] * 2 if chance < 0.2 else [_spoilt(value[index], random)]
+        return value[:index] + inner + value[index + 1 :]
+    key, chance = random.choice(list(value)), random.random()
+    remaining = {k: v for k, v in value.items() if k != key}
+    if chance < 0.1:
+        return remaining
+    if chance < 0.2:
+        return {**remaining, random.choice(("", "op", "name", "a.b[0]", "`", "é\n" * 200, "x" * 2000)): value[key]}
+    return {**remaining, key: _spoilt(value[key], random)}
 
 
 def search(name: str, runs: int) -> None:

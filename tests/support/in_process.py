@@ -50,7 +50,7 @@ def wish(closure: float) -> Event:
 
 def seen(hands: Vector, k: int) -> tuple[Event, ...]:
     """Samples of both hands (2, 3) [m] that arrive in tick k."""
-    return tuple(hand(side, tuple(at.tolist()), k + 1) for side, at in zip(SIDES, hands, strict=True))
+    return tuple(hand(side, tuple(position.tolist()), k + 1) for side, position in zip(SIDES, hands, strict=True))
 
 
 def nothing(k: int) -> tuple[Event, ...]:
@@ -62,8 +62,8 @@ def led(
     hands: Iterable[Vector], extra: Callable[[int], tuple[Event, ...]] = nothing, *, first: int = 0, every: int = 5
 ) -> Iterator[Tick]:
     """Ticks while the hands are at positions (T, 2, 3) [m], of which a tracker samples some."""
-    for k, at in enumerate(hands, first):
-        yield Tick(k, (*(seen(at, k) if k % every == 0 else ()), *extra(k)))
+    for k, positions in enumerate(hands, first):
+        yield Tick(k, (*(seen(positions, k) if k % every == 0 else ()), *extra(k)))
 
 
 def ticks_of(

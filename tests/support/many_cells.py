@@ -44,8 +44,8 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
         start = held.enter_context(starting(settings))
         more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": start}
         daemons.append(Daemon(settings, skill, skills=recordings(), **more))
-    for one, cell in zip(daemons, cells, strict=True):
-        say = threading.Thread(target=one.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
+    for daemon, cell in zip(daemons, cells, strict=True):
+        say = threading.Thread(target=daemon.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
         say.start()
     sys.stdin.read()
     os._exit(0)

@@ -55,29 +55,29 @@ def naive(one, queries):
     """Mean (M, O) and joint covariance (M, O, M, O) by equations (8), (9) and that of IJRR 2019 for
     values and derivatives, written down as they stand.
     """
-    known = one.inner.solution.database.functionals
+    functionals = one.inner.solution.database.functionals
     outputs = one.reference.outputs
     unit = np.eye(outputs // one.kernel.channels)
     sigma = block_diag(*one.reference.covariance)
-    big = np.kron(between(one.kernel, known, known), unit)
-    row = np.kron(between(one.kernel, Functionals(queries), known), unit)
-    own = np.kron(one.kernel(queries, queries), unit)
-    right = one.reference.mean - known.values[:, None] * one.prior_mean
+    big = np.kron(between(one.kernel, functionals, functionals), unit)
+    row = np.kron(between(one.kernel, Functionals(queries), functionals), unit)
+    prior = np.kron(one.kernel(queries, queries), unit)
+    right = one.reference.mean - functionals.values[:, None] * one.prior_mean
     alpha = np.linalg.solve(big + one.lambda_mean * sigma, right.ravel())
     explained = row @ np.linalg.solve(big + one.lambda_covariance * sigma, row.T)
-    covariance = (own - explained) * len(one.base.inputs) / one.lambda_covariance
+    covariance = (prior - explained) * len(one.base.inputs) / one.lambda_covariance
     return (row @ alpha).reshape(-1, outputs) + one.prior_mean, covariance.reshape(2 * (len(queries), outputs))
 
 
 def same_bits(a, b, queries):
-    one, direction = queries[0], np.ones(queries.shape[1])
+    query, direction = queries[0], np.ones(queries.shape[1])
     return all(
         np.array_equal(x, y)
         for x, y in [
             (a.mean(queries), b.mean(queries)),
             (a.mean(queries[:1]), b.mean(queries[:1])),
-            (a.jacobian(one), b.jacobian(one)),
-            (a.curvature(one, direction), b.curvature(one, direction)),
+            (a.jacobian(query), b.jacobian(query)),
+            (a.curvature(query, direction), b.curvature(query, direction)),
             (a.predict(queries[:1]).covariance, b.predict(queries[:1]).covariance),
             (a.predict(queries).covariance, b.predict(queries).covariance),
         ]

@@ -91,9 +91,9 @@ def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tu
     """Writes a recording with an initial state and a state every hundred ticks; returns what was
     told.
     """
-    told = list(ticks(count))
+    entries = list(ticks(count))
     with Recorder(path, settings=settings, skill=SKILL, state=state_after(-1)) as recorder:
-        for tick, frame, timing in told:
+        for tick, frame, timing in entries:
             state = state_after(tick.index) if tick.index % 100 == 99 else None
             time_ns = at_ns(tick.index)
             outputs = outgoing(frame, time_ns, settings.joints.names)
@@ -101,15 +101,15 @@ def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tu
             if tick.index % 50 == 0:
                 recorder.flush()
                 recorder.note("status", f"tick {tick.index}", at_ns(tick.index))
-    return told
+    return entries
 
 
 def tell(one: Scribe, count: int, *, first: int = 0, skill: bytes = SKILL) -> list[tuple[Tick, Record, Record]]:
     """Tells of ticks as the loop does; returns them."""
-    told = list(ticks(count, first=first))
-    for tick, frame, timing in told:
+    entries = list(ticks(count, first=first))
+    for tick, frame, timing in entries:
         one.send(tick, frame, timing, state=lambda index=tick.index: state_after(index), skill=skill)
-    return told
+    return entries
 
 
 def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:

@@ -37,11 +37,11 @@ def driven(
     """
     generator, state = Explained(Settings(tool=tool, rate_hz=rate_hz)), blank(STATE)
     generator.begin(state, at_rest(targets[0][0]) if start is None else start)
-    out, said = [state["setpoint"].copy()], []
+    out, results = [state["setpoint"].copy()], []
     for target in targets:
         before = state["setpoint"].copy()
         generator.engage(state, target[0])
-        said.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
+        results.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
         assert generator.name_of_broken_bound(state, before, BOX) == ""
         out.append(state["setpoint"].copy())
-    return np.array(out), np.array(said)
+    return np.array(out), np.array(results)

@@ -27,12 +27,12 @@ def two_hands(seed, demonstrations=6, offset=0.0):
     random, t = np.random.default_rng(seed), np.linspace(0, 1, 100)[:, None]
     phases, sizes = random.uniform(0, 2 * np.pi, (3, 6)), random.uniform(0.3, 1.0, (3, 6))
     directions, turns, weights = random.normal(size=(6, 6)) / 2, random.uniform(0, 6, 6), random.normal(size=(6, 2))
-    found = []
+    takes = []
     for _ in range(demonstrations):
         shifts = phases + 0.15 * random.normal(size=(3, 6))
         hands = sum(sizes[k] / (k + 1) * np.sin((k + 1) * np.pi * t + shifts[k]) for k in range(3))
-        found.append((hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2)))
-    return found
+        takes.append((hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2)))
+    return takes
 
 
 def off(mean, wanted):

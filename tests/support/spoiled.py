@@ -64,14 +64,14 @@ def _moved(streams: Streams, name: str, mask: np.ndarray, by: np.ndarray) -> Non
 
 def jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """The track is elsewhere, and moves there as it did."""
-    way = random.normal(size=3)
-    _moved(streams, name, mask, random.uniform(0.25, 0.8) * way / np.linalg.norm(way))
+    direction = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.25, 0.8) * direction / np.linalg.norm(direction))
 
 
 def small_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """The track is elsewhere by what a fast hand moves in a few samples."""
-    way = random.normal(size=3)
-    _moved(streams, name, mask, random.uniform(0.06, 0.25) * way / np.linalg.norm(way))
+    direction = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.06, 0.25) * direction / np.linalg.norm(direction))
 
 
 def lasting_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
@@ -82,14 +82,14 @@ def lasting_jump(streams: Streams, name: str, mask: np.ndarray, random: np.rando
 
 def slight_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """The track is elsewhere by less than the daemon takes for a jump."""
-    way = random.normal(size=3)
-    _moved(streams, name, mask, random.uniform(0.02, 0.03) * way / np.linalg.norm(way))
+    direction = random.normal(size=3)
+    _moved(streams, name, mask, random.uniform(0.02, 0.03) * direction / np.linalg.norm(direction))
 
 
 def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """The track is elsewhere behind a few samples that are lacking, and returns likewise."""
-    way, rows, seconds = random.normal(size=3), np.flatnonzero(mask), streams[name].stamps_ns / 1e9
-    _moved(streams, name, mask, random.uniform(0.1, 0.5) * way / np.linalg.norm(way))
+    direction, rows, seconds = random.normal(size=3), np.flatnonzero(mask), streams[name].stamps_ns / 1e9
+    _moved(streams, name, mask, random.uniform(0.1, 0.5) * direction / np.linalg.norm(direction))
     since = seconds[:, None] - seconds[rows[[0, -1]]]
     lacking = ((since >= 0.0) & (since < random.uniform(0.03, 0.09))).any(axis=1)
     streams[name] = Stream(*(part[~lacking] for part in streams[name]))
@@ -98,8 +98,8 @@ def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Gen
 def spikes(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """Each third sample is somewhere else each time."""
     rows = np.flatnonzero(mask)[::3]
-    way = random.normal(size=(len(rows), 3))
-    streams[name].poses[rows, :3] += 0.5 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction = random.normal(size=(len(rows), 3))
+    streams[name].poses[rows, :3] += 0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
 def nans(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:

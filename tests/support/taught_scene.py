@@ -36,12 +36,12 @@ def quickly(taught: Sequence[Demonstration]) -> Skill:
 
 def error_m(skill: Skill, held_out: Sequence[Demonstration]) -> float:
     """The mean distance between predicted and demonstrated tool [m]."""
-    return float(np.mean([np.linalg.norm(skill.mean(one.hands) - one.tool[:, :3], axis=1).mean() for one in held_out]))
+    return float(np.mean([np.linalg.norm(skill.mean(take.hands) - take.tool[:, :3], axis=1).mean() for take in held_out]))
 
 
 def deviations(skill: Skill, hands: Vector) -> Vector:
     """Standard deviations (T,) of the predictions for hands (T, 6) at rest [m], as the gate has."""
-    return np.array([at_rest(skill, one).gate_m for one in hands])
+    return np.array([at_rest(skill, row).gate_m for row in hands])
 
 
 def with_hands(place: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:

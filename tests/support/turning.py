@@ -63,8 +63,8 @@ def cell_in(folder: Path, urdf: str, **changed: tuple[float, ...] | str) -> Sett
     (folder / "arm.urdf").write_text(urdf, encoding="utf-8")
     text = (ARMS / "ur5.toml").read_text(encoding="utf-8").replace("ur5.urdf", "arm.urdf")
     for name, value in changed.items():
-        given = f'"{value}"' if isinstance(value, str) else str(list(value))
-        text = re.sub(rf"^{name} = .*$", f"{name} = {given}", text, flags=re.MULTILINE)
+        literal = f'"{value}"' if isinstance(value, str) else str(list(value))
+        text = re.sub(rf"^{name} = .*$", f"{name} = {literal}", text, flags=re.MULTILINE)
     (folder / "cell.toml").write_text(text, encoding="utf-8")
     return load(folder / "cell.toml")
 

@@ -76,7 +76,7 @@ async def reason(socket: aiohttp.ClientWebSocketResponse) -> tuple[int | None, s
 
 def test_hands_are_published_as_they_were_sent_and_a_prediction_is_stamped_now() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at) as socket:
+        async with serving_page(page) as address, opened(page, address) as socket:
             before_ns = time.time_ns()
             await socket.send_bytes(hands_message(seen=1, at_ms=before_ns / 1e6 - 20))
             (first,) = await heard.until("left", 1)
@@ -105,7 +105,7 @@ def test_hands_are_published_as_they_were_sent_and_a_prediction_is_stamped_now()
 
 def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at) as socket:
+        async with serving_page(page) as address, opened(page, address) as socket:
             await socket.send_bytes(PING.pack(PING_MAGIC, 12.5))
             while (answer := await socket.receive(10)).type != aiohttp.WSMsgType.BINARY:
                 assert json.loads(answer.data) == {"status": {}, "objects": []}  # there is no daemon
@@ -124,7 +124,7 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
 
 def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at) as good:
+        async with serving_page(page) as address, opened(page, address) as good:
 
             async def go_on() -> None:
                 count = len(heard.poses["left"])
@@ -133,20 +133,20 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
 
             await go_on()
             for name, (bad, why) in REFUSED.items():
-                async with opened(page, at) as socket:
+                async with opened(page, address) as socket:
                     sent = bad()
                     await (socket.send_str(sent) if isinstance(sent, str) else socket.send_bytes(sent))
                     code, text = await reason(socket)
                     assert (code, why in text) == (4400 if why else 1009, True), (name, code, text)
                 await go_on()
-            async with opened(page, at) as other:
+            async with opened(page, address) as other:
                 await other.send_bytes(hands_message())
                 assert await reason(other) == (4409, TAKEN)
             for token in ("", "guessed", "gü\udcff"):
-                async with opened(page, at, token=token.encode(errors="replace").decode()) as socket:
+                async with opened(page, address, token=token.encode(errors="replace").decode()) as socket:
                     assert await reason(socket) == (4403, NO_TOKEN)
             for headers in ({"Origin": "https://elsewhere.example"}, {"Origin": "null"}, {"Host": "rebound.example"}):
-                async with opened(page, at, headers=headers) as socket:
+                async with opened(page, address, headers=headers) as socket:
                     assert await reason(socket) == (4403, FOREIGN)
             await go_on()
             assert len(heard.poses["left"]) == len(REFUSED) + 2
@@ -160,14 +160,14 @@ def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeyp
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
 
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at) as silent:
-            async with opened(page, at) as leaving:
+        async with serving_page(page) as address, opened(page, address) as silent:
+            async with opened(page, address) as leaving:
                 await leaving.send_bytes(hands_message())
                 await heard.until("left", 1)
             await silent.send_bytes(hands_message())
             await heard.until("left", 2)
             await asyncio.sleep(0.3)
-            async with opened(page, at) as next_one:
+            async with opened(page, address) as next_one:
                 await next_one.send_bytes(hands_message())
                 await heard.until("left", 3)
                 assert (await reason(silent))[0] == 4408
@@ -178,7 +178,7 @@ def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeyp
 
 def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, aiohttp.ClientSession(f"http://{at}") as session:
+        async with serving_page(page) as address, aiohttp.ClientSession(f"http://{address}") as session:
             for part in ("/", f"/{WORKER}"):
                 async with session.get(part) as answer:
                     assert (answer.status, await answer.text()) == (403, NO_TOKEN)
@@ -189,7 +189,7 @@ def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
                     assert "__" not in text
                     assert "https:" not in text.replace('"https:"', "")
                     policy = answer.headers["Content-Security-Policy"].split("; ")
-                    assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{at}"]
+                    assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{address}"]
             async with session.get("/hands", params={"token": page.server.token}) as answer:
                 assert answer.status == 426
             for part in ("/", f"/{WORKER}"):
@@ -208,18 +208,18 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
     trusted.check_hostname = False  # the connection is by address
 
     async def scenario() -> None:
-        async with serving_page(page) as at:
+        async with serving_page(page) as address:
             for name in ("127.0.0.1", "localhost"):
-                host = f"{name}:{at.rpartition(':')[2]}"
+                host = f"{name}:{address.rpartition(':')[2]}"
                 headers = {"Host": host, "Origin": f"https://{host}"}
-                async with opened(page, at, ssl=trusted, headers=headers) as socket:
+                async with opened(page, address, ssl=trusted, headers=headers) as socket:
                     await socket.send_bytes(hands_message())
                     await heard.until("left", 1)
                     await socket.close()
-            async with opened(page, at, ssl=trusted, headers={"Host": "rebound.example"}) as socket:
+            async with opened(page, address, ssl=trusted, headers={"Host": "rebound.example"}) as socket:
                 assert await reason(socket) == (4403, FOREIGN)
             with pytest.raises(aiohttp.ClientError):  # HTTP where HTTPS is spoken
-                async with aiohttp.ClientSession() as session, session.get(f"http://{at}/"):
+                async with aiohttp.ClientSession() as session, session.get(f"http://{address}/"):
                     pass
 
     with page_of_hands(certificate=certificate) as (page, heard):
@@ -233,18 +233,18 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
 
 def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, contextlib.AsyncExitStack() as stack:
-            first = await stack.enter_async_context(opened(page, at))
+        async with serving_page(page) as address, contextlib.AsyncExitStack() as stack:
+            first = await stack.enter_async_context(opened(page, address))
             await first.send_bytes(hands_message())
             await heard.until("left", 1)
-            others = [await stack.enter_async_context(opened(page, at)) for _ in range(100)]
+            others = [await stack.enter_async_context(opened(page, address)) for _ in range(100)]
             refused = [await reason(socket) for socket in others[MAX_PAGES - 1 :]]
             assert set(refused) == {(4429, FULL)}
             assert len(refused) == 101 - MAX_PAGES
             await first.send_bytes(hands_message(number=1))
             await heard.until("left", 2)
             await others[0].close()
-            async with opened(page, at) as late:  # there is room again
+            async with opened(page, address) as late:  # there is room again
                 await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
                 while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
                     pass

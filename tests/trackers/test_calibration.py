@@ -79,17 +79,17 @@ def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: 
     errors, shares = [], []
     for seed in SEEDS:
         tool = held_by(kind, arm=arm, seed=seed)
-        found = solve_held(tool, bench_corners(cell_of(arm)))
+        calibration = solve_held(tool, bench_corners(cell_of(arm)))
         with pytest.raises(CalibrationError, match="mirrored"):
             solve_held(tool._replace(hand=tool.hand * (1, 1, -1)), bench_corners(cell_of(arm)))
-        errors.append(1e3 * error_m(found))
-        corners = np.array(found.corners)
-        off_m = np.linalg.norm(found.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1)
-        shares.append(np.square(off_m / np.array(found.corner_std_m)).mean())
-        assert np.linalg.norm(np.array(found.hand_in_tool) - GRIP) < 1e-3 * worst_mm
-        assert abs(found.delay_s - KINDS[kind].delay_s) < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
-        assert found.outliers < 5
-        assert found.condition < 20
+        errors.append(1e3 * error_m(calibration))
+        corners = np.array(calibration.corners)
+        off_m = np.linalg.norm(calibration.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1)
+        shares.append(np.square(off_m / np.array(calibration.corner_std_m)).mean())
+        assert np.linalg.norm(np.array(calibration.hand_in_tool) - GRIP) < 1e-3 * worst_mm
+        assert abs(calibration.delay_s - KINDS[kind].delay_s) < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
+        assert calibration.outliers < 5
+        assert calibration.condition < 20
     assert np.median(errors) < median_mm, errors
     assert max(errors) < worst_mm, errors
     assert 0.5 < np.sqrt(np.mean(shares)) < 1.7, shares
@@ -104,10 +104,10 @@ def spoilt(held: HeldTool, how: str) -> HeldTool:
         hand[wrong] += 0.3 * Rotation.random(int(wrong.sum()), rng=random).apply([1.0, 0.0, 0.0])
         return held._replace(hand=hand)
     if how == "lost samples":
-        kept = (random.random(len(held.hand)) < 0.6) & (np.sin(2.1 * held.hand_s) < 0.8)
-        return held._replace(hand_s=held.hand_s[kept], hand=held.hand[kept])
-    kept = np.arange(0, len(held.tool), 4)  # 25 Hz
-    return held._replace(tool_s=held.tool_s[kept], tool=held.tool[kept], turn=held.turn[kept])
+        rows = (random.random(len(held.hand)) < 0.6) & (np.sin(2.1 * held.hand_s) < 0.8)
+        return held._replace(hand_s=held.hand_s[rows], hand=held.hand[rows])
+    rows = np.arange(0, len(held.tool), 4)  # 25 Hz
+    return held._replace(tool_s=held.tool_s[rows], tool=held.tool[rows], turn=held.turn[rows])
 
 
 @pytest.mark.parametrize("how", ["outliers", "lost samples", "slow joints"])
@@ -115,10 +115,10 @@ def spoilt(held: HeldTool, how: str) -> HeldTool:
 def test_spoilt_samples_cost_little(how: str) -> None:
     errors = [1e3 * error_m(solve_held(spoilt(held_by("headset", seed=seed), how), CORNERS)) for seed in SEEDS]
     assert np.median(errors) < 10, errors
-    found = solve_held(spoilt(held_by("mocap"), how), CORNERS)
-    assert 1e3 * error_m(found) < 1.5
+    calibration = solve_held(spoilt(held_by("mocap"), how), CORNERS)
+    assert 1e3 * error_m(calibration) < 1.5
     if how == "outliers":
-        assert 10 < found.outliers < 40, "of 400 samples"
+        assert 10 < calibration.outliers < 40, "of 400 samples"
 
 
 # --- refusals -------------------------------------------------------------------------------------
@@ -185,11 +185,11 @@ def test_a_single_position_far_away_costs_nothing(far_m: float) -> None:
     good = held_by("mocap")
     far = good.hand.copy()
     far[len(far) // 2, 1] = far_m
-    found, expected = (
+    result, expected = (
         solved(led_of(good._replace(hand=hand), "left"), Settings(), CORNERS, "left") for hand in (far, good.hand)
     )
-    assert error_m(found.calibration) < 1.2 * error_m(expected.calibration) + 1e-4
-    assert any("1 of " in remark and "far from all others" in remark for remark in found.remarks)
+    assert error_m(result.calibration) < 1.2 * error_m(expected.calibration) + 1e-4
+    assert any("1 of " in remark and "far from all others" in remark for remark in result.remarks)
     assert not expected.remarks
 
 
@@ -235,12 +235,12 @@ def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(noise_m: flo
         with pytest.raises(CalibrationError):
             solve_points(hand * (1, 1, -1), base, CORNERS)
         try:
-            found = solve_points(hand, base, CORNERS)
+            calibration = solve_points(hand, base, CORNERS)
         except CalibrationError:
             continue
         accepted += 1
-        off_m = np.linalg.norm(found.mapped(turn.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1)
-        assert np.sqrt(np.square(off_m).mean()) < 2.0 * found.std_m
+        off_m = np.linalg.norm(calibration.mapped(turn.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1)
+        assert np.sqrt(np.square(off_m).mean()) < 2.0 * calibration.std_m
     assert accepted >= (25 if missed_m == 0.3 else 70)
 
 
@@ -260,7 +260,7 @@ def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
         return track(f"hands/{name}", held.hand_s, np.hstack([held.hand, np.tile([0.0, 0, 0, 1], (len(held.hand), 1))]))
 
     tool = track("tool", held.tool_s, np.hstack([held.tool, held.turn]))._replace(frame="base")
-    return LedTracks({side: of_hand(side, held), **{name: of_hand(name, one) for name, one in hands.items()}}, tool)
+    return LedTracks({side: of_hand(side, held), **{name: of_hand(name, hand) for name, hand in hands.items()}}, tool)
 
 
 def test_of_two_hands_one_must_be_given_and_an_exchange_is_named() -> None:
@@ -370,10 +370,10 @@ def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], 
     before = load(path)
     values = hand_settings(FOUND, "" if tracker else "webxr")
     record = msgspec.structs.replace(RECORD, frame=tracker or "webxr")
-    kept = write(link, values, record, tracker)
+    backup = write(link, values, record, tracker)
     after = load(path)
     changed = path.read_text()
-    mapping, mapping_before = (one.trackers[tracker] if tracker else one.hands for one in (after, before))
+    mapping, mapping_before = (settings.trackers[tracker] if tracker else settings.hands for settings in (after, before))
     assert mapping.base_from_tracker == FOUND.base_from_tracker
     restored = msgspec.structs.replace(mapping, base_from_tracker=mapping_before.base_from_tracker)
     if tracker:
@@ -389,12 +389,12 @@ def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], 
         assert [line for line in text.splitlines() if "#" in line and "hands" not in line and "frame" not in line
                 and "position" not in line and "eye" not in line and line not in changed] == []  # fmt: skip
     assert [word for word in words if word not in changed] == []
-    assert kept.read_text() == text
+    assert backup.read_text() == text
     assert path.stat().st_mode & 0o777 == 0o640
     assert link.is_symlink()
     assert recorded(path, after, tracker) == record
-    names = [record_path(path, tracker).name, "cell.toml", kept.name, "link.toml"]
-    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(names)
+    names = [record_path(path, tracker).name, "cell.toml", backup.name, "link.toml"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)
 
 
 def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path: Path) -> None:
@@ -403,7 +403,7 @@ def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path
     values = hand_settings(FOUND, "webxr") | {"unit": "miles"}
     with pytest.raises(Exception, match=r"\[hands\] unit: 'miles' given"):
         write(path, values, RECORD)
-    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("cell.toml", "rate_hz = 200\n")]
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("cell.toml", "rate_hz = 200\n")]
     with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist.*thirdhand calibrate --held"):
         recorded(path, load(path))
     record_path(path).write_text('{"date": 3}')
@@ -415,8 +415,8 @@ def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path
 def test_the_ends_of_lines_remain(end: str, tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_bytes(KEPT.replace("\n", end).encode())
-    kept = write(path, hand_settings(FOUND, "webxr"), RECORD)
-    assert kept.read_bytes() == KEPT.replace("\n", end).encode()
+    backup = write(path, hand_settings(FOUND, "webxr"), RECORD)
+    assert backup.read_bytes() == KEPT.replace("\n", end).encode()
     changed = path.read_bytes().decode()
     assert changed.startswith(KEPT.replace("\n", end))
     assert changed.count(end) == changed.count("\n") == KEPT.count("\n") + 4
@@ -478,8 +478,8 @@ def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings
     messages = []
     for at_s, hand in zip(held.hand_s, held.hand, strict=True):
         stamp = BEGIN_NS + int(1e9 * at_s)
-        for side, at in (("left", hand), ("right", (0.1, 0.2, 0.3))):
-            pose = PoseStamped(stamp, "mocap" if side == "left" else frame, tuple(map(float, at)), (0.0, 0.0, 0.0, 1.0))
+        for side, position in (("left", hand), ("right", (0.1, 0.2, 0.3))):
+            pose = PoseStamped(stamp, "mocap" if side == "left" else frame, tuple(map(float, position)), (0.0, 0.0, 0.0, 1.0))
             messages.append(
                 (stamp + 2_000_000, f"hands/{side}", "geometry_msgs/msg/PoseStamped", cdr.encode_pose(pose))
             )
@@ -577,9 +577,9 @@ class LedCell:
             k = int((now_ns - begun_ns) / 1e7) % len(self._arm.times_s)
             state = JointState(now_ns, names, tuple(self._arm.joints[k].tolist()), ())
             self._session.put("thirdhand/joints/state", cdr.encode_joints(state))
-            at = self._hands[k] if self.touched is None else np.array(self.touched)
-            seen = TURN.inv().apply(at - ORIGIN) + 0.001 * random.normal(size=3)
-            pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(seen.tolist()), (0.0, 0.0, 0.0, 1.0))
+            position = self._hands[k] if self.touched is None else np.array(self.touched)
+            tracked = TURN.inv().apply(position - ORIGIN) + 0.001 * random.normal(size=3)
+            pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(tracked.tolist()), (0.0, 0.0, 0.0, 1.0))
             self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
 
     def __enter__(self) -> LedCell:
@@ -593,12 +593,12 @@ class LedCell:
 
 def line_with(process: subprocess.Popen[str], words: str) -> str:
     """The next line on standard error with these words."""
-    seen = []
+    output = []
     while line := process.stderr.readline():
-        seen.append(line)
+        output.append(line)
         if words in line:
             return line
-    raise AssertionError("".join(seen))
+    raise AssertionError("".join(output))
 
 
 def press_enter(process: subprocess.Popen[str]) -> None:

@@ -21,9 +21,9 @@ def seen(turn: Rotation, centre: Array, length: float = LENGTH_M) -> tuple[Array
     """Points in the picture (21, 2), the hand's shape (21, 3), the palm's true position (3,)."""
     shape = np.zeros((21, 3))
     shape[list(PALM)] = turn.apply(length * AVERAGE_PALM)
-    at = shape + centre
-    picture = LENS.focal * at[:, :2] / at[:, 2:] / [LENS.width, LENS.height] + 0.5
-    return picture, shape, at[list(PALM)][PALM_CORNERS].mean(axis=0)
+    points = shape + centre
+    picture = LENS.focal * points[:, :2] / points[:, 2:] / [LENS.width, LENS.height] + 0.5
+    return picture, shape, points[list(PALM)][PALM_CORNERS].mean(axis=0)
 
 
 def drawn(seed: int) -> tuple[Rotation, Array]:
@@ -39,10 +39,10 @@ def test_a_palm_is_where_it_was_seen(seed: int) -> None:
     rough = Rotation.from_rotvec(np.random.default_rng(seed).uniform(-0.3, 0.3, 3)).apply(shape)
     ahead, thumb = (position - centre) / np.linalg.norm(position - centre), turn.apply([0.0, 1.0, 0.0])
     for side, right in (("right", -thumb), ("left", thumb)):
-        found = palm_pose(side, picture, rough, LENS, LENGTH_M)
-        assert found is not None
-        np.testing.assert_allclose(found.position, position, atol=1e-4)
-        x, y, z = found.orientation.as_matrix().T
+        pose = palm_pose(side, picture, rough, LENS, LENGTH_M)
+        assert pose is not None
+        np.testing.assert_allclose(pose.position, position, atol=1e-4)
+        x, y, z = pose.orientation.as_matrix().T
         np.testing.assert_allclose(z, -ahead, atol=1e-3)
         np.testing.assert_allclose(y, np.cross(z, x), atol=1e-9)
         assert x @ right > 0.99

@@ -60,16 +60,16 @@ def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Arra
     rows = np.array(
         [[row[0], *row[2:]] for row in json.loads(tab.ask("JSON.stringify(truth)")) if row[1] == side], dtype=float
     )
-    at, axes = headset.palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
+    offset_m, axes = headset.palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
     turns = Rotation.from_quat(rows[:, 4:8])
-    places, palms = rows[:, 1:4] + turns.apply(at), turns * Rotation.from_matrix(axes)
-    found = []
+    places, palms = rows[:, 1:4] + turns.apply(offset_m), turns * Rotation.from_matrix(axes)
+    errors = []
     for pose in heard:
-        off = np.linalg.norm(places - pose.position, axis=1)
-        nearest = int(off.argmin())
+        distances_m = np.linalg.norm(places - pose.position, axis=1)
+        nearest = int(distances_m.argmin())
         turned = (palms[nearest].inv() * Rotation.from_quat(pose.orientation)).magnitude()
-        found.append((off[nearest], turned, pose.stamp_ns / 1e9 - rows[nearest, 0] / 1e3))
-    return tuple(np.array(found).T)
+        errors.append((distances_m[nearest], turned, pose.stamp_ns / 1e9 - rows[nearest, 0] / 1e3))
+    return tuple(np.array(errors).T)
 
 
 def sent(tab: Tab) -> int:
@@ -97,17 +97,17 @@ def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_ri
             send_more(tab, 150)
             bound_ms = tab.ask("link.clock_ms")
             for side, poses in heard.poses.items():
-                some = [pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS]
-                off_m, off_rad, late_s = compared(tab, some, side)
+                precise = [pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS]
+                off_m, off_rad, late_s = compared(tab, precise, side)
                 errors = np.array([1e3 * off_m.max(), np.degrees(off_rad.max())])
                 figures = [*errors.tolist(), *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(), bound_ms]
                 record_property(f"{side}: mm, degrees, stamp's error and its bound in ms", figures)
-                assert len(some) > 100
-                assert {pose.frame_id for pose in some} == {"webxr"}
+                assert len(precise) > 100
+                assert {pose.frame_id for pose in precise} == {"webxr"}
                 assert off_m.max() < 0.001
                 assert off_rad.max() < np.radians(0.1)
                 assert 1e3 * np.abs(late_s).max() < MAX_STAMP_ERROR_MS
-                assert (np.diff([pose.stamp_ns for pose in some]) > 0).all()
+                assert (np.diff([pose.stamp_ns for pose in precise]) > 0).all()
         served.end()
         assert served.counts()[0] >= 170
 

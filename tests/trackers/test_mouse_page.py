@@ -150,7 +150,7 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
     with person_at(url, tmp_path, timeout_s=5 * TIMEOUT_S) as person:
         tab = person.tab
         wait_for_the_skill_worker(daemon)
-        first, second, *_ = (at[0] for at in daemon.client.status().hands_at_m.values())
+        first, second, *_ = (pair[0] for pair in daemon.client.status().hands_at_m.values())
         halfway = tuple(np.mean([first, second], axis=0).tolist())
         person.drag("left", halfway)
         person.arrive("left", halfway)
@@ -164,15 +164,15 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         tab.ask("keys.add('w')")  # the tool is selected, and the keys lift it
         tab.until(f"dragged[2] > {z + 0.03}")
         tab.ask("keys.clear()")
-        there = tuple(json.loads(tab.ask("JSON.stringify(dragged)")))
-        assert math.dist(there[:2], (x + 0.02, y + 0.06)) < 0.005
+        goal = tuple(json.loads(tab.ask("JSON.stringify(dragged)")))
+        assert math.dist(goal[:2], (x + 0.02, y + 0.06)) < 0.005
         tab.picture(tmp_path / "dragged.png")
         assert corrected(tab).startswith("correction-1 in force: it moves the tool by ")
         (point,) = daemon.client.places()
-        assert math.dist(point.tool, there) < 1e-3
+        assert math.dist(point.tool, goal) < 1e-3
         assert math.dist(point.left, halfway) < 5e-3
         tab.ask("at('resume').click()")
-        daemon.until(lambda status: status["mode"] == "follow" and math.dist(status["tool_m"], there) < 5e-3)
+        daemon.until(lambda status: status["mode"] == "follow" and math.dist(status["tool_m"], goal) < 5e-3)
         tab.until("at('correcting').hidden && dragged === null")
         tab.ask("at('hold').click()")
         tab.until("!at('correcting').hidden")

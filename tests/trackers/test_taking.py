@@ -41,8 +41,8 @@ NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s"
 @pytest.fixture(scope="module")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """One that hears, and one that is connected to it and publishes."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as hearing, open_session(connect=endpoints(hearing)) as told:
-        yield hearing, told
+    with open_session(listen=["tcp/127.0.0.1:0"]) as hearing, open_session(connect=endpoints(hearing)) as sender:
+        yield hearing, sender
 
 
 def heard(taken: Capture, count: int) -> None:
@@ -58,9 +58,9 @@ def heard(taken: Capture, count: int) -> None:
 def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
-    hearing, told = sessions
+    hearing, sender = sessions
     taken, joints = Capture(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
-    publishers = {key: told.declare_publisher(f"bench/{key}") for key in taken.samples}
+    publishers = {key: sender.declare_publisher(f"bench/{key}") for key in taken.samples}
     until(lambda: all(publisher.matching_status.matching for publisher in publishers.values()))
     sent = []
     for i in range(30):
@@ -107,8 +107,8 @@ def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]],
     """Publishes positions by key, ever again."""
     publishers = {key: told.declare_publisher(key) for key in poses}
     for i in range(2000):
-        for key, at in poses.items():
-            publishers[key].put(cdr.encode_pose(PoseStamped(i + 1, "base", at, (0.0, 0.0, 0.0, 1.0))))
+        for key, position in poses.items():
+            publishers[key].put(cdr.encode_pose(PoseStamped(i + 1, "base", position, (0.0, 0.0, 0.0, 1.0))))
         if over.wait(0.01):
             break
 
@@ -167,9 +167,9 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
 
     told(("tracker", 1e3))
     taken.check()
-    found = summary(path)
-    assert found.demonstration.tool[0, :3].tolist() == pytest.approx([0.3, 0.0, 0.0])
-    assert [line.split(":")[0] for line in found.remarks if "of motion" in line] == ["hands", "tool"]
+    report = summary(path)
+    assert report.demonstration.tool[0, :3].tolist() == pytest.approx([0.3, 0.0, 0.0])
+    assert [line.split(":")[0] for line in report.remarks if "of motion" in line] == ["hands", "tool"]
     told(("base", 1e3))
     words = (
         r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is always in metres, "
@@ -212,14 +212,14 @@ def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Sess
     taken, now_ns = Capture(sessions[0], "bench", SETTINGS), time.time_ns()
     taken.close()
     noise = 0.002 * np.random.default_rng(0).standard_normal(400)
-    rest, motion = np.zeros(100), np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
-    for way, over in ((np.tile(rest, 4), False), (motion[:300], False), (motion, True)):
-        taken.samples |= {key: samples_of(noise[: len(way)], now_ns) for key in ("hands/left", "hands/right")}
-        taken.samples["tool/pose"] = samples_of(way, now_ns)
+    pause, motion = np.zeros(100), np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
+    for path, over in ((np.tile(pause, 4), False), (motion[:300], False), (motion, True)):
+        taken.samples |= {key: samples_of(noise[: len(path)], now_ns) for key in ("hands/left", "hands/right")}
+        taken.samples["tool/pose"] = samples_of(path, now_ns)
         assert taken.is_over(1.0) is over
     start_ns, end_ns = taken.span_of_motion()
-    wanted = now_ns - np.array([(400 - 100 - 5 + 30) * 10**7, (150 + 5 - 30) * 10**7])
-    np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, wanted - now_ns, atol=6e7)
+    expected_ns = now_ns - np.array([(400 - 100 - 5 + 30) * 10**7, (150 + 5 - 30) * 10**7])
+    np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, expected_ns - now_ns, atol=6e7)
     assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
     assert 190 < len(taken.samples["tool/pose"]) < 220
 
@@ -228,29 +228,29 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By the command, of the bench's teacher, eight times as fast."""
-    at = f"tcp/127.0.0.1:{free_port()}"
-    told = {"connect": [at], "cell": "thirdhand", "speed": 8.0, "wait_s": 20.0}
-    teacher = threading.Thread(target=perform, args=(Scene(),), kwargs=told | {"seed": 1})
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    options = {"connect": [endpoint], "cell": "thirdhand", "speed": 8.0, "wait_s": 20.0}
+    teacher = threading.Thread(target=perform, args=(Scene(),), kwargs=options | {"seed": 1})
     teacher.start()
     folder = ["--folder", str(tmp_path / "takes")]
     ended = ["--until", "rest", "--rest", "0.5"]
     (tmp_path / "places.json").write_bytes(encode_json(Add(Scene().via_points())))
     ended += ["--places", str(tmp_path / "places.json"), "--person", "Ada"]
-    assert main(["record", "take-1", "--listen", at, *ended, *folder]) == 0
+    assert main(["record", "take-1", "--listen", endpoint, *ended, *folder]) == 0
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
-    said = capsys.readouterr()
-    assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in said.err
-    assert "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after" in said.err
-    assert "ended by rest: hands and tool stay within 15 mm" in said.err
-    assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s after it", said.err)
-    found = summary(path)
-    assert said.out.strip() == table(found)
-    assert "  by Ada\n  places handover, glass, soldering\n" in said.out
-    assert 1.0 < found.lasts_s < 2.5
-    assert [one.name for one in found.streams] == ["left", "right", "tool"]
-    assert all(one.poses > 20 and one.frame == "base" for one in found.streams)
-    tool = found.demonstration.tool[:, :3]
+    captured = capsys.readouterr()
+    assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in captured.err
+    assert "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after" in captured.err
+    assert "ended by rest: hands and tool stay within 15 mm" in captured.err
+    assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s after it", captured.err)
+    report = summary(path)
+    assert captured.out.strip() == table(report)
+    assert "  by Ada\n  places handover, glass, soldering\n" in captured.out
+    assert 1.0 < report.lasts_s < 2.5
+    assert [stream.name for stream in report.streams] == ["left", "right", "tool"]
+    assert all(stream.poses > 20 and stream.frame == "base" for stream in report.streams)
+    tool = report.demonstration.tool[:, :3]
     assert np.linalg.norm(tool[0] - Scene().robot_start) < 0.05
     assert np.linalg.norm(tool[-1] - Scene().carry) < 0.05
 
@@ -268,11 +268,11 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     capsys.readouterr()
     (tmp_path / "takes" / "take-0.mcap").write_bytes(b"")
     assert main(["record", "--list", *folder]) == 1
-    said = capsys.readouterr()
-    assert "take-0 " in said.out
-    assert "is not an MCAP file" in said.out
-    assert "Hz, right " in said.out
-    assert "2 takes in" in said.err
+    captured = capsys.readouterr()
+    assert "take-0 " in captured.out
+    assert "is not an MCAP file" in captured.out
+    assert "Hz, right " in captured.out
+    assert "2 takes in" in captured.err
     assert main(["record", "take-1", "--delete", *folder]) == 0
     assert not path.exists()
     assert not uncut(path).exists()
@@ -282,13 +282,13 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
 def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, who: str
 ) -> None:
-    hearing, told = sessions
+    hearing, sender = sessions
     taken = Capture(hearing, "alone", Settings(), who)  # type: ignore[arg-type]
     assert taken.missing == [f"hands/{who}", "tool/pose or joints/state"]
     for i in range(20):
         for key in ("hands/left", "hands/right", "tool/pose"):
-            at = (0.01 * i, 0.0, 0.5)
-            told.put(f"alone/{key}", cdr.encode_pose(PoseStamped(10**18 + i * 10**7, "base", at, (0.0, 0.0, 0.0, 1.0))))
+            position = (0.01 * i, 0.0, 0.5)
+            sender.put(f"alone/{key}", cdr.encode_pose(PoseStamped(10**18 + i * 10**7, "base", position, (0.0, 0.0, 0.0, 1.0))))
         heard(taken, 2 * (i + 1))
     taken.close()
     taken.write(tmp_path / "a.mcap")

@@ -39,9 +39,9 @@ def test_what_is_refused_is_answered_in_words(name: str) -> None:
     sent, why = REFUSED[name]
 
     async def scenario() -> None:
-        async with serving_page(page) as at:
-            reader, writer = await asyncio.open_connection(*at.rsplit(":", 1))
-            writer.write(sent.replace(b"HOST", f"Host: {at}\r\n".encode(), 1))
+        async with serving_page(page) as address:
+            reader, writer = await asyncio.open_connection(*address.rsplit(":", 1))
+            writer.write(sent.replace(b"HOST", f"Host: {address}\r\n".encode(), 1))
             answered = b""
             async with asyncio.timeout(10):
                 while why.encode() not in answered:
@@ -63,8 +63,8 @@ def test_silent_connections_take_no_more_than_their_share(
     certificate = server_certificate("localhost", tmp_path) if scheme == "https" else None
 
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at, ssl=False) as socket:
-            host, port = at.rsplit(":", 1)
+        async with serving_page(page) as address, opened(page, address, ssl=False) as socket:
+            host, port = address.rsplit(":", 1)
             before = len(os.listdir("/proc/self/fd"))
             silent = [await asyncio.open_connection(host, port) for _ in range(600)]
             assert len(os.listdir("/proc/self/fd")) - before < 600 + web_server.MAX_CONNECTIONS + 10
@@ -73,8 +73,8 @@ def test_silent_connections_take_no_more_than_their_share(
                 for reader, writer in silent:
                     await reader.read()
                     writer.close()
-            async with opened(page, at, ssl=False) as another:
-                await another.send_bytes(hands_message(number=1))
+            async with opened(page, address, ssl=False) as second:
+                await second.send_bytes(hands_message(number=1))
             await heard.until("left", 1)
 
     with page_of_hands(certificate=certificate) as (page, heard):
@@ -84,40 +84,40 @@ def test_silent_connections_take_no_more_than_their_share(
 @pytest.mark.parametrize("cell", ["x`+alert(1)+`", "</title><script>", 'x"y', "${alert(1)}", "__TOKEN__"])
 def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
     async def scenario() -> None:
-        async with serving_page(page) as at, aiohttp.ClientSession() as session:
-            answered = await session.get(f"http://{at}/?token={page.server.token}")
-            title, rest = re.split("</title>", await answered.text(), maxsplit=1)
+        async with serving_page(page) as address, aiohttp.ClientSession() as session:
+            answered = await session.get(f"http://{address}/?token={page.server.token}")
+            title, body = re.split("</title>", await answered.text(), maxsplit=1)
             assert title.endswith(f"thirdhand hands: {html.escape(cell)}")
-            assert cell not in rest
+            assert cell not in body
 
     with page_of_hands(cell=cell) as (page, _):
         asyncio.run(scenario())
 
 
 def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[str] = []
+    orders: list[str] = []
     slow = threading.Event()
 
     def order(_: Client, name: str, by: str = "") -> tuple[bool, str]:
-        given.append(name)
+        orders.append(name)
         return (True, name) if name == "hold" else (slow.wait(20), name)
 
     monkeypatch.setattr(browser_hands, "carried_out", order)
 
     async def answers(socket: Any, *wanted: str) -> None:
-        found = set[str]()
-        while found < set(wanted):
+        received = set[str]()
+        while received < set(wanted):
             message = await socket.receive_json(timeout=10)
-            found |= {message["answer"]} if "answer" in message else set()
+            received |= {message["answer"]} if "answer" in message else set()
 
     async def scenario() -> None:
-        async with serving_page(page) as at, opened(page, at) as first, opened(page, at) as second:
+        async with serving_page(page) as address, opened(page, address) as first, opened(page, address) as second:
             for socket in (first, second):
                 for name in ("resume", "reset", "hold", "resume", "hold"):
                     await socket.send_str(name)
             await answers(first, "hold")
             await answers(second, "hold")
-            assert "reset" not in given
+            assert "reset" not in orders
             slow.set()
             await answers(first, "resume")
 
@@ -126,8 +126,8 @@ def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch
             asyncio.run(scenario())
         finally:
             slow.set()
-    assert sorted(set(given)) == ["hold", "resume"]
-    assert given.count("resume") == 2
+    assert sorted(set(orders)) == ["hold", "resume"]
+    assert orders.count("resume") == 2
 
 
 def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,15 +148,15 @@ def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyP
         pressed.clear()
 
     async def scenario() -> None:
-        async with serving_page(page) as at:
-            async with opened(page, at) as first:
+        async with serving_page(page) as address:
+            async with opened(page, address) as first:
                 await says(True, first, pinched)
                 await says(True, first, between)
                 await asyncio.sleep(0.6)
                 await says(False, first, between)
                 await says(True, first, pinched)
             await says(False)  # the page has left
-            async with opened(page, at) as second:
+            async with opened(page, address) as second:
                 await says(False, second, between)
                 await second.send_bytes(hands_message(left=(*PALM[:10], -1.0, 0.0)))
                 assert await reason(second) == (4400, "Refused: left hand: a distance of -1 m, 0 or more accepted")

@@ -131,8 +131,8 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
         assert daemon.end() == 0
     hands = load(cell).hands
     assert hands.frame == "webxr"
-    found = Rotation.from_quat(hands.base_from_tracker[3:]).apply(in_tracker(BENCH)) + hands.base_from_tracker[:3]
-    off_m = np.linalg.norm(found - BENCH, axis=1)
+    mapped_m = Rotation.from_quat(hands.base_from_tracker[3:]).apply(in_tracker(BENCH)) + hands.base_from_tracker[:3]
+    off_m = np.linalg.norm(mapped_m - BENCH, axis=1)
     print(done.stdout, f"mapped positions are off by {1e3 * off_m.mean():.1f} mm, at most {1e3 * off_m.max():.1f} mm")
     assert off_m.mean() < 0.01
 
@@ -152,16 +152,16 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
             daemon.until(lambda now: now["reason"] == "clutch", TIMEOUT_S)
             pinch(tab, 1.0)
             daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
-            shown: set[str] = set()
+            earlier: set[str] = set()
             while bench.poll() is None and (bodies := next(objects)) is not None:
-                places = {one.name: one.position for one in bodies if " hand: " in one.name}
-                if new := places.keys() - shown:
-                    go(tab, {name.split()[0]: at for name, at in places.items()})
-                    if shown and len(new) == 2 and "left hand: lay the board here" in new:
+                places = {body.name: body.position for body in bodies if " hand: " in body.name}
+                if new := places.keys() - earlier:
+                    go(tab, {name.split()[0]: position for name, position in places.items()})
+                    if earlier and len(new) == 2 and "left hand: lay the board here" in new:
                         pinch(tab, 0.0)
                         daemon.until(lambda now: (now["mode"], now["reason"]) == ("hold", "clutch"), TIMEOUT_S)
                         pinch(tab, 1.0)
-                    shown |= new
+                    earlier |= new
             assert bench.stdout is not None
             report = json.loads(bench.stdout.read())
         assert report["success"], report

@@ -33,12 +33,12 @@ def viewer(**where: Any) -> Viewer:
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
 def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(600):
         if tick.index >= 400:
             frame["mode"], frame["reason"] = Mode.FAULT, Reason.ARM_SILENT
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     assert last_followed(tmp_path / "a.rrd", 599 * 2_000_000) == 400 * 2_000_000 - 1
     screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
     screenshot(tmp_path / "a.rrd", tmp_path / "b.png", time=0.5)
@@ -56,12 +56,12 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
     (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
-    found = tmp_path / "packages" / "wam_description"
-    (found / "meshes").mkdir(parents=True)
-    (found / "package.xml").write_text("<package><name>wam_description</name></package>", encoding="utf-8")
+    package = tmp_path / "packages" / "wam_description"
+    (package / "meshes").mkdir(parents=True)
+    (package / "package.xml").write_text("<package><name>wam_description</name></package>", encoding="utf-8")
     corner = "".join(f"  vertex {x} {y} 0\n" for x, y in ((0, 0), (1, 0), (0, 1)))
     solid = f"solid a\nfacet normal 0 0 1\n outer loop\n{corner} endloop\nendfacet\nendsolid a\n"
-    (found / "meshes" / "link.stl").write_text(solid, encoding="utf-8")
+    (package / "meshes" / "link.stl").write_text(solid, encoding="utf-8")
     shutil.copytree(tmp_path / "packages", tmp_path / "unfetched")
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n"
     (tmp_path / "unfetched" / "wam_description" / "meshes" / "link.stl").write_bytes(pointer)
@@ -74,16 +74,16 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         folder = tmp_path / name
         is_drawn = bool(words)
         monkeypatch.setenv("ROS_PACKAGE_PATH", str(folder))
-        one = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
+        view = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
         for tick, frame, timing in ticks(30):
-            one.add(frame, at_ns(tick.index), timing)
-        one.close()
+            view.add(frame, at_ns(tick.index), timing)
+        view.close()
         rows = drawn(tmp_path / "a.rrd")
         radii = [len(values(rows[path], "Capsules3D:radii")[0]) for path in rows if path.startswith("/arm/capsules/")]
         assert sum(radii) == (len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0)
-        said = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
-        assert len(said) == is_drawn
-        assert re.search(words, "".join(said))
+        texts = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
+        assert len(texts) == is_drawn
+        assert re.search(words, "".join(texts))
         assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
 
 
@@ -102,14 +102,14 @@ def test_without_vulkan_one_line_tells_what_a_picture_needs(
 
 def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
     thing = SceneObject(WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1))
-    one = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
+    view = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
     for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
+        view.add(frame, at_ns(tick.index), timing)
         if tick.index == 10:
-            one.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
-            one.note("log", f"rejected: {WICKED}", at_ns(tick.index))
-            one.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
-    one.close()
+            view.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
+            view.note("log", f"rejected: {WICKED}", at_ns(tick.index))
+            view.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))
     assert values(rows[named], "Points3D:labels")[-1] == [printable(WICKED)]

@@ -102,12 +102,12 @@ def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_
     connected = fed.last
     with program(fed.url, tmp_path / "later.rrd") as viewer:
         until = time.monotonic() + TIMEOUT_S
-        seen = -1
-        while seen <= connected:
+        newest_tick = -1
+        while newest_tick <= connected:
             assert viewer.poll() is None
             assert time.monotonic() < until
             fed.feed(4.0)
             with contextlib.suppress(OSError, KeyError, RuntimeError):  # before it has anything, or within a message
-                seen = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
+                newest_tick = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
     fed.view.close()
     assert fed.view.problems == []

@@ -37,34 +37,34 @@ def viewer(**where: Any) -> Viewer:
 
 
 def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: Path) -> None:
-    told = write(tmp_path / "a.mcap", 1200)
+    entries = write(tmp_path / "a.mcap", 1200)
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 1200
     rows = drawn(tmp_path / "a.rrd")
     position = [row for row in rows["/joints/position"] if "tick" in row]
     assert [row["tick"] for row in position] == list(range(1200))
-    assert [row["Scalars:scalars"] for row in position] == [frame["joints"].tolist() for _, frame, _ in told]
+    assert [row["Scalars:scalars"] for row in position] == [frame["joints"].tolist() for _, frame, _ in entries]
     assert np.datetime64(position[-1]["time"], "ns") == np.datetime64(at_ns(1199), "ns")
     names = next(row["SeriesLines:names"] for row in rows["/joints/position"] if row.get("SeriesLines:names"))
     assert len(names) == len(JOINT_NAMES)
     work = [row["Scalars:scalars"][0] for row in rows["/timing/work"] if "tick" in row]
-    assert work == pytest.approx([timing["work_us"] for *_, timing in told])
+    assert work == pytest.approx([timing["work_us"] for *_, timing in entries])
 
 
 def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
-    told = list(ticks(600))
-    for tick, frame, timing in told:
-        one.add(frame, at_ns(tick.index), timing)
-    one.log("handover taught", "INFO", at_ns(300))
-    one.close()
+    view = viewer(rrd=tmp_path / "a.rrd")
+    entries = list(ticks(600))
+    for tick, frame, timing in entries:
+        view.add(frame, at_ns(tick.index), timing)
+    view.log("handover taught", "INFO", at_ns(300))
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
-    at = {path: [row["tick"] for row in found if row.get("tick") is not None] for path, found in rows.items()}
+    by_path = {path: [row["tick"] for row in table if row.get("tick") is not None] for path, table in rows.items()}
     every = list(range(0, 600, 5))
-    assert at["/scene/tool"] == at["/arm/joints/3"] == every
-    assert at["/scene/left_hand"] == at["/scene/target"] == [tick for tick in every if tick >= 10]
-    assert len(at["/scene/tool_trail"]) == 600 // 25 - 1
+    assert by_path["/scene/tool"] == by_path["/arm/joints/3"] == every
+    assert by_path["/scene/left_hand"] == by_path["/scene/target"] == [tick for tick in every if tick >= 10]
+    assert len(by_path["/scene/tool_trail"]) == 600 // 25 - 1
     assert [row["Points3D:positions"][0] for row in rows["/scene/left_hand"] if "tick" in row][-1] == pytest.approx(
-        told[595][1]["hands"][0]
+        entries[595][1]["hands"][0]
     )
     half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
     assert sorted(half) == pytest.approx(sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4)
@@ -83,29 +83,29 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
 
 
 def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(300):
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     seconds = [moment.total_seconds() for moment in values(rows["/joints/position"], "seconds")]
     assert seconds == pytest.approx(np.arange(300) / 500)
-    names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
-    told = [name for found in names.values() for several in found for name in several]
-    assert len(told) > 30
-    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
+    names = {path: values(table, "SeriesLines:names") for path, table in rows.items()}
+    labels = [name for groups in names.values() for several in groups for name in several]
+    assert len(labels) > 30
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(900):
         if 300 <= tick.index < 600:  # away, and then back elsewhere
             frame["hand_ages"][0] = tick.index - 300
         if tick.index >= 600:
             frame["hands"][0] += 0.5
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
-    strips = [found[0] for found in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")]
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
+    strips = [batch[0] for batch in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")]
     corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
     assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
     steps = [np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips]
@@ -114,12 +114,12 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
 
 
 def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(100):
         frame["commanded"] = 1
-        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
-        one.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told)), ("hold", b"")])
-    one.close()
+        measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
+        view.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(measured)), ("hold", b"")])
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
     assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
@@ -130,19 +130,19 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     tmp_path: Path, skill: Skill
 ) -> None:
     place = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
-    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
-    told = list(ticks(40))
-    for tick, frame, timing in told[:20]:
-        one.add(frame, at_ns(tick.index), timing)
-    one.learn(with_file(replace(skill, via_points=(place,))).file)
-    for tick, frame, timing in told[20:]:
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+    view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    entries = list(ticks(40))
+    for tick, frame, timing in entries[:20]:
+        view.add(frame, at_ns(tick.index), timing)
+    view.learn(with_file(replace(skill, via_points=(place,))).file)
+    for tick, frame, timing in entries[20:]:
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
     assert len(lines) >= 5
     assert all(len(line) > 50 for line in lines)
-    before, after = (rows["/skill/places/tool"][at].get("Points3D:labels") or [] for at in (0, -1))
+    before, after = (rows["/skill/places/tool"][index].get("Points3D:labels") or [] for index in (0, -1))
     assert "vise" not in before
     assert "vise" in after
     half = dict(zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True))
@@ -153,31 +153,31 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
 
 
 def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Path, skill: Skill) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
+    view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
     turned = Rotation.from_euler("x", 3, degrees=True)
-    for tick, made, timing in ticks(200):
-        frame = made.copy()
+    for tick, original, timing in ticks(200):
+        frame = original.copy()
         if tick.index >= 100:
             frame["closure"], frame["gripper"] = 0.7, CLOSED
             frame["orientation_covariance"] = np.radians(2.0) ** 2 * np.eye(3)
             frame["tool_orientation"] = (Rotation.from_quat(frame["orientation"]) * turned).as_quat()
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
-    told = {
+    curves = {
         path: np.ravel(values(rows[path], "Scalars:scalars")) for path in rows if path.startswith(("/turn", "/grip"))
     }
-    assert told["/turn/target"][-50:] == pytest.approx(3.0, abs=1e-6)
-    assert told["/turn/std"] == pytest.approx([2.0] * 100)
-    assert told["/gripper/predicted"][-100:] == pytest.approx([70.0] * 100)
-    assert told["/gripper/commanded"] == pytest.approx([100.0] * 100)
+    assert curves["/turn/target"][-50:] == pytest.approx(3.0, abs=1e-6)
+    assert curves["/turn/std"] == pytest.approx([2.0] * 100)
+    assert curves["/gripper/predicted"][-100:] == pytest.approx([70.0] * 100)
+    assert curves["/gripper/commanded"] == pytest.approx([100.0] * 100)
 
 
 def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
+    view = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
     for tick, frame, timing in ticks(30):
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/joints/position"], "tick")) == 30
     assert any(text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT))
@@ -188,14 +188,14 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     glass = SceneObject(
         "glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1)
     )
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(60):
-        one.add(frame, at_ns(tick.index), timing)
+        view.add(frame, at_ns(tick.index), timing)
         if tick.index in (10, 40):
-            found = (board, glass)[: 1 if tick.index == 40 else 2]
-            one.note("objects", encode_json(found).decode(), at_ns(tick.index))
-    one.note("requests", 'via_points {"op": "clear"}', at_ns(50))
-    one.close()
+            objects = (board, glass)[: 1 if tick.index == 40 else 2]
+            view.note("objects", encode_json(objects).decode(), at_ns(tick.index))
+    view.note("requests", 'via_points {"op": "clear"}', at_ns(50))
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {"tool_plate"}
     assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx([0.04, 0.025, 0.001])
@@ -230,16 +230,16 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
 
 
 def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
-    one = viewer(live_port=0)
-    assert one.url is not None
-    port = int(one.url.rsplit(":", 1)[1].split("/")[0])
+    view = viewer(live_port=0)
+    assert view.url is not None
+    port = int(view.url.rsplit(":", 1)[1].split("/")[0])
     for tick, frame, timing in ticks(300):
-        one.add(frame, at_ns(tick.index), timing)
+        view.add(frame, at_ns(tick.index), timing)
     with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         assert connection.getpeername()[0] == "127.0.0.1"
     with pytest.raises(OSError, match="refused"), socket.create_connection(("127.0.0.2", port), timeout=5):
         pass
-    one.close()
+    view.close()
 
 
 @pytest.mark.parametrize(
@@ -267,20 +267,20 @@ def test_what_cannot_be_shown_is_said_in_words(
     monkeypatch.chdir(tmp_path)
     Path("press.npz").write_bytes(b"PK")
     assert main(["view", *arguments]) in (1, 2)
-    said = capsys.readouterr().err
-    assert re.search(error, said)
-    assert said.startswith("thirdhand view: ")
-    assert len(said.splitlines()) == 1
+    stderr = capsys.readouterr().err
+    assert re.search(error, stderr)
+    assert stderr.startswith("thirdhand view: ")
+    assert len(stderr.splitlines()) == 1
 
 
 def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(100):
-        told = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
-        one.add(
-            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(told))] if tick.index > 50 else []
+        measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
+        view.add(
+            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(measured))] if tick.index > 50 else []
         )
-    one.close()
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     for number in range(len(JOINT_NAMES)):
         first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
@@ -291,13 +291,13 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
 
 @pytest.mark.parametrize("conducts", [1])
 def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
-    one = viewer(rrd=tmp_path / "a.rrd")
+    view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(200):
         frame["hand_ages"][1 - conducts] = -1
         frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
         frame["tool"] += [0.02, 0.0, 0.0]
-        one.add(frame, at_ns(tick.index), timing)
-    one.close()
+        view.add(frame, at_ns(tick.index), timing)
+    view.close()
     rows = drawn(tmp_path / "a.rrd")
     followed = list(range(10, 200))
     assert values(rows["/scene/target"], "tick") == followed[::5]

@@ -75,8 +75,8 @@ def test_curves_and_trails_are_interrupted_where_frames_are_missing(
     gap.
     """
     with Recorder(tmp_path / "a.mcap", settings=Settings(), skill=SKILL, thin=True) as recorder:
-        for number, (made, frame, timing) in enumerate(ticks(400)):
-            index = made.index + pause_ticks * (number >= 203)
+        for number, (source, frame, timing) in enumerate(ticks(400)):
+            index = source.index + pause_ticks * (number >= 203)
             frame["tick"] = timing["tick"] = index
             recorder.write(Tick(index), frame, time_ns=at_ns(index), timing=timing, lost=lost * (number == 203))
     convert(tmp_path / "a.mcap", tmp_path / "a.rrd")

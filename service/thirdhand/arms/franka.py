@@ -35,9 +35,9 @@ TWICE = np.array((12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0))
 
 def speed_limits(position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
     """Lowest and highest velocity (7,) [rad/s], within the robot's limits at this position."""
-    there, twice = position + LIMIT_LOOKAHEAD_S * velocity, np.minimum(TWICE, 2.0 * BRAKE)
-    up = np.sqrt(twice * np.maximum(UPPER_RAD - there, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
-    down = np.sqrt(twice * np.maximum(there - LOWER_RAD, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
+    ahead_rad, twice = position + LIMIT_LOOKAHEAD_S * velocity, np.minimum(TWICE, 2.0 * BRAKE)
+    up = np.sqrt(twice * np.maximum(UPPER_RAD - ahead_rad, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
+    down = np.sqrt(twice * np.maximum(ahead_rad - LOWER_RAD, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
     return -np.clip(down, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS), np.clip(up, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS)
 
 

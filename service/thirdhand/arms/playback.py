@@ -97,8 +97,8 @@ class Playback:
         self._now = self._heard = 0.0  # [s] time by counting steps, and the time at which the newest command arrived
         self._lateness_s = 0.0  # time of the drive's clock that is not made up yet
         self._offset = self._needed = 0.0
-        here = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
-        self._knots.extend(here)
+        knots = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
+        self._knots.extend(knots)
         self._moved()  # compiles it: a period has no time for that
         self._knots.clear()
         self._moved()
@@ -171,12 +171,12 @@ class Playback:
     def _take(self, command: Command) -> str:
         """Queue a command; returns the reason if it is refused, else an empty text."""
         position, velocity = np.array(command.position), np.array(command.velocity)
-        at, last = self._state[0], self._newest
-        if not position.shape == velocity.shape == at.shape:
-            return f"{len(command.position)} joints, {len(at)} needed"
+        arm_position, last = self._state[0], self._newest
+        if not position.shape == velocity.shape == arm_position.shape:
+            return f"{len(command.position)} joints, {len(arm_position)} needed"
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             return "a joint that is not finite"
-        outside = np.maximum(np.minimum(self._lower, at) - position, position - np.maximum(self._upper, at))
+        outside = np.maximum(np.minimum(self._lower, arm_position) - position, position - np.maximum(self._upper, arm_position))
         if outside.max() > LIMIT_TOLERANCE:
             return f"joint {outside.argmax() + 1} outside its limits: {position[outside.argmax()]:.3f} rad"
         if (fast := np.abs(velocity) - self._max_velocity).max() > LIMIT_TOLERANCE:
@@ -184,9 +184,9 @@ class Playback:
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
         ticks = 0 if last is None else tick - last.tick
         if last is None or max(self._now - self._heard, abs(ticks) * self.tick_s) > REJOIN_AFTER_S:
-            off = (np.abs(position - at) / np.array(self._limits.per_rad)).max()
-            if self._state[1:].any() or off > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
-                return f"a new sequence that does not begin where the arm stands: {off:.3f} rad off, or moving"
+            deviation_rad = (np.abs(position - arm_position) / np.array(self._limits.per_rad)).max()
+            if self._state[1:].any() or deviation_rad > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
+                return f"a new sequence that does not begin where the arm stands: {deviation_rad:.3f} rad off, or moving"
             self._knots.clear()
             self._lengths_s.clear()
             time_s = self._now
@@ -233,17 +233,17 @@ class Playback:
             self._knots.popleft()
         first, second = self._knots[0], self._knots[1]
         span = np.array((first.time_s, second.time_s, playhead_s, slower))
-        wanted: Vector = np.empty_like(self._state[1])
-        _aim(self._state, first.values, second.values, span, self._parameters, wanted)
+        velocities: Vector = np.empty_like(self._state[1])
+        _aim(self._state, first.values, second.values, span, self._parameters, velocities)
         if self._speed_limits is not None:
-            wanted = np.clip(wanted, *self._speed_limits(self._state[0], self._state[1]))
-        return wanted
+            velocities = np.clip(velocities, *self._speed_limits(self._state[0], self._state[1]))
+        return velocities
 
 
 def _mean_length(lengths: deque[float]) -> float:
     """The mean of lengths without outliers."""
     middle = median_low(lengths)
-    return fmean(one for one in lengths if abs(one - middle) <= TICK_OUTLIER * middle)
+    return fmean(length for length in lengths if abs(length - middle) <= TICK_OUTLIER * middle)
 
 
 def _steps(last: Knot, position: Vector, velocity: Vector, ticks: int, tick_s: float) -> float:
@@ -271,14 +271,14 @@ def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters:
     span (4,): times [s] of both commands and of the playhead, and the relative slowing of the
     playhead.
     """
-    given = parameters[0]
+    config = parameters[0]
     lasts_s, playhead_s = span[1] - span[0], span[2] - span[0]
     inside_s = min(max(playhead_s, 0.0), lasts_s)
     beyond_s, u = playhead_s - inside_s, inside_s / lasts_s
     held_s = min(max(beyond_s, -EXTRAPOLATED_S), EXTRAPOLATED_S)
     for i in range(len(wanted)):
-        begin, end, way = lasts_s * first[1, i], lasts_s * second[1, i], second[0, i] - first[0, i]
-        bend, twist = 3.0 * way - 2.0 * begin - end, begin + end - 2.0 * way
+        begin, end, distance = lasts_s * first[1, i], lasts_s * second[1, i], second[0, i] - first[0, i]
+        bend, twist = 3.0 * distance - 2.0 * begin - end, begin + end - 2.0 * distance
         position = first[0, i] + u * (begin + u * (bend + u * twist))
         velocity = (begin + u * (2.0 * bend + u * 3.0 * twist)) / lasts_s
         acceleration = (2.0 * bend + u * 6.0 * twist) / lasts_s**2
@@ -286,9 +286,9 @@ def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters:
         velocity = (velocity + held_s * acceleration) * (1.0 - span[3])
         if held_s != beyond_s:
             acceleration = 0.0
-        error = position - state[0, i] - velocity * given.period_s
+        error = position - state[0, i] - velocity * config.period_s
         velocity += min(max(POSITION_GAIN_HZ * error, -MAX_CORRECTION_RADPS), MAX_CORRECTION_RADPS)
-        acceleration += given.velocity_gain[i] * (velocity - acceleration * given.period_s - state[1, i])
-        change = min(max(acceleration - state[2, i], -given.max_change[i]), given.max_change[i])
-        acceleration = min(max(state[2, i] + change, -given.max_acceleration[i]), given.max_acceleration[i])
-        wanted[i] = state[1, i] + given.period_s * acceleration
+        acceleration += config.velocity_gain[i] * (velocity - acceleration * config.period_s - state[1, i])
+        change = min(max(acceleration - state[2, i], -config.max_change[i]), config.max_change[i])
+        acceleration = min(max(state[2, i] + change, -config.max_acceleration[i]), config.max_acceleration[i])
+        wanted[i] = state[1, i] + config.period_s * acceleration

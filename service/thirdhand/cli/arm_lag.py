@@ -47,15 +47,15 @@ def lag(commanded: Mapping[str, Samples], measured: Mapping[str, Samples]) -> La
         if name in commanded and len(states) >= LEAST_STATES and len(commanded[name]) >= LEAST_STATES
     ]
     moving = [pair for pair in pairs if np.ptp(pair[1]) > LAG_TRAVEL_RAD]
-    found: Lag | None = None
+    estimate: Lag | None = None
     low, high = LAG_RANGE_S
     for step_s in LAG_STEPS_S if moving else ():
         candidates = [_at(float(tau), moving) for tau in np.arange(low, high + step_s / 2, step_s)]
-        found = min(candidates, key=lambda one: one.error_rad)
-        low, high = found.lag_s - step_s, found.lag_s + step_s
-    if found is None or found.std_s > LAG_STD_S or found.residual_share > MAX_RESIDUAL_SHARE:
+        estimate = min(candidates, key=lambda one: one.error_rad)
+        low, high = estimate.lag_s - step_s, estimate.lag_s + step_s
+    if estimate is None or estimate.std_s > LAG_STD_S or estimate.residual_share > MAX_RESIDUAL_SHARE:
         return None
-    return found if LAG_RANGE_S[0] < found.lag_s < LAG_RANGE_S[1] else None
+    return estimate if LAG_RANGE_S[0] < estimate.lag_s < LAG_RANGE_S[1] else None
 
 
 def _columns(samples: Samples) -> tuple[Vector, Vector]:
@@ -74,16 +74,16 @@ def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -
         inside = (times - LAG_RANGE_S[1] >= command_times[0]) & (times - LAG_RANGE_S[0] <= command_times[-1])
         after = np.clip(np.searchsorted(command_times, times), 1, len(command_times) - 1)
         inside &= command_times[after] - command_times[after - 1] < MAX_COMMAND_GAP_S
-        at = times[inside] - lag_s
-        if len(at) < LEAST_STATES:
+        delayed_times = times[inside] - lag_s
+        if len(delayed_times) < LEAST_STATES:
             continue
-        expected = np.interp(at, command_times, commands)
+        expected = np.interp(delayed_times, command_times, commands)
         residual = positions[inside] - expected
         squares += float(np.sum((residual - residual.mean()) ** 2))
         spread += float(np.sum((expected - expected.mean()) ** 2))
-        velocity = np.interp(at, command_times, np.gradient(commands, command_times))
+        velocity = np.interp(delayed_times, command_times, np.gradient(commands, command_times))
         speeds += float(np.sum((velocity - velocity.mean()) ** 2))
-        count += len(at)
+        count += len(delayed_times)
     if not speeds or spread < count * LEAST_SPREAD_RAD**2:  # the motion was outside of the compared times
         return Lag(lag_s, math.inf, math.inf, math.inf)
     error = math.sqrt(squares / count)

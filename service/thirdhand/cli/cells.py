@@ -39,7 +39,7 @@ def cells(args: argparse.Namespace) -> int:
         print(msgspec.json.format(_as_json(served)).decode())
     elif served:
         console = Console(highlight=False)
-        (console if console.is_terminal else Console(width=MOST_LETTERS)).print(_table(row(one) for one in served))
+        (console if console.is_terminal else Console(width=MOST_LETTERS)).print(_table(row(cell) for cell in served))
     if not served:
         print("thirdhand status: no daemon is alive on this network", file=sys.stderr)
     return 0 if served else 1
@@ -47,7 +47,7 @@ def cells(args: argparse.Namespace) -> int:
 
 def _watch(session: zenoh.Session, args: argparse.Namespace) -> None:
     """Show each cell as it changes: in a table on a terminal, else in lines."""
-    seen: dict[tuple[str, str], tuple[Cell, float]] = {}
+    latest_cells: dict[tuple[str, str], tuple[Cell, float]] = {}
     printed: dict[tuple[str, str], str] = {}
     draws = sys.stdout.isatty() and not args.json
     with interrupt.clean_up_first(), Live(auto_refresh=False) if draws else contextlib.nullcontext() as live:
@@ -55,8 +55,8 @@ def _watch(session: zenoh.Session, args: argparse.Namespace) -> None:
             begun_s = time.monotonic()
             served = served_cells(session, timeout_s=WATCH_S)
             now_s = time.monotonic()
-            seen |= {(cell.name, cell.session): (cell, now_s) for cell in served}
-            rows = {key: row(cell, now_s - at_s) for key, (cell, at_s) in sorted(seen.items())}
+            latest_cells |= {(cell.name, cell.session): (cell, now_s) for cell in served}
+            rows = {key: row(cell, now_s - at_s) for key, (cell, at_s) in sorted(latest_cells.items())}
             if args.json:
                 print(_as_json(served).decode(), flush=True)
             elif live is not None:

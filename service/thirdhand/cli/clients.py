@@ -59,8 +59,8 @@ def _add(args: argparse.Namespace) -> Any:
     if args.here and args.name:
         for name, position in still(args).items():
             setattr(args, name, getattr(args, name) or position)
-    given = [side for side in SIDES if getattr(args, side)]
-    if args.name and args.tool and len(given) == 1 and ask(args, "status").get("hands") == given[0]:
+    sides = [side for side in SIDES if getattr(args, side)]
+    if args.name and args.tool and len(sides) == 1 and ask(args, "status").get("hands") == sides[0]:
         args.left = args.right = args.left or args.right  # the skill ignores the other hand
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError(
@@ -89,8 +89,8 @@ def correct(args: argparse.Namespace) -> int:
     elif args.tool or args.now or args.turned:
         raise UsageError("--undo accepts no other option")
     reply = ask(args, "correct", request)
-    found = msgspec.convert(reply["correction"], Correction)
-    print(f"{found.name} {'undone' if found.undone else 'in force'} since tick {reply['tick']}: {found.text}")
+    correction = msgspec.convert(reply["correction"], Correction)
+    print(f"{correction.name} {'undone' if correction.undone else 'in force'} since tick {reply['tick']}: {correction.text}")
     print("Then `thirdhand resume`: the tool approaches its target at [tool] engage_speed.")
     if note := reply.get("note"):
         print(note[0].upper() + note[1:])

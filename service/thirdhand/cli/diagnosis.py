@@ -85,10 +85,10 @@ def findings(
     each joint since the first status [rad], and `lag_ms` the measured lag of the arm; None: it was
     not measured.
     """
-    found = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}, lag_ms))
-    if any(finding.level == "wrong" for finding in found):  # a busy machine may be the cause
-        found = [wrong(*msgspec.structs.astuple(one)[1:]) if one.what == MACHINE else one for one in found]
-    return sorted(found, key=lambda finding: LEVELS.index(finding.level))
+    results = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}, lag_ms))
+    if any(finding.level == "wrong" for finding in results):  # a busy machine may be the cause
+        results = [wrong(*msgspec.structs.astuple(finding)[1:]) if finding.what == MACHINE else finding for finding in results]
+    return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
 
 def _in_order_of_cause(
@@ -101,17 +101,17 @@ def _in_order_of_cause(
 ) -> Iterator[Finding]:
     before, now = seen[0], seen[-1]
     listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
-    found, wanted = f"version {now.version}, {listens}", f"version {own_version}, as here"
-    yield judged(now.version == own_version, "daemon", found, wanted, what_to_do(Condition.VERSIONS_DIFFER))
+    actual, expected = f"version {now.version}, {listens}", f"version {own_version}, as here"
+    yield judged(now.version == own_version, "daemon", actual, expected, what_to_do(Condition.VERSIONS_DIFFER))
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
         return
     yield from _machine(before, now)
     for name in now.sources:
         yield from _source(before, now, name, published)
-    if of_humble := [one for one in published if one.endswith(f"/{NO_TYPE_HASH}")][:MOST_OTHER_KEYS]:
-        found, advice = f"Humble publishes {', '.join(of_humble)}", what_to_do(Condition.HUMBLE)
-        yield Finding("note", "ROS 2", found, "keys with the hash of their type, as of Iron and later", advice)
+    if of_humble := [key_expr for key_expr in published if key_expr.endswith(f"/{NO_TYPE_HASH}")][:MOST_OTHER_KEYS]:
+        actual, advice = f"Humble publishes {', '.join(of_humble)}", what_to_do(Condition.HUMBLE)
+        yield Finding("note", "ROS 2", actual, "keys with the hash of their type, as of Iron and later", advice)
     for name in now.streams:
         yield from _rejected(before, now, name)
     yield _driver(before, now)
@@ -125,16 +125,16 @@ def _in_order_of_cause(
     yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
-        found = f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
+        actual = f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
         advice = what_to_do(Condition.CLOCKS_DIFFER)
-        yield Finding("note", "clock here", found, f"within {OWN_CLOCK_S:g} s", advice)
+        yield Finding("note", "clock here", actual, f"within {OWN_CLOCK_S:g} s", advice)
 
 
 def _mode(now: Status) -> Finding:
-    found = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
-    found += f": {now.because}" if now.because else ""
+    actual = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
+    actual += f": {now.because}" if now.because else ""
     level = "ok" if now.mode == "follow" else "note" if now.reason == "operator" else "wrong"
-    return Finding(level, "mode", found, "follow", now.remedy)
+    return Finding(level, "mode", actual, "follow", now.remedy)
 
 
 def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
@@ -146,89 +146,89 @@ def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
     }
     if still:
         name = max(still, key=lambda joint: still[joint])
-        found = f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since commands began"
-        yield wrong("arm's drives", found, "joints that follow their commands", what_to_do(Condition.DRIVES_OFF))
+        actual = f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since commands began"
+        yield wrong("arm's drives", actual, "joints that follow their commands", what_to_do(Condition.DRIVES_OFF))
 
 
 def _lag(lag_ms: float | None) -> Finding:
-    what = "arm's lag"
+    subject = "arm's lag"
     if lag_ms is None:
         return Finding(
-            "ok", what, "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"
+            "ok", subject, "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"
         )
-    found, wanted = f"the arm follows its commands {lag_ms:.0f} ms late", f"up to {LATE_ARM_MS:.0f} ms"
+    actual, expected = f"the arm follows its commands {lag_ms:.0f} ms late", f"up to {LATE_ARM_MS:.0f} ms"
     level = "ok" if lag_ms <= LATE_ARM_MS else "note"
-    return Finding(level, what, found, wanted, what_to_do(Condition.ARM_LATE))
+    return Finding(level, subject, actual, expected, what_to_do(Condition.ARM_LATE))
 
 
 def _limits(seen: Sequence[Status]) -> Iterator[Finding]:
     """Limits of the tool where the task is, and the one that binds most often."""
     if limits := seen[-1].tool_limits:
-        yield Finding("ok", "tool's limits", "; ".join(f"{where} {one.text}" for where, one in limits.items()))
-    bound = Counter(one.binding for one in seen if one.binding)
+        yield Finding("ok", "tool's limits", "; ".join(f"{where} {limit.text}" for where, limit in limits.items()))
+    bound = Counter(status.binding for status in seen if status.binding)
     name, count = bound.most_common(1)[0] if bound else ("", 0)
     if count > BOUND_SHARE * len(seen):
-        found, wanted = f"{name}, in {count / len(seen):.0%} of the time", f"in less than {BOUND_SHARE:.0%}"
-        yield Finding("note", "limit that binds", found, wanted, what_to_do(Condition.LIMIT_BINDS))
+        actual, expected = f"{name}, in {count / len(seen):.0%} of the time", f"in less than {BOUND_SHARE:.0%}"
+        yield Finding("note", "limit that binds", actual, expected, what_to_do(Condition.LIMIT_BINDS))
 
 
 def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
     """A tool that has been off its target for long."""
     distances_m = [
-        math.dist(one.tool_measured_m or one.tool_m, one.target_m)
-        for one in seen
-        if one.mode == "follow" and one.tool_m is not None and one.target_m is not None
+        math.dist(status.tool_measured_m or status.tool_m, status.target_m)
+        for status in seen
+        if status.mode == "follow" and status.tool_m is not None and status.target_m is not None
     ]
     lasts_s, flags = (seen[-1].time_ns - seen[0].time_ns) / 1e9, seen[-1].flags
     if len(distances_m) == len(seen) and lasts_s > OFF_TARGET_S and min(distances_m) > OFF_TARGET_M:
-        found = f"{100 * min(distances_m):.0f} cm or more from its target for {lasts_s:.1f} s"
+        actual = f"{100 * min(distances_m):.0f} cm or more from its target for {lasts_s:.1f} s"
         advice = "; ".join(map(what_to_do, flags)) or what_to_do(Condition.OFF_TARGET)
         level = "note" if flags else "wrong"
-        yield Finding(level, "tool", found, f"within {100 * OFF_TARGET_M:.0f} cm once the hands rest", advice)
+        yield Finding(level, "tool", actual, f"within {100 * OFF_TARGET_M:.0f} cm once the hands rest", advice)
 
 
 def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
-    source, what = now.sources[name], SOURCE_NAMES[name]
+    source, subject = now.sources[name], SOURCE_NAMES[name]
     least, most = map(int, re.findall(r"\d+", BY_KEY[KEYS[name]].rate))
-    wanted = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
+    expected = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
         f"joints {', '.join(now.joints)}"
         if name == "arm"
         else f"frame {', '.join(repr(frame) for frame in now.frames if frame)} or none"
     )
     if not source.rate_hz and name in SIDES and name not in now.needed:
-        yield Finding("ok", what, "nothing arrives; the skill does not need it")
+        yield Finding("ok", subject, "nothing arrives; the skill does not need it")
         return
     if not source.rate_hz:
-        found = "nothing arrives" if source.age_ms is None else f"nothing arrived for {source.age_ms / 1000:.1f} s"
+        actual = "nothing arrives" if source.age_ms is None else f"nothing arrived for {source.age_ms / 1000:.1f} s"
         group = KEYS[name].rpartition("/")[0]
         ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
-        ours |= {one for one in published if one.endswith(NO_TYPE_HASH)}
-        others = [one for one in published if f"/{group}/" in one and one not in ours][:MOST_OTHER_KEYS]
-        found += f", but on {', '.join(others)}" if others else ""
+        ours |= {key_expr for key_expr in published if key_expr.endswith(NO_TYPE_HASH)}
+        others = [key_expr for key_expr in published if f"/{group}/" in key_expr and key_expr not in ours][:MOST_OTHER_KEYS]
+        actual += f", but on {', '.join(others)}" if others else ""
         advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)
         advice += f" ({', '.join(now.endpoints)})" if now.endpoints else ""
         rename = f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}; or " if others else ""
-        yield wrong(what, found, wanted, rename + advice)
+        yield wrong(subject, actual, expected, rename + advice)
         return
-    found = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
-    found += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
+    actual = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
+    actual += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     is_fine = source.fresh and source.rate_hz >= LEAST_RATE_SHARE * least
     advice = "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
     rejected = list(_rejected(before, now, name))
     yield from rejected
-    if not source.fresh and any(one.level == "wrong" for one in rejected):
+    if not source.fresh and any(finding.level == "wrong" for finding in rejected):
         return  # all of its samples are rejected; the reason is found above
-    yield judged(is_fine, what, found, wanted, advice or what_to_do(Condition.RATE_LOW))
+    yield judged(is_fine, subject, actual, expected, advice or what_to_do(Condition.RATE_LOW))
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
         order = "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
-        found = f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be measured"
+        actual = f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be measured"
         level = "note" if name == "arm" else "wrong"  # no latency is computed from the arm's stamps
         advice = what_to_do(Condition.CLOCKS_DIFFER)
-        yield Finding(level, f"{what}'s clock", found, f"less than {LATE_MS / 1000:g} s", advice)
+        yield Finding(level, f"{subject}'s clock", actual, f"less than {LATE_MS / 1000:g} s", advice)
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
-    source, what = now.inputs[name], input_name(name)
+    source, subject = now.inputs[name], input_name(name)
     seconds = max((now.time_ns - before.time_ns) / 1e9, 0.1)
     earlier, arriving_hz = before.inputs.get(name, Source()).rejected, max(source.rate_hz, 1.0)
     rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
@@ -238,15 +238,15 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
             advice = (_unit_advice(source) or source.advice if cause == source.cause else "") or what_to_do(cause)
-            yield Finding(level, what, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
+            yield Finding(level, subject, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
     if share > REJECTED_SHARE and name == "arm":
-        seen = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE)
-        found = explained(Reason.TWO_SOURCES, seen)
-        wanted = f"one publisher of {key(now.cell, KEYS[name])}"
-        yield wrong(what, found.why.removeprefix(f"{what}, "), wanted, found.what_to_do)
+        evidence = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE)
+        explanation = explained(Reason.TWO_SOURCES, evidence)
+        expected = f"one publisher of {key(now.cell, KEYS[name])}"
+        yield wrong(subject, explanation.why.removeprefix(f"{subject}, "), expected, explanation.what_to_do)
     if source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM:
         found_mm = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis"
-        yield wrong(what, found_mm, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
+        yield wrong(subject, found_mm, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
 
 
 def _unit_advice(source: Source) -> str:
@@ -260,13 +260,13 @@ def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
         return Finding("note", "arm", "assumed, not measured", "", what_to_do(Condition.NO_ARM))
     commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
-    found = f"{'somebody' if heard else 'nobody'} listens to {commands}"
-    return judged(heard, "arm's driver", found, "a driver", what_to_do(Condition.NO_DRIVER))
+    actual = f"{'somebody' if heard else 'nobody'} listens to {commands}"
+    return judged(heard, "arm's driver", actual, "a driver", what_to_do(Condition.NO_DRIVER))
 
 
 def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
     now, boxes = seen[-1], seen[-1].demonstrated_m
-    below = {side: min(one.below_table_m.get(side, 0.0) for one in seen) for side in SIDES}
+    below = {side: min(status.below_table_m.get(side, 0.0) for status in seen) for side in SIDES}
     if max(below.values()) > MAX_BELOW_TABLE_M:
         depths = " and ".join(
             f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm" for side, depth in below.items() if depth > MAX_BELOW_TABLE_M
@@ -278,13 +278,13 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
             what_to_do(Condition.CALIBRATION_OFF),
         )
     positions = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
-    off = {side: _outside(at, boxes[side]) for side, at in positions.items()}
+    outside_m = {side: _outside(position_m, boxes[side]) for side, position_m in positions.items()}
     crossed = [
-        _outside(at, boxes[other]) for side, at in positions.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
+        _outside(position_m, boxes[other]) for side, position_m in positions.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
     ]
-    is_exchanged = len(off) == len(SIDES) and max(crossed) < OUTSIDE_M < min(off.values())
+    is_exchanged = len(outside_m) == len(SIDES) and max(crossed) < OUTSIDE_M < min(outside_m.values())
     advice = what_to_do(Condition.HANDS_EXCHANGED if is_exchanged else Condition.HAND_ELSEWHERE)
-    if off and max(off.values()) > OUTSIDE_M and _is_y_up(seen):
+    if outside_m and max(outside_m.values()) > OUTSIDE_M and _is_y_up(seen):
         written = "[{}]".format(", ".join(f"{v:g}" for v in Y_UP))
         yield wrong(
             "tracker's axes",
@@ -293,24 +293,24 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
             f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = {written}, with the position of the tracker's "
             "origin in base [m] as its first three numbers",
         )
-    for side, at in positions.items():
-        found = f"at {_point(at)} m, {off[side]:.2f} m from where the skill knows it"
-        wanted = " to ".join(map(_point, boxes[side])) + " m"
+    for side, position_m in positions.items():
+        actual = f"at {_point(position_m)} m, {outside_m[side]:.2f} m from where the skill knows it"
+        expected = " to ".join(map(_point, boxes[side])) + " m"
         remedy = _unit_advice(now.sources[side]) or advice
-        yield judged(off[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", found, wanted, remedy)
+        yield judged(outside_m[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", actual, expected, remedy)
     if now.deviation_m is not None:
-        found = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
-        wanted = f"up to {100 * now.threshold_m:.1f} cm"
-        yield judged(now.deviation_m <= now.threshold_m, "skill", found, wanted, what_to_do("far_from_demonstrations"))
+        actual = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
+        expected = f"up to {100 * now.threshold_m:.1f} cm"
+        yield judged(now.deviation_m <= now.threshold_m, "skill", actual, expected, what_to_do("far_from_demonstrations"))
 
 
 def _is_y_up(seen: Sequence[Status]) -> bool:
     """True if y seems to be the hands' height: it changes while z does not."""
-    at = [one.hands_m for one in seen if all(side in one.hands_m for side in SIDES)]
-    heights = [[hands[side][1] for hands in at] for side in SIDES]
-    levels = [[hands[side][2] for hands in at] for side in SIDES]
+    positions_m = [status.hands_m for status in seen if all(side in status.hands_m for side in SIDES)]
+    heights = [[hands[side][1] for hands in positions_m] for side in SIDES]
+    levels = [[hands[side][2] for hands in positions_m] for side in SIDES]
     return (
-        bool(at)
+        bool(positions_m)
         and all(max(level) - min(level) < LEVEL_M for level in levels)
         and any(max(height) - min(height) > RAISED_M for height in heights)
         and abs(heights[0][0] - heights[1][0]) < 3 * RAISED_M
@@ -320,28 +320,28 @@ def _is_y_up(seen: Sequence[Status]) -> bool:
 def _machine(before: Status, now: Status) -> Iterator[Finding]:
     missed, ticks, late_us = now.missed - before.missed, max(now.tick - before.tick, 1), now.lateness_us.p99
     if now.busy:
-        wanted = "a machine that keeps time; on any other, arm, network and clocks seem to fail"
-        yield Finding("note", MACHINE, f"too busy: {now.busy}", wanted, what_to_do(Condition.MACHINE_BUSY))
-    found = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
+        expected = "a machine that keeps time; on any other, arm, network and clocks seem to fail"
+        yield Finding("note", MACHINE, f"too busy: {now.busy}", expected, what_to_do(Condition.MACHINE_BUSY))
+    actual = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period
-    wanted = f"less than {MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
+    expected = f"less than {MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
     is_fine = missed <= MISSED_SHARE * ticks and late_us <= most_us
-    yield judged(is_fine, "loop", found, wanted, what_to_do(Condition.MACHINE_BUSY))
+    yield judged(is_fine, "loop", actual, expected, what_to_do(Condition.MACHINE_BUSY))
 
 
 def _privileges_and_recording(now: Status) -> Iterator[Finding]:
-    found, wanted = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
-    yield judged(now.realtime, "real time", found, wanted, what_to_do(Condition.NO_REAL_TIME))
-    found, wanted = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
-    yield judged(now.memory_locked, "memory", found, wanted, what_to_do(Condition.NOT_LOCKED))
+    actual, expected = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
+    yield judged(now.realtime, "real time", actual, expected, what_to_do(Condition.NO_REAL_TIME))
+    actual, expected = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
+    yield judged(now.memory_locked, "memory", actual, expected, what_to_do(Condition.NOT_LOCKED))
     scribe = now.scribe
     state, lost = scribe.get("state", "off"), scribe.get("lost", 0)
     if state == "off":
         yield Finding("note", "recording", "off", "", what_to_do(Condition.NOT_RECORDED))
         return
-    found = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
+    actual = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
     is_fine = state != "interrupted" and not lost
-    yield judged(is_fine, "recording", found, "recording, none lost", what_to_do(Condition.TICKS_LOST))
+    yield judged(is_fine, "recording", actual, "recording, none lost", what_to_do(Condition.TICKS_LOST))
     if scribe.get("free_mb") is not None:
         yield _disk(scribe)
 
@@ -349,9 +349,9 @@ def _privileges_and_recording(now: Status) -> Iterator[Finding]:
 def _disk(scribe: Mapping[str, Any]) -> Finding:
     """Free space for recordings, and the time until it is full."""
     free_mb, full_h = scribe["free_mb"], hours_until_full(scribe)
-    wanted = f"more than {FREE_MB / 1000:g} GB, and {DISK_LASTS_H:g} h"
+    expected = f"more than {FREE_MB / 1000:g} GB, and {DISK_LASTS_H:g} h"
     is_fine = free_mb > FREE_MB and (full_h is None or full_h > DISK_LASTS_H)
-    return judged(is_fine, "disk", disk(scribe), wanted, what_to_do(Condition.DISK_SHORT))
+    return judged(is_fine, "disk", disk(scribe), expected, what_to_do(Condition.DISK_SHORT))
 
 
 def _outside(at: Vector3, box: tuple[Vector3, Vector3]) -> float:

@@ -38,14 +38,14 @@ Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad]
 
 def doctor(args: argparse.Namespace) -> int:
     """Exit code 1 if something is wrong."""
-    found = []
+    results = []
     for finding in _examined(args):
-        found.append(finding)
+        results.append(finding)
         if not args.json:
             print(printable_lines(finding.text()), flush=True)
-    count = sum(finding.level == "wrong" for finding in found)
+    count = sum(finding.level == "wrong" for finding in results)
     if args.json:
-        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        print(msgspec.json.format(msgspec.json.encode(results)).decode())
     else:
         many = f"{count} things are wrong; the first may cause the others"
         print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
@@ -61,13 +61,13 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
     with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
         try:
             with contextlib.closing(statuses(session, args.cell)) as arriving:
-                seen = [next(arriving)]
+                history = [next(arriving)]
                 travel = Travel()
-                if seen[0].command_heard:  # otherwise the daemon would take this subscriber for a driver
+                if history[0].command_heard:  # otherwise the daemon would take this subscriber for a driver
                     closing.enter_context(travel.watching(session, args.cell))
                 end = time.monotonic() + args.seconds
                 while time.monotonic() < end:
-                    seen.append(next(arriving))
+                    history.append(next(arriving))
         except StartingError as error:
             yield wrong("daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING))
             return
@@ -86,7 +86,7 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
             yield wrong("daemon", str(error), f"version {version('thirdhand')}", what_to_do(Condition.VERSIONS_DIFFER))
             return
     yield from findings(
-        *seen,
+        *history,
         own_ns=time.time_ns(),
         own_version=version("thirdhand"),
         published=published.keys,
@@ -131,8 +131,8 @@ class Travel:
             {name: list(series) for name, series in joints.copy().items()}
             for joints in (self._commanded, self._measured)
         )
-        found = lag(commanded, measured)
-        return None if found is None else 1000 * found.lag_s
+        estimate = lag(commanded, measured)
+        return None if estimate is None else 1000 * estimate.lag_s
 
     @staticmethod
     def _take(joints: dict[str, Series], sample: zenoh.Sample) -> None:
@@ -151,16 +151,16 @@ def _span(series: Series) -> float:
 
 def unreachable(endpoint: str, error_text: str) -> Finding:
     """The reason why no session with an endpoint can be opened."""
-    wanted = f"a daemon that listens on {endpoint}"
+    expected = f"a daemon that listens on {endpoint}"
     if (address := tcp_address(endpoint)) is None:
-        return wrong("port", error_text, wanted, what_to_do(Condition.PORT_CLOSED))
+        return wrong("port", error_text, expected, what_to_do(Condition.PORT_CLOSED))
     host, port = address
     try:
         socket.create_connection(address, timeout=PROBE_S).close()
     except ConnectionRefusedError:
-        return wrong("port", f"nothing listens on {host} port {port}", wanted, what_to_do(Condition.PORT_CLOSED))
+        return wrong("port", f"nothing listens on {host} port {port}", expected, what_to_do(Condition.PORT_CLOSED))
     except (OSError, OverflowError) as error:
-        found = f"{host} port {port} cannot be reached: {in_words(error)}"
-        return wrong("port", found, wanted, what_to_do(Condition.NO_WAY))
-    found = f"something listens on {host} port {port}, but opens no Zenoh session"
-    return wrong("port", found, wanted, what_to_do(Condition.PORT_FOREIGN))
+        actual = f"{host} port {port} cannot be reached: {in_words(error)}"
+        return wrong("port", actual, expected, what_to_do(Condition.NO_WAY))
+    actual = f"something listens on {host} port {port}, but opens no Zenoh session"
+    return wrong("port", actual, expected, what_to_do(Condition.PORT_FOREIGN))

@@ -32,30 +32,30 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
     NotHereError if hands or tool are not seen, or move, for HERE_TIMEOUT_S.
     """
     reported: set[str] = set()
-    seen: list[tuple[float, dict[str, list[float]]]] = []
+    samples: list[tuple[float, dict[str, list[float]]]] = []
     with reached(args, HERE_TIMEOUT_S) as session:
         client = Client(session, args.cell)
         client.wait_until_ready(timeout_s=HERE_TIMEOUT_S)
         hands = client.status().hands
         going = [name for name in (*SIDES, "tool") if name not in SIDES or hands in ("both", name)]
-        wanted = [name for name in going if not getattr(args, name)]
-        say(f"waiting until {', '.join(wanted)} are seen and hold still for {STILL_S:g} s")
+        names = [name for name in going if not getattr(args, name)]
+        say(f"waiting until {', '.join(names)} are seen and hold still for {STILL_S:g} s")
         begun_s = time.monotonic()
         while True:
             now, at_s = client.ask("status"), time.monotonic()
-            lacking = _not_seen(now, wanted)
+            lacking = _not_seen(now, names)
             if lacking.keys() - reported:
                 say("; ".join(lacking.values()))
             reported = set(lacking)
             if lacking:
-                seen.clear()
+                samples.clear()
             else:
                 positions = {**now["hands_m"], "tool": now["tool_measured_m"] or now["tool_m"]}
-                seen.append((at_s, {name: positions[name] for name in wanted}))
-                while any(math.dist(seen[0][1][name], seen[-1][1][name]) > STILL_M for name in wanted):
-                    seen.pop(0)
-                if at_s - seen[0][0] >= STILL_S:
-                    return seen[-1][1]
+                samples.append((at_s, {name: positions[name] for name in names}))
+                while any(math.dist(samples[0][1][name], samples[-1][1][name]) > STILL_M for name in names):
+                    samples.pop(0)
+                if at_s - samples[0][0] >= STILL_S:
+                    return samples[-1][1]
             if at_s - begun_s > HERE_TIMEOUT_S:
                 raise NotHereError(
                     f"nothing was taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
@@ -65,10 +65,10 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
 
 def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
     """Messages on the wanted positions that are not known now, by name."""
-    found = {}
+    messages = {}
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
         if age_ms is None or age_ms > MAX_HAND_AGE_MS:
             ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
-            found[side] = f"the {side} hand {ago}; --{side} X Y Z gives its position"
-    return found | ({"tool": "the tool's position is unknown before the first tick"} if status["tick"] < 0 else {})
+            messages[side] = f"the {side} hand {ago}; --{side} X Y Z gives its position"
+    return messages | ({"tool": "the tool's position is unknown before the first tick"} if status["tick"] < 0 else {})

@@ -75,8 +75,8 @@ def via_points(add: AddCommand) -> None:
     )
     a.add_argument("name", nargs="?", help="the name of the via-point; a via-point of this name is replaced")
     for place in (*SIDES, "tool"):
-        at = f"the position of the {place}{' hand' * (place != 'tool')} in frame base [m]"
-        a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
+        help_text = f"the position of the {place}{' hand' * (place != 'tool')} in frame base [m]"
+        a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=help_text)
     flag(a, "--here", "use the present positions, once hands and tool hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     option(a, "--std", "M", "the standard deviation of the tool's position there [m]", defaults.std)
@@ -119,8 +119,8 @@ def correct(add: AddCommand) -> None:
             run="clients.correct",
         )
     )
-    at = "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this hold)"
-    c.add_argument("--tool", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=at)
+    help_text = "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this hold)"
+    c.add_argument("--tool", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=help_text)
     now = "correct for the hands of this moment (default: for those at which the hold began, as leading takes a hand)"
     flag(c, "--now", now)
     flag(c, "--turned", "correct the orientation of the tool too")

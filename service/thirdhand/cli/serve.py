@@ -133,18 +133,18 @@ class PrintableFormatter(logging.Formatter):
 
 def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
     """The settings, overridden by the options of the command line."""
-    given: dict[str, Any] = msgspec.to_builtins(settings)
+    values: dict[str, Any] = msgspec.to_builtins(settings)
     for section, field, value in (
-        (given, "cell", args.cell),
-        (given, "rate_hz", args.rate),
-        (given["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
-        (given["network"], "connect", args.connect),
-        (given["arm"], "source", args.joints),
-        (given["files"], "record", str(args.record) if args.record else None),
+        (values, "cell", args.cell),
+        (values, "rate_hz", args.rate),
+        (values["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
+        (values["network"], "connect", args.connect),
+        (values["arm"], "source", args.joints),
+        (values["files"], "record", str(args.record) if args.record else None),
     ):
         if value is not None:
             section[field] = value
     try:
-        return converted(given, origin="command line")
+        return converted(values, origin="command line")
     except SettingsError as error:
         raise UsageError(str(error)) from None

@@ -59,7 +59,7 @@ def check(args: argparse.Namespace) -> int:
         *(("port", _endpoint, endpoint, settings) for endpoint in (*network.listen, *live)),
         *(("router", _endpoint, endpoint, None) for endpoint in network.connect),
     ]
-    is_wrong = bool([one for one in conditions if not is_met(*one)])
+    is_wrong = bool([condition for condition in conditions if not is_met(*condition)])
     if uncompiled := bytecode.missing():
         print(f"note   {'bytecode':<14} {printable(uncompiled)}", flush=True)
     return int(is_wrong)
@@ -90,17 +90,17 @@ def _skill(settings: Settings, path: Path) -> str:
 
 
 def _folder(folder: Path) -> str:
-    found = existing_folder(folder)
-    if not found.is_dir():
-        raise ExplainedError(f"{found} is not a folder; a folder, or nothing, needed there")
-    system = os.statvfs(found)
+    existing = existing_folder(folder)
+    if not existing.is_dir():
+        raise ExplainedError(f"{existing} is not a folder; a folder, or nothing, needed there")
+    system = os.statvfs(existing)
     if system.f_flag & os.ST_RDONLY:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(found))
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(existing))
     if not system.f_blocks:
-        raise ExplainedError(f"{found} stores no files; a folder on a disk needed")
-    if not os.access(found, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
-        raise ExplainedError(f"{folder}: {found} cannot be written by user {os.geteuid()}; its owner can allow that")
-    return f"{folder} can be {'written' if found == folder.absolute() else 'made'}"
+        raise ExplainedError(f"{existing} stores no files; a folder on a disk needed")
+    if not os.access(existing, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        raise ExplainedError(f"{folder}: {existing} cannot be written by user {os.geteuid()}; its owner can allow that")
+    return f"{folder} can be {'written' if existing == folder.absolute() else 'made'}"
 
 
 def _disk(files: Files) -> str:
@@ -125,13 +125,13 @@ def _endpoint(endpoint: str, settings: Settings | None) -> str:
         if settings is None:
             socket.create_connection(address, timeout=ROUTER_TIMEOUT_S).close()
             return f"{where} accepts connections"
-        family, kind, number, _, at = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
+        family, kind, number, _, socket_address = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(at)
+            probe.bind(socket_address)
     except OSError as error:
-        own = None if settings is None else holder_of(settings)
-        if own is not None and endpoint in own[1]:
-            return f"{where} is in use by this cell's running daemon, process {own[0]}"
+        holder = None if settings is None else holder_of(settings)
+        if holder is not None and endpoint in holder[1]:
+            return f"{where} is in use by this cell's running daemon, process {holder[0]}"
         raise ExplainedError(f"{where}: {in_words(error)}") from None
     return f"{where} is free" + ", and other machines can reach it" * (not is_local(where))

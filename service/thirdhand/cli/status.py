@@ -41,9 +41,9 @@ def status(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(now)).decode())
         return code
-    found = rows(now)
-    width = max(map(len, found))
-    for name, text in found.items():
+    texts = rows(now)
+    width = max(map(len, texts))
+    for name, text in texts.items():
         print(f"{name:<{width}}  {text}")
     return code
 
@@ -121,7 +121,7 @@ def rows(now: Status) -> dict[str, str]:
     granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
         ", memory locked" if now.memory_locked else ", memory not locked"
     )
-    found = {
+    texts = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
@@ -157,15 +157,15 @@ def rows(now: Status) -> dict[str, str]:
     for name in ("lateness_us", "work_us", "latency_ms"):
         label, unit = name.rsplit("_", 1)
         values, digits = getattr(now, name), 1 if unit == "us" else 2
-        found[label] = (
+        texts[label] = (
             f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f} "
             + unit.replace("us", "µs")
             if values.max
             else "none yet"
         )
     if clocks := differing_clocks(now):
-        found["latency"] = f"unknown: {clocks}"
-    return {name: text for name, text in found.items() if text}
+        texts["latency"] = f"unknown: {clocks}"
+    return {name: text for name, text in texts.items() if text}
 
 
 def hours_until_full(scribe: Mapping[str, Any]) -> float | None:
@@ -176,15 +176,15 @@ def hours_until_full(scribe: Mapping[str, Any]) -> float | None:
 
 def disk(scribe: Mapping[str, Any]) -> str:
     """Free space where the scribe records, in words, and how long it lasts if that is known."""
-    rate, found = scribe.get("mb_per_hour"), f"{in_gb(scribe['free_mb'])} free where it records"
+    rate, text = scribe.get("mb_per_hour"), f"{in_gb(scribe['free_mb'])} free where it records"
     if not rate:
-        return found
-    found += f", {rate / 1000:.2g} GB an hour written"
+        return text
+    text += f", {rate / 1000:.2g} GB an hour written"
     if (full_h := hours_until_full(scribe)) is not None:
-        return f"{found}: full in {lasting(3.6e6 * full_h)}"
+        return f"{text}: full in {lasting(3.6e6 * full_h)}"
     begins_ms = 3.6e6 * scribe["keep_mb_left"] / rate
     begins = f"in {lasting(begins_ms)} " if begins_ms else ""
-    return f"{found}: never full, {begins}each new file takes an older one's place"
+    return f"{text}: never full, {begins}each new file takes an older one's place"
 
 
 def in_gb(size_mb: float) -> str:
@@ -200,13 +200,13 @@ def _doubt(now: Status) -> str:
 
 def differing_clocks(now: Status) -> str:
     """The sources whose clocks differ too much for a latency, and the differences; empty: none."""
-    found = []
+    phrases = []
     for side in SIDES:
         apart_ms = getattr(now.sources.get(side), "clock_ms", None)
         if apart_ms is not None and not AHEAD_MS <= apart_ms <= LATE_MS:
             difference = f"{lasting(abs(apart_ms))} {'ahead of' if apart_ms < 0 else 'behind'}"
-            found.append(f"the {SOURCE_NAMES[side]}'s stamps are {difference} the daemon's clock")
-    return ", ".join(found)
+            phrases.append(f"the {SOURCE_NAMES[side]}'s stamps are {difference} the daemon's clock")
+    return ", ".join(phrases)
 
 
 def _at(point: tuple[float, float, float] | None) -> str:
@@ -232,8 +232,8 @@ def _nearest(now: Status) -> str:
     if not fresh:
         return "no hand is seen"
     near = f"{100 * now.hand_distance_m:.1f} cm to a hand, at most {now.hand_limit_m_s:.2f} m/s toward it"
-    gone = [side for side in now.hand_age_ms if side not in fresh]
-    return near + (f"; the {gone[0]} hand is assumed where it was last seen" if gone else "")
+    unseen_sides = [side for side in now.hand_age_ms if side not in fresh]
+    return near + (f"; the {unseen_sides[0]} hand is assumed where it was last seen" if unseen_sides else "")
 
 
 def _arm(now: Status) -> str:

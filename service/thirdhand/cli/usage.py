@@ -42,20 +42,20 @@ class Parser(argparse.ArgumentParser):
         """The help text: usage, and the commands in their groups."""
         if not self.groups:
             return super().format_help()
-        shown = argparse.HelpFormatter(self.prog, max_help_position=15)
-        shown.add_text(self.description)
+        formatter = argparse.HelpFormatter(self.prog, max_help_position=15)
+        formatter.add_text(self.description)
         for title, commands in self.groups.items():
-            shown.start_section(title)
-            shown.add_arguments(argparse.Action([], name, help=about) for name, about in commands.items())
-            shown.end_section()
-        shown.add_text(self.epilog)
-        return f"{self.format_usage()}\n{shown.format_help()}"
+            formatter.start_section(title)
+            formatter.add_arguments(argparse.Action([], name, help=about) for name, about in commands.items())
+            formatter.end_section()
+        formatter.add_text(self.epilog)
+        return f"{self.format_usage()}\n{formatter.format_help()}"
 
     def error(self, message: str) -> NoReturn:
         """Print usage and message, and exit with code 2."""
-        found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
-        words = re.findall(r"[\w-]+", found[2]) if found else []
-        super().error(message + (did_you_mean(found[1], words, cutoff=0.5) if found else ""))
+        choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        words = re.findall(r"[\w-]+", choice[2]) if choice else []
+        super().error(message + (did_you_mean(choice[1], words, cutoff=0.5) if choice else ""))
 
 
 class AddCommand:

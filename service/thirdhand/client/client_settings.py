@@ -65,15 +65,15 @@ def client_settings(
     Raises SettingsError, which names the wrong file, variable or option.
     """
     path = _file()
-    found = {} if path is None else _checked(str(path), _read(path))
-    given = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
-    for name, option in given.items():
+    settings = {} if path is None else _checked(str(path), _read(path))
+    options = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
+    for name, option in options.items():
         if text := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
             listed = [part.strip() for part in text.split(",")] if name == "connect" else text
-            found |= _checked(f"${variable}", {name: listed})
+            settings |= _checked(f"${variable}", {name: listed})
         if option or option == "":
-            found |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
-    return msgspec.convert(found, ClientSettings)
+            settings |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
+    return msgspec.convert(settings, ClientSettings)
 
 
 def _checked(origin: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -101,14 +101,14 @@ def _read(path: Path) -> dict[str, Any]:
     SettingsError.
     """
     try:
-        given = toml_in(text_in(path))
+        content = toml_in(text_in(path))
     except (OSError, UnusableError) as error:
         raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
     except ValueError as error:
         raise SettingsError(f"{path}: {error}") from None
-    if isinstance(given.get("connect"), str):
-        given["connect"] = [given["connect"]]
+    if isinstance(content.get("connect"), str):
+        content["connect"] = [content["connect"]]
     for name in ("certificate", "zenoh_config"):
-        if isinstance(value := given.get(name), str) and value and not value.startswith("~"):
-            given[name] = str(path.parent / value)
-    return given
+        if isinstance(value := content.get(name), str) and value and not value.startswith("~"):
+            content[name] = str(path.parent / value)
+    return content

@@ -86,8 +86,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
         frame_id: str = BASE,
     ) -> None:
         """Publish the poses of the hands that the tracker sees now, in its frame."""
-        given = {"left": left, "right": right}
-        poses = {f"hands/{side}": _pose(side, pose) for side, pose in given.items() if pose is not None}
+        arguments = {"left": left, "right": right}
+        poses = {f"hands/{side}": _pose(side, pose) for side, pose in arguments.items() if pose is not None}
         if not poses:
             raise ValueError("no hand given; left, right or both needed")
         self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
@@ -140,12 +140,12 @@ class Connection(Client, AbstractContextManager["Connection"]):
             scene = tuple(objects)
         except TypeError:
             raise ValueError(f"objects: {reprlib.repr(objects)} given; SceneObjects needed") from None
-        for one in scene:
-            if not isinstance(one, SceneObject):
-                raise ValueError(f"object {one!r} given; a SceneObject needed")
-            if one.shape not in markers.NUMBERS:
+        for scene_object in scene:
+            if not isinstance(scene_object, SceneObject):
+                raise ValueError(f"object {scene_object!r} given; a SceneObject needed")
+            if scene_object.shape not in markers.NUMBERS:
                 accepted = ", ".join(markers.NUMBERS)
-                raise ValueError(f"object {one.name!r}: shape {one.shape!r} given; one of {accepted} accepted")
+                raise ValueError(f"object {scene_object.name!r}: shape {scene_object.shape!r} given; one of {accepted} accepted")
         markers.decode_objects(markers.encode_objects(0, scene))  # raises the error that the daemon would report
         self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
 
@@ -198,8 +198,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def _heard(self, suffix: str) -> Publisher:
         """The publisher on a channel, once somebody listens. Raises UnreachableError."""
-        if (known := self._publishers.get(suffix)) is not None:
-            return known
+        if (cached := self._publishers.get(suffix)) is not None:
+            return cached
         publisher = Publisher(self._session, self._cell, suffix)
         try:
             wait_until_heard(publisher, timeout_s=LISTENER_TIMEOUT_S)

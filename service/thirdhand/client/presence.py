@@ -37,7 +37,7 @@ def is_connected(session: zenoh.Session) -> bool:
 
 def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> frozenset[str]:
     """The ids of the Zenoh sessions of the daemons that serve a cell."""
-    return frozenset(own for _, own in _tokens(session, channels.presence(cell), timeout_s))
+    return frozenset(session_id for _, session_id in _tokens(session, channels.presence(cell), timeout_s))
 
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
@@ -57,7 +57,7 @@ def why_silent(session: zenoh.Session, cell: str) -> str:
 
 def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> tuple[Cell, ...]:
     """All cells that are served on a network, sorted by name; queried in parallel."""
-    found = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))
+    tokens = sorted(_tokens(session, channels.PRESENCE_OF_ALL, timeout_s))
     queries = [
         session.get(
             channels.key(name, "status"),
@@ -66,7 +66,7 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
         )
-        for name in dict(found)
+        for name in dict(tokens)
     ]
     statuses: dict[str, Status] = {}
     for replies in queries:
@@ -74,7 +74,7 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
             if reply.ok is not None and reply.replier_id is not None:
                 with contextlib.suppress(RefusedError):
                     statuses[str(reply.replier_id.zid)] = decoded(reply.ok.payload.to_bytes(), Status)
-    return tuple(Cell(printable(name), own, statuses.get(own)) for name, own in found)
+    return tuple(Cell(printable(name), session_id, statuses.get(session_id)) for name, session_id in tokens)
 
 
 class Overheard(AbstractContextManager["Overheard"]):
@@ -84,7 +84,7 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
-        self._subscribers = [session.declare_subscriber(one, self._take) for one in expressions]
+        self._subscribers = [session.declare_subscriber(expression, self._take) for expression in expressions]
 
     def __exit__(self, *_: object) -> None:
         self.close()

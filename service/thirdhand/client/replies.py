@@ -18,5 +18,5 @@ def decoded(data: bytes, kind: type[Decoded]) -> Decoded:
     try:
         return validated(printable_values(msgspec.json.decode(data)), kind)
     except (msgspec.DecodeError, InvalidError, RecursionError, UnicodeDecodeError) as error:
-        what = f"not a {kind.__name__}: {in_words(error, named=False)}"
-        raise RefusedError(f"{what}. Do daemon and client have the same version?") from None
+        problem = f"not a {kind.__name__}: {in_words(error, named=False)}"
+        raise RefusedError(f"{problem}. Do daemon and client have the same version?") from None

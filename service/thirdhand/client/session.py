@@ -87,7 +87,7 @@ def open_session(
     The caller closes the session. Raises UnreachableError, and CertificateError at once if TLS
     fails for a certificate.
     """
-    for how, endpoint in [*(("connect to", one) for one in connect), *(("listen on", one) for one in listen)]:
+    for how, endpoint in [*(("connect to", address) for address in connect), *(("listen on", address) for address in listen)]:
         if lacks := lacking(endpoint):
             raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
@@ -183,9 +183,9 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
     tls, is_plain = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), not endpoint.startswith("tls/")
     try:
         if folder and not is_plain:
-            own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+            certificate, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
             tls.load_verify_locations(authority)
-            tls.load_cert_chain(own, key)
+            tls.load_cert_chain(certificate, key)
         else:
             tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
         with (
@@ -248,8 +248,8 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
             f"nobody answers at {', '.join(connect)}: "
             "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
         )
-    found = re.search(r"\(os error (\d+)\)", reason)
-    words = in_words(OSError(number := int(found[1]), os.strerror(number))) if found else reason
+    os_error = re.search(r"\(os error (\d+)\)", reason)
+    words = in_words(OSError(number := int(os_error[1]), os.strerror(number))) if os_error else reason
     return f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
 
 
@@ -269,8 +269,8 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
 
 def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
     """The endpoints to connect to in a configuration, for every mode or for clients."""
-    found = json.loads(config.get_json("connect/endpoints"))
-    return tuple(found.get("client") or () if isinstance(found, dict) else found or ())
+    configured = json.loads(config.get_json("connect/endpoints"))
+    return tuple(configured.get("client") or () if isinstance(configured, dict) else configured or ())
 
 
 def _tls(folder: str | Path | None) -> dict[str, Any]:
@@ -281,24 +281,24 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     if not folder:
         return {}
     try:
-        own, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+        certificate, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
     except RuntimeError:
         raise UnreachableError(f"certificate {folder}: no user of this name has a folder here") from None
-    for path in (own, key, authority):
+    for path in (certificate, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: {FOLDER_NEEDED}")
     try:
         tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         tls.load_verify_locations(authority)
-        tls.load_cert_chain(own, key, password="none")
+        tls.load_cert_chain(certificate, key, password="none")
     except ssl.SSLError:
         raise UnreachableError(
-            f"cannot use {own}, {key} and {authority}: certificates in PEM, and the key of the first without a "
+            f"cannot use {certificate}, {key} and {authority}: certificates in PEM, and the key of the first without a "
             "password, needed"
         ) from None
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):
-        settings |= {f"{side}_certificate": str(own), f"{side}_private_key": str(key)}
+        settings |= {f"{side}_certificate": str(certificate), f"{side}_private_key": str(key)}
     settings |= {"verify_name_on_connect": True, "close_link_on_expiration": True}
     return {"transport/link/tls": settings}  # replaces any other TLS settings
 

@@ -122,13 +122,13 @@ def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
 def checked_stamp(stamp_ns: Any) -> int:
     """A stamp [ns since 1970] that a message can carry. Raises ValueError."""
     try:
-        found = operator.index(stamp_ns)
+        checked_ns = operator.index(stamp_ns)
     except TypeError:
-        found = -1
-    if not 0 <= found < MAX_STAMP_NS:
+        checked_ns = -1
+    if not 0 <= checked_ns < MAX_STAMP_NS:
         needed = "whole nanoseconds since 1970 needed, like time.time_ns()"
         raise ValueError(f"stamp_ns: {reprlib.repr(stamp_ns)} given; {needed}")
-    return found
+    return checked_ns
 
 
 def checked_frame(frame_id: Any) -> None:

@@ -108,11 +108,11 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
     """The layout of positions, velocities and efforts with these counts. The count of velocities
     and of efforts precedes them; that of positions precedes the layout.
     """
-    layout, at = f"<{counts[0]}d", 0
+    layout, offset = f"<{counts[0]}d", 0
     for count in counts[1:]:
-        layout, at = layout + "I", at + 4
+        layout, offset = layout + "I", offset + 4
         if count:
-            layout, at = layout + ("4x" if at % 8 else "") + f"{count}d", 0
+            layout, offset = layout + ("4x" if offset % 8 else "") + f"{count}d", 0
     return struct.Struct(layout)
 
 
@@ -258,10 +258,10 @@ class Reader:
     def unpack(self, layout: struct.Struct, align: int) -> tuple[Any, ...]:
         if self._is_big_endian:
             layout = _big_endian(layout)
-        at = self._at + (-(self._at - 4) % min(align, self._max_align))
-        self._at = at + layout.size
+        offset = self._at + (-(self._at - 4) % min(align, self._max_align))
+        self._at = offset + layout.size
         try:
-            return layout.unpack_from(self._data, at)
+            return layout.unpack_from(self._data, offset)
         except struct.error:
             raise WireError(f"{len(self._data)} bytes end before byte {self._at} of the message") from None
 
@@ -359,18 +359,18 @@ def decode_joints(data: bytes) -> JointState:
 
     A source repeats the same names, so their place in the message is found only once.
     """
-    known = _joint_layouts.get(len(data))
-    if known is not None and data.startswith(known.fixed, _STAMPED) and data.startswith(CDR_HEADER):
-        numbers = known.numbers.unpack_from(data, _STAMPED + len(known.fixed))
-        n, v = known.counts[0], known.counts[0] + 1 + known.counts[1]
-        if numbers[n] == known.counts[1] and numbers[v] == known.counts[2]:
+    layout = _joint_layouts.get(len(data))
+    if layout is not None and data.startswith(layout.fixed, _STAMPED) and data.startswith(CDR_HEADER):
+        numbers = layout.numbers.unpack_from(data, _STAMPED + len(layout.fixed))
+        n, v = layout.counts[0], layout.counts[0] + 1 + layout.counts[1]
+        if numbers[n] == layout.counts[1] and numbers[v] == layout.counts[2]:
             return JointState(
                 _stamp_ns(*_STAMP.unpack_from(data, 4)),
-                known.names,
+                layout.names,
                 numbers[:n],
                 numbers[n + 1 : v],
                 numbers[v + 1 :],
-                known.frame_id,
+                layout.frame_id,
             )
     reader = Reader(data, MAX_BYTES)
     stamp, frame = reader.header()
@@ -442,20 +442,20 @@ def decode_transforms(
 
     Raises WireError; mistakes of single transforms are appended to `rejected` instead, if given.
     """
-    reader, wanted, found = Reader(data, longest), _spellings(frames), []
+    reader, spellings, transforms = Reader(data, longest), _spellings(frames), []
     for _ in range(reader.items()):
         stamp, parent, child, pose = reader.transform()
-        if frames and child not in wanted:
+        if frames and child not in spellings:
             continue
         try:
             frame, name = (_text(raw).lstrip("/") for raw in (parent, child))
-            found.append((name, PoseStamped(_stamp_ns(*stamp), frame, pose[:3], pose[3:])))
+            transforms.append((name, PoseStamped(_stamp_ns(*stamp), frame, pose[:3], pose[3:])))
         except WireError as error:
             if rejected is None:
                 raise
             rejected.append(str(error))
     reader.end()
-    return found
+    return transforms
 
 
 def decode_tick(data: bytes) -> tuple[int, bytes, int, int | None]:
@@ -469,9 +469,9 @@ def decode_tick(data: bytes) -> tuple[int, bytes, int, int | None]:
     index, lost, count = _TICK.unpack_from(data, 4)
     if len(data) - 20 < count:
         raise WireError(f"a Tick with {count} events in {len(data)} bytes")
-    at = 20 + count + -count % 4
-    is_checked = len(data) >= at + _LENGTH.size
-    return index, data[20 : 20 + count], lost, _LENGTH.unpack_from(data, at)[0] if is_checked else None
+    offset = 20 + count + -count % 4
+    is_checked = len(data) >= offset + _LENGTH.size
+    return index, data[20 : 20 + count], lost, _LENGTH.unpack_from(data, offset)[0] if is_checked else None
 
 
 def decode_skill(data: bytes) -> bytes:

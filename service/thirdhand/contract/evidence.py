@@ -102,16 +102,16 @@ NOTHING = Evidence()
 
 def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
     """An incident in words, with the figures that were seen."""
-    found, remedy = "", ""
+    finding, remedy = "", ""
     match member:
         case Reason():
-            found, remedy = _reason(member, seen)
+            finding, remedy = _reason(member, seen)
         case Flag.STUCK:
-            found = _stuck(seen.stuck)
+            finding = _stuck(seen.stuck)
         case Cause() | Condition.MALFORMED:
-            found, remedy = _rejection(member, seen)
+            finding, remedy = _rejection(member, seen)
     named = word(member)
-    why = found or what_happened(named, seen.settings)
+    why = finding or what_happened(named, seen.settings)
     remedy = remedy or what_to_do(named)
     if seen.busy and isinstance(member, Reason) and _is_of_a_busy_machine(member, seen):
         why = f"this machine was too busy, {seen.busy}; {why}"
@@ -121,96 +121,96 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
 
 def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
     """The finding and its remedy if the figures show a closer cause; empty otherwise."""
-    found, closer = "", ""
+    finding, closer = "", ""
     match reason:
         case Reason.NO_HANDS | Reason.STALE_HAND:
-            found, closer = _unseen(seen), _rejected_remedy(seen, *SIDES)
+            finding, closer = _unseen(seen), _rejected_remedy(seen, *SIDES)
             if not closer and reason is Reason.STALE_HAND and any(_rate_too_low(seen, side) for side in SIDES):
                 closer = what_to_do(Condition.HANDS_TOO_RARE)
             elif not closer and any(hand.batches_ms for hand in _hands(seen)):
                 closer = what_to_do(Condition.DELAYED)
         case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
-            found = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"
+            finding = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"
             closer = unit_advice(unit)
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
-            found = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
+            finding = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
             if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:
-                found = f"the {' and the '.join(jumping)} jumped in the last second; {found}"
+                finding = f"the {' and the '.join(jumping)} jumped in the last second; {finding}"
                 closer = what_to_do(word(Cause.JUMPED))
         case Reason.TWO_SOURCES:
-            found = _contest(seen)
+            finding = _contest(seen)
         case Reason.ARM_NOT_READY:
-            found, closer = _not_ready(seen)
+            finding, closer = _not_ready(seen)
         case Reason.BLOCKED:
-            found = _stuck(seen.stuck)
+            finding = _stuck(seen.stuck)
         case Reason.ARM_ERROR:
-            found = _joint_error(seen)
+            finding = _joint_error(seen)
             if contradiction := _contradiction(seen):
-                found = f"{contradiction}; {found or what_happened(word(reason), seen.settings)}"
+                finding = f"{contradiction}; {finding or what_happened(word(reason), seen.settings)}"
                 closer = what_to_do(Condition.TWO_DRIVERS) + THEN_RESET
         case Reason.ARM_SILENT:
-            found = _silence(seen)
+            finding = _silence(seen)
             if _rate_too_low(seen, "arm"):
                 closer = what_to_do(Condition.JOINTS_TOO_RARE) + THEN_RESET
         case Reason.TOOL_SPEED if seen.measured_speed is not None:
-            found = "the tool was measured at {:.2f} m/s, {:g} accepted".format(*seen.measured_speed)
+            finding = "the tool was measured at {:.2f} m/s, {:g} accepted".format(*seen.measured_speed)
         case Reason.TOOL_SPEED if seen.commanded_speed is not None:
-            found = "a command reached {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
+            finding = "a command reached {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
         case Reason.SERVICE:
-            found = seen.failure
+            finding = seen.failure
         case Reason.CLUTCH:
-            found = seen.clutch
-    return found, closer
+            finding = seen.clutch
+    return finding, closer
 
 
 def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
     """The rejected sample, and what to do if the figures show a closer cause; empty otherwise."""
     if seen.sample is None:
         return seen.mistake, ""
-    came, found, closer = seen.sample, seen.mistake, ""
+    came, finding, closer = seen.sample, seen.mistake, ""
     turned, advanced_s = getattr(came, "orientation", ()), (came.stamp_ns - seen.newest_ns) * 1e-9
-    at = f"at {figures(came.position)} in the tracker's frame" if turned else f"joints at {figures(came.position)}"
+    position_text = f"at {figures(came.position)} in the tracker's frame" if turned else f"joints at {figures(came.position)}"
     match cause:
         case Cause.NOT_FINITE if (out := seen.outside) is not None:
-            found = f"{out.joint} at {out.value:g} {out.unit}; a finite number needed"
+            finding = f"{out.joint} at {out.value:g} {out.unit}; a finite number needed"
         case Cause.NOT_FINITE:
-            found = f"{at}{f', orientation {figures(turned)}' if turned else ''}; finite numbers needed"
+            finding = f"{position_text}{f', orientation {figures(turned)}' if turned else ''}; finite numbers needed"
         case Cause.NOT_A_ROTATION:
             norm = sum(v * v for v in turned) ** 0.5
-            found = f"orientation {figures(turned)} of norm {norm:.3g}; norm 1 needed, x y z w"
+            finding = f"orientation {figures(turned)} of norm {norm:.3g}; norm 1 needed, x y z w"
         case Cause.OUT_OF_RANGE if (out := seen.outside) is not None:
             is_degrees = out.unit == "rad" and abs(out.value) > FULL_TURN_RAD
             like = ", which looks like degrees" if is_degrees else ""
-            found = f"{out.joint} at {out.value:.4g} {out.unit}{like}; {out.low:g} to {out.high:g} accepted"
+            finding = f"{out.joint} at {out.value:.4g} {out.unit}{like}; {out.low:g} to {out.high:g} accepted"
             closer = what_to_do(Condition.DEGREES) if is_degrees else ""
         case Cause.REPEATED:
-            found = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
+            finding = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
         case Cause.OLDER:
-            found = f"stamped {lasting(-1000 * advanced_s)} before the newest accepted one"
+            finding = f"stamped {lasting(-1000 * advanced_s)} before the newest accepted one"
             if seen.is_set_back:
-                found, closer = f"{found}: its clock was set back", what_to_do(Condition.CLOCK_STEPPED)
+                finding, closer = f"{finding}: its clock was set back", what_to_do(Condition.CLOCK_STEPPED)
         case Cause.AHEAD:
-            found = f"stamped {lasting(1000 * advanced_s)} after the newest accepted one"
+            finding = f"stamped {lasting(1000 * advanced_s)} after the newest accepted one"
             if seen.held_up_s is None:
-                found, closer = f"{found}: its clock stepped ahead", what_to_do(Condition.CLOCK_STEPPED)
+                finding, closer = f"{finding}: its clock stepped ahead", what_to_do(Condition.CLOCK_STEPPED)
             else:
-                found += f", which arrived {lasting(1000 * seen.held_up_s)} late (its clock is right)"
+                finding += f", which arrived {lasting(1000 * seen.held_up_s)} late (its clock is right)"
                 closer = what_to_do(Condition.DELAYED)
         case Cause.JUMPED if (jump := seen.jump) is not None:
-            found = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one sample to the next"
+            finding = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one sample to the next"
         case Cause.JUMPED:
-            found = f"{at}, from one sample to the next"
+            finding = f"{position_text}, from one sample to the next"
         case Cause.SWAPPED:
-            found = f"{at}, where the other hand was; left and right look exchanged"
+            finding = f"{position_text}, where the other hand was; left and right look exchanged"
         case Cause.WRONG_FRAME:
             accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
-            found = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
-    return found, closer
+            finding = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
+    return finding, closer
 
 
 def _unseen(seen: Evidence) -> str:
     """The hands that are not seen, since when, and what of them is rejected."""
-    said = []
+    clauses = []
     for side in SIDES:
         if (source := seen.sources.get(side)) is not None and not source.fresh:
             since = "has not been seen yet" if source.age_ms is None else f"was last seen {lasting(source.age_ms)} ago"
@@ -219,8 +219,8 @@ def _unseen(seen: Evidence) -> str:
             instead = (
                 f", as what arrives is rejected as {source.cause}: {source.refused}" if _is_rejected(source) else ""
             )
-            said.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
-    return "; ".join(said)
+            clauses.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
+    return "; ".join(clauses)
 
 
 def _unit_of_all(seen: Evidence) -> str:
@@ -255,10 +255,10 @@ def _joint_error(seen: Evidence) -> str:
     """The largest joint error at the fault, and the worst joint now."""
     if seen.error_rad is None or seen.worst_joint is None:
         return ""
-    joint, off, unit = seen.worst_joint
+    joint, deviation, unit = seen.worst_joint
     half = "" if unit == "rad" else ", half as many m for one that slides"
     at_fault = "a joint was {:.3f} rad off, {:g} accepted".format(*seen.error_rad)
-    return f"{at_fault}{half}; now {joint} is off by {off:.3f} {unit}"
+    return f"{at_fault}{half}; now {joint} is off by {deviation:.3f} {unit}"
 
 
 def _contradiction(seen: Evidence) -> str:
@@ -301,18 +301,18 @@ def _not_ready(seen: Evidence) -> tuple[str, str]:
         return "", ""
     if rejected := _rejected_remedy(seen, "arm"):
         return f"what arrives from the arm is rejected as {source.cause}: {source.refused}", rejected
-    at, closer = "the arm has not rested in one posture for long enough", ""
+    condition, closer = "the arm has not rested in one posture for long enough", ""
     if out is not None:
-        at = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
+        condition = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
     elif seen.inside is not None:
-        at = "the part that {} moves is inside of {} by {:.3f} m".format(*seen.inside)
+        condition = "the part that {} moves is inside of {} by {:.3f} m".format(*seen.inside)
     if seen.inside is not None:
         closer = what_to_do(Condition.ARM_INSIDE)
     elif _rate_too_low(seen, "arm"):
         closer = what_to_do(Condition.JOINTS_TOO_RARE)
     elif source.fresh:
         closer = what_to_do(Condition.ARM_UNSETTLED)
-    return _silence(seen) or at, closer
+    return _silence(seen) or condition, closer
 
 
 def _stuck(seen: Stuck | None) -> str:
@@ -320,8 +320,8 @@ def _stuck(seen: Stuck | None) -> str:
     if seen is None:
         return ""
     limits = f"{', '.join(seen.joints_at_limits)} at a limit" if seen.joints_at_limits else "it cannot come nearer"
-    way = f"on its way out, posture {seen.posture} of {seen.postures}" if seen.posture else "no way out is known yet"
-    return f"the tool is {seen.off_m:.2f} m from its target: {limits}; {way}"
+    way_out = f"on its way out, posture {seen.posture} of {seen.postures}" if seen.posture else "no way out is known yet"
+    return f"the tool is {seen.off_m:.2f} m from its target: {limits}; {way_out}"
 
 
 def _is_rejected(source: Source) -> bool:
@@ -349,7 +349,7 @@ def lasting(duration_ms: float) -> str:
     if duration_ms < 1000.0:
         return f"{duration_ms:.0f} ms"
     sizes_ms = {"days": 86.4e6, "h": 3.6e6, "min": 60e3}
-    unit, size_ms = next((one for one in sizes_ms.items() if duration_ms >= 2.0 * one[1]), ("s", 1000.0))
+    unit, size_ms = next((size for size in sizes_ms.items() if duration_ms >= 2.0 * size[1]), ("s", 1000.0))
     count = duration_ms / size_ms
     return f"{count:.{3 if count < 1000.0 else 4}g} {unit}"
 

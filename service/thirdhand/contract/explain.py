@@ -93,8 +93,8 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
 
     `$.points[0].left: 2 numbers, 3 needed`.
     """
-    message, found, path = str(error).rpartition(" - at `")
-    message, path = (message, path.rstrip("`")) if found else (str(error), "$")
+    message, separator, path = str(error).rpartition(" - at `")
+    message, path = (message, path.rstrip("`")) if separator else (str(error), "$")
     if message.startswith("$"):
         return message  # from a check of our own, which names the path itself
     try:
@@ -104,9 +104,9 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
         return f"$: {error}"
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
-        known = _known(node)
-        problem = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(known) or 'none'}"
-        return problem + did_you_mean(unknown[1], known)
+        field_names = _known(node)
+        problem = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(field_names) or 'none'}"
+        return problem + did_you_mean(unknown[1], field_names)
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
     if (
@@ -180,12 +180,12 @@ def _chosen(node: Any, value: Any) -> Any:
     """Of tagged structs, the one that the value's tag names; of a type or null, that type."""
     if not isinstance(node, inspect.UnionType):
         return node
-    types = [one for one in node.types if not isinstance(one, inspect.NoneType)]
+    types = [member for member in node.types if not isinstance(member, inspect.NoneType)]
     if len(types) == 1 and value is not None:
         return types[0]
     if isinstance(value, dict):
-        tagged = (one for one in node.types if isinstance(one, inspect.StructType) and one.tag_field)
-        return next((one for one in tagged if value.get(one.tag_field) == one.tag), node)
+        tagged = (member for member in node.types if isinstance(member, inspect.StructType) and member.tag_field)
+        return next((member for member in tagged if value.get(member.tag_field) == member.tag), node)
     return node
 
 

@@ -56,10 +56,10 @@ class JointStates:
         self._parts = {name: part for name, part in self._parts.items() if at_s - part[0] <= self._patience_s}
         if len(self._parts) < len(self._names):
             return None
-        found = self._assembled()
+        state = self._assembled()
         self._parts.clear()
         self._state_s = at_s
-        return found
+        return state
 
     def incomplete(self, message: JointState, at_s: float) -> JointState | None:
         """The newest incomplete state, if no whole one was found for `patience_s`: it names what is

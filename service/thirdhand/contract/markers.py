@@ -27,12 +27,12 @@ def encode_objects(stamp_ns: int, objects: Sequence[SceneObject]) -> bytes:
     """CDR bytes of a MarkerArray with one marker for each object."""
     out = cdr.Writer()
     out.pack(_COUNT, len(objects), align=4)
-    for one in objects:
-        out.header(stamp_ns, one.frame_id)
-        out.string(one.name)
-        out.pack(_KIND, 0, NUMBERS[one.shape], _ADD, align=4)
-        out.pack(_PLACED, *one.position, *one.orientation, *one.size, align=8)
-        out.pack(_COLOUR, *one.colour, align=4)
+    for scene_object in objects:
+        out.header(stamp_ns, scene_object.frame_id)
+        out.string(scene_object.name)
+        out.pack(_KIND, 0, NUMBERS[scene_object.shape], _ADD, align=4)
+        out.pack(_PLACED, *scene_object.position, *scene_object.orientation, *scene_object.size, align=8)
+        out.pack(_COLOUR, *scene_object.colour, align=4)
         out.pack(_LIFETIME, 0, 0, align=4)  # unlimited
         out.pack(_BYTE, 0, align=1)  # not locked to its frame
         out.pack(_COUNT, 0, align=4)  # points
@@ -55,7 +55,7 @@ def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
 
     Raises WireError.
     """
-    reader, found = cdr.Reader(data, LARGEST), []
+    reader, objects = cdr.Reader(data, LARGEST), []
     for _ in range(reader.items()):
         _, frame = reader.header()
         name = reader.string()
@@ -75,11 +75,11 @@ def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
         reader.skip(_BYTE, 1)
         reader.unpack(_BYTE, 1)
         if action == _ADD and kind in SHAPES:
-            found.append(_checked(SceneObject(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
+            objects.append(_checked(SceneObject(name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour)))
     reader.end()
-    if len(found) > MOST_OBJECTS or len({one.name for one in found}) < len(found):
-        raise WireError(f"{len(found)} objects; up to {MOST_OBJECTS}, each with a name of its own, accepted")
-    return tuple(found)
+    if len(objects) > MOST_OBJECTS or len({scene_object.name for scene_object in objects}) < len(objects):
+        raise WireError(f"{len(objects)} objects; up to {MOST_OBJECTS}, each with a name of its own, accepted")
+    return tuple(objects)
 
 
 def _checked(one: SceneObject) -> SceneObject:

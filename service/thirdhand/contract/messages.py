@@ -97,14 +97,14 @@ def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, 
 @functools.lru_cache(maxsize=64)
 def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
     """The index of each name among those given. Raises WireError."""
-    found = {name: i for i, name in enumerate(given)}
-    missing = [name for name in names if name not in found]
+    indices = {name: i for i, name in enumerate(given)}
+    missing = [name for name in names if name not in indices]
     if missing:
         raise WireError(f"joints {missing} missing among {len(given)}, {', '.join(given[:10])[:200]}")
     repeated = [name for name in names if given.count(name) > 1]
     if repeated:
         raise WireError(f"joints {repeated} named more than once among {len(given)}; one position each needed")
-    return tuple(found[name] for name in names)
+    return tuple(indices[name] for name in names)
 
 
 def finite(values: tuple[float, ...]) -> bool:

@@ -21,7 +21,7 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+    return "".join(character if character.isprintable() else character.encode("unicode_escape").decode() for character in text)
 
 
 def printable_lines(text: str) -> str:
@@ -40,8 +40,8 @@ def printable_values(value: Any) -> Any:
         case str():
             return printable(value)
         case list():
-            return [printable_values(one) for one in value]
+            return [printable_values(item) for item in value]
         case dict():
-            return {printable_values(key): printable_values(one) for key, one in value.items()}
+            return {printable_values(key): printable_values(item) for key, item in value.items()}
         case _:
             return value

@@ -202,14 +202,14 @@ def decode_request(data: bytes, kind: Any) -> Any:
     """
     data = data.removeprefix(codecs.BOM_UTF8)
     try:
-        given = msgspec.json.decode(data or b"{}")
+        request = msgspec.json.decode(data or b"{}")
         json.loads(data or b"{}", object_pairs_hook=_check_once)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RequestError(f"not JSON: {in_words(error, named=False)}") from None
     try:
-        return msgspec.convert(given, kind)
+        return msgspec.convert(request, kind)
     except msgspec.ValidationError as error:
-        raise RequestError(explained(error, given, kind)) from None
+        raise RequestError(explained(error, request, kind)) from None
 
 
 def _check_once(pairs: list[tuple[str, Any]]) -> None:

@@ -75,13 +75,13 @@ def access_control(
     """
 
     def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
-        found = [channels.key(cell, suffix) for suffix in suffixes]
+        expressions = [channels.key(cell, suffix) for suffix in suffixes]
         if topics and ros2_domain is not None:
-            known = (channels.BY_KEY[suffix] for suffix in suffixes)
-            also = (ros2.of_channel(cell, channel) for channel in known if channel in TOPICS)
-            found += [ros2.key(ros2_domain, topic) for topic in also]
-            found += [ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes]
-        return found
+            candidates = (channels.BY_KEY[suffix] for suffix in suffixes)
+            also = (ros2.of_channel(cell, channel) for channel in candidates if channel in TOPICS)
+            expressions += [ros2.key(ros2_domain, topic) for topic in also]
+            expressions += [ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes]
+        return expressions
 
     heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)
     asked = keys(tuple(channel.key for channel in channels.CHANNELS if channel.queryable))
@@ -95,9 +95,9 @@ def access_control(
     def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
         return [allow(name, "ingress", ingress, key_exprs), allow(name, "egress", egress, key_exprs)]
 
-    shown = {ros2.key(ros2_domain or 0, topic): topic for topic in more_topics if topic.channel.startswith("/")}
-    latched = [one for key, topic in shown.items() if topic.latched for one in (key, ros2.kept(key))]
-    hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *shown])
+    viewer_topics = {ros2.key(ros2_domain or 0, topic): topic for topic in more_topics if topic.channel.startswith("/")}
+    latched = [key_expr for key, topic in viewer_topics.items() if topic.latched for key_expr in (key, ros2.kept(key))]
+    hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *viewer_topics])
     record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True))
     ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 

@@ -78,8 +78,8 @@ def of_settings(settings: Any) -> Iterator[Topic]:
 
 def heard(cell: str, settings: Any, suffixes: Collection[str]) -> list[Topic]:
     """The topics on which a cell with these settings receives messages of some channels."""
-    own = [of_channel(cell, channel) for channel in HEARD if channel.key in suffixes]
-    return own + [topic for topic in of_settings(settings) if topic.heard and topic.channel in suffixes]
+    cell_topics = [of_channel(cell, channel) for channel in HEARD if channel.key in suffixes]
+    return cell_topics + [topic for topic in of_settings(settings) if topic.heard and topic.channel in suffixes]
 
 
 def of_channel(cell: str, channel: channels.Channel) -> Topic:
@@ -117,12 +117,12 @@ def tokens(domain: int, cell: str, session: str, topics: Iterable[Topic]) -> dic
     heard; its node's is under ("", False).
     """
     node = f"%/{_mangled(f'/{cell}')}/{NODE}"
-    found = {("", False): f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
-    for number, topic in enumerate({(one.name, one.heard): one for one in topics}.values(), start=1):
+    by_topic = {("", False): f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
+    for number, topic in enumerate({(candidate.name, candidate.heard): candidate for candidate in topics}.values(), start=1):
         kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _LATCHED if topic.latched else _RELIABLE)
-        what = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
-        found[topic.name, topic.heard] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{what}"
-    return found
+        topic_part = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
+        by_topic[topic.name, topic.heard] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{topic_part}"
+    return by_topic
 
 
 def gid(token: str) -> bytes:

@@ -143,21 +143,21 @@ class Controller:
         lap("intake")
         conditions |= self._alone(frame)
         unseen = UNSEEN.index(side) if (side := conditions & EITHER_UNSEEN) else None
-        wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
-        if wanted is not None:
-            conditions |= SEGMENT_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
+        request = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
+        if request is not None:
+            conditions |= SEGMENT_AMBIGUOUS * request.is_ambiguous | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
         lap("skill")
-        here = self._decide(frame, conditions, math.nan if wanted is None else wanted.gate_m)
+        kinematics = self._decide(frame, conditions, math.nan if request is None else request.gate_m)
         lap("decision")
-        self._separation.step(state, frame, here.record)
+        self._separation.step(state, frame, kinematics.record)
         lap("separation")
-        if wanted is None:
+        if request is None:
             self._hold(frame, lap)
             self._skill.nothing(state, frame)
         elif self._memory["mode"][0] != FOLLOW:
             self._hold(frame, lap)
         else:
-            self._follow(frame, wanted, here, lap)
+            self._follow(frame, request, kinematics, lap)
         unchanging: Frame = np.frombuffer(as_array(frame).tobytes(), self._layout)[0]
         return unchanging
 
@@ -202,18 +202,18 @@ class Controller:
 
     def _decide(self, frame: Frame, conditions: int, gate_m: float) -> Kinematics:
         """Determine the mode, and start an arm that has become ready. Returns its kinematics."""
-        state, here, threshold = self._state, self._at(), self.skill.threshold
+        state, kinematics, threshold = self._state, self._at(), self.skill.threshold
         if self._memory["arm_ready"][0] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
             conditions |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > self._capsule_excess_m)
-        starts = self.decision.step(state, frame, here.record, conditions, gate_m=gate_m, threshold=threshold)
+        starts = self.decision.step(state, frame, kinematics.record, conditions, gate_m=gate_m, threshold=threshold)
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
             self._here = None
         if starts:
-            here = self._at()
-            self._setpoint.begin(state, frame, here)
-        return here
+            kinematics = self._at()
+            self._setpoint.begin(state, frame, kinematics)
+        return kinematics
 
     def _follow(self, frame: Frame, wanted: Wanted, here: Kinematics, lap: Lap) -> None:
         """Advance setpoint and joints by one period. A setpoint outside its bounds, or a tool that
@@ -242,15 +242,15 @@ class Controller:
         """Brake the joints; or move them back into their limits, out of a thing that they are
         inside of, or along a way out. The setpoint is reset to the tool.
         """
-        state, separation, here = self._state, self._separation, self._at()
-        own = self.decision.own_motion(state, here.tasks)
-        if own is None:
+        state, separation, kinematics = self._state, self._separation, self._at()
+        velocity = self.decision.own_motion(state, kinematics.tasks)
+        if velocity is None:
             moved = self._limiter.stop(state, frame, separation)
         else:
-            own = own * separation.share(own)
+            velocity = velocity * separation.share(velocity)
             if state["leaves"]:
-                own = own + self._arm.follow(state, here, separation).velocity
-            moved = self._limiter.step(state, frame, own, np.zeros(len(own)), separation)
+                velocity = velocity + self._arm.follow(state, kinematics, separation).velocity
+            moved = self._limiter.step(state, frame, velocity, np.zeros(len(velocity)), separation)
         self._here = moved.here
         lap("limiter")
         self._setpoint.begin(state, frame, moved.here, engages=not self.decision.is_brief(state))
@@ -291,8 +291,8 @@ def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
     Before the arm is ready there is no command, and without known hands no target.
     """
     tick = int(frame["tick"])
-    made = ((one.key, _OUTPUTS[one.key](frame, stamp_ns, joints)) for one in STREAMS if tick % one.every == 0)
-    return [(key, payload) for key, payload in made if payload is not None]
+    messages = ((stream.key, _OUTPUTS[stream.key](frame, stamp_ns, joints)) for stream in STREAMS if tick % stream.every == 0)
+    return [(key, payload) for key, payload in messages if payload is not None]
 
 
 def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:

@@ -168,18 +168,18 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
 
     The capsules are ordered by link.
     """
-    turn, at = np.eye(3), np.zeros(3)
-    own, moved, there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    turn, origin = np.eye(3), np.zeros(3)
+    joint_turn, moved, next_origin = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     capsule, count = 0, len(capsules)
     for link in range(len(q) + 1):
         if link > 0:
             frame = frames[link - 1]
             for i in range(3):
-                there[i] = at[i]
+                next_origin[i] = origin[i]
                 for k in range(3):
-                    there[i] += turn[i, k] * frame[k, 3]
+                    next_origin[i] += turn[i, k] * frame[k, 3]
             slides = axes[link - 1, 3] != 0.0
-            _about(axes[link - 1], 0.0 if slides else q[link - 1], own)
+            _about(axes[link - 1], 0.0 if slides else q[link - 1], joint_turn)
             for i in range(3):
                 for j in range(3):
                     moved[i, j] = 0.0
@@ -188,17 +188,17 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
             if slides:
                 for i in range(3):
                     for k in range(3):
-                        there[i] += moved[i, k] * axes[link - 1, k] * q[link - 1]
+                        next_origin[i] += moved[i, k] * axes[link - 1, k] * q[link - 1]
             for i in range(3):
-                at[i] = there[i]
+                origin[i] = next_origin[i]
                 for j in range(3):
                     turn[i, j] = 0.0
                     for k in range(3):
-                        turn[i, j] += moved[i, k] * own[k, j]
+                        turn[i, j] += moved[i, k] * joint_turn[k, j]
         while capsule < count and capsules[capsule].link == link:
             for end in range(2):
                 for i in range(3):
-                    out[capsule, end, i] = at[i]
+                    out[capsule, end, i] = origin[i]
                     for k in range(3):
                         out[capsule, end, i] += turn[i, k] * capsules[capsule].ends[end, k]
             capsule += 1
@@ -276,9 +276,9 @@ def carry_back(near: Vector, then: Vector, now: Vector) -> None:
     """Move the first point of `near` from the segment `then` (2, 3) to the same share of `now`."""
     long = whole = 0.0
     for i in range(3):
-        way = then[1, i] - then[0, i]
-        long += way * (near[i] - then[0, i])
-        whole += way * way
+        extent = then[1, i] - then[0, i]
+        long += extent * (near[i] - then[0, i])
+        whole += extent * extent
     share = long / whole if whole > 0.0 else 0.0
     for i in range(3):
         near[i] = now[0, i] + share * (now[1, i] - now[0, i])
@@ -313,9 +313,9 @@ def _slope(segment: Vector, box: Vector, share: float) -> float:
     """
     total = 0.0
     for i in range(3):
-        way = segment[1, i] - segment[0, i]
-        at = segment[0, i] + share * way
-        total += (at - min(max(at, box[0, i]), box[1, i])) * way
+        extent = segment[1, i] - segment[0, i]
+        point = segment[0, i] + share * extent
+        total += (point - min(max(point, box[0, i]), box[1, i])) * extent
     return total
 
 
@@ -328,15 +328,15 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
     """
     square, least, face, side = 0.0, math.inf, 2, -1.0
     for i in range(3):
-        at = segment[0, i] + share * (segment[1, i] - segment[0, i])
-        near[i] = at
-        near[3 + i] = min(max(at, box[0, i]), box[1, i])
-        near[6 + i] = near[3 + i] - at
+        point = segment[0, i] + share * (segment[1, i] - segment[0, i])
+        near[i] = point
+        near[3 + i] = min(max(point, box[0, i]), box[1, i])
+        near[6 + i] = near[3 + i] - point
         square += near[6 + i] * near[6 + i]
-        if at - box[0, i] < least:
-            least, face, side = at - box[0, i], i, 1.0
-        if box[1, i] - at < least:
-            least, face, side = box[1, i] - at, i, -1.0
+        if point - box[0, i] < least:
+            least, face, side = point - box[0, i], i, 1.0
+        if box[1, i] - point < least:
+            least, face, side = box[1, i] - point, i, -1.0
     distance = math.sqrt(square)
     if distance > LEAST:
         for i in range(3):

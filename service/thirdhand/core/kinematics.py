@@ -96,11 +96,11 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
 
     The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
     """
-    here, joints = heres[0], len(dq)
-    jacobian, tool = here.jacobian, here.position
+    kinematics, joints = heres[0], len(dq)
+    jacobian, tool = kinematics.jacobian, kinematics.position
     rotation, shift, turned, moved = np.eye(3), np.zeros(3), np.empty((3, 3)), np.empty(3)
     linear, angular, axis, moment = np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
-    own, own_shift = np.empty((3, 3)), np.empty(3)
+    turn, own_shift = np.empty((3, 3)), np.empty(3)
     for j in range(joints):
         wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
         # moment about the origin: the tool's velocity less w × tool
@@ -120,21 +120,21 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
         if not turns:
             c, s = 1.0, 0.0
         v = 1.0 - c
-        own[0, 0], own[0, 1], own[0, 2] = c + v * wx * wx, v * wx * wy - s * wz, v * wx * wz + s * wy
-        own[1, 0], own[1, 1], own[1, 2] = v * wx * wy + s * wz, c + v * wy * wy, v * wy * wz - s * wx
-        own[2, 0], own[2, 1], own[2, 2] = v * wx * wz - s * wy, v * wy * wz + s * wx, c + v * wz * wz
+        turn[0, 0], turn[0, 1], turn[0, 2] = c + v * wx * wx, v * wx * wy - s * wz, v * wx * wz + s * wy
+        turn[1, 0], turn[1, 1], turn[1, 2] = v * wx * wy + s * wz, c + v * wy * wy, v * wy * wz - s * wx
+        turn[2, 0], turn[2, 1], turn[2, 2] = v * wx * wz - s * wy, v * wy * wz + s * wx, c + v * wz * wz
         if turns:  # about the point o = w × u of the axis: o - own o
             ox, oy, oz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
-            own_shift[0] = ox - (own[0, 0] * ox + own[0, 1] * oy + own[0, 2] * oz)
-            own_shift[1] = oy - (own[1, 0] * ox + own[1, 1] * oy + own[1, 2] * oz)
-            own_shift[2] = oz - (own[2, 0] * ox + own[2, 1] * oy + own[2, 2] * oz)
+            own_shift[0] = ox - (turn[0, 0] * ox + turn[0, 1] * oy + turn[0, 2] * oz)
+            own_shift[1] = oy - (turn[1, 0] * ox + turn[1, 1] * oy + turn[1, 2] * oz)
+            own_shift[2] = oz - (turn[2, 0] * ox + turn[2, 1] * oy + turn[2, 2] * oz)
         else:
             own_shift[0], own_shift[1], own_shift[2] = ux * way[j], uy * way[j], uz * way[j]
         for i in range(3):
             moved[i] = shift[i]
             for k in range(3):
                 moved[i] += rotation[i, k] * own_shift[k]
-                turned[i, k] = rotation[i, 0] * own[0, k] + rotation[i, 1] * own[1, k] + rotation[i, 2] * own[2, k]
+                turned[i, k] = rotation[i, 0] * turn[0, k] + rotation[i, 1] * turn[1, k] + rotation[i, 2] * turn[2, k]
         rotation[:], shift[:] = turned, moved
     for i in range(3):
         moved[i] = rotation[i, 0] * tool[0] + rotation[i, 1] * tool[1] + rotation[i, 2] * tool[2] + shift[i]
@@ -156,14 +156,14 @@ def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     These are the damped least-squares joint motions that move the tool along one axis and leave its
     orientation free. S makes joints with higher limits move more.
     """
-    arm, here = arms[0], heres[0]
-    joints = here.tasks.shape[1]
+    arm, kinematics = arms[0], heres[0]
+    joints = kinematics.tasks.shape[1]
     scaled, root, right = np.empty((3, joints)), np.empty((3, 3)), np.empty(3)
     for order in range(3):
         for i in range(3):
             for joint in range(joints):
-                scaled[i, joint] = here.tasks[i, joint] * arm.spared[order, joint]
-        factorise(scaled, here.damping, root)
+                scaled[i, joint] = kinematics.tasks[i, joint] * arm.spared[order, joint]
+        factorise(scaled, kinematics.damping, root)
         for axis in range(3):
             right[:] = 0.0
             right[axis] = 1.0

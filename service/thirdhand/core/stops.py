@@ -32,8 +32,8 @@ def fastest_stop(
     out (6,): velocity, acceleration and displacement after dt; smallest and largest displacement
     until rest, with 0 among them; duration [s].
     """
-    then = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
-    sign = -1.0 if then > 0.0 else 1.0  # in this direction the stop accelerates
+    crest = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
+    sign = -1.0 if crest > 0.0 else 1.0  # in this direction the stop accelerates
     v, a = sign * velocity, sign * acceleration
     peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
     hold = 0.0
@@ -46,7 +46,7 @@ def fastest_stop(
     else:
         peak = max(peak, a)
     x = t = low = high = 0.0
-    found = False
+    is_sampled = False
     after_x = after_v = after_a = 0.0
     for phase in range(3):
         if phase == 0:
@@ -57,11 +57,11 @@ def fastest_stop(
             jerk, lasts = -max_jerk, peak / max_jerk
         if lasts <= 0.0:
             continue
-        if not found and dt <= t + lasts:
+        if not is_sampled and dt <= t + lasts:
             h = dt - t
             after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
             after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
-            found = True
+            is_sampled = True
         # the displacement is extreme where the velocity is 0, or at an end of the phase
         disc = a * a - 2.0 * jerk * v
         for root in (-1.0, 1.0):
@@ -78,7 +78,7 @@ def fastest_stop(
         a += lasts * jerk
         t += lasts
         low, high = min(low, x), max(high, x)
-    if not found:
+    if not is_sampled:
         after_x, after_v, after_a = x, 0.0, 0.0
     out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
     out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)

@@ -40,12 +40,12 @@ def tool_limits(arm: Arm, settings: Settings, postures: Vector, directions: Vect
         shares = np.linalg.norm(costs, axis=2)
     else:
         shares = np.abs(np.einsum("ni,noij->noj", directions, costs))
-    own, names = (settings.tool.max_speed, settings.tool.acceleration), settings.joints.names
-    found: list[tuple[float, str]] = []
-    for order, most in enumerate(own):
+    bounds, names = (settings.tool.max_speed, settings.tool.acceleration), settings.joints.names
+    limits: list[tuple[float, str]] = []
+    for order, most in enumerate(bounds):
         joint, needed = int(shares[:, order].max(axis=0).argmax()), float(shares[:, order].max())
-        found.append((1.0 / needed, names[joint]) if needed * most > 1.0 else (most, ""))
-    (speed, speed_joint), (acceleration, acceleration_joint) = found
+        limits.append((1.0 / needed, names[joint]) if needed * most > 1.0 else (most, ""))
+    (speed, speed_joint), (acceleration, acceleration_joint) = limits
     return ToolLimits(round(speed, 3), speed_joint, round(acceleration, 2), acceleration_joint)
 
 
@@ -91,10 +91,10 @@ def _along(arm: Arm, settings: Settings, positions: Vector, orientation: Vector)
         length = float(np.linalg.norm(end - begin))
         count = int(length / step_m)
         for i in range(count):
-            at = begin + (end - begin) * (i + 1) / count
-            q = q + PATH_STEP_S * arm.step(q, at, (end - begin) / (count * PATH_STEP_S), orientation).velocity
+            position = begin + (end - begin) * (i + 1) / count
+            q = q + PATH_STEP_S * arm.step(q, position, (end - begin) / (count * PATH_STEP_S), orientation).velocity
             step += 1
-            if step % POSTURE_EVERY == 0 and np.linalg.norm(arm.at(q).position - at) < ON_PATH_M:
+            if step % POSTURE_EVERY == 0 and np.linalg.norm(arm.at(q).position - position) < ON_PATH_M:
                 postures.append(q)
                 directions.append((end - begin) / length)
     return np.array(postures), np.array(directions)

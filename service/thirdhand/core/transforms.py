@@ -25,7 +25,7 @@ class Frames:
         self._root, self._names, self._urdf = urdf.root, settings.joints.names, urdf
         self._still = {joint.child for joint in urdf.joints if joint.kind == "fixed"}
         self._links = links
-        self.fixed = [one for one in self._at(()) if one.child in self._still]
+        self.fixed = [transform for transform in self._at(()) if transform.child in self._still]
         self.fixed.append(Transform(settings.arm.plate, "tool", offset[:3], offset[3:]))
         if all(BASE not in (joint.parent, joint.child) for joint in urdf.joints):
             self.fixed.append(Transform(BASE, urdf.root, (0.0, 0.0, 0.0), _UPRIGHT))
@@ -36,14 +36,14 @@ class Frames:
 
     def moving(self, frame: Frame, joints: Sequence[float]) -> list[Transform]:
         """Transforms of a frame at joints [rad], in chain order; unknown ones are left out."""
-        found = [one for one in self._at(joints) if one.child not in self._still]
+        transforms = [transform for transform in self._at(joints) if transform.child not in self._still]
         setpoint, turn, target, target_turn = (
             tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
         )
-        found.append(Transform(self._root, "setpoint", setpoint, turn))
+        transforms.append(Transform(self._root, "setpoint", setpoint, turn))
         for side, name in enumerate(SIDES):
             if frame["hand_ages"][side] >= 0:
-                found.append(Transform(self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
+                transforms.append(Transform(self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
         if frame["covariance"].any():  # without both hands nothing is predicted
-            found.append(Transform(self._root, "target", target, target_turn))
-        return found
+            transforms.append(Transform(self._root, "target", target, target_turn))
+        return transforms

@@ -73,7 +73,7 @@ class WayOut:
                     break
             if ways:
                 break
-        return min((way for way in ways if len(way) <= WAY), key=_length, default=[])
+        return min((candidate for candidate in ways if len(candidate) <= WAY), key=_length, default=[])
 
     def has_posture(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> bool:
         """True if the arm has a collision-free posture with the tool at a position (3,) [m], in an
@@ -122,8 +122,8 @@ class WayOut:
         `joints` first. Without an `orientation`, any orientation is accepted.
         """
         starts = self._starts(joints, limits, random)
-        found = list(itertools.islice(self._free(starts, limits, position, orientation, hands), 2 * GOALS))
-        return sorted(found, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
+        postures = list(itertools.islice(self._free(starts, limits, position, orientation, hands), 2 * GOALS))
+        return sorted(postures, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
 
     def _solved(self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
         """Posture (J,) within the limits with the tool at its target, from the start q (J,); None
@@ -135,12 +135,12 @@ class WayOut:
         `turn_lever` [m]; J are the rows of `tasks` for it.
         """
         for _ in range(ITERATIONS):
-            here = self._arm.at(q)
-            error, tasks, turn = position - here.position, here.tasks[:3], 0.0
+            kinematics = self._arm.at(q)
+            error, tasks, turn = position - kinematics.position, kinematics.tasks[:3], 0.0
             if orientation is not None:
-                left = here.rotation.T @ self._turn(here, orientation)
+                left = kinematics.rotation.T @ self._turn(kinematics, orientation)
                 turn = float(np.linalg.norm(left))
-                error, tasks = np.append(error, self._lever * left[: len(here.tasks) - 3]), here.tasks
+                error, tasks = np.append(error, self._lever * left[: len(kinematics.tasks) - 3]), kinematics.tasks
             if np.linalg.norm(error[:3]) < REACHED_M and turn < REACHED_RAD:
                 return q
             step = tasks.T @ np.linalg.solve(tasks @ tasks.T + DAMPING * np.eye(len(tasks)), error)
@@ -152,16 +152,16 @@ class WayOut:
         the arm follows only the direction of the tool's z axis, it is the shortest rotation of that
         axis.
         """
-        turn, wanted = np.empty(3), np.empty(3)
+        turn, target_axis = np.empty(3), np.empty(3)
         if self._whole:
             now = np.empty(4)
             quaternion_of(here.rotation, now)
             turn_between(now, orientation, turn)
             return turn
-        axis_of(orientation, wanted)
+        axis_of(orientation, target_axis)
         now = np.ascontiguousarray(here.rotation[:, 2])
         swing(now, orientation, turn)
-        return math.pi * here.rotation[:, 0] if now @ wanted < OPPOSITE else turn
+        return math.pi * here.rotation[:, 0] if now @ target_axis < OPPOSITE else turn
 
     def _is_free(self, a: Vector, b: Vector, hands: Vector, least: float) -> bool:
         """True if all postures on a straight line in joint space, GRAIN_RAD apart, have more than
@@ -188,8 +188,8 @@ class WayOut:
                 if met is None:
                     break
                 if np.array_equal(met, new):
-                    one, two = _to_root(grown, before), _to_root(other, other_before)[::-1]
-                    path = one[::-1] + two[::-1][1:] if number % 2 == 0 else two + one[1:]
+                    branch, two = _to_root(grown, before), _to_root(other, other_before)[::-1]
+                    path = branch[::-1] + two[::-1][1:] if number % 2 == 0 else two + branch[1:]
                     return path if np.array_equal(path[0], start) else path[::-1]
         return []
 
@@ -229,8 +229,8 @@ def _length(path: list[Vector]) -> float:
 
 def _to_root(nodes: list[Vector], before: list[int]) -> list[Vector]:
     """Postures from the newest node of a tree back to its root."""
-    path, at = [], len(nodes) - 1
-    while at >= 0:
-        path.append(nodes[at])
-        at = before[at]
+    path, index = [], len(nodes) - 1
+    while index >= 0:
+        path.append(nodes[index])
+        index = before[index]
     return path

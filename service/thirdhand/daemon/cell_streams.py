@@ -205,11 +205,11 @@ class CellStreams:
         keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
         if domain is not None:
             topics = ros2.heard(cell, settings.ros2, inputs)
-            keys += [(one.channel, ros2.key(domain, one)) for one in topics if not one.frame]
-            for one in (topic for topic in topics if topic.frame):
-                frames.setdefault(ros2.key(domain, one), {})[one.frame] = one.channel
+            keys += [(topic.channel, ros2.key(domain, topic)) for topic in topics if not topic.frame]
+            for transform_topic in (topic for topic in topics if topic.frame):
+                frames.setdefault(ros2.key(domain, transform_topic), {})[transform_topic.frame] = transform_topic.channel
             topics += [ros2.of_channel(cell, channel) for channel in ros2.SAID]
-            topics += [one for one in ros2.of_settings(settings.ros2) if not one.heard]
+            topics += [topic for topic in ros2.of_settings(settings.ros2) if not topic.heard]
         self._subscribers = [
             (suffix, session.declare_subscriber(key, RingChannel(_most(suffix)))) for suffix, key in keys
         ]

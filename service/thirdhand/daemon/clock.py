@@ -95,11 +95,11 @@ class Deadlines:
         while (late := self._now_ns() - deadline) < 0:
             pass
         due = self.stamp_ns + passed * self.period_ns
-        off = self._wall_ns() - late - due
-        if -STEP_NS < off < STEP_NS:
-            self.stamp_ns = due + off // DRAW
+        drift_ns = self._wall_ns() - late - due
+        if -STEP_NS < drift_ns < STEP_NS:
+            self.stamp_ns = due + drift_ns // DRAW
         else:
-            self.stamp_ns = due + off if off > 0 else self.stamp_ns + CREEP_NS
+            self.stamp_ns = due + drift_ns if drift_ns > 0 else self.stamp_ns + CREEP_NS
         return index, late
 
     def _sleep_until(self, at_ns: int) -> None:

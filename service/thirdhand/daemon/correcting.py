@@ -86,11 +86,11 @@ class Corrections:
         if speed > MAX_LED_RADPS:
             raise RequestError(f"the arm moves at {speed:.2f} rad/s; {MAX_LED_RADPS} rad/s accepted: hold it still")
         self._arm = self._arm or Arm(settings, robot_description(settings))
-        here, quaternion = self._arm.at(np.array(state["measured"])), np.empty(4)
-        quaternion_of(here.rotation, quaternion)
+        kinematics, quaternion = self._arm.at(np.array(state["measured"])), np.empty(4)
+        quaternion_of(kinematics.rotation, quaternion)
         x, y, z, w = (round(value, 6) for value in quaternion.tolist())
         orientation = (x, y, z, w) if request.turned else None
-        return LedTool(held_tick, hands, segment, np.array(here.position), orientation, np.array(state["measured"]))
+        return LedTool(held_tick, hands, segment, np.array(kinematics.position), orientation, np.array(state["measured"]))
 
     def _hands(self, request: Correct, skill: Skill, frame: Frame, state: Record) -> tuple[Vector, int]:
         """The hands (6,) [m] and the segment of a correction. Raises RequestError."""

@@ -197,8 +197,8 @@ class Daemon:
             self._session.close()  # type: ignore[no-untyped-call]
             missing = self._scribe.close()
             recording = self._scribe.newest_recording
-            kept = f"its newest recording is {recording}" if recording else "it recorded nothing"
-            log.info("ended: the daemon of cell %s; %s", self._settings.cell, kept)
+            recording_text = f"its newest recording is {recording}" if recording else "it recorded nothing"
+            log.info("ended: the daemon of cell %s; %s", self._settings.cell, recording_text)
             if missing:
                 log.warning("%s", missing)
         return missing
@@ -282,9 +282,9 @@ class Daemon:
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
         stages, before, latency_ms = [0.0] * len(STAGES), self._began_ns, 0.0
-        for stage, at in self._laps:
-            stages[STAGE_NUMBERS[stage]] = (at - before) / 1e3
-            before = at
+        for stage, lap_ns in self._laps:
+            stages[STAGE_NUMBERS[stage]] = (lap_ns - before) / 1e3
+            before = lap_ns
         if 0 in frame["hand_ages"].tolist():
             latency_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
             if 0 <= latency_ms < MAX_LATENCY_MS:
@@ -407,8 +407,8 @@ class Daemon:
             clock.between_ticks()
             percentiles[name] = window.percentiles()
         clock.between_ticks()
-        known = self._failure, inside, machine.at_stop, self._sources.clutch(state), streams
-        return CellStatus(frame, self._controller, state, sources, self._settings, *known).status(
+        evidence = self._failure, inside, machine.at_stop, self._sources.clutch(state), streams
+        return CellStatus(frame, self._controller, state, sources, self._settings, *evidence).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
@@ -453,11 +453,11 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
         return adapted
 
     restored = saved.restored(skill, taught, skill)
-    found = out_of_reach(restored, beyond_m(settings, restored.tool_positions), settings)
-    if found.is_refused:
-        raise SkillError(found.text)
-    if found.text:
-        log.warning("%s", found.text)
+    finding = out_of_reach(restored, beyond_m(settings, restored.tool_positions), settings)
+    if finding.is_refused:
+        raise SkillError(finding.text)
+    if finding.text:
+        log.warning("%s", finding.text)
     return restored
 
 

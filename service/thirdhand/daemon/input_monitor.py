@@ -110,9 +110,9 @@ class InputMonitor:
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
         index, arrivals = SOURCES.index(source), self.arrivals[self._keys[source]]
-        seen = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
+        sample_tick = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
-        age_ms = None if seen < 0 else round((int(state["tick"]) - seen) * settings.period_s * 1e3, 1)
+        age_ms = None if sample_tick < 0 else round((int(state["tick"]) - sample_tick) * settings.period_s * 1e3, 1)
         stale_ms = 0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
         silent_ms = settings.arm.silent_ms if source == "arm" else stale_ms
         late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
@@ -124,7 +124,7 @@ class InputMonitor:
             late_95_ms=None if late is None else round(late[1], 1),
             contested=round(float(state["arm_contested"]), 3) if source == "arm" else 0.0,
             scatter_mm=None
-            if source == "arm" or seen < 0
+            if source == "arm" or sample_tick < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
             unit=self._unit_of(arrivals.newest),
             batches_ms=0.0 if source == "arm" else round(arrivals.batches_ms(stale_ms or settings.hands.stale_ms), 1),
@@ -152,15 +152,15 @@ class InputMonitor:
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
             history, name = self._histories[source], input_name(source)
-            logged, found = history.logged, history.found
+            logged, explanations = history.logged, history.found
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
-                yield f"{name}: rejected as {cause}{in_full(*found[cause])}"
+                yield f"{name}: rejected as {cause}{in_full(*explanations[cause])}"
             more = {cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]}
             if counts and more:
                 logged |= now.rejected
-                which = ", ".join(f"{n} {cause} ({now.rejected[cause]} in all)" for cause, n in more.items())
-                yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {which}"
+                causes = ", ".join(f"{n} {cause} ({now.rejected[cause]} in all)" for cause, n in more.items())
+                yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {causes}"
         if counts:
             self._counted_s = now_s
 
@@ -176,7 +176,7 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     cause, sample, newest_ns, _ = refused
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
     is_set_back = cause is Cause.OLDER and arrivals.is_set_back(newest_ns)
-    seen = Evidence(
+    facts = Evidence(
         settings=settings,
         sample=sample,
         newest_ns=newest_ns,
@@ -186,11 +186,11 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     )
     if isinstance(sample, PoseStamped):
         mistake = _too_far(sample, settings) if cause is Cause.OUT_OF_RANGE else ""
-        return seen._replace(mistake=mistake)
+        return facts._replace(mistake=mistake)
     try:
         position, velocity = measured(sample, settings.joints.names)
     except WireError as error:
-        return seen._replace(mistake=str(error))
+        return facts._replace(mistake=str(error))
     if cause is Cause.JUMPED:
         joints = settings.joints
         leaps = [*map(Jump, joints.names, refused.joints, position, joints.units)]
@@ -198,11 +198,11 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
             abs(_turned(leap, kind) / per_rad)
             for leap, kind, per_rad in zip(leaps, joints.every_kind, joints.per_rad, strict=True)
         ]
-        return seen._replace(jump=leaps[sizes.index(max(sizes))])
+        return facts._replace(jump=leaps[sizes.index(max(sizes))])
     outside = [*_outside(settings.joints, position, velocity)]
     if cause is Cause.NOT_FINITE:
-        outside = [one for one in outside if not math.isfinite(one.value)]
-    return seen._replace(outside=outside[0] if outside else None)
+        outside = [joint for joint in outside if not math.isfinite(joint.value)]
+    return facts._replace(outside=outside[0] if outside else None)
 
 
 def _turned(leap: Jump, kind: str) -> float:
@@ -214,9 +214,9 @@ def _turned(leap: Jump, kind: str) -> float:
 def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]) -> Iterator[Outside]:
     """Measured values outside the accepted ranges."""
     of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
-    for (name, unit, per_rad, lower, upper), at, speed in zip(of_joints, position, velocity, strict=True):
+    for (name, unit, per_rad, lower, upper), value, speed in zip(of_joints, position, velocity, strict=True):
         low, high = lower - TUNING.intake.max_outside_rad * per_rad, upper + TUNING.intake.max_outside_rad * per_rad
-        if not low <= at <= high:
-            yield Outside(name, at, low, high, unit)
+        if not low <= value <= high:
+            yield Outside(name, value, low, high, unit)
         if not abs(speed) <= (fastest := TUNING.intake.max_joint_radps * per_rad):
             yield Outside(name, speed, -fastest, fastest, f"{unit}/s")

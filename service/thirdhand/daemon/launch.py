@@ -93,8 +93,8 @@ def launched(
     LaunchError.
     """
     config, log = folder / "cell.toml", folder / "service.log"
-    given = settings or Settings()
-    followed = msgspec.structs.replace(given, arm=msgspec.structs.replace(given.arm, start="follow"))  # nobody resumes
+    base_settings = settings or Settings()
+    followed = msgspec.structs.replace(base_settings, arm=msgspec.structs.replace(base_settings.arm, start="follow"))  # nobody resumes
     files = {"state": folder / "state", "record": record}
     config.write_text(
         "# A cell with a free port and its own files.\n"
@@ -116,8 +116,8 @@ def launched(
 
 def described(settings: Settings) -> str:
     """The settings that differ from the defaults as TOML, without name, network and files."""
-    given, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
-    changed = {name: given[name] for name in given if given[name] != usual[name]}
+    values, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
+    changed = {name: values[name] for name in values if values[name] != usual[name]}
     rate = f"rate_hz = {changed['rate_hz']}\n" if "rate_hz" in changed else ""
     return rate + "".join(
         f"[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in section.items())
@@ -174,8 +174,8 @@ def played(
     `reported` is called once the report has arrived; the bench follows commands a moment longer, in
     which the service can be stopped: an arm that disappears is a fault. Raises LaunchError.
     """
-    at = ("--connect", endpoint, "--cell", "thirdhand")
-    command = python("-m", "thirdhand_sim", *at, *_end_with_this(), "--once", "--output", "-", *arguments)
+    connection = ("--connect", endpoint, "--cell", "thirdhand")
+    command = python("-m", "thirdhand_sim", *connection, *_end_with_this(), "--once", "--output", "-", *arguments)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     clock = threading.Timer(timeout_s, process.kill)
     clock.start()

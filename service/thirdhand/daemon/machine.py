@@ -21,12 +21,12 @@ PRESSURE = Path("/proc/pressure/cpu")  # a file of Linux; if it is missing, only
 
 def resident_mb(**processes: int | None) -> dict[str, float]:
     """Resident memory [MB] of processes by name, given by their numbers, of those that exist."""
-    found = {}
+    sizes_mb = {}
     for name, number in processes.items():
         with contextlib.suppress(OSError):
             pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
-            found[name] = round(pages * resource.getpagesize() / 1e6, 1)
-    return found
+            sizes_mb[name] = round(pages * resource.getpagesize() / 1e6, 1)
+    return sizes_mb
 
 
 class _Sample(NamedTuple):
@@ -64,14 +64,14 @@ class Machine:
         first, last = self._samples[0], self._samples[-1]
         missed, ticks, lasts_s = last.missed - first.missed, last.tick - first.tick, last.at_s - first.at_s
         waiting = (last.waited_s - first.waited_s) / lasts_s if lasts_s > BUSY_WINDOW_S / 2 else 0.0
-        found = []
+        reasons = []
         if missed > MISSED_SHARE * max(ticks, 1):
-            found.append(f"{missed} of {ticks} deadlines were missed")
+            reasons.append(f"{missed} of {ticks} deadlines were missed")
         if late_ms > LATE_LOOP_MS:
-            found.append(f"the loop was up to {late_ms:.0f} ms late")
+            reasons.append(f"the loop was up to {late_ms:.0f} ms late")
         if waiting > WAITING_SHARE:
-            found.append(f"processes waited for a processor {min(waiting, 1.0):.0%} of the time")
-        return ", ".join(found)
+            reasons.append(f"processes waited for a processor {min(waiting, 1.0):.0%} of the time")
+        return ", ".join(reasons)
 
     def _waited_s(self) -> float:
         """Time since the machine's start in which some process waited for a processor [s]; 0 if not

@@ -298,8 +298,8 @@ class Queryables:
 
     def _set_segment(self, name: str) -> Reply:
         if name not in (names := self._skill.model.names):
-            known = ", ".join(names) or "none, as the skill was not learned between via-points"
-            raise RequestError(f"$.name: no via-point {name!r} of the task. There are: {known}")
+            listing = ", ".join(names) or "none, as the skill was not learned between via-points"
+            raise RequestError(f"$.name: no via-point {name!r} of the task. There are: {listing}")
         return _in_force_since(self.inbox.send(order("segment", name)).wait())
 
     @property
@@ -319,9 +319,9 @@ class Queryables:
         Raises RequestError for a loaded skill of which the arm does not reach most tool positions.
         """
         distances_m = self._beyond_m(self._settings, skill.tool_positions)
-        found = out_of_reach(skill, distances_m, self._settings)
-        if is_loaded and found.is_refused:
-            raise RequestError(found.text)
+        finding = out_of_reach(skill, distances_m, self._settings)
+        if is_loaded and finding.is_refused:
+            raise RequestError(finding.text)
         self._keep(skill.file)
         before = self._skill
         points = in_force(skill)
@@ -333,16 +333,16 @@ class Queryables:
         except OSError as error:  # the skill is in force already
             remark = f"{remark} the via-points end at a restart: they cannot be saved ({in_words(error)})".strip()
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
-        remarks = filter(None, (remark, risk, found.text))
+        remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
         files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
-        found = {path.stem: path for path in files}  # links to files elsewhere are ignored
-        path = found.get(name.removesuffix(".npz"))
+        paths = {path.stem: path for path in files}  # links to files elsewhere are ignored
+        path = paths.get(name.removesuffix(".npz"))
         if path is None:
-            names = ", ".join(found) or "none"
+            names = ", ".join(paths) or "none"
             raise RequestError(f"$.name: no skill {name!r} in the skill folder; its skills: {names}")
         skill, remark = self._skill_worker.load(path), ""
         skill.check_accepted()
@@ -362,8 +362,8 @@ class Queryables:
                     if name in names[:i]:
                         raise RequestError(f"$.names[{i}]: {name!r} given twice; each name once needed")
                     if name not in points:
-                        known = ", ".join(points) or "none"
-                        raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {known}")
+                        listing = ", ".join(points) or "none"
+                        raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {listing}")
                 points = {name: point for name, point in points.items() if name not in names}
             case Add(added, tolerance):
                 self._check(added)
@@ -408,8 +408,8 @@ class Queryables:
         held_tick = held_since(self._moment()[1])
         if (point := newest_correction(self._skill.via_points)) is None:
             raise RequestError("no correction is in force")
-        kept = tuple(one for one in self._skill.via_points if one != point)
-        points = (*kept, *self._corrections.replaced.get(point, ()))
+        remaining = tuple(via_point for via_point in self._skill.via_points if via_point != point)
+        points = (*remaining, *self._corrections.replaced.get(point, ()))
         after, effect = self._skill_worker.correct(self._skill, points, point)
         reply = self._adopt(after, check=functools.partial(check_same_hold, held_tick))
         return self._of_correction(reply, point, effect, undone=True)
@@ -433,17 +433,17 @@ class Queryables:
         low, high = self._skill.workspace
         distances_m = self._beyond_m(self._settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
-            given = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
+            prefix = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
             if point.segment not in (None, *(begins := self._skill.model.names[:-1])):
-                known = ", ".join(begins) or "none"
+                listing = ", ".join(begins) or "none"
                 raise RequestError(
-                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments begin at: {known}"
+                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments begin at: {listing}"
                 )
             if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
-                raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")
+                raise RequestError(f"{prefix} outside the skill's workspace, {corners} m accepted")
             if distance_m > 0.0:
-                raise RequestError(f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")
+                raise RequestError(f"{prefix} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")
 
 
 def _in_force_since(frame: Frame) -> Reply:

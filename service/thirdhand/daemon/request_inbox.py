@@ -138,6 +138,6 @@ class RequestInbox:
                 raise RequestError("the arm is led by hand, which no resume ends; end hand guiding, then resume")
             was_led = state["operator_hold"] and state["guided_tick"] >= max(state["held_tick"], 1)
             if by and (was_led or self._holders != {by}):
-                who = "somebody else holds the arm too" if by in self._holders else f"{by!r} does not hold the arm"
-                raise RequestError(f"$.by: {who}; a resume without `by` needed, which ends all holds")
+                reason = "somebody else holds the arm too" if by in self._holders else f"{by!r} does not hold the arm"
+                raise RequestError(f"$.by: {reason}; a resume without `by` needed, which ends all holds")
             self._holders.clear()

@@ -42,9 +42,9 @@ def _diagnostics(payload: bytes) -> bytes:
         for part, value in inner.items():
             text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
             values[f"{name}.{part}".rstrip(".")] = text
-    what = in_brief(status["mode"], status["reason"]) + in_full(status["because"], status["remedy"])
+    summary = in_brief(status["mode"], status["reason"]) + in_full(status["because"], status["remedy"])
     name = f"{status['cell']}: {ros2.NODE}"
-    return cdr.encode_diagnostics(status["time_ns"], DIAGNOSTIC_LEVELS[status["mode"]], name, what, values)
+    return cdr.encode_diagnostics(status["time_ns"], DIAGNOSTIC_LEVELS[status["mode"]], name, summary, values)
 
 
 def _converted(payload: bytes, topic: ros2.Topic, names: tuple[str, ...], period_ns: int) -> bytes:
@@ -113,7 +113,7 @@ class Ros2Domain:
         run_beside_real_time()
         while (item := self._waiting.get()) is not None:
             suffix, payload = item
-            for topic in (one for one in self._topics if one.channel == suffix):
+            for topic in (candidate for candidate in self._topics if candidate.channel == suffix):
                 self._received[topic.name] += 1
                 if self._received[topic.name] % topic.every:
                     continue

@@ -41,7 +41,7 @@ def _identity(settings: Settings) -> str:
     calibration does not change it.
     """
     chain = Urdf(robot_description(settings)).chain(settings.arm.plate)
-    return "; ".join(" ".join([one.name, *(f"{round(v, 2) + 0.0:.2f}" for v in one.translation)]) for one in chain)
+    return "; ".join(" ".join([joint.name, *(f"{round(v, 2) + 0.0:.2f}" for v in joint.translation)]) for joint in chain)
 
 
 class SavedViaPoints:
@@ -64,8 +64,8 @@ class SavedViaPoints:
         """The via-points and the tolerance taught to this skill of this arm; None if there are
         none. `remark` names those that the arm does not reach.
         """
-        found = restored(self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT)
-        return found and self._reached(skill, *found)
+        saved = restored(self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT)
+        return saved and self._reached(skill, *saved)
 
     def restored(self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], Made], otherwise: Made) -> Made:
         """The value that `make` returns for the via-points and the tolerance taught to this skill
@@ -73,8 +73,8 @@ class SavedViaPoints:
         """
 
         def made(content: bytes) -> Made:
-            found = self._decoded(content, skill)
-            return otherwise if found is None else make(*self._reached(skill, *found))
+            saved = self._decoded(content, skill)
+            return otherwise if saved is None else make(*self._reached(skill, *saved))
 
         return restored(self.path(skill), made, otherwise, what=WHAT)
 

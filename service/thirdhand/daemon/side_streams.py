@@ -63,8 +63,8 @@ def side_streams(
     """The streams on `side_keys`, counted in `arrivals`."""
 
     def note_objects(payload: bytes, now_ns: int) -> None:
-        found = channels.BY_KEY[OBJECTS_KEY].codec.decode(payload)
-        scribe.note(OBJECTS_KEY, encode_json(found).decode(), now_ns)
+        scene = channels.BY_KEY[OBJECTS_KEY].codec.decode(payload)
+        scribe.note(OBJECTS_KEY, encode_json(scene).decode(), now_ns)
 
     def record_image(key: str, payload: bytes, now_ns: int) -> None:
         scribe.image(key, image_in(payload, now_ns), now_ns)

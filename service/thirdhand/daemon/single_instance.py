@@ -107,18 +107,18 @@ def holder_of(settings: Settings) -> tuple[int, frozenset[str]] | None:
 
     path = state_folder(settings) / "daemon.lock"
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, psutil.Error):
-        found = json.loads(content(path, MAX_HOLDER_BYTES))
-        if any(file.path == str(path) for file in psutil.Process(int(found["pid"])).open_files()):
-            return int(found["pid"]), frozenset(found["endpoints"])
+        record = json.loads(content(path, MAX_HOLDER_BYTES))
+        if any(file.path == str(path) for file in psutil.Process(int(record["pid"])).open_files()):
+            return int(record["pid"]), frozenset(record["endpoints"])
     return None
 
 
 def _holder(descriptor: int | None) -> str:
     """A description of the holder of a lock, from the lock file."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        found = json.loads(os.pread(descriptor, MAX_HOLDER_BYTES, 0))  # type: ignore[arg-type]
-        where = f"listening on {', '.join(found['endpoints'])}" if found["endpoints"] else "not listening, or not yet"
-        return f"process {found['pid']}, {where}"
+        record = json.loads(os.pread(descriptor, MAX_HOLDER_BYTES, 0))  # type: ignore[arg-type]
+        where = f"listening on {', '.join(record['endpoints'])}" if record["endpoints"] else "not listening, or not yet"
+        return f"process {record['pid']}, {where}"
     return "a process that did not write its number"
 
 
@@ -127,9 +127,9 @@ def allow_descriptors() -> int:
     it. Raises ExplainedError for fewer than LEAST_DESCRIPTORS.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
+    target = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit < LEAST_DESCRIPTORS:
         raise ExplainedError(
@@ -145,14 +145,14 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     Raises OccupiedError if another daemon on this network serves it. If two daemons start at once,
     both may be refused.
     """
-    own = str(session.zid())
-    token = session.liveliness().declare_token(channels.presence(cell, own))
-    others = living(session, cell) - {own}
+    session_id = str(session.zid())
+    token = session.liveliness().declare_token(channels.presence(cell, session_id))
+    others = living(session, cell) - {session_id}
     if not others:
         return token
     token.undeclare()  # type: ignore[no-untyped-call]
     holder = f"Zenoh session {min(others)}"
     with contextlib.suppress(UnreachableError, RefusedError):
-        found = Client(session, cell, timeout_s=2.0).status()
-        holder += f", version {found.version}, listening on {', '.join(found.endpoints) or 'nothing'}"
+        status = Client(session, cell, timeout_s=2.0).status()
+        holder += f", version {status.version}, listening on {', '.join(status.endpoints) or 'nothing'}"
     raise OccupiedError(f"cell {cell} is already served ({holder}): stop that daemon, or give this one another --cell")

@@ -79,7 +79,7 @@ class Startup:
 
     @property
     def _ready(self) -> int:
-        return sum(name in self._compiled or bool(one.signatures) for name, one in self._functions.items())
+        return sum(name in self._compiled or bool(function.signatures) for name, function in self._functions.items())
 
     def note(self, function: str, is_ready: bool) -> None:
         """Note that the compilation of a function begins, or that it is ready."""

@@ -54,7 +54,7 @@ class CellStatus(NamedTuple):
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
         frame, sources, settings = self.frame, self.sources, self.settings
-        begun, seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
+        begun, is_seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
         skill, (mode, reason) = self.controller.skill, outcome(frame)
         flags, seen_now = Flag(int(frame["flags"])), self.evidence()
         why = explained(Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now)
@@ -85,14 +85,14 @@ class CellStatus(NamedTuple):
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
-            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
+            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if is_seen[i]},
             below_table_m={
-                side: depth_m for i, side in enumerate(SIDES) if seen[i] and (depth_m := self._below_table_m(i))
+                side: depth_m for i, side in enumerate(SIDES) if is_seen[i] and (depth_m := self._below_table_m(i))
             },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
             },
-            hands_at_m={name: (_point(at[:3]), _point(at[3:])) for name, at in _hands_at(skill)},
+            hands_at_m={name: (_point(hands[:3]), _point(hands[3:])) for name, hands in _hands_at(skill)},
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
@@ -152,25 +152,25 @@ class CellStatus(NamedTuple):
 
     def _is_unneeded(self, name: str, source: Source) -> bool:
         """True for a hand that the skill does not need, and that has disappeared."""
-        side, gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
-        return side is not None and name in SIDES and name != SIDES[side] and gone
+        side, is_gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
+        return side is not None and name in SIDES and name != SIDES[side] and is_gone
 
     def _outside(self) -> Outside | None:
         """The first joint outside its limits, if the arm moves back into them."""
         joints, measured = self.settings.joints, self.state["measured"].tolist()
-        found = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
+        candidates = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
         returning = int(self.state["arm_ready"]) == RETURNING
-        return next((one for one in found if returning and not one.low <= one.value <= one.high), None)
+        return next((joint for joint in candidates if returning and not joint.low <= joint.value <= joint.high), None)
 
     def _stuck(self) -> Stuck:
         """Joints that keep the tool from its target, and the way out."""
         joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
         at_limits = [
             name
-            for name, at, low, high, per_rad in zip(
+            for name, position, low, high, per_rad in zip(
                 joints.names, q, joints.lower, joints.upper, joints.per_rad, strict=True
             )
-            if min(at - low, high - at) < AT_LIMIT_RAD * per_rad
+            if min(position - low, high - position) < AT_LIMIT_RAD * per_rad
         ]
         off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
         count = int(state["way_count"])
@@ -225,8 +225,8 @@ def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
     without via-points, one unnamed pair of demonstrated hands.
     """
     hands = skill.model.hands
-    found = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
-    return [(name, at) for name, at in found if np.isfinite(at).all()]
+    named_hands = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    return [(name, row) for name, row in named_hands if np.isfinite(row).all()]
 
 
 def _point(values: Any) -> Vector3:

@@ -40,12 +40,12 @@ class WayFinder:
     def _find(self, *arguments: np.ndarray) -> None:
         began_s = time.monotonic()
         try:
-            found = self._worker.compute(way_out_of, self._settings, *arguments)
+            postures = self._worker.compute(way_out_of, self._settings, *arguments)
         except SkillError as error:
             self._say(f"the search for a way out failed: {error}")
             return
         finally:
             self._next_s = time.monotonic() + AGAIN_S
-        self._send(order("way", json.dumps([posture.tolist() for posture in found])))
-        ways = f"a way out of {len(found)} postures" if found else "no way out"
+        self._send(order("way", json.dumps([posture.tolist() for posture in postures])))
+        ways = f"a way out of {len(postures)} postures" if postures else "no way out"
         self._say(f"the tool is stuck: {ways}, found in {time.monotonic() - began_s:.1f} s")

@@ -167,9 +167,9 @@ class ForkServer:
         The operating system lists it under the first 15 characters of `name`. A terminal's Ctrl-C
         does not reach it: it must end when its socket closes.
         """
-        own, theirs = socket.socketpair(socket.AF_UNIX, kind)
+        parent_end, theirs = socket.socketpair(socket.AF_UNIX, kind)
         with theirs:
-            return Child(own, self.request(module, name, descriptors=[theirs.fileno()]))
+            return Child(parent_end, self.request(module, name, descriptors=[theirs.fileno()]))
 
     def request(self, module: str, *more: str, descriptors: Iterable[int] = ()) -> subprocess.Popen[bytes]:
         """Have the server import a module and, with a descriptor, fork a child that runs it."""
@@ -369,24 +369,24 @@ def from_memory(fd: int) -> list[memoryview]:
         view = memoryview(mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ))
     finally:
         os.close(fd)
-    parts, at = [], 0
-    while at < size:
-        (length,) = _PART_LENGTH.unpack_from(view, at)
-        at += _ALIGNED
-        if at + length > size:
+    parts, offset = [], 0
+    while offset < size:
+        (length,) = _PART_LENGTH.unpack_from(view, offset)
+        offset += _ALIGNED
+        if offset + length > size:
             raise EOFError("a part reaches beyond the end of the file")
-        parts.append(view[at : at + length])
-        at += length + -length % _ALIGNED
+        parts.append(view[offset : offset + length])
+        offset += length + -length % _ALIGNED
     return parts
 
 
 def descriptors(ancillary: Iterable[tuple[int, int, bytes]]) -> list[int]:
     """The descriptors in the ancillary data of `recvmsg`."""
-    found: list[int] = []
+    fds: list[int] = []
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            found += [fd for (fd,) in struct.iter_unpack("=i", data)]
-    return found
+            fds += [fd for (fd,) in struct.iter_unpack("=i", data)]
+    return fds
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ def release_start_memory() -> None:
         loaded = {path for _, _, writable, path, _ in mappings if writable == "w"}
         for begin, end, writable, path, anonymous_kb in mappings:
             if path in loaded and writable == "-" and anonymous_kb == "0":
-                at = int(begin, 16)
-                libc.madvise(ctypes.c_void_p(at), ctypes.c_size_t(int(end, 16) - at), _MADV_DONTNEED)
+                address = int(begin, 16)
+                libc.madvise(ctypes.c_void_p(address), ctypes.c_size_t(int(end, 16) - address), _MADV_DONTNEED)
 
 
 def share_one_heap() -> None:

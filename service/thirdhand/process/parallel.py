@@ -38,23 +38,23 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
 
 
 def _on_cluster(work: Callable[[Item], Outcome], items: Sequence[Item], address: str) -> Iterator[Outcome]:
-    given = f"--workers dask:{address}"
+    option = f"--workers dask:{address}"
     try:
         from distributed import Client, KilledWorker
     except ImportError:
-        raise ExplainedError(f"{given}: the package distributed needed here") from None
+        raise ExplainedError(f"{option}: the package distributed needed here") from None
     try:
         location = urlsplit(address if "://" in address else f"tcp://{address}")
         if not (location.hostname and location.port):  # Dask would wait for the domain name service
             raise ValueError("no host and port")
         client = Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:  # no address, or nothing answers there
-        raise ExplainedError(f"{given}: {in_words(error)}; a running cluster's address needed") from None
+        raise ExplainedError(f"{option}: {in_words(error)}; a running cluster's address needed") from None
     with client:
         try:
             yield from (future.result() for future in client.map(work, items, pure=False))
         except KilledWorker:
-            raise ExplainedError(f"{given}: a worker was killed, perhaps for lack of memory") from None
+            raise ExplainedError(f"{option}: a worker was killed, perhaps for lack of memory") from None
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

@@ -25,8 +25,8 @@ def say(line: str) -> None:
     """
     terminal = sys.stderr.isatty()
     in_place = terminal and line.lstrip().startswith(STARTING)
-    shown = line[: shutil.get_terminal_size().columns - 1] if in_place else line
-    print(f"{CLEAR * terminal}{printable_lines(shown)}", end="" if in_place else "\n", file=sys.stderr, flush=True)
+    text = line[: shutil.get_terminal_size().columns - 1] if in_place else line
+    print(f"{CLEAR * terminal}{printable_lines(text)}", end="" if in_place else "\n", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
@@ -39,8 +39,8 @@ def progress(
     every_s: float = LINE_EVERY_S,
 ) -> Iterator[Callable[[int], None]]:
     """A context with a function to call with the number of units done, out of `total` if known."""
-    with contextlib.closing(_Shown(what, total, unit, after_s, every_s)) as shown:
-        yield shown.done
+    with contextlib.closing(_Shown(what, total, unit, after_s, every_s)) as display:
+        yield display.done
 
 
 @contextlib.contextmanager
@@ -48,8 +48,8 @@ def steps(
     what: str, *, after_s: float = SHOWN_AFTER_S, every_s: float = LINE_EVERY_S
 ) -> Iterator[Callable[[str], None]]:
     """A context with a function to call with the name of each step as it begins."""
-    with contextlib.closing(_Shown(what, None, "", after_s, every_s)) as shown:
-        yield shown.doing
+    with contextlib.closing(_Shown(what, None, "", after_s, every_s)) as display:
+        yield display.doing
 
 
 class _Shown:
@@ -88,8 +88,8 @@ class _Shown:
             def show_cursor(self, show: bool = True) -> bool:
                 return False
 
-        known = self._total is not None
-        columns = [BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()] if known else []
+        has_total = self._total is not None
+        columns = [BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()] if has_total else []
         text = TextColumn("{task.description}", markup=False)
         with Progress(
             SpinnerColumn(), text, *columns, TimeElapsedColumn(), console=Cursor(stderr=True), transient=True

@@ -36,27 +36,27 @@ class RecordingError(ExplainedError, ValueError):
 @functools.cache
 def machine() -> dict[str, str]:
     """Versions, CPU and BLAS of this machine, on which the result of a tick may depend."""
-    found = {
+    facts = {
         "python": platform.python_version(),
         "system": platform.platform(),
         "cpu": platform.processor() or platform.machine(),
     }
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        found["cpu"] = next(
-            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), found["cpu"]
+        facts["cpu"] = next(
+            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), facts["cpu"]
         )
     build: Any = np.show_config(mode="dicts")
     blas = build["Build Dependencies"]["blas"]
-    found["blas"] = f"{blas['name']} {blas['version']}"
-    found["features"] = " ".join(build["SIMD Extensions"].get("found", []))
-    found["libc"] = " ".join(platform.libc_ver())
+    facts["blas"] = f"{blas['name']} {blas['version']}"
+    facts["features"] = " ".join(build["SIMD Extensions"].get("found", []))
+    facts["libc"] = " ".join(platform.libc_ver())
     kernels = {library.get("architecture") for library in threadpool_info() if library["user_api"] == "blas"}
-    found["kernel"] = " ".join(sorted(filter(None, kernels)))
+    facts["kernel"] = " ".join(sorted(filter(None, kernels)))
     for name in ("thirdhand", "numpy", "scipy", "pin", "ruckig", "msgspec", "mcap", "eclipse-zenoh"):
         with contextlib.suppress(packages.PackageNotFoundError):
-            found[name] = packages.version(name)
-    return found
+            facts[name] = packages.version(name)
+    return facts
 
 
 class _WholeWrites:
@@ -72,10 +72,10 @@ class _WholeWrites:
         self.closed = False
 
     def write(self, data: bytes) -> int:
-        rest = memoryview(data)
+        remainder = memoryview(data)
         try:
-            while rest:
-                rest = rest[os.write(self.descriptor, rest) :]
+            while remainder:
+                remainder = remainder[os.write(self.descriptor, remainder) :]
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self.descriptor, self._size)
@@ -212,8 +212,8 @@ def existing(path: str | Path) -> Path:
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         path.stat()  # reports a link that leads to itself
     if not path.is_file():
-        found = sorted(other.name for other in path.parent.glob("*.mcap"))
-        names = f" Its folder has: {', '.join(found)}." if found else ""
+        recordings = sorted(other.name for other in path.parent.glob("*.mcap"))
+        names = f" Its folder has: {', '.join(recordings)}." if recordings else ""
         raise RecordingError(f"no recording {path}.{names}")
     if begin_of(path) != MCAP0_MAGIC:
         raise RecordingError(f"{path} is not an MCAP file")

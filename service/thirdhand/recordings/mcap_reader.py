@@ -117,12 +117,12 @@ class _Reading:
         """The schemas and channels in the file's summary, if that is intact: they are needed if the
         chunk that first held them is damaged.
         """
-        at = self._summary() if self._closed else 0
-        while 0 < at < self._footer_at:
-            opcode, end = self._head(at)
+        offset = self._summary() if self._closed else 0
+        while 0 < offset < self._footer_at:
+            opcode, end = self._head(offset)
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                yield from self._parsed(opcode, self._content(at, end))
-            at = end
+                yield from self._parsed(opcode, self._content(offset, end))
+            offset = end
 
     def _summary(self) -> int:
         """The first byte of the summary if its checksum is right, else 0."""
@@ -134,31 +134,31 @@ class _Reading:
 
     def records(self) -> Iterator[McapRecord]:
         """The records of the data section, with those in chunks one by one."""
-        at = len(MCAP0_MAGIC)
+        offset = len(MCAP0_MAGIC)
         while True:
-            self.at = at
+            self.at = offset
             end = None
             try:
-                opcode, end = self._head(at)
-                content = self._content(at, end)
-                found = self._parsed(opcode, content)
+                opcode, end = self._head(offset)
+                content = self._content(offset, end)
+                entries = self._parsed(opcode, content)
             except _BROKEN as error:
                 self._checksum = None
-                resume_at = self._resume_at(at, end)
+                resume_at = self._resume_at(offset, end)
                 why = str(error) or type(error).__name__
                 if resume_at is None:
-                    self._faults.append(FileFault(not self._closed, at, self._size - at, why))
+                    self._faults.append(FileFault(not self._closed, offset, self._size - offset, why))
                     return
-                self._faults.append(FileFault(False, at, resume_at - at, why))
-                at = resume_at
+                self._faults.append(FileFault(False, offset, resume_at - offset, why))
+                offset = resume_at
                 continue
             if self._checksum is not None:
                 self._checksum = zlib.crc32(content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum))
-            yield from found
+            yield from entries
             if opcode == Opcode.DATA_END:
                 self._end(end)
                 return
-            at = end
+            offset = end
 
     def _head(self, at: int) -> tuple[int, int]:
         """Opcode and end of the record at a byte."""

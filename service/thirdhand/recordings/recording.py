@@ -276,8 +276,8 @@ class Recording:
         """This recording. Raises RecordingError if its skill or its arm is damaged."""
         lacking = [name for name, part in (("skill", self.skill), ("arm", self.urdf)) if not part]
         if lacking and self._damage:
-            what = " and ".join(lacking)
-            raise RecordingError(f"{self.path} lacks its {what}; only a report does without: {self._damage}")
+            part_names = " and ".join(lacking)
+            raise RecordingError(f"{self.path} lacks its {part_names}; only a report does without: {self._damage}")
         return self
 
     def ticks(self) -> int | None:

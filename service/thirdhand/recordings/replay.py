@@ -232,8 +232,8 @@ class _Comparison:
         while step is not None:
             self._skills.events(step)
             self.last = step
-            wanted = self.after is None or step.tick >= self.after
-            if step.state is not None and wanted and self._resumes(step):
+            is_due = self.after is None or step.tick >= self.after
+            if step.state is not None and is_due and self._resumes(step):
                 return step
             step = next(self._steps, None)
             if step is not None and (step.lost or step.damage):
@@ -265,13 +265,13 @@ class _Comparison:
         if step.state is not None and state is not None:
             different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
         outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
-        same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
-        same = same and step.checksum in (None, checksum(frame))
+        is_same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        is_same = is_same and step.checksum in (None, checksum(frame))
         if self.recorder:
             self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
         result.ticks += 1
-        result.identical += same
-        if not same and not result.first_difference:
+        result.identical += is_same
+        if not is_same and not result.first_difference:
             fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
             result.first_difference = f"first difference at tick {tick.index}: {fields or 'its checksum'}"
         for name, value in different.items():

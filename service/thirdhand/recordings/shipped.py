@@ -43,8 +43,8 @@ def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
     Raises SettingsError.
     """
     if rate_hz is not None:
-        given = msgspec.to_builtins(cell_of(arm))
-        return converted(given | {"rate_hz": rate_hz}, origin="command line")
+        values = msgspec.to_builtins(cell_of(arm))
+        return converted(values | {"rate_hz": rate_hz}, origin="command line")
     if arm == "wam":
         return Settings()
     if arm in ARMS:

@@ -81,7 +81,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
     joints = len(settings.joints.names)
     layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
     step: dict[str, Any] | None = None
-    seen, damage = 0, ""
+    fault_count, damage = 0, ""
     refused: set[str] = set()  # keys of which a message was not decoded
     readable: set[str] = set()  # keys of which a message was decoded
 
@@ -91,7 +91,7 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
             return
         numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
         lacks_frame = outputs and whole and "frame" not in step and step["checksum"] is None
-        if len(messages.faults) > seen and (len(came) != len(numbers) or lacks_frame):
+        if len(messages.faults) > fault_count and (len(came) != len(numbers) or lacks_frame):
             return
         kinds = [_kind(number) for number in numbers]
         if came != kinds or lacks_frame:
@@ -101,10 +101,10 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
 
     try:
         for _, channel, message in messages:
-            if len(messages.faults) > seen:
+            if len(messages.faults) > fault_count:
                 yield from finished()
-                damage = "; ".join(str(fault) for fault in messages.faults[seen:])
-                step, seen = None, len(messages.faults)
+                damage = "; ".join(str(fault) for fault in messages.faults[fault_count:])
+                step, fault_count = None, len(messages.faults)
             name = names.get(channel.topic)
             if name is None or (name in _RECORDS and not outputs):
                 continue

@@ -32,8 +32,8 @@ def named_after(cell: str, folder: Path) -> list[Path]:
     OSError.
     """
     names = re.compile(re.escape(stem_of(cell)) + r"-\d{8}T\d{6}Z(-2)*")
-    found = sorted(folder.iterdir()) if folder.exists() else []  # iterdir reports a folder that cannot be read
-    return [path for path in found if path.suffix == ".mcap" and names.fullmatch(path.stem)]
+    paths = sorted(folder.iterdir()) if folder.exists() else []  # iterdir reports a folder that cannot be read
+    return [path for path in paths if path.suffix == ".mcap" and names.fullmatch(path.stem)]
 
 
 def _ages_s(changed: list[float], longest_gap_s: float) -> list[float]:
@@ -75,10 +75,10 @@ class RecordingPaths:
                 if number == 1 or not numbered.exists():
                     return numbered
             return None
-        at = max(datetime.now(UTC).replace(microsecond=0), self._newest + timedelta(seconds=1))
-        while (path := self._folder / f"{stem_of(self._settings.cell)}-{at:%Y%m%dT%H%M%SZ}.mcap").exists():
-            at += timedelta(seconds=1)
-        self._newest = at
+        stamp = max(datetime.now(UTC).replace(microsecond=0), self._newest + timedelta(seconds=1))
+        while (path := self._folder / f"{stem_of(self._settings.cell)}-{stamp:%Y%m%dT%H%M%SZ}.mcap").exists():
+            stamp += timedelta(seconds=1)
+        self._newest = stamp
         return path
 
     def prune(self, writing: Path | None) -> list[Path]:

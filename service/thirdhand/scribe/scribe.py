@@ -107,15 +107,15 @@ class Scribe:
 
         It takes 1 ms per megabyte: call it on another thread before the loop adopts a skill.
         """
-        known = self._memory.get(id(skill))
-        if known is None:
+        entry = self._memory.get(id(skill))
+        if entry is None:
             fd = child.in_memory(skill)
-            known = self._memory.setdefault(id(skill), (skill, fd))
-            if known[1] != fd:
+            entry = self._memory.setdefault(id(skill), (skill, fd))
+            if entry[1] != fd:
                 os.close(fd)
             elif len(self._memory) > 4:
                 os.close(self._memory.pop(next(iter(self._memory)))[1])
-        return known[1]
+        return entry[1]
 
     def send(
         self,

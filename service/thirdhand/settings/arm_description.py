@@ -88,13 +88,13 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
         if all(math.isfinite(getattr(joint, name)) for joint in moving):
             joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    wanted = (
+    required = (
         ("joints", joints, "velocity"),
         ("joints", joints, "acceleration"),
         ("joints", joints, "jerk"),
         ("arm", arm, "posture"),
     )
-    if missing := [f"[{path}] {name}" for path, section, name in wanted if name not in section]:
+    if missing := [f"[{path}] {name}" for path, section, name in required if name not in section]:
         needed = f"missing; the URDF does not define it, {len(moving)} numbers needed, one for each joint"
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
@@ -131,10 +131,10 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
             ("acceleration", 0, joint.acceleration),
             ("jerk", 0, joint.jerk),
         ):
-            given = getattr(joints, name)[i]
-            if not low <= given <= high:
+            value = getattr(joints, name)[i]
+            if not low <= value <= high:
                 accepted = f"{low} or more" if name == "lower" else f"up to {high}"
                 where = f"[joints] {name}, entry {i + 1}"
-                wide.append(f"{where}: {given} given; {accepted} accepted by the URDF of {joint.name}")
+                wide.append(f"{where}: {value} given; {accepted} accepted by the URDF of {joint.name}")
     if wide:
         raise SettingsError("\n".join(wide))

@@ -360,7 +360,7 @@ class Settings(Section, frozen=True):
                 yield f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and $.hands.frame needed"
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
-            *((f"$.trackers.{name}.base_from_tracker", one.base_from_tracker) for name, one in self.trackers.items()),
+            *((f"$.trackers.{name}.base_from_tracker", tracker.base_from_tracker) for name, tracker in self.trackers.items()),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
@@ -393,24 +393,24 @@ class Settings(Section, frozen=True):
         fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
         uneven = {path: values for path, values in fields.items() if len(values) != count}
         for path, values in uneven.items():
-            what = "kinds" if path == "$.joints.kinds" else "numbers"
-            yield f"{path}: {len(values)} {what}, {count} needed, one for each of $.joints.names"
+            quantity = "kinds" if path == "$.joints.kinds" else "numbers"
+            yield f"{path}: {len(values)} {quantity}, {count} needed, one for each of $.joints.names"
         if uneven:
             return
         widest = self._widest()
         for name in LIMITS:
-            for i, (given, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
-                if name == "lower" and given < bound:
-                    yield f"$.joints.lower[{i}]: {given} given; {bound} or more accepted"
-                if name == "upper" and given > bound:
-                    yield f"$.joints.upper[{i}]: {given} given; {bound} or less accepted"
-                if name not in ("lower", "upper") and not 0 < given <= bound:
-                    yield f"$.joints.{name}[{i}]: {given} given; above 0, up to {bound} accepted"
-        for i, (low, high, at) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
+            for i, (limit, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
+                if name == "lower" and limit < bound:
+                    yield f"$.joints.lower[{i}]: {limit} given; {bound} or more accepted"
+                if name == "upper" and limit > bound:
+                    yield f"$.joints.upper[{i}]: {limit} given; {bound} or less accepted"
+                if name not in ("lower", "upper") and not 0 < limit <= bound:
+                    yield f"$.joints.{name}[{i}]: {limit} given; above 0, up to {bound} accepted"
+        for i, (low, high, position) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
             if not low < high:
                 yield f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed"
-            elif not low <= at <= high:
-                yield f"$.arm.posture[{i}]: {at} given; {low} to {high} accepted"
+            elif not low <= position <= high:
+                yield f"$.arm.posture[{i}]: {position} given; {low} to {high} accepted"
 
     def _widest(self) -> dict[str, PerJoint]:
         """Bounds of the limits: the defaults for the shipped arm, infinity for others."""
@@ -424,8 +424,8 @@ class Settings(Section, frozen=True):
         """Names of the frames that a hand's pose may have; the empty name stands for the frame of
         `[hands]`.
         """
-        own = () if self.hands.frame in ("", BASE) else (self.hands.frame,)
-        return (BASE, *own, "", *self.trackers)
+        hand_frames = () if self.hands.frame in ("", BASE) else (self.hands.frame,)
+        return (BASE, *hand_frames, "", *self.trackers)
 
     def tracker_section(self, frame: str) -> str:
         """The table that maps poses in a frame."""
@@ -460,7 +460,7 @@ class Settings(Section, frozen=True):
 def without_secrets(settings: Settings) -> Settings:
     """The settings without the parameters of endpoints, which may hold keys."""
     network = settings.network
-    listen, connect = (tuple(one.partition("#")[0] for one in some) for some in (network.listen, network.connect))
+    listen, connect = (tuple(endpoint.partition("#")[0] for endpoint in endpoints) for endpoints in (network.listen, network.connect))
     return msgspec.structs.replace(settings, network=msgspec.structs.replace(network, listen=listen, connect=connect))
 
 
@@ -497,8 +497,8 @@ def _make_paths_absolute(given: Any, folder: Path | None) -> None:
             table[name] = _absolute(value, base, f"[{section}] {name}")
         elif isinstance(table, dict) and isinstance(value, list | tuple):
             table[name] = [
-                _absolute(one, base, f"[{section}] {name}, entry {i + 1}") if isinstance(one, str) else one
-                for i, one in enumerate(value)
+                _absolute(entry, base, f"[{section}] {name}, entry {i + 1}") if isinstance(entry, str) else entry
+                for i, entry in enumerate(value)
             ]
 
 
@@ -526,8 +526,8 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         _make_paths_absolute(given, folder)
         arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            own = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
-            given = completed(given, Urdf(own, origin=arm["urdf"]))
+            urdf_text = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
+            given = completed(given, Urdf(urdf_text, origin=arm["urdf"]))
         settings = validated(given, Settings)
         urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
         check(settings.joints, urdf, settings.arm.plate)
@@ -549,22 +549,22 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
         urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
     )
     reach = settings.reach
-    found = workspace.shell(reach.min_x, reach.min_z)
-    if found.outer < LEAST_OUTER_M:
+    shell = workspace.shell(reach.min_x, reach.min_z)
+    if shell.outer < LEAST_OUTER_M:
         raise SettingsError(
-            f"[arm] plate: its joints move the tool by {1000 * found.outer:.0f} mm; an arm that moves it, or a pose of "
+            f"[arm] plate: its joints move the tool by {1000 * shell.outer:.0f} mm; an arm that moves it, or a pose of "
             "the tool away from the last axis ([tool] plate_from_tool), needed"
         )
-    outer = reach.outer if "outer" in given else min(found.outer, reach.outer)
-    inner = reach.inner if "inner" in given else min(found.inner, found.inner / found.outer * outer)
-    centre = reach.centre if "centre" in given else found.centre
+    outer = reach.outer if "outer" in given else min(shell.outer, reach.outer)
+    inner = reach.inner if "inner" in given else min(shell.inner, shell.inner / shell.outer * outer)
+    centre = reach.centre if "centre" in given else shell.centre
     reach = msgspec.structs.replace(reach, centre=centre, inner=inner, outer=outer)
     share = workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
     needed = REACHED_SHARE if given & {"centre", "inner", "outer"} else LEAST_REACHED_SHARE
     if share < needed:
         raise SettingsError(
             f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
-            f"By its kinematics the tool is {found.inner:g} to {found.outer:g} m from {list(found.centre)}; "
+            f"By its kinematics the tool is {shell.inner:g} to {shell.outer:g} m from {list(shell.centre)}; "
             f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
         )
     return msgspec.structs.replace(settings, reach=reach)
@@ -575,21 +575,21 @@ def _of_cell(given: dict[str, Any], cell: str, origin: str) -> dict[str, Any]:
     `[cells.NAME]` in place of theirs. Raises SettingsError.
     """
     cells = given.pop("cells", {})
-    if not isinstance(cells, dict) or not all(isinstance(one, dict) for one in cells.values()):
+    if not isinstance(cells, dict) or not all(isinstance(table, dict) for table in cells.values()):
         raise SettingsError(f"{origin}: [cells]: tables by the cells' names needed, like [cells.bench1.tool]")
     if not cells and not cell:
         return given
     if cell not in cells:
-        found = f"cell {cell!r} given" if cell else "no cell given"
-        raise SettingsError(f"{origin}: {found}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} needed")
+        problem = f"cell {cell!r} given" if cell else "no cell given"
+        raise SettingsError(f"{origin}: {problem}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} needed")
     return _merged(given | {"cell": cell}, cells[cell])
 
 
 def _merged(given: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    both = {name: (given.get(name), value) for name, value in changes.items()}
+    pairs = {name: (given.get(name), value) for name, value in changes.items()}
     return given | {
         name: _merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
-        for name, (before, value) in both.items()
+        for name, (before, value) in pairs.items()
     }
 
 
@@ -598,11 +598,11 @@ def parse(text: str, *, origin: str, folder: Path | None = None, cell: str = "")
     SettingsError.
     """
     try:
-        given = toml_in(text)
+        content = toml_in(text)
     except ValueError as error:  # also of a number with too many digits
         raise SettingsError(f"{origin}: {error}") from None
-    given = _of_cell(given, cell, origin)
-    return converted(given, origin=origin, folder=folder)
+    content = _of_cell(content, cell, origin)
+    return converted(content, origin=origin, folder=folder)
 
 
 def load(path: Path, cell: str = "") -> Settings:

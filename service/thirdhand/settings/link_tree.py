@@ -32,11 +32,11 @@ def root_of(links: Sequence[str], joints: Sequence[Edge]) -> str:
     """The root link. Raises ValueError if links and joints do not form a tree."""
     if len(links) > MAX_LINKS:
         raise ValueError(f"{len(links)} links; up to {MAX_LINKS} accepted: leave out what does not belong to the arm")
-    for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
+    for kind, names in (("link", links), ("joint", [joint.name for joint in joints])):
         if "" in names:
-            raise ValueError(f"a {what} without a name")
+            raise ValueError(f"a {kind} without a name")
         if twice := _named([name for name, count in Counter(names).items() if count > 1]):
-            raise ValueError(f"{what} {twice} is declared twice; each name once needed")
+            raise ValueError(f"{kind} {twice} is declared twice; each name once needed")
     declared, above = set(links), {joint.child: joint for joint in joints}
     for joint in joints:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
@@ -55,19 +55,19 @@ def root_of(links: Sequence[str], joints: Sequence[Edge]) -> str:
     reached, below = set(roots), _children(joints)
     waiting = list(roots)
     while waiting:
-        found = below.get(waiting.pop(), [])
-        reached.update(found)
-        waiting += found
+        children = below.get(waiting.pop(), [])
+        reached.update(children)
+        waiting += children
     if lost := [link for link in links if link not in reached]:
         raise ValueError(f"the joints above {_named(lost)} form a cycle; a tree with one root needed")
     return roots[0]
 
 
 def _children(joints: Iterable[Edge]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+    children: dict[str, list[str]] = {}
     for joint in joints:
-        found.setdefault(joint.parent, []).append(joint.child)
-    return found
+        children.setdefault(joint.parent, []).append(joint.child)
+    return children
 
 
 def _named(names: Sequence[str]) -> str:

@@ -49,7 +49,7 @@ def covered(text: str, path: Path, packages: tuple[str, ...] = ()) -> str:
     if lost := unfound(robot, path, packages, "collision"):
         raise UrdfError(f"{path}: {lost}. Links with a box, cylinder or sphere instead need no mesh")
     for link in robot.iter("link"):
-        for mesh in (found for one in link.iter("collision") for found in one.iter("mesh")):
+        for mesh in (element for shape in link.iter("collision") for element in shape.iter("mesh")):
             if COVER not in mesh.attrib:
                 mesh.set(COVER, " ".join(f"{number:.5f}" for number in _capsule(mesh, link, path, packages)))
     return ElementTree.tostring(robot, encoding="unicode")
@@ -62,27 +62,27 @@ def _capsule(
     the mesh. Raises UrdfError.
     """
     name, scale = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
-    what = f"{urdf}: the collision mesh {name} of link {link.get('name', '')!r}"
+    subject = f"{urdf}: the collision mesh {name} of link {link.get('name', '')!r}"
     try:
         factors = np.array([float(number) for number in scale.split()])
         if factors.shape != (3,) or not np.isfinite(factors).all() or not factors.all():
-            raise UrdfError(f"{what}: scale {scale!r} given; three finite numbers, none of them 0, needed")
-        file = next(one for one in _candidates(name, urdf, packages) if one.is_file())
+            raise UrdfError(f"{subject}: scale {scale!r} given; three finite numbers, none of them 0, needed")
+        file = next(candidate for candidate in _candidates(name, urdf, packages) if candidate.is_file())
         data = content(file, MAX_MESH_BYTES)
         made_by = hashlib.sha256(Path(__file__).read_bytes())
         made_by.update(repr((file.suffix.lower(), factors.tolist())).encode() + data)
-        if (known := _kept(made_by.hexdigest())) is None:
+        if (capsule := _kept(made_by.hexdigest())) is None:
             points = _vertices(file, data) * factors
             if not len(points) or not np.isfinite(points).all():
                 raise ValueError("vertices with finite numbers needed")
-            known = capsule_around(points)
-            _keep(made_by.hexdigest(), known)
+            capsule = capsule_around(points)
+            _keep(made_by.hexdigest(), capsule)
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
         words = in_words(error, named=False).rpartition("message:")[2]  # the library's source file is cut off
-        raise UrdfError(f"{what} cannot be read: {' '.join(words.split())}") from None
-    return known
+        raise UrdfError(f"{subject} cannot be read: {' '.join(words.split())}") from None
+    return capsule
 
 
 def found_meshes(
@@ -91,7 +91,7 @@ def found_meshes(
     """The meshes of a robot whose files exist, each with its file."""
     for mesh in robot.iter("mesh"):
         candidates = _candidates(mesh.get("filename", ""), urdf, packages)
-        if file := next((one for one in candidates if one.is_file()), None):
+        if file := next((candidate for candidate in candidates if candidate.is_file()), None):
             yield mesh, file
 
 
@@ -101,38 +101,38 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
     """
     lost: dict[str, str] = {}  # link by name of the file
     for link in robot.iter("link"):
-        for mesh in (found for one in link.iter(kind) for found in one.iter("mesh")):
+        for mesh in (element for shape in link.iter(kind) for element in shape.iter("mesh")):
             name = mesh.get("filename", "")
-            if COVER not in mesh.attrib and not any(one.is_file() for one in _candidates(name, urdf, packages)):
+            if COVER not in mesh.attrib and not any(candidate.is_file() for candidate in _candidates(name, urdf, packages)):
                 lost.setdefault(name, link.get("name", ""))
     if not lost:
         return ""
     name, link_name = next(iter(lost.items()))
-    what = f"the {kind} mesh {name} of link {link_name!r} is not found"
+    problem = f"the {kind} mesh {name} of link {link_name!r} is not found"
     if len(lost) > 1:
         links = ", ".join(dict.fromkeys(lost.values()))
-        what = f"{len(lost)} {kind} meshes of links {links} are not found, the first is {name}"
+        problem = f"{len(lost)} {kind} meshes of links {links} are not found, the first is {name}"
     tried = _candidates(name, urdf, packages)
     if not name.startswith(("package://", "model://")):
-        return f"{what}: there is no {tried[0]}; put it there"
-    rest = name.rpartition("://")[2]
-    folders = ", ".join(str(one).removesuffix(rest) for one in tried if str(one).endswith(rest))
+        return f"{problem}: there is no {tried[0]}; put it there"
+    path = name.rpartition("://")[2]
+    folders = ", ".join(str(candidate).removesuffix(path) for candidate in tried if str(candidate).endswith(path))
     return (
-        f"{what}; package {rest.partition('/')[0]!r} with this file is in none of {folders}. Name the folder that "
+        f"{problem}; package {path.partition('/')[0]!r} with this file is in none of {folders}. Name the folder that "
         "holds the package in [arm] packages (`thirdhand arm`: by --packages)"
     )
 
 
 def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     """The paths at which the file of a mesh may be."""
-    scheme, _, rest = name.rpartition("://")
-    rest = name.removeprefix("file:") if name.startswith("file:/") and not scheme else rest
-    rest = rest.removeprefix("localhost") if rest.startswith("localhost/") and scheme == "file" else rest
+    scheme, _, path = name.rpartition("://")
+    path = name.removeprefix("file:") if name.startswith("file:/") and not scheme else path
+    path = path.removeprefix("localhost") if path.startswith("localhost/") and scheme == "file" else path
     folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))  # of the URDF, and of a link's target
     if scheme not in ("package", "model"):
-        return [folder / file for file in dict.fromkeys((rest, unquote(rest))) for folder in folders]
-    package, _, inside = rest.partition("/")
-    named = [Path(one).expanduser() for one in packages]
+        return [folder / file for file in dict.fromkeys((path, unquote(path))) for folder in folders]
+    package, _, inside = path.partition("/")
+    named = [Path(root).expanduser() for root in packages]
     above = dict.fromkeys(parent for folder in folders for parent in (folder, *folder.parents))
     return [
         *(folder / inside for folder in (*above, *named) if folder.name == package),
@@ -170,11 +170,11 @@ def _unit_m(collada: bytes) -> float:
 def _kept(name: str) -> tuple[float, ...] | None:
     """A cached capsule; None if there is no such file, or it does not hold a capsule."""
     with contextlib.suppress(OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
-        found = tuple(
+        capsule = tuple(
             float(number) for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()
         )
-        if len(found) == 7 and all(map(math.isfinite, found)) and found[6] > 0.0:
-            return found
+        if len(capsule) == 7 and all(map(math.isfinite, capsule)) and capsule[6] > 0.0:
+            return capsule
     return None
 
 
@@ -213,14 +213,14 @@ def capsule_around(points: Points) -> tuple[float, ...]:
 
     for axis in np.linalg.eigh(outline.T @ outline)[1].T:
         across = np.linalg.svd(axis[None])[2][1:]
-        found = minimize(
+        optimum = minimize(
             cost,
             np.zeros(4),
             (axis, across),
             method="Nelder-Mead",
             options={"maxfev": EVALUATIONS, "initial_simplex": SIMPLEX, "xatol": 1e-3, "fatol": 1e-4 * size**4},
         )
-        best = min(best, around(found.x, axis, across), key=lambda one: one[0])
+        best = min(best, around(optimum.x, axis, across), key=lambda one: one[0])
     ends = np.round(best[1] + np.tile(middle, 2), END_DIGITS)
     return (*ends.tolist(), _radius(points, ends) + 10.0**-END_DIGITS)
 
@@ -251,6 +251,6 @@ def _outline(points: Points) -> Points:
 
 def _radius(points: Points, ends: Points) -> float:
     """The greatest distance of points (N, 3) from the segment between two ends (6,)."""
-    start, way = ends[:3], ends[3:] - ends[:3]
-    share = np.clip((points - start) @ way / (way @ way + MIN_AXIS2_M2), 0.0, 1.0)
-    return float(np.linalg.norm(points - start - share[:, None] * way, axis=1).max())
+    start, axis = ends[:3], ends[3:] - ends[:3]
+    share = np.clip((points - start) @ axis / (axis @ axis + MIN_AXIS2_M2), 0.0, 1.0)
+    return float(np.linalg.norm(points - start - share[:, None] * axis, axis=1).max())

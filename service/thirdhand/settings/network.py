@@ -60,12 +60,12 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     @property
     def reached_at(self) -> tuple[str, ...]:
         """The endpoints at which programs of this machine reach the daemon."""
-        listening = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", one) for one in self.listen]
-        return tuple(one for one in listening if not re.search(r":0([?#]|$)", one)) or self.connect
+        listening = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in self.listen]
+        return tuple(endpoint for endpoint in listening if not re.search(r":0([?#]|$)", endpoint)) or self.connect
 
     def __post_init__(self) -> None:
-        given = {"listen": self.listen, "connect": self.connect}
-        for name, endpoint in ((f"{key}[{i}]", one) for key, some in given.items() for i, one in enumerate(some)):
+        endpoints = {"listen": self.listen, "connect": self.connect}
+        for name, endpoint in ((f"{key}[{i}]", entry) for key, entries in endpoints.items() for i, entry in enumerate(entries)):
             if lacks := lacking(endpoint):
                 raise ValueError(f"$.network.{name}: {lacks}")
             if self.certificate and not endpoint.startswith("tls/"):

@@ -98,11 +98,11 @@ class Workspace:
         sqrt(d² + (2 r sin(a / 2))²).
         """
         flat, angles = self._flattened(points)
-        distances, found = map(np.asarray, self._tree.query(flat, k=neighbours))
+        distances, indices = map(np.asarray, self._tree.query(flat, k=neighbours))
         if not self._turns:
             return np.asarray(distances.min(axis=1))
         lower, upper = self._first
-        turn = (angles[:, None] - self._starts[found] - lower) % (2 * math.pi)
+        turn = (angles[:, None] - self._starts[indices] - lower) % (2 * math.pi)
         excess = np.where(turn <= upper - lower, 0.0, np.minimum(turn - (upper - lower), 2 * math.pi - turn))
         return np.asarray(np.hypot(distances, 2.0 * flat[:, :1] * np.sin(excess / 2.0)).min(axis=1))
 
@@ -112,9 +112,9 @@ class Workspace:
         """
         if not self._turns:
             return points, np.zeros(len(points))
-        one = np.linalg.svd(self._axis[None])[2][1]  # any direction across the axis
+        across = np.linalg.svd(self._axis[None])[2][1]  # any direction across the axis
         away = points - self._centre
-        x, y = away @ one, away @ np.cross(self._axis, one)
+        x, y = away @ across, away @ np.cross(self._axis, across)
         return np.column_stack((np.hypot(x, y), away @ self._axis)), np.arctan2(y, x)
 
     def shell(self, min_x: float, min_z: float) -> Shell:
@@ -170,8 +170,8 @@ def _ball(centre: Vectors, radius: float, min_x: float, min_z: float) -> tuple[V
     """
     points = centre + radius * (2.0 * _spread(TEST_POINTS, 3) - 1.0)
     distances = np.linalg.norm(points - centre, axis=1)
-    kept = (distances <= radius) & (points[:, 0] >= min_x) & (points[:, 2] >= min_z)
-    return points[kept], distances[kept]
+    is_inside = (distances <= radius) & (points[:, 0] >= min_x) & (points[:, 2] >= min_z)
+    return points[is_inside], distances[is_inside]
 
 
 def _longest(flags: NDArray[np.bool_]) -> tuple[int, int]:
@@ -189,33 +189,33 @@ def _placed(
     """
     x, y, z, *quaternion = plate_from_tool
     toward = Rotation.from_quat(quaternion).as_matrix()[:, 2]
-    at, along = np.tile((x, y, z), (len(postures), 1)), np.tile(toward, (len(postures), 1))
+    positions, along = np.tile((x, y, z), (len(postures), 1)), np.tile(toward, (len(postures), 1))
     columns = iter(postures.T[::-1, :, None])
     for joint in reversed(chain):  # from the plate to the root
         axis = np.array(joint.axis)
         if joint.kind == "prismatic":
-            at = at + next(columns) * axis
+            positions = positions + next(columns) * axis
         elif joint.kind != "fixed":  # R(q) v = v + sin q (a x v) + (1 - cos q) a x (a x v)
             cross, q = np.cross(axis, np.eye(3)), next(columns)
             first, second = np.sin(q), 1.0 - np.cos(q)
-            at, along = (v + first * (v @ cross) + second * (v @ (cross @ cross)) for v in (at, along))
-        own = Rotation.from_quat(joint.rotation).as_matrix().T
-        at, along = at @ own + joint.translation, along @ own
+            positions, along = (v + first * (v @ cross) + second * (v @ (cross @ cross)) for v in (positions, along))
+        joint_turn = Rotation.from_quat(joint.rotation).as_matrix().T
+        positions, along = positions @ joint_turn + joint.translation, along @ joint_turn
     rest_turn, rest_at, axes = np.eye(3), np.zeros(3), []
     for joint in chain:
         rest_at = rest_at + rest_turn @ np.array(joint.translation)
         rest_turn = rest_turn @ Rotation.from_quat(joint.rotation).as_matrix()
         if joint.kind != "fixed":
             axes.append((rest_at, rest_turn @ np.array(joint.axis)))
-    return at, along, axes
+    return positions, along, axes
 
 
 def _shoulder(axes: Sequence[tuple[Vectors, Vectors]]) -> Vectors:
     """The point of the first axis that is nearest to the second. For parallel axes, or one alone:
     the projection of the second's origin onto the first axis.
     """
-    (at, along), (other, across) = axes[0], axes[min(1, len(axes) - 1)]
-    between, cosine = other - at, float(along @ across)
+    (origin, along), (other, across) = axes[0], axes[min(1, len(axes) - 1)]
+    between, cosine = other - origin, float(along @ across)
     if 1.0 - cosine * cosine > 1e-6:
         between = between - across * ((between @ across) - cosine * (between @ along)) / (1.0 - cosine * cosine)
-    return np.asarray(at + along * (between @ along))
+    return np.asarray(origin + along * (between @ along))

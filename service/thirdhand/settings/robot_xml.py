@@ -54,7 +54,7 @@ def element_of(text: str | bytes) -> Element:
         if count > MAX_ELEMENTS:
             raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_ELEMENTS} elements")
         matters = len(open_tags) > 1 and open_tags[1] in ("link", "joint")
-        if tag.startswith("xacro:") or (matters and any("${" in one or "$(" in one for one in attributes.values())):
+        if tag.startswith("xacro:") or (matters and any("${" in value or "$(" in value for value in attributes.values())):
             raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
         if foreign or ":" in tag:
             foreign += 1
@@ -120,21 +120,21 @@ def numbers(element: Element | None, name: str, default: str) -> tuple[float, ..
     """The finite numbers in an attribute. Raises ValueError."""
     text = default if element is None else element.get(name, default)
     try:
-        found = tuple(float(number) for number in text.split())
+        values = tuple(float(number) for number in text.split())
     except ValueError:
-        found = (math.nan,)
-    if element is not None and not all(abs(number) <= MAX_NUMBER for number in found):
+        values = (math.nan,)
+    if element is not None and not all(abs(number) <= MAX_NUMBER for number in values):
         raise ValueError(f"<{element.tag} {name}={text!r}>: finite numbers up to {MAX_NUMBER:g} needed")
-    return found
+    return values
 
 
 def three(element: Element | None, name: str, default: str) -> tuple[float, float, float]:
     """The three finite numbers in an attribute. Raises ValueError."""
-    found = numbers(element, name, default)
-    if len(found) != 3:
+    values = numbers(element, name, default)
+    if len(values) != 3:
         assert element is not None
-        raise ValueError(f"<{element.tag} {name}={element.get(name)!r}>: {len(found)} numbers, 3 needed")
-    return found[0], found[1], found[2]
+        raise ValueError(f"<{element.tag} {name}={element.get(name)!r}>: {len(values)} numbers, 3 needed")
+    return values[0], values[1], values[2]
 
 
 def check_numbers(robot: Element) -> None:
@@ -173,13 +173,13 @@ def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]])
         name, kind = joint.get("name", ""), "fixed"
         if name in moving:
             kind = "prismatic" if joint.get("type") == "prismatic" else "continuous"
-        kept = ElementTree.SubElement(out, "joint", name=name, type=kind)
+        joint_copy = ElementTree.SubElement(out, "joint", name=name, type=kind)
         for tag in ("parent", "child", "origin"):
-            if (given := joint.find(tag)) is not None:
-                part = ElementTree.SubElement(kept, tag, given.attrib)
+            if (source := joint.find(tag)) is not None:
+                part = ElementTree.SubElement(joint_copy, tag, source.attrib)
                 for number in part.attrib.keys() & {"xyz", "rpy"}:
-                    part.set(number, " ".join(map(repr, numbers(given, number, ""))))
+                    part.set(number, " ".join(map(repr, numbers(source, number, ""))))
         if name in moving:
-            ElementTree.SubElement(kept, "axis", xyz=" ".join(map(repr, moving[name])))
-            ElementTree.SubElement(kept, "limit", ANY_LIMIT)
+            ElementTree.SubElement(joint_copy, "axis", xyz=" ".join(map(repr, moving[name])))
+            ElementTree.SubElement(joint_copy, "limit", ANY_LIMIT)
     return ElementTree.tostring(out, encoding="unicode")

@@ -69,9 +69,9 @@ class Urdf:
             self.root = root_of(links, self.joints)
             check_numbers(self._robot)
             self.shapes = tuple(
-                _shape(link.get("name", ""), one)
+                _shape(link.get("name", ""), collision)
                 for link in self._robot.findall("link")
-                for one in link.findall("collision")
+                for collision in link.findall("collision")
             )
             if len(self.shapes) > MAX_SHAPES:
                 raise ValueError(f"{len(self.shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links fewer")
@@ -83,15 +83,15 @@ class Urdf:
 
     def chain(self, tip: str) -> tuple[UrdfJoint, ...]:
         """The joints from the root to link `tip`, in order. Raises UrdfError."""
-        found: list[UrdfJoint] = []
+        joints: list[UrdfJoint] = []
         link = tip
         while link != self.root:
             if link not in self._above:
                 last = ", ".join(self.leaves) + did_you_mean(link, self._above)
                 raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
-            found.append(self._above[link])
-            link = found[-1].parent
-        return tuple(reversed(found))
+            joints.append(self._above[link])
+            link = joints[-1].parent
+        return tuple(reversed(joints))
 
     def kinematics(self, names: Sequence[str]) -> str:
         """A URDF with links and joints only, in which the joints of these names move."""
@@ -132,13 +132,13 @@ class Urdf:
 
 def _moved(joint: UrdfJoint, position: float) -> Transform:
     """Pose of a joint's child link in its parent link."""
-    at, turn = joint.translation, joint.rotation
+    translation, turn = joint.translation, joint.rotation
     if position and joint.kind == "prismatic":
         dx, dy, dz = rotated(turn, joint.axis)
-        at = (at[0] + position * dx, at[1] + position * dy, at[2] + position * dz)
+        translation = (translation[0] + position * dx, translation[1] + position * dy, translation[2] + position * dz)
     elif position:
         turn = multiply(turn, about(joint.axis, position))
-    return Transform(joint.parent, joint.child, at, turn)
+    return Transform(joint.parent, joint.child, translation, turn)
 
 
 def _limited(joint: UrdfJoint) -> UrdfJoint:
@@ -157,14 +157,14 @@ def _lack(joint: UrdfJoint) -> str:
     if not any(joint.axis):
         return "has the axis 0 0 0; a direction needed"
     if not is_continuous and not -MAX_JOINT_LIMIT <= joint.lower < joint.upper <= MAX_JOINT_LIMIT:
-        given = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
-        return f"{given}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit> and soft limits"
+        problem = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
+        return f"{problem}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit> and soft limits"
     if not 0.0 < joint.velocity <= MAX_JOINT_LIMIT and not (is_continuous and joint.velocity == math.inf):
-        given = f"has the velocity {_or_none(joint.velocity)}"
-        return f"{given}; above 0, up to {MAX_JOINT_LIMIT:g} {unit}/s, needed in its <limit>"
+        problem = f"has the velocity {_or_none(joint.velocity)}"
+        return f"{problem}; above 0, up to {MAX_JOINT_LIMIT:g} {unit}/s, needed in its <limit>"
     if not min(joint.acceleration, joint.jerk) > 0.0:
-        given = f"has the acceleration {joint.acceleration:g} and the jerk {joint.jerk:g}"
-        return f"{given}; numbers above 0 needed in its <limit>"
+        problem = f"has the acceleration {joint.acceleration:g} and the jerk {joint.jerk:g}"
+        return f"{problem}; numbers above 0 needed in its <limit>"
     return ""
 
 
@@ -246,12 +246,12 @@ def _shape(link: str, element: Element) -> Shape:
     geometry, origin = element.find("geometry"), element.find("origin")
     if geometry is None or not len(geometry):
         raise ValueError(f"a collision of link {link!r} without geometry")
-    kind, given = geometry[0].tag, geometry[0]
+    kind, shape = geometry[0].tag, geometry[0]
     try:
         if kind == "mesh":
-            size = numbers(given, COVER, "")
+            size = numbers(shape, COVER, "")
         elif kind in SIZES:
-            size = tuple(number for name in SIZES[kind] for number in numbers(given, name, ""))
+            size = tuple(number for name in SIZES[kind] for number in numbers(shape, name, ""))
             if len(size) != SIZE_COUNTS[kind] or not all(number > 0.0 for number in size):
                 raise ValueError(f"<{kind}> has no size; {' and '.join(SIZES[kind])} above 0 needed")
         else:
@@ -267,8 +267,8 @@ def _turn(origin: Element | None) -> Quaternion:
 
 
 def _link(element: Element, which: str) -> str:
-    found = element.find(which)
-    return "" if found is None else found.get("link", "")
+    child = element.find(which)
+    return "" if child is None else child.get("link", "")
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:

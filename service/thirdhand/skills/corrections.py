@@ -163,8 +163,8 @@ def _end_of(skill: Skill, hands: Vector, segment: int) -> str:
 
 def _apart_m(skill: Skill, hands: Vector, others: Vector) -> float:
     """The distance [m] between two pairs of hands (6,): that of the hand that is farther off."""
-    off = skill.conducting(hands) - skill.conducting(others)
-    return float(np.linalg.norm(off.reshape(2, 3), axis=1).max())
+    difference = skill.conducting(hands) - skill.conducting(others)
+    return float(np.linalg.norm(difference.reshape(2, 3), axis=1).max())
 
 
 def _hands(point: ViaPoint) -> Vector:

@@ -55,8 +55,8 @@ class Demonstration(NamedTuple):
     @property
     def turns(self) -> Vector:
         """The entries (T, 18) of both hands' rotation matrices, row by row."""
-        both = (Rotation.from_quat(part[:, 3:]).as_matrix() for part in (self.left, self.right))
-        return np.hstack([matrices.reshape(-1, 9) for matrices in both])
+        rotations = (Rotation.from_quat(part[:, 3:]).as_matrix() for part in (self.left, self.right))
+        return np.hstack([matrices.reshape(-1, 9) for matrices in rotations])
 
     @property
     def seconds(self) -> Vector:
@@ -79,8 +79,8 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one of every `step` samples."""
-        one = Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
-        return one._replace(begins=tuple(sorted({-(-begin // step) for begin in self.begins})))
+        demonstration = Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
+        return demonstration._replace(begins=tuple(sorted({-(-begin // step) for begin in self.begins})))
 
 
 class NamedDemonstration(NamedTuple):
@@ -93,16 +93,16 @@ class NamedDemonstration(NamedTuple):
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     """The hash with which a skill names the demonstrations that it was learned from."""
     parts = (
-        part.tobytes() for one in demonstrations for part in (one.hands, one.tool, one.gripper) if part is not None
+        part.tobytes() for demonstration in demonstrations for part in (demonstration.hands, demonstration.tool, demonstration.gripper) if part is not None
     )
     return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
 
 
 def exchanged(demonstration: Demonstration) -> list[Demonstration]:
     """The demonstration with its hands exchanged, and also with those of its via-points, if any."""
-    one = demonstration._replace(left=demonstration.right, right=demonstration.left)
-    places = tuple(msgspec.structs.replace(place, left=place.right, right=place.left) for place in one.places)
-    return [one, one._replace(places=places)] if places else [one]
+    mirrored = demonstration._replace(left=demonstration.right, right=demonstration.left)
+    places = tuple(msgspec.structs.replace(place, left=place.right, right=place.left) for place in mirrored.places)
+    return [mirrored, mirrored._replace(places=places)] if places else [mirrored]
 
 
 def persons(demonstrations: Sequence[Demonstration]) -> list[int]:
@@ -110,8 +110,8 @@ def persons(demonstrations: Sequence[Demonstration]) -> list[int]:
     sitting counts as one: demonstrations without a pause of SITTING_S between them; with fewer than
     LEAST_SITTINGS of these, each demonstration has its own number.
     """
-    people = [one.person or str(i) for i, one in enumerate(demonstrations)]
-    if len({one.person for one in demonstrations if one.person}) < 2:
+    people = [demonstration.person or str(i) for i, demonstration in enumerate(demonstrations)]
+    if len({demonstration.person for demonstration in demonstrations if demonstration.person}) < 2:
         people = _sittings(demonstrations)
     order = {person: number for number, person in enumerate(dict.fromkeys(people))}
     return [order[person] for person in people]

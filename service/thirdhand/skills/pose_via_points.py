@@ -40,12 +40,12 @@ def turn_through(
     if base is None:
         learned = skill.model.primitive.base
         base = flat_orientation(learned.inputs, learned.kernel, skill.orientation)
-    at, quaternions = inputs[list(taught)], np.array(list(taught.values()))
+    taught_inputs, quaternions = inputs[list(taught)], np.array(list(taught.values()))
     quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
-    now = OrientationKMP(base.primitive, base.auxiliary).mean(at)
+    now = OrientationKMP(base.primitive, base.auxiliary).mean(taught_inputs)
     quaternions *= np.where((now * quaternions).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     zeta = log(quaternions, base.auxiliary)
-    return replace(base, primitive=_through(base.primitive, at, zeta, STD_RAD / 2, tolerance))
+    return replace(base, primitive=_through(base.primitive, taught_inputs, zeta, STD_RAD / 2, tolerance))
 
 
 def gripper_through(
@@ -67,17 +67,17 @@ def check_turns(owners: Sequence[ViaPoint], inputs: Vector) -> None:
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     for i, j in np.argwhere(np.triu(hands < math.pi / STEEPEST_RAD_PER_M, 1)).tolist():
-        one, other, distance_m = owners[i], owners[j], float(hands[i, j])
+        first, other, distance_m = owners[i], owners[j], float(hands[i, j])
         pair = (
-            f"via-points {one.name!r} and {other.name!r} contradict each other: their hands are {distance_m:.4f} m "
+            f"via-points {first.name!r} and {other.name!r} contradict each other: their hands are {distance_m:.4f} m "
             "apart"
         )
-        if one.orientation is not None and other.orientation is not None:
-            turn, most = _angle(one.orientation, other.orientation), STEEPEST_RAD_PER_M * distance_m + NEAR_RAD
+        if first.orientation is not None and other.orientation is not None:
+            turn, most = _angle(first.orientation, other.orientation), STEEPEST_RAD_PER_M * distance_m + NEAR_RAD
             if turn > most:
                 by, to = math.degrees(turn), math.degrees(most)
                 raise SkillError(f"{pair} and their tools turned by {by:.0f}°; up to {to:.0f}° accepted")
-        if {one.gripper, other.gripper} == {"open", "closed"} and distance_m < NEAR_M:
+        if {first.gripper, other.gripper} == {"open", "closed"} and distance_m < NEAR_M:
             raise SkillError(f"{pair}, with the gripper open at one and closed at the other; {NEAR_M} m needed")
 
 
@@ -85,8 +85,8 @@ def missed_by_rad(skill: Skill, point: ViaPoint) -> float | None:
     """The error [rad] of a via-point's orientation; None if it has none."""
     if point.orientation is None or skill.turn is None:
         return None
-    at = skill.model.inputs(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])
-    x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(at)[0].tolist()
+    inputs = skill.model.inputs(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])
+    x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(inputs)[0].tolist()
     return _angle(point.orientation, (x, y, z, w))
 
 

@@ -65,7 +65,7 @@ def beyond_m(settings: Settings, positions: Vector) -> Vector:
     whichever is larger; 0 within both.
     """
     joints, still = settings.joints, np.zeros(3)
-    held = [clamp(at, still, still, box=ANYWHERE, reach=settings.reach).position for at in positions]
+    held = [clamp(position, still, still, box=ANYWHERE, reach=settings.reach).position for position in positions]
     chain = Urdf(description(urdf_path(settings), cover=False)).chain(settings.arm.plate)
     workspace = workspace_of(chain, joints.lower, joints.upper, settings.tool.plate_from_tool)
     distances = np.linalg.norm(positions - np.reshape(held, positions.shape), axis=1)

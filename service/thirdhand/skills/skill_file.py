@@ -64,11 +64,11 @@ REGIONS, FARTHEST_RADIUS = "regions", 1e6
 ALL_RANGES = (
     RANGES
     | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
-    | {name: found for model in MODELS for name, found in model.ranges.items()}
+    | {name: bounds for model in MODELS for name, bounds in model.ranges.items()}
 )
 INPUT_ARRAYS = ("base_inputs", "via_inputs", "error_inputs")
 PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
-    f"{part}_{what}" for part in ("base", "via") for what in ("inputs", "mean", "covariance")
+    f"{part}_{quantity}" for part in ("base", "via") for quantity in ("inputs", "mean", "covariance")
 }
 OTHERS = ("format", "units", "name", "learned_from", "places", "figures", "conductor", "turned", "checksum", "names")
 DEMONSTRATIONS = "demonstrations"
@@ -174,8 +174,8 @@ def arrays_in(data: bytes) -> dict[str, Any]:
 def decoded(data: bytes, *, origin: str) -> StoredSkill:
     """The skill in the bytes of an .npz file; `origin` names it in errors. Raises SkillError."""
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # as every .npz
-        made = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
-        raise SkillError(f"{origin}: not a skill (no .npz archive){made}")
+        advice = "; `thirdhand learn` makes one of demonstrations" * data.startswith(b"\x89MCAP")
+        raise SkillError(f"{origin}: not a skill (no .npz archive){advice}")
     try:
         arrays = arrays_in(data)
         if (number := arrays["format"].item()) != SKILL_FORMAT:
@@ -228,9 +228,9 @@ def skill_in(path: Path) -> StoredSkill:
 
 
 def _regions(numbers: list[float]) -> Regions:
-    (scale, std_s), radii, rest = numbers[:2], numbers[2 : 2 + len(LEVELS)], numbers[2 + len(LEVELS) :]
+    (scale, std_s), radii, remainder = numbers[:2], numbers[2 : 2 + len(LEVELS)], numbers[2 + len(LEVELS) :]
     regions = Regions(scale, std_s, tuple(radii))
-    return regions._replace(ratios=tuple(rest[:-1]), alarm=rest[-1]) if rest else regions
+    return regions._replace(ratios=tuple(remainder[:-1]), alarm=remainder[-1]) if remainder else regions
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
@@ -247,9 +247,9 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
-    own = [name for name in _model(arrays).ranges if name in arrays]  # one that is missing is found missing later
+    model_arrays = [name for name in _model(arrays).ranges if name in arrays]  # one that is missing is found missing later
     clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
-    yield from _beyond(arrays, [*RANGES, *own], "")
+    yield from _beyond(arrays, [*RANGES, *model_arrays], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
             yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
@@ -348,15 +348,15 @@ def _faults(skill: Skill) -> Iterator[str]:
 
 def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
     """Faults of the predictions of the orientation's or the gripper's primitive at its inputs."""
-    wanted, given = (skill.model.shape[0], outputs), (primitive.inputs.shape[1], primitive.outputs)
-    if given != wanted:
-        yield f"{name} has {given[0]} inputs and {given[1]} outputs, {wanted[0]} and {wanted[1]} needed"
+    needed_shape, shape = (skill.model.shape[0], outputs), (primitive.inputs.shape[1], primitive.outputs)
+    if shape != needed_shape:
+        yield f"{name} has {shape[0]} inputs and {shape[1]} outputs, {needed_shape[0]} and {needed_shape[1]} needed"
         return
     with np.errstate(all="ignore"):
-        found = np.abs(primitive.mean(primitive.inputs))
+        magnitudes = np.abs(primitive.mean(primitive.inputs))
         steep = np.linalg.norm(primitive.jacobians(primitive.inputs), axis=(1, 2)).max()
-    if not found.max() <= FARTHEST_TURN:
-        yield f"{name} says {found.max():g} where it was learned, up to {FARTHEST_TURN:.2g} accepted"
+    if not magnitudes.max() <= FARTHEST_TURN:
+        yield f"{name} says {magnitudes.max():g} where it was learned, up to {FARTHEST_TURN:.2g} accepted"
     if not steep <= STEEPEST:
         yield f"{name} changes by {steep:g} a metre where it was learned, up to {STEEPEST:g} accepted"
 
@@ -364,18 +364,18 @@ def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> I
 def _tried(skill: Skill) -> Iterator[str]:
     """Faults of the skill's predictions at its own inputs, as with weights of another skill."""
     with np.errstate(all="ignore"):
-        tried = [(one.hands, one.mean(one.hands)) for one in (skill.model.unadapted(), skill.model)]
+        tried = [(model.hands, model.mean(model.hands)) for model in (skill.model.unadapted(), skill.model)]
     low, high = skill.workspace
-    for where, found in tried:
-        beyond = np.maximum(np.maximum(low - found, found - high), 0.0).max(axis=1)
-        if not (np.isfinite(found).all() and beyond.max() <= MARGIN_M):
+    for where, positions in tried:
+        beyond = np.maximum(np.maximum(low - positions, positions - high), 0.0).max(axis=1)
+        if not (np.isfinite(positions).all() and beyond.max() <= MARGIN_M):
             worst = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
             yield (
                 f"with the hands at {np.round(where[worst], 3).tolist()}, where it was learned, the tool is at "
-                f"{found[worst].tolist()}; its box and {MARGIN_M} m around it accepted"
+                f"{positions[worst].tolist()}; its box and {MARGIN_M} m around it accepted"
             )
     primitive = skill.model.primitive
-    for at in primitive.inputs[:: max(1, len(primitive.inputs) // 5)]:
-        steep = float(np.linalg.norm(primitive.jacobian(at)))
+    for hands in primitive.inputs[:: max(1, len(primitive.inputs) // 5)]:
+        steep = float(np.linalg.norm(primitive.jacobian(hands)))
         if not steep <= STEEPEST:
-            yield f"with the hands at {np.round(at, 3).tolist()} the tool moves {steep:g} times as far as they do"
+            yield f"with the hands at {np.round(hands, 3).tolist()} the tool moves {steep:g} times as far as they do"

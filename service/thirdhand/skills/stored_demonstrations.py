@@ -42,29 +42,29 @@ class _About(msgspec.Struct, frozen=True, kw_only=True):
 
 def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
     """The demonstrations as bytes."""
-    kept_hz = min(KEPT_HZ, MOST_KEPT / sum(one.period_s * len(one.stamps_ns) for _, one in demonstrations))
-    thin = [(name, one.every(max(1, int(1.0 / (kept_hz * one.period_s) + 1e-6)))) for name, one in demonstrations]
+    kept_hz = min(KEPT_HZ, MOST_KEPT / sum(demo.period_s * len(demo.stamps_ns) for _, demo in demonstrations))
+    thin = [(name, demo.every(max(1, int(1.0 / (kept_hz * demo.period_s) + 1e-6)))) for name, demo in demonstrations]
     about = [
         _About(
             name=name,
-            samples=len(one.stamps_ns),
-            frame=one.frame,
-            places=one.places,
-            conducts=one.conducts,
-            person=one.person,
-            begins=one.begins,
-            has_gripper=one.gripper is not None,
+            samples=len(demo.stamps_ns),
+            frame=demo.frame,
+            places=demo.places,
+            conducts=demo.conducts,
+            person=demo.person,
+            begins=demo.begins,
+            has_gripper=demo.gripper is not None,
         )
-        for name, one in thin
+        for name, demo in thin
     ]
     out = io.BytesIO()
     np.savez_compressed(
         out,
         about=np.frombuffer(msgspec.json.encode(about), np.uint8),
-        stamps=np.concatenate([one.stamps_ns for _, one in thin]),
-        poses=np.concatenate([np.hstack([one.left, one.right, one.tool]) for _, one in thin]).astype(np.float32),
+        stamps=np.concatenate([demo.stamps_ns for _, demo in thin]),
+        poses=np.concatenate([np.hstack([demo.left, demo.right, demo.tool]) for _, demo in thin]).astype(np.float32),
         closures=np.concatenate(
-            [np.zeros(len(one.stamps_ns)) if one.gripper is None else one.gripper for _, one in thin]
+            [np.zeros(len(demo.stamps_ns)) if demo.gripper is None else demo.gripper for _, demo in thin]
         ).astype(np.float32),
     )
     return out.getvalue()
@@ -83,9 +83,9 @@ def stored_demonstrations(skill: StoredSkill) -> list[NamedDemonstration]:
     try:
         arrays = arrays_in(skill.demonstrations)
         about = validated(msgspec.json.decode(arrays["about"].tobytes()), tuple[_About, ...])
-        ends = np.cumsum([one.samples for one in about])
+        ends = np.cumsum([entry.samples for entry in about])
         columns = [np.split(arrays[name], ends) for name in ("stamps", "poses", "closures")]
-        out = [_demonstration(one, *parts) for one, *parts in zip(about, *(part[:-1] for part in columns), strict=True)]
+        out = [_demonstration(entry, *parts) for entry, *parts in zip(about, *(part[:-1] for part in columns), strict=True)]
         for _, demonstration in out:
             check(demonstration)
     except (ValueError, KeyError, IndexError, zipfile.BadZipFile, msgspec.MsgspecError) as error:

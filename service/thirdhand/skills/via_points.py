@@ -51,8 +51,8 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
             # by 1 / N unless it is a mixture's, so the variance of a via-point is scaled, too.
             weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
             skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
-            at = skill.model.inputs(inputs, [rest_of(point, skill.model.names) for point in owners])
-            turn, gripper = turn_through(skill, owners, at, tolerance), gripper_through(skill, owners, at, tolerance)
+            model_inputs = skill.model.inputs(inputs, [rest_of(point, skill.model.names) for point in owners])
+            turn, gripper = turn_through(skill, owners, model_inputs, tolerance), gripper_through(skill, owners, model_inputs, tolerance)
     except ValueError as error:
         raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
     return with_file(replace(skill, turn=turn, gripper=gripper))
@@ -60,8 +60,8 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
 
 def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
     """The via-point with both hands at the position of the conducting one."""
-    at = (point.left, point.right)[conductor]
-    return msgspec.structs.replace(point, left=at, right=at)
+    hand = (point.left, point.right)[conductor]
+    return msgspec.structs.replace(point, left=hand, right=hand)
 
 
 def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) -> None:
@@ -87,8 +87,8 @@ def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]
     """Return whether each pair (V, V) belongs to two via-points of the skill's task, to via-points
     of two of its segments, or to one of each.
     """
-    known = skill.model.names
-    names = np.array([p.name if p.name in known else f"{p.segment} ->" if p.segment in known else "" for p in owners])
+    task_names = skill.model.names
+    names = np.array([p.name if p.name in task_names else f"{p.segment} ->" if p.segment in task_names else "" for p in owners])
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 
@@ -129,8 +129,8 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
 
 def tool_at(skill: Skill, point: ViaPoint) -> Vector:
     """The tool position (3,) [m] for hands that rest at a via-point."""
-    found: Vector = skill.mean(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])[0]
-    return found
+    position: Vector = skill.mean(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])[0]
+    return position
 
 
 def points_made_of(via_points: Sequence[ViaPoint]) -> int:

@@ -112,10 +112,10 @@ def blueprint(
         tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
     left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
     relative = rrb.TimeRangeBoundary.cursor_relative
-    at, first_s, last_s = (relative, -WINDOW_S, 0.0) if end_s is None else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
+    boundary, first_s, last_s = (relative, -WINDOW_S, 0.0) if end_s is None else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
     whole_s = max(1.0, (last_s - first_s) / (1 - LEGEND_SHARE))
-    shown, beside_numbers = (
-        rr.TimeRange(start=at(seconds=first_s - share * whole_s), end=at(seconds=first_s + whole_s))
+    time_range, beside_numbers = (
+        rr.TimeRange(start=boundary(seconds=first_s - share * whole_s), end=boundary(seconds=first_s + whole_s))
         for share in (0.0, NUMBERS_SHARE)
     )
     loaded = (
@@ -133,7 +133,7 @@ def blueprint(
             contents=["+ $origin/**", *(left_out if origin == "/deviation" else [])],
             name=view.title,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
-            axis_x=rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=shown),
+            axis_x=rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=time_range),
             axis_y=rrb.ScalarAxis(range=(low, high)),
             time_ranges=loaded,
         )
@@ -154,7 +154,7 @@ def blueprint(
         rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/segment"), active_tab=0),
         rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),
         rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
-        rrb.Tabs(*(plot(f"/joints/{what}") for what in ("velocity", "position", "acceleration", "error"))),
+        rrb.Tabs(*(plot(f"/joints/{quantity}") for quantity in ("velocity", "position", "acceleration", "error"))),
         modes(),  # below the curves, with the same time axis
         row_shares=[3, 3, 3, 5, 2.6],  # the legend of the joints has seven names
     )

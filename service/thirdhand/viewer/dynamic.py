@@ -103,9 +103,9 @@ class DynamicScene:
     def chunks(self, batch: list[DrawnFrame]) -> Iterator[rr.chunk.Chunk]:
         """The chunks that show a batch of frames."""
         begin = 0
-        for i, shown in enumerate(batch):
-            step_ticks = int(shown.frame["tick"]) - int(batch[i - 1].frame["tick"] if i else self._last_tick)
-            if shown.after_gap or step_ticks > self._max_step_ticks:
+        for i, drawn in enumerate(batch):
+            step_ticks = int(drawn.frame["tick"]) - int(batch[i - 1].frame["tick"] if i else self._last_tick)
+            if drawn.after_gap or step_ticks > self._max_step_ticks:
                 yield from self._unbroken(batch[begin:i])
                 yield from self._interruption()
                 begin = i
@@ -126,8 +126,8 @@ class DynamicScene:
         """The chunks that show frames between which none is missing."""
         if not batch:
             return
-        frames = np.array([shown.frame for shown in batch])
-        times = np.array([shown.time_ns for shown in batch], np.int64)
+        frames = np.array([drawn.frame for drawn in batch])
+        times = np.array([drawn.time_ns for drawn in batch], np.int64)
         ticks = frames["tick"]
         self.index(times[:1])
 
@@ -136,17 +136,17 @@ class DynamicScene:
             index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows], to_ns=to_ns)]
             return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
 
-        seen = frames["hand_ages"] >= 0
+        is_seen = frames["hand_ages"] >= 0
         is_repeated = self._live and ticks[-1] - self._mode_sent_tick > self._repeat_ticks
         if batch[0].measured is None and (self._shown is None or is_repeated):
             yield from self._unmeasured(times[:1])
-        yield from self._curves(batch, frames, seen, columns)
+        yield from self._curves(batch, frames, is_seen, columns)
         yield from self._modes(frames, columns)
         before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
         self._last_ns = int(times[-1])
         sampled = np.flatnonzero(ticks // self._every != before // self._every)
         if len(sampled):
-            yield from self._scene(batch, frames, sampled, seen, columns)
+            yield from self._scene(batch, frames, sampled, is_seen, columns)
         corners = np.flatnonzero(ticks // self._trail_every != before // self._trail_every)
         if len(corners):
             yield from self._trail(frames, corners, columns)
@@ -156,18 +156,18 @@ class DynamicScene:
         for number, joint in enumerate(self._ghost):
             if joint is not None:
                 size = rr.Transform3D.columns(scale=[(TINY, TINY, TINY)])
-                at = [*joint.compute_transform_columns([0.0], clamp=False), *size]
-                yield rr.chunk.Chunk.from_columns(f"/measured/joints/{number}", self.index(time_ns), at)
+                pose = [*joint.compute_transform_columns([0.0], clamp=False), *size]
+                yield rr.chunk.Chunk.from_columns(f"/measured/joints/{number}", self.index(time_ns), pose)
 
     def _curves(
         self, batch: list[DrawnFrame], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns
     ) -> Iterator[rr.chunk.Chunk]:
         def scalars(path: str, rows: Any, values: NDArray[Any], view: str = "") -> Iterator[rr.chunk.Chunk]:
-            found = values[rows]
-            if len(found):
-                self.peaks.setdefault(view or path, []).append(float(np.nanmax(np.abs(found), initial=0.0)))
-                width = self._widths[path] = found[0].size
-                yield columns(path, rows, rr.Scalars.columns(scalars=found.ravel()).partition([width] * len(found)))
+            samples = values[rows]
+            if len(samples):
+                self.peaks.setdefault(view or path, []).append(float(np.nanmax(np.abs(samples), initial=0.0)))
+                width = self._widths[path] = samples[0].size
+                yield columns(path, rows, rr.Scalars.columns(scalars=samples.ravel()).partition([width] * len(samples)))
 
         every = slice(None)
         yield from scalars("/joints/position", every, frames["joints"])
@@ -180,9 +180,9 @@ class DynamicScene:
         near = np.flatnonzero(seen.any(axis=1))
         yield from scalars("/separation/distance", near, frames["hand_distance"])
         yield from scalars("/separation/limit", near, frames["hand_limit"])
-        known = _predicted(frames, seen)
-        aimed = np.flatnonzero(known)
-        following = known & (frames["mode"] == Mode.FOLLOW)
+        is_predicted = _predicted(frames, seen)
+        aimed = np.flatnonzero(is_predicted)
+        following = is_predicted & (frames["mode"] == Mode.FOLLOW)
         off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
         gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
         self._followed = bool(following[-1])
@@ -191,26 +191,26 @@ class DynamicScene:
             "/turn/target", np.flatnonzero(following | gap_starts), self._rotation_error(frames, following), "/turn"
         )
         std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
-        yield from scalars("/turn/std", np.flatnonzero(known & (std_deg > 0)), np.degrees(std_deg), "/turn")
+        yield from scalars("/turn/std", np.flatnonzero(is_predicted & (std_deg > 0)), np.degrees(std_deg), "/turn")
         segmented = np.flatnonzero(frames["segment_belief"] > 0)
         yield from scalars("/segment/number", segmented, frames["segment"] + 1.0)
         yield from scalars("/segment/probable", segmented, frames["segment_belief"])
-        gripping = known & (frames["closure"] >= 0)
+        gripping = is_predicted & (frames["closure"] >= 0)
         yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
         is_commanded = gripping & (frames["gripper"] != UNKNOWN)
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
-        yield from scalars("/deviation/target", np.flatnonzero(known & (std_m > 0)), 1e3 * std_m, "/deviation")
-        yield from scalars("/doubt/target", np.flatnonzero(known), 100.0 * frames["error_probability"], "/doubt")
-        other = known & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
+        yield from scalars("/deviation/target", np.flatnonzero(is_predicted & (std_m > 0)), 1e3 * std_m, "/deviation")
+        yield from scalars("/doubt/target", np.flatnonzero(is_predicted), 100.0 * frames["error_probability"], "/doubt")
+        other = is_predicted & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
         yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
         if self._gate is not None and len(aimed):
             yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
-        measured = [i for i, shown in enumerate(batch) if shown.measured is not None and frames["commanded"][i]]
-        off = np.zeros(len(batch))
-        off[measured] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured]
-        yield from scalars("/joints/error", measured, off)
-        timed = [i for i, shown in enumerate(batch) if shown.timing is not None]
+        measured = [i for i, drawn in enumerate(batch) if drawn.measured is not None and frames["commanded"][i]]
+        error_rad = np.zeros(len(batch))
+        error_rad[measured] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured]
+        yield from scalars("/joints/error", measured, error_rad)
+        timed = [i for i, drawn in enumerate(batch) if drawn.timing is not None]
         if timed:
             timings = np.zeros(len(batch), TIMING)
             timings[timed] = [batch[i].timing for i in timed]
@@ -276,32 +276,32 @@ class DynamicScene:
         seen: NDArray[np.bool_],
         columns: Columns,
     ) -> Iterator[rr.chunk.Chunk]:
-        known = np.array([i for i in rows if batch[i].measured is not None], np.intp)
-        measured = [batch[i].measured for i in known]
+        measured_rows = np.array([i for i in rows if batch[i].measured is not None], np.intp)
+        measured = [batch[i].measured for i in measured_rows]
         for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
             if joint is not None:
                 angles = frames["joints"][rows, number].tolist()
                 yield columns(f"/arm/joints/{number}", rows, joint.compute_transform_columns(angles, clamp=False))
-            if ghost is not None and len(known):
+            if ghost is not None and len(measured_rows):
                 angles = [float(q[number]) for q in measured if q is not None]
-                yield columns(f"/measured/joints/{number}", known, ghost.compute_transform_columns(angles, clamp=False))
+                yield columns(f"/measured/joints/{number}", measured_rows, ghost.compute_transform_columns(angles, clamp=False))
         tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows])
         yield columns("/scene/tool", rows, tool)
         yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
         for side, name in enumerate(SIDES):
-            shown = rows[seen[rows, side]]
-            if len(shown):
-                yield columns(f"/scene/{name}_hand", shown, rr.Points3D.columns(positions=frames["hands"][shown, side]))
-        shown = rows[_predicted(frames, seen)[rows]]
-        if len(shown):
-            variances, axes = np.linalg.eigh(frames["covariance"][shown])
+            drawn_rows = rows[seen[rows, side]]
+            if len(drawn_rows):
+                yield columns(f"/scene/{name}_hand", drawn_rows, rr.Points3D.columns(positions=frames["hands"][drawn_rows, side]))
+        drawn_rows = rows[_predicted(frames, seen)[rows]]
+        if len(drawn_rows):
+            variances, axes = np.linalg.eigh(frames["covariance"][drawn_rows])
             axes[:, :, 0] *= np.linalg.det(axes)[:, None]
             half = np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3)
-            unsure = frames["flags"][shown] & int(Flag.UNSURE) > 0
-            colours = [palette.GATE if one else palette.TARGET for one in unsure]
-            orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][shown]
+            unsure = frames["flags"][drawn_rows] & int(Flag.UNSURE) > 0
+            colours = [palette.GATE if is_unsure else palette.TARGET for is_unsure in unsure]
+            orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][drawn_rows]
             region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations, colors=colours)
-            yield columns("/scene/target", shown, region)
+            yield columns("/scene/target", drawn_rows, region)
         if len(near := rows[seen[rows].any(axis=1)]):
             lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)
             strips = rr.LineStrips3D.columns(strips=lines, labels=labels)
@@ -311,7 +311,7 @@ class DynamicScene:
         """The line (2, 3) from the nearest hand to the arm, and its length as text; without a hand
         nearby, a point and no text.
         """
-        body, found = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
+        body, nearest = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
         placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
         place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
         if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST_REPORTED_M):
@@ -319,10 +319,10 @@ class DynamicScene:
                 hand = np.stack([frame["hands"][side], frame["hands"][side] + self._forearm])
                 for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
                     distance = between_segments(ends, hand, near) - radius - self._hand_radius
-                    if distance < found[0]:
+                    if distance < nearest[0]:
                         surfaces = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]
-                        found = distance, np.stack(surfaces)
-        distance, line = found
+                        nearest = distance, np.stack(surfaces)
+        distance, line = nearest
         return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
 
     def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
@@ -334,7 +334,7 @@ class DynamicScene:
         ]
         tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1), stale[:, 0]))
         for name, positions, ages, limits in tracks:
-            trail, shown, strips = self._trails[name], [], []
+            trail, drawn_rows, strips = self._trails[name], [], []
             for i in rows:
                 fresh = 0 <= ages[i] < limits[i]
                 if not fresh or (trail and np.linalg.norm(trail[-1] - positions[i]) > TRAIL_BREAK_M):
@@ -342,10 +342,10 @@ class DynamicScene:
                 if fresh:
                     trail.append(positions[i].astype(np.float32))
                 if ages[i] >= 0:
-                    shown.append(i)
+                    drawn_rows.append(i)
                     strips.append(np.array(trail, np.float32).reshape(-1, 3))
-            if shown:
-                yield columns(f"/scene/{name}_trail", shown, rr.LineStrips3D.columns(strips=strips))
+            if drawn_rows:
+                yield columns(f"/scene/{name}_trail", drawn_rows, rr.LineStrips3D.columns(strips=strips))
 
 
 def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

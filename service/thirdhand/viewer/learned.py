@@ -80,8 +80,8 @@ def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
     """The named via-points in a skill's demonstrations."""
     if "names" in arrays and "nominal" in arrays:
         names = map(printable, msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...]))
-        for name, at in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
-            left, right, tool = ((x, y, z) for x, y, z in at)
+        for name, positions in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
+            left, right, tool = ((x, y, z) for x, y, z in positions)
             yield MarkedViaPoint(name, left, right, tool)
 
 
@@ -99,7 +99,7 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
     """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
     for first, (name, colour) in enumerate(palette.BY_TRACK.items()):
         columns = slice(3 * first, 3 * first + 3)
-        lines = [one[:: 1 + len(one) // MAX_LINE_POINTS, columns] for one in skill.demonstrations]
+        lines = [track[:: 1 + len(track) // MAX_LINE_POINTS, columns] for track in skill.demonstrations]
         style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}
         yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
     count = len(skill.reference)
@@ -124,20 +124,20 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
 def about(skill: SkillContents) -> str:
     """A description of the skill, as Markdown."""
     rows = skill.figures.get("demonstrations", ())
-    shown = len(skill.demonstrations)
+    count = len(skill.demonstrations)
     lines = [f"# {as_markdown(skill.name or 'skill')}", ""]
     if len(skill.reference):
         lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
     lines.append(
-        f"Learned from {shown} demonstrations (faint lines)." if shown else "Its file holds no demonstrations."
+        f"Learned from {count} demonstrations (faint lines)." if count else "Its file holds no demonstrations."
     )
     lines.append(f"The arm holds if the deviation from what the skill knows exceeds {1000 * skill.threshold:.0f} mm.")
     lines += ["", "## Via-points", ""]
     if skill.via_points:
         lines += ["| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |", "|---|---|---|---|"]
         for point in skill.via_points:
-            at = ", ".join(f"{value:.3f}" for value in point.tool)
-            lines.append(f"| {as_markdown(point.name)} | {at} | {1000 * point.radius:.0f} | {point.follow} |")
+            position_text = ", ".join(f"{value:.3f}" for value in point.tool)
+            lines.append(f"| {as_markdown(point.name)} | {position_text} | {1000 * point.radius:.0f} | {point.follow} |")
     else:
         lines.append("None.")
     if rows:

@@ -25,32 +25,32 @@ def object_chunks(
     and columns.
     """
     names, labelled = set(), set(labelled)
-    for found in objects:
-        path = _path(found.name)
-        names.add(found.name)
-        colour = [round(255 * value) for value in found.colour]
+    for scene_object in objects:
+        path = _path(scene_object.name)
+        names.add(scene_object.name)
+        colour = [round(255 * value) for value in scene_object.colour]
         style: dict[str, Any] = {"colors": [colour], "fill_mode": [rr.components.FillMode.Solid]}
-        pose = {"centers": [found.position], "quaternions": [found.orientation]}
-        half = [tuple(size / 2 for size in found.size)]
-        frame = "tf#/" if found.frame_id == BASE else found.frame_id
+        pose = {"centers": [scene_object.position], "quaternions": [scene_object.orientation]}
+        half = [tuple(size / 2 for size in scene_object.size)]
+        frame = "tf#/" if scene_object.frame_id == BASE else scene_object.frame_id
         yield at(path, *rr.CoordinateFrame.columns(frame=[frame]))
-        if found.shape == "cylinder":
-            radius = (found.size[0] + found.size[1]) / 4
-            yield at(path, *row(rr.Cylinders3D, 1, lengths=[found.size[2]], radii=[radius], **pose, **style))
+        if scene_object.shape == "cylinder":
+            radius = (scene_object.size[0] + scene_object.size[1]) / 4
+            yield at(path, *row(rr.Cylinders3D, 1, lengths=[scene_object.size[2]], radii=[radius], **pose, **style))
         else:
-            kind = rr.Boxes3D if found.shape == "box" else rr.Ellipsoids3D
+            kind = rr.Boxes3D if scene_object.shape == "box" else rr.Ellipsoids3D
             yield at(path, *row(kind, 1, half_sizes=half, **pose, **style))
-        label = {"labels": [printable(found.name)], "show_labels": [found.name not in labelled]}
+        label = {"labels": [printable(scene_object.name)], "show_labels": [scene_object.name not in labelled]}
         label |= {"colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
-        yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[_label_at(found)], radii=[0.0], **label))
+        yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[_label_at(scene_object)], radii=[0.0], **label))
     for name in set(before) - names:
         yield at(_path(name), *rr.Clear.columns(is_recursive=[True]))
 
 
 def are_the_same(before: tuple[SceneObject, ...], after: tuple[SceneObject, ...]) -> bool:
     """True if objects have only moved: names, shapes, sizes and colours are as before."""
-    return [_look(one) for one in before] == [_look(one) for one in after]
+    return [_look(scene_object) for scene_object in before] == [_look(scene_object) for scene_object in after]
 
 
 def moved_chunks(rows: Sequence[Sequence[SceneObject]], index: list[rr.TimeColumn]) -> Iterator[rr.chunk.Chunk]:
@@ -58,10 +58,10 @@ def moved_chunks(rows: Sequence[Sequence[SceneObject]], index: list[rr.TimeColum
     count = len(rows)
     for moves in zip(*rows, strict=True):
         first, path = moves[0], _path(moves[0].name)
-        frames = ["tf#/" if one.frame_id == BASE else one.frame_id for one in moves]
+        frames = ["tf#/" if move.frame_id == BASE else move.frame_id for move in moves]
         kind: Any = {"cylinder": rr.Cylinders3D, "box": rr.Boxes3D}.get(first.shape, rr.Ellipsoids3D)
-        centers, turns = [one.position for one in moves], [one.orientation for one in moves]
-        labels = [_label_at(one) for one in moves]
+        centers, turns = [move.position for move in moves], [move.orientation for move in moves]
+        labels = [_label_at(move) for move in moves]
         poses = kind.columns(centers=centers, quaternions=turns).partition([1] * count)
         names = rr.Points3D.columns(positions=labels).partition([1] * count)
         for where, columns in ((path, poses), (f"{path}/name", names)):

@@ -14,14 +14,14 @@ _REQUESTS = {"via_points": "Teaching", "skill": "Loading a skill", **{name: f"A 
 
 def sentence(note: str) -> str:
     """A note as a sentence; plain text is returned unchanged."""
-    name, _, rest = note.partition(" ")
+    name, _, content = note.partition(" ")
     if name not in _REQUESTS:
         return note
-    outcome, _, why = rest.partition(": ")
+    outcome, _, why = content.partition(": ")
     if outcome in ("refused", "failed"):
         return f"{_REQUESTS[name]} {'was refused' if outcome == 'refused' else outcome}: {in_file(why)}"
     try:
-        request = msgspec.json.decode(rest, type=dict[str, Any])
+        request = msgspec.json.decode(content, type=dict[str, Any])
     except msgspec.DecodeError:
         return note
     match request:

@@ -53,7 +53,7 @@ class ArmModels:
     def __init__(self, urdf: Path, settings: Settings) -> None:
         live = urdf == urdf_path(settings)  # otherwise the URDF is a recording's, whose meshes are already covered
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
-        self.body, self.covered = body_of(settings, text), any(one.kind == "mesh" for one in Urdf(text).shapes)
+        self.body, self.covered = body_of(settings, text), any(shape.kind == "mesh" for shape in Urdf(text).shapes)
         with tempfile.TemporaryDirectory() as folder:
             self.remark = _write_drawn(urdf.read_bytes(), settings, drawn_urdf := Path(folder) / "arm.urdf")
             self.commanded = rr.urdf.UrdfTree.from_file_path(drawn_urdf, entity_path_prefix="arm")
@@ -88,7 +88,7 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
         for part in (*link.findall("inertial"), *link.findall("collision")):
             link.remove(part)
     packages = (*settings.arm.packages, *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)))
-    packages += tuple(f"{one}/share" for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one)
+    packages += tuple(f"{prefix}/share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix)
     lost = unfound(robot, origin, packages, "visual")
     cause = f"{lost}; ROS_PACKAGE_PATH names more" if lost else ""
     files: dict[ElementTree.Element, Path] = {}
@@ -176,7 +176,7 @@ def _log_capsules(
     for link in np.unique(body.capsules["link"]):
         capsules = body.capsules[body.capsules["link"] == link]
         along = capsules["ends"][:, 1] - capsules["ends"][:, 0]
-        turns = [Rotation.align_vectors([one], [UP])[0].as_quat() if one.any() else UPRIGHT for one in along]
+        turns = [Rotation.align_vectors([axis], [UP])[0].as_quat() if axis.any() else UPRIGHT for axis in along]
         fill = rr.components.FillMode.TransparentFillMajorWireframe if faint else rr.components.FillMode.Solid
         shapes = rr.Capsules3D(
             lengths=np.linalg.norm(along, axis=1),

@@ -192,8 +192,8 @@ class Viewer:
     def _put_skill(self) -> None:
         """Show the skill, once there are frames."""
         if self._contents is not None and self._repeated_ns:
-            at = self._at(self._repeated_ns)
-            self._put(list(learned.skill_chunks(self._contents, at)))
+            chunk_at = self._at(self._repeated_ns)
+            self._put(list(learned.skill_chunks(self._contents, chunk_at)))
 
     def _show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
         previous, self._objects = self._objects, objects
@@ -259,7 +259,7 @@ def _free_port(port: int) -> int:
 
 def rerun_program() -> Path:
     """The Rerun program that is installed with the library; it need not be on the path."""
-    found = importlib.util.find_spec("rerun_cli")
-    if found is None or found.origin is None:
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
         raise ViewerError("the Rerun program is not installed: pip install 'thirdhand[view]'")
-    return Path(found.origin).with_name("rerun.exe" if sys.platform == "win32" else "rerun")
+    return Path(spec.origin).with_name("rerun.exe" if sys.platform == "win32" else "rerun")

@@ -36,8 +36,8 @@ def devices() -> int:
     instance, count = ctypes.c_void_p(), ctypes.c_uint32()
     if vulkan.vkCreateInstance(ctypes.byref(InstanceCreateInfo(CREATE_INSTANCE)), None, ctypes.byref(instance)) != 0:
         return 0
-    found = vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
-    return count.value if found == 0 else 0
+    result = vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
+    return count.value if result == 0 else 0
 
 
 def is_there() -> bool:
@@ -45,5 +45,5 @@ def is_there() -> bool:
     if not sys.platform.startswith("linux"):
         return True  # elsewhere the viewer draws by the system's own interface
     program = Path(__file__).read_text(encoding="utf-8") + "\nprint(devices())"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    return found.stdout.strip() not in {"", "0"}
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    return process.stdout.strip() not in {"", "0"}

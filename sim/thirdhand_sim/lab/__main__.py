@@ -45,7 +45,7 @@ FOLDERS = {
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     recorded = {name: " (recorded hands)" * name.endswith(OF_OTHERS) for name in EXPERIMENTS}
-    names = "\n".join(f"  {name:<16} {one.about}{recorded[name]}" for name, one in EXPERIMENTS.items())
+    names = "\n".join(f"  {name:<16} {experiment.about}{recorded[name]}" for name, experiment in EXPERIMENTS.items())
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.lab",
         description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
@@ -53,8 +53,8 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    which = "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
-    p.add_argument("name", metavar="NAME", choices=[*EXPERIMENTS, "all", "stale"], help=which)
+    name_help = "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
+    p.add_argument("name", metavar="NAME", choices=[*EXPERIMENTS, "all", "stale"], help=name_help)
     output = "folder of the results (for stale: recordings/experiments by default)"
     p.add_argument("--output", metavar="DIR", type=Path, help=output)
     for name, text in FOLDERS.items():
@@ -67,8 +67,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     p.add_argument("--arm", default="wam", help=arm)
-    again = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
-    p.add_argument("--redraw", action="store_true", help=again)
+    redraw_help = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
+    p.add_argument("--redraw", action="store_true", help=redraw_help)
     p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
@@ -82,7 +82,7 @@ def jobs(name: str, options: Options) -> dict[str, Options]:
     if options.hands is not None and name == "motion":
         names = [name + OF_OTHERS]
     tuning = {"people"} if options.group == "tuning" else set()
-    return {one: options if one.endswith(OF_OTHERS) or one in tuning else replace(options, hands=None) for one in names}
+    return {job: options if job.endswith(OF_OTHERS) or job in tuning else replace(options, hands=None) for job in names}
 
 
 def redraw(results: Results, experiment: ModuleType) -> None:
@@ -97,10 +97,10 @@ def redraw(results: Results, experiment: ModuleType) -> None:
 
 def make(results: Results, experiment: ModuleType, options: Options) -> None:
     """Runs an experiment and writes its result. Raises one of FAILURES."""
-    known = (result_of(results.folder, results.name) or {}).get("options", {})
-    for one, value in known.items():
-        if isinstance(value, dict) and getattr(options, one) is None:
-            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{one} DIR again")
+    earlier_options = (result_of(results.folder, results.name) or {}).get("options", {})
+    for option, value in earlier_options.items():
+        if isinstance(value, dict) and getattr(options, option) is None:
+            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{option} DIR again")
     began, results.origin = time.monotonic(), origin(results.name, options)
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)
@@ -120,12 +120,12 @@ def main(arguments: list[str] | None = None) -> int:
     if args.name != "stale" and args.output is None:
         p.error("--output DIR is missing: the folder for the results")
     options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
-    wanted = jobs(args.name, options)
+    selected = jobs(args.name, options)
     try:
         if args.name == "stale":
-            return stale(args.output or RESULTS, wanted)
+            return stale(args.output or RESULTS, selected)
         pyplot()  # reports now what is missing, not after an hour
-        return int(sum(made(name, one, args) for name, one in wanted.items()) > 0)
+        return int(sum(made(name, job_options, args) for name, job_options in selected.items()) > 0)
     except FAILURES as error:
         print(f"python -m thirdhand_sim.lab: {in_words(error)}", file=sys.stderr)
         return 1
@@ -142,19 +142,19 @@ def made(name: str, options: Options, args: argparse.Namespace) -> int:
         experiment = importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}")
         redraw(results, experiment) if args.redraw else make(results, experiment, options)
     except Exception as error:
-        said = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
-        sys.stderr.write(f"python -m thirdhand_sim.lab: {name}: {said}")
+        explanation = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+        sys.stderr.write(f"python -m thirdhand_sim.lab: {name}: {explanation}")
         return 1
     return 0
 
 
 def stale(folder: Path, wanted: dict[str, Options]) -> int:
     """Lists the results in a folder that do not belong to this tree; returns the exit code."""
-    found = {name: staleness(name, result_of(folder, name), tree(), options) for name, options in wanted.items()}
-    for name, why in found.items():
+    reasons = {name: staleness(name, result_of(folder, name), tree(), options) for name, options in wanted.items()}
+    for name, why in reasons.items():
         if why:
             print(f"{name:<16} {why}")
-    print(f"{sum(map(bool, found.values()))} of {len(found)} results in {folder} are stale")
+    print(f"{sum(map(bool, reasons.values()))} of {len(reasons)} results in {folder} are stale")
     return 0
 
 

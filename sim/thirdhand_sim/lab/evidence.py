@@ -84,15 +84,15 @@ def kmp_outputs() -> Iterable[Array]:
         outputs = [np.hstack([np.sin(3 * u + 0.1 * k), 0.2 * k * np.cos(4 * u) + u]) for k in range(3)]
         samples = np.hstack([np.concatenate(lines), np.concatenate(outputs)])
         mixture = GaussianMixture.fit(samples, components=3, seed=0, regularization=1e-4)
-        at = lines[1][::2]
-        reference = mixture.regress(at)
-        primitive = KMP.fit(at, reference, kernel=GaussianKernel(6.0), lambda_mean=0.5, lambda_covariance=2.0)
+        points = lines[1][::2]
+        reference = mixture.regress(points)
+        primitive = KMP.fit(points, reference, kernel=GaussianKernel(6.0), lambda_mean=0.5, lambda_covariance=2.0)
         through = Gaussians.of([[0.8, 0.2], [0.7, 0.8]], deviation=0.05)
         adapted = primitive.adapt(lines[1][[10, 30]], through, tolerance=0.1)
         yield from (mixture.means, reference.mean, reference.covariance)
-        for one in (primitive, adapted):
-            predicted, parts = one.predict(lines[2]), one.uncertainty(lines[2])
-            yield from (one.mean(lines[2]), predicted.mean, predicted.covariance, one.jacobian(lines[2][7]))
+        for predictor in (primitive, adapted):
+            predicted, parts = predictor.predict(lines[2]), predictor.uncertainty(lines[2])
+            yield from (predictor.mean(lines[2]), predicted.mean, predicted.covariance, predictor.jacobian(lines[2][7]))
             yield from (parts.variability, parts.distance)
 
 
@@ -111,23 +111,23 @@ def _git(*arguments: str) -> str:
 
 def origin(name: str, options: Options) -> dict[str, Any]:
     """The origin of a result that is made now, as its JSON names it."""
-    known, here = machine(), tree()
+    machine_facts, digests = machine(), tree()
     return {
         "commit": commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": {**{part: known.get(part, "unknown") for part in MACHINE}, "cores": os.cpu_count()},
+        "machine": {**{part: machine_facts.get(part, "unknown") for part in MACHINE}, "cores": os.cpu_count()},
         "seeds": EXPERIMENTS[name].seeds.named(),
         "options": options_of(name, options),
-        "depends_on": {one: here[one] for one in EXPERIMENTS[name].depends_on},
+        "depends_on": {dependency: digests[dependency] for dependency in EXPERIMENTS[name].depends_on},
     }
 
 
 def options_of(name: str, options: Options) -> dict[str, Any]:
     """The options that an experiment uses; folders by their number of files and a digest."""
-    given = {one: getattr(options, one) for one in ("share", *EXPERIMENTS[name].options)}
+    values = {option: getattr(options, option) for option in ("share", *EXPERIMENTS[name].options)}
     return {
-        "set" if one == "group" else one: _folder(value) if isinstance(value, Path) else value
-        for one, value in given.items()
+        "set" if option == "group" else option: _folder(value) if isinstance(value, Path) else value
+        for option, value in values.items()
     }
 
 
@@ -148,10 +148,10 @@ def staleness(name: str, result: Mapping[str, Any] | None, here: Mapping[str, st
         return "there is no result"
     if "depends_on" not in result:
         return "measured with an unknown version"
-    for one, value in options_of(name, options).items():
-        if value is not None and value != (was := result["options"].get(one)):
-            return f"measured with {one} {was}, and {value} is wanted"
-    changed = [one for one in EXPERIMENTS[name].depends_on if result["depends_on"].get(one) != here[one]]
+    for option, value in options_of(name, options).items():
+        if value is not None and value != (was := result["options"].get(option)):
+            return f"measured with {option} {was}, and {value} is wanted"
+    changed = [dependency for dependency in EXPERIMENTS[name].depends_on if result["depends_on"].get(dependency) != here[dependency]]
     return f"{' and '.join(changed)} changed since {result['commit']}" if changed else ""
 
 

@@ -37,9 +37,9 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
     figure, axes = plt.subplots(1, len(SMALL_KINDS), figsize=(9, 3.4), sharey=True, layout="constrained")
     for panel, kind in zip(axes, SMALL_KINDS, strict=True):
         panel.axhline(1.0, color="0.8", lw=1)
-        for who, (label, colour) in FOLLOWER_LABELS.items():
+        for follower, (label, colour) in FOLLOWER_LABELS.items():
             for path, style in zip(PATHS, ("-", "--"), strict=True):
-                values = numbers[kind][who][path]
+                values = numbers[kind][follower][path]
                 panel.plot(numbers["hz"], values, style, marker="o", ms=3, color=colour, label=f"{label}: {path}")
         panel.set(title=f"small motion of {kind}", xlabel="frequency [Hz]", ylim=(0, None))
         panel.set_xticks(range(1, 13))

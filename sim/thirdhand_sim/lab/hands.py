@@ -49,7 +49,7 @@ class Traces(NamedTuple):
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     scratch = results.folder / "hands-live"
-    found: dict[str, tuple[RunReport | None, Traces]] = {}
+    runs: dict[str, tuple[RunReport | None, Traces]] = {}
     tries: dict[str, int] = {}
     for name, drawn, taught in (
         ("reproduction", NOMINAL, False),
@@ -57,12 +57,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         ("adaptation", MOVED, True),
     ):
         if options.share < 1:  # a quick look, in process
-            found[name] = (None, _in_process(drawn, taught=taught))
+            runs[name] = (None, _in_process(drawn, taught=taught))
             continue
         ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)
         recording = next(scratch.glob("*.mcap")).replace(results.folder / f"hands-{name}.mcap")
         convert(recording, results.folder / ("hands.rrd" if name == "adaptation" else f"hands-{name}.rrd"))
-        found[name] = (ran, _recorded(recording))
+        runs[name] = (ran, _recorded(recording))
         tries[name] = attempts
         results.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
     if scratch.is_dir():
@@ -75,11 +75,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         },
         "attempts": tries,
         "evidence_is_periods_skipped_at_most": SKIPPED,
-        **{name: _numbers(ran) for name, (ran, _) in found.items() if ran is not None},
+        **{name: _numbers(ran) for name, (ran, _) in runs.items() if ran is not None},
         "beside_the_paper": differences(options.share),
         "shown": {
             name: {part: line.round(3).T for part, line in traces._asdict().items()}
-            for name, (_, traces) in found.items()
+            for name, (_, traces) in runs.items()
             if name in DRAWN
         },
     }
@@ -101,29 +101,29 @@ def _recorded(path: Path) -> Traces:
     frames = read(Recording.open(path)).frames
     following = frames[frames["mode"] == Mode.FOLLOW]
     moving = np.linalg.norm(following["hand_velocities"], axis=2).max(axis=1) > MOVING_M_S
-    kept = following[int(np.argmax(moving)) :: SERVICE_HZ // SHOWN_HZ]
-    return Traces(kept["hands"][:, 0], kept["hands"][:, 1], kept["tool"])
+    shown_frames = following[int(np.argmax(moving)) :: SERVICE_HZ // SHOWN_HZ]
+    return Traces(shown_frames["hands"][:, 0], shown_frames["hands"][:, 1], shown_frames["tool"])
 
 
 def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
     skill = shipped_skill()
     adapt = ours(drawn.scene) if taught else lambda bench: skill
-    seen = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
-    began = int(np.argmax(seen.time_s > 0))
-    each = 250 // SHOWN_HZ
-    return Traces(seen.hands[began::each, 0], seen.hands[began::each, 1], seen.tool[began::each])
+    rehearsal = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
+    began = int(np.argmax(rehearsal.time_s > 0))
+    stride = 250 // SHOWN_HZ
+    return Traces(rehearsal.hands[began::stride, 0], rehearsal.hands[began::stride, 1], rehearsal.tool[began::stride])
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the paths of hands and tool. That of the stages shows more than the numbers."""
     runs = {
-        name: Traces(*(np.array(shown[part]).T for part in Traces._fields)) for name, shown in numbers["shown"].items()
+        name: Traces(*(np.array(paths[part]).T for part in Traces._fields)) for name, paths in numbers["shown"].items()
     }
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.8), subplot_kw={"projection": "3d"})
     everything = []
-    for one in demonstrated():
-        traces = Traces(one.hands[:, :3], one.hands[:, 3:], one.tool[:, :3])
+    for demonstration in demonstrated():
+        traces = Traces(demonstration.hands[:, :3], demonstration.hands[:, 3:], demonstration.tool[:, :3])
         everything += list(traces)
         _trace(left, traces, "-", 1.0)
     left.set_title("(a) five demonstrations", loc="left", fontsize=9)
@@ -180,9 +180,9 @@ def _draw_stages(results: Results) -> None:
     things: list[Any] = []
 
     def look(bench: Bench) -> None:
-        seen = bench.observe()
+        observation = bench.observe()
         if bench.time_s > 0:
-            so_far.append(np.stack([seen.hands.left.position, seen.hands.right.position, np.array(seen.tool.position)]))
+            so_far.append(np.stack([observation.hands.left.position, observation.hands.right.position, np.array(observation.tool.position)]))
         if len(shots) < len(middle) and bench.time_s > middle[len(shots)]:
             colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
             path = np.array(so_far)
@@ -198,19 +198,19 @@ def _draw_stages(results: Results) -> None:
         axes.imshow(colours)
         for line, colour in zip(traces, (LEFT, RIGHT, TOOL), strict=True):
             if np.ptp(line, axis=0).max() > 0.02:
-                at = pixels(line, matrix, SIZE)
-                axes.plot(*at.T, color=colour, lw=2)
+                pixel_path = pixels(line, matrix, SIZE)
+                axes.plot(*pixel_path.T, color=colour, lw=2)
                 axes.annotate(
                     "",
-                    at[-1],
-                    at[-max(2, len(at) // 12 + len(at) // 8)],
+                    pixel_path[-1],
+                    pixel_path[-max(2, len(pixel_path) // 12 + len(pixel_path) // 8)],
                     arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2, "mutation_scale": 18},
                 )
         axes.set_title(title, loc="left")
         axes.set_axis_off()
-    for at, name in zip(pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True):
+    for pixel, name in zip(pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True):
         aside = (-35, 45) if name == "solder" else (25, -38)  # the iron stands behind it
-        grid[0, 0].annotate(name, at, at + np.array(aside), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
+        grid[0, 0].annotate(name, pixel, pixel + np.array(aside), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
     handles = [
         plt.Line2D([], [], color=c, label=n)
         for c, n in ((LEFT, "path of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))

@@ -153,17 +153,17 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
 
 def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follower]:
     """All followers; for a quick look one of each kind, and ours."""
-    found = {"ours": ours(skill, settings)}
+    by_name = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
     for dial in DIALS if share == 1 else ():
         tool = msgspec.structs.replace(settings.tool, follow=dial)
-        found[f"ours, {dial}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
+        by_name[f"ours, {dial}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
     for least_hz, beta in CHASES[:first]:
-        found[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
+        by_name[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
     for coefficient in SERVOS[:first]:
-        found[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
-    found["no smoothing"], found[TRUTH] = unsmoothed(skill, settings), truth(skill, settings)
-    return found
+        by_name[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
+    by_name["no smoothing"], by_name[TRUTH] = unsmoothed(skill, settings), truth(skill, settings)
+    return by_name
 
 
 def sequences(options: Options, middle: Array) -> list[Moving]:
@@ -171,7 +171,7 @@ def sequences(options: Options, middle: Array) -> list[Moving]:
     share = options.share
     people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
     if share < 1:  # a quick look
-        people = [one for one in people if one.group in FLOOR_GROUPS]
+        people = [sequence for sequence in people if sequence.group in FLOOR_GROUPS]
     numbers = STOPS.share(share, least=2)
     return [
         *people,
@@ -190,21 +190,21 @@ def prepare(share: float, arm: str) -> None:
     # A function of the hands' positions alone, so that only the followers differ.
     skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
-    for which, one in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
-        _known[which] = one, settings, followers(one, settings, share)
+    for skill_key, loaded_skill in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
+        _known[skill_key] = loaded_skill, settings, followers(loaded_skill, settings, share)
 
 
 def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
-    name, which, hands = task
-    skill, settings, by_name = _known[which]
-    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
-    found = figures(name, replace(hands, group=hands.group + which), target, seen)
+    name, skill_key, hands = task
+    skill, settings, by_name = _known[skill_key]
+    target, followed = targets(skill, hands.truth, settings), by_name[name](hands)
+    result = figures(name, replace(hands, group=hands.group + skill_key), target, followed)
     if hands.jumping is None:
-        return found
+        return result
     begun = round(BEGUN_S / PERIOD_S)
-    off = seen.tool[begun:] - targets(skill, hands.jumping[begun:], settings)
-    return replace(found, error_with_jumps_mm=1000 * rms(off))
+    error_m = followed.tool[begun:] - targets(skill, hands.jumping[begun:], settings)
+    return replace(result, error_with_jumps_mm=1000 * rms(error_m))
 
 
 def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
@@ -212,9 +212,9 @@ def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     name, kind, rate_hz, number = task
     skill, settings, by_name = _known[SHIPPED]
     hands = small_motion(skill.hands.mean(axis=0), kind, rate_hz, number)
-    target, seen = targets(skill, hands.truth, settings), by_name[name](hands)
-    assert seen.setpoint is not None
-    return [gains.gain(target, path, rate_hz) for path in (seen.setpoint, seen.tool)]
+    target, followed = targets(skill, hands.truth, settings), by_name[name](hands)
+    assert followed.setpoint is not None
+    return [gains.gain(target, path, rate_hz) for path in (followed.setpoint, followed.tool)]
 
 
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
@@ -223,9 +223,9 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
     overshoot = settled = math.nan
     if not math.isnan(hands.stop_s):
         begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
-        way = derivative(target, PERIOD_S, order=1)[begin]
-        past = (tool[begin:] - target[-1]) @ (way / np.linalg.norm(way))
-        overshoot = max(0.0, 1000 * float(past.max()))
+        velocity = derivative(target, PERIOD_S, order=1)[begin]
+        excess_m = (tool[begin:] - target[-1]) @ (velocity / np.linalg.norm(velocity))
+        overshoot = max(0.0, 1000 * float(excess_m.max()))
         late = np.flatnonzero(1000 * np.linalg.norm(tool[end:] - target[-1], axis=1) > SETTLED_MM)
         settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
     tool, target = tool[begun:], target[begun:]
@@ -257,27 +257,27 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     if options.hands is not None:
         return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
-    tasks = [(name, SHIPPED, one) for name in by_name for one in hands if name != TRUTH or one.group == SMOOTH]
+    tasks = [(name, SHIPPED, sequence) for name in by_name for sequence in hands if name != TRUTH or sequence.group == SMOOTH]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
-    tasks += [(name, OF_SUCH_HANDS, one) for name in by_both for one in hands if one.group in FLOOR_GROUPS]
-    found = _measured(tasks, options)
-    table = {name: _summary([one for one in found if one.follower == name]) for name in by_name if name != TRUTH}
+    tasks += [(name, OF_SUCH_HANDS, sequence) for name in by_both for sequence in hands if sequence.group in FLOOR_GROUPS]
+    measured = _measured(tasks, options)
+    table = {name: _summary([row for row in measured if row.follower == name]) for name in by_name if name != TRUTH}
     for name, groups in table.items():
         results.say(f"{name}: {brief(groups)}")
     floors = {
-        group: best_linear([one for one in hands if one.group == group], skill, rate_hz=rate_hz)
+        group: best_linear([sequence for sequence in hands if sequence.group == group], skill, rate_hz=rate_hz)
         for group, rate_hz in FLOOR_GROUPS.items()
     }
     _record(results, hands[1], by_name["ours"](hands[1]))
     numbers = {
         "hands": "modelled",
         "by_follower": table,
-        "by_person": _by_person(results, [one for one in found if math.isnan(one.overshoot_mm)]),
+        "by_person": _by_person(results, [row for row in measured if math.isnan(row.overshoot_mm)]),
         "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
         "gain_by_frequency": _gains(results, options, dict(zip(("ours", "chase"), by_both, strict=True))),
-        "joint_speeds_in_the_scene": _joint_speeds(found, (TRUTH, *by_both, "no smoothing")),
-        "by_sequence": [msgspec.to_builtins(one) for one in found if one.follower == "ours"],
-        "by_arm": _by_arm(results, options, [one for one in hands if one.group in FLOOR_GROUPS]),
+        "joint_speeds_in_the_scene": _joint_speeds(measured, (TRUTH, *by_both, "no smoothing")),
+        "by_sequence": [msgspec.to_builtins(row) for row in measured if row.follower == "ours"],
+        "by_arm": _by_arm(results, options, [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]),
     }
     draw_numbers(results, numbers)
     return numbers
@@ -286,14 +286,14 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
     """Means over the sequences of each group; of stops the worst too."""
     out: dict[str, dict[str, float]] = {}
-    for group in dict.fromkeys(one.group for one in rows):
-        of = [one for one in rows if one.group == group]
-        top = max(one.top_speed for one in of)
+    for group in dict.fromkeys(row.group for row in rows):
+        of = [row for row in rows if row.group == group]
+        top = max(row.top_speed for row in of)
         if math.isnan(of[0].overshoot_mm):
             names = ("error_rms_mm", "error_p95_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
-            out[group] = {name: float(np.mean([getattr(one, name) for one in of])) for name in names}
+            out[group] = {name: float(np.mean([getattr(row, name) for row in of])) for name in names}
         else:
-            overshoot, settled = [one.overshoot_mm for one in of], [one.settled_ms for one in of]
+            overshoot, settled = [row.overshoot_mm for row in of], [row.settled_ms for row in of]
             out[group] = {
                 "overshoot_mean_mm": float(np.mean(overshoot)),
                 "overshoot_worst_mm": max(overshoot),
@@ -312,7 +312,7 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
 def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
     """The tasks of ours and of the chases on these hands."""
     names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
-    return [(name, SHIPPED, one) for name in names for one in hands]
+    return [(name, SHIPPED, sequence) for name in names for sequence in hands]
 
 
 def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str, dict[str, dict[str, float]]]:
@@ -320,8 +320,8 @@ def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str
     tasks, out = _beside_chases(hands), {}
     for arm in ARMS:
         prepare(options.share, arm)  # of this process, which measures if there is one worker
-        found = _measured(tasks, replace(options, arm=arm))
-        out[arm] = {group: _compared([one for one in found if one.group == group]) for group in FLOOR_GROUPS}
+        measured = _measured(tasks, replace(options, arm=arm))
+        out[arm] = {group: _compared([row for row in measured if row.group == group]) for group in FLOOR_GROUPS}
         results.say(f"{arm}, rms [mm]: {brief(out[arm])}")
     return out
 
@@ -338,13 +338,13 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
         for number in numbers
     ]
     begin = functools.partial(prepare, options.share, options.arm)
-    found = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin)))
-    found = found.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
-    means = np.sqrt(np.mean(found**2, axis=3))
+    values = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin)))
+    values = values.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
+    means = np.sqrt(np.mean(values**2, axis=3))
     out: dict[str, Any] = {"hz": rates}
     for kind, of_kind in zip(SMALL_KINDS, means, strict=True):
         out[kind] = {
-            who: dict(zip(gains.PATHS, of.T.tolist(), strict=True)) for who, of in zip(names, of_kind, strict=True)
+            follower: dict(zip(gains.PATHS, of.T.tolist(), strict=True)) for follower, of in zip(names, of_kind, strict=True)
         }
         results.say(f"gain of {kind}, by Hz: {brief(out[kind])}")
     return out
@@ -352,29 +352,29 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
 
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
     """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
-    harder = [("ours", SHIPPED, one) for one in hands if one.group in HARDER_GROUPS]
-    hands = [one for one in hands if one.group in FLOOR_GROUPS]
-    found = _measured(_beside_chases(hands), options)
-    takes = Counter(one.person for one in hands if one.group == "clean")
-    found += [
-        replace(one, group=WITH_JUMPS, error_rms_mm=one.error_with_jumps_mm) for one in found if one.group == "recorded"
+    harder = [("ours", SHIPPED, sequence) for sequence in hands if sequence.group in HARDER_GROUPS]
+    hands = [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
+    measured = _measured(_beside_chases(hands), options)
+    takes = Counter(sequence.person for sequence in hands if sequence.group == "clean")
+    measured += [
+        replace(row, group=WITH_JUMPS, error_rms_mm=row.error_with_jumps_mm) for row in measured if row.group == "recorded"
     ]
-    people = _by_person(results, found)
-    kinds = {person: _usual_tracker(found, person) for person in takes}
+    people = _by_person(results, measured)
+    kinds = {person: _usual_tracker(measured, person) for person in takes}
     together: dict[str, dict[str, float]] = {}
     trackers: dict[str, dict[str, dict[str, float]]] = {}
     for group in people:
-        of = [one for one in found if one.group == group]
+        of = [row for row in measured if row.group == group]
         together[group] = _compared(of)
         results.say(f"{group}, all: {brief(together[group])}")
         trackers[group] = {
-            kind: _compared([one for one in of if kinds[one.person] == kind]) for kind in sorted(set(kinds.values()))
+            kind: _compared([row for row in of if kinds[row.person] == kind]) for kind in sorted(set(kinds.values()))
         }
         results.say(f"{group}, by tracker: {brief(trackers[group])}")
-    bound = _bound(results, [one for one in hands if one.group == "recorded"], found)
+    bound = _bound(results, [sequence for sequence in hands if sequence.group == "recorded"], measured)
     worse, of_harder = {}, _measured(harder, options)
     for group in HARDER_GROUPS:
-        error_mm = _pooled([one for one in of_harder if one.group == group], "ours")
+        error_mm = _pooled([row for row in of_harder if row.group == group], "ours")
         worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
         results.say(f"{group}, all: {brief(worse[group])}")
     numbers = {
@@ -396,12 +396,12 @@ def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[
     fitted to each recording; medians over recordings.
     """
     skill = _known[SHIPPED][0]
-    mine = {one.name: one for one in found if one.follower == "ours" and one.group == hands[0].group}
+    mine = {row.name: row for row in found if row.follower == "ours" and row.group == hands[0].group}
     errors: dict[str, list[tuple[float, float]]] = {}
-    for one in hands:
-        floors = best_linear([one], skill, rate_hz=round(1 / float(np.median(np.diff(one.stamps)))))
-        pair = mine[one.name].error_rms_mm, error_at(floors, mine[one.name].jerk_ratio)
-        for kind in (one.tracker, "all"):
+    for sequence in hands:
+        floors = best_linear([sequence], skill, rate_hz=round(1 / float(np.median(np.diff(sequence.stamps)))))
+        pair = mine[sequence.name].error_rms_mm, error_at(floors, mine[sequence.name].jerk_ratio)
+        for kind in (sequence.tracker, "all"):
             errors.setdefault(kind, []).append(pair)
     out = {
         kind: dict(zip(("ours", "bound"), np.median(pairs, axis=0).tolist(), strict=True))
@@ -414,10 +414,10 @@ def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[
 def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
     """The errors of each group and person, as of `_compared`."""
     out: dict[str, dict[str, dict[str, float]]] = {}
-    for group in dict.fromkeys(one.group for one in rows):
-        of = [one for one in rows if one.group == group]
-        people = dict.fromkeys(one.person for one in of)
-        out[group] = {person: _compared([one for one in of if one.person == person]) for person in people}
+    for group in dict.fromkeys(row.group for row in rows):
+        of = [row for row in rows if row.group == group]
+        people = dict.fromkeys(row.person for row in of)
+        out[group] = {person: _compared([row for row in of if row.person == person]) for person in people}
         results.say(f"{group}, rms [mm]: {brief(out[group])}")
     return out
 
@@ -427,36 +427,36 @@ def _compared(rows: list[Figures]) -> dict[str, float]:
     for each person. Our lag is a median too.
     """
     errors: dict[str, list[float]] = {"ours": [], "chase": []}
-    for name in dict.fromkeys(one.person for one in rows):
-        mine = [one for one in rows if one.person == name]
-        chases = sorted({one.follower for one in mine if one.follower.startswith("chase")})
+    for name in dict.fromkeys(row.person for row in rows):
+        mine = [row for row in rows if row.person == name]
+        chases = sorted({row.follower for row in mine if row.follower.startswith("chase")})
         best = min(chases, key=lambda follower: _pooled(mine, follower))
-        for who, follower in (("ours", "ours"), ("chase", best)):
-            errors[who] += [one.error_rms_mm for one in mine if one.follower == follower]
-    out = {who: float(np.sqrt(np.mean(np.square(each)))) for who, each in errors.items()}
-    medians = {f"{who}_median": float(np.median(each)) for who, each in errors.items()}
+        for family, follower in (("ours", "ours"), ("chase", best)):
+            errors[family] += [row.error_rms_mm for row in mine if row.follower == follower]
+    out = {family: float(np.sqrt(np.mean(np.square(errors_mm)))) for family, errors_mm in errors.items()}
+    medians = {f"{family}_median": float(np.median(errors_mm)) for family, errors_mm in errors.items()}
     ratios = {
         "ratio": out["ours"] / out["chase"],
         "ratio_of_medians": medians["ours_median"] / medians["chase_median"],
     }
-    lag_ms = float(np.median([one.lag_ms for one in rows if one.follower == "ours"]))
+    lag_ms = float(np.median([row.lag_ms for row in rows if row.follower == "ours"]))
     return {**out, **ratios, **medians, "lag_ms": lag_ms, "takes": len(errors["ours"])}
 
 
 def _usual_tracker(rows: list[Figures], name: str) -> str:
     """The kind of tracker that recorded most sequences of a person."""
-    return Counter(one.tracker for one in rows if one.person == name).most_common(1)[0][0]
+    return Counter(row.tracker for row in rows if row.person == name).most_common(1)[0][0]
 
 
 def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """The joints' speeds by frequency and the share of ripple, for each follower."""
-    rows = {one.follower: one.joint_speeds for one in found if one.group == SMOOTH and one.follower in names}
+    rows = {row.follower: row.joint_speeds for row in found if row.group == SMOOTH and row.follower in names}
     kinds = {name.partition(",")[0]: rows[name] for name in names}
     return {kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()}
 
 
 def _pooled(rows: list[Figures], follower: str) -> float:
-    return math.sqrt(np.mean([one.error_rms_mm**2 for one in rows if one.follower == follower]))
+    return math.sqrt(np.mean([row.error_rms_mm**2 for row in rows if row.follower == follower]))
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
@@ -468,11 +468,11 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     for panel, group in zip(axes, FLOOR_GROUPS, strict=True):
         if "by_follower" in numbers:
             _draw_followers(panel, numbers["by_follower"], group, numbers["best_linear_filter"][group])
-            seen = "as a camera sees them, 30 Hz"
+            recorded_title = "as a camera sees them, 30 Hz"
         else:
             _draw_people(panel, numbers["by_person"][group])
-            seen = "as recorded"
-        panel.set_title("clean, 100 Hz" if group == "clean" else seen)
+            recorded_title = "as recorded"
+        panel.set_title("clean, 100 Hz" if group == "clean" else recorded_title)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     results.figure(figure)
     if "by_follower" in numbers:
@@ -498,7 +498,7 @@ def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[d
 
 def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
     names = sorted(rows, key=lambda name: rows[name]["chase"])
-    ours, chase = ([rows[name][who] for name in names] for who in ("ours", "chase"))
+    ours, chase = ([rows[name][family] for name in names] for family in ("ours", "chase"))
     panel.hlines(range(len(names)), ours, chase, color="0.8", lw=2)
     panel.plot(chase, range(len(names)), "s", color=ADAPTED, ms=5, label="the best One-Euro filter and Ruckig")
     panel.plot(ours, range(len(names)), "o", color=TOOL, ms=6, label="ours")
@@ -516,7 +516,7 @@ def _record(results: Results, hands: Moving, seen: Followed) -> None:
     stream = results.recording()
     assert seen.estimate is not None
     times = np.arange(len(hands.truth)) * PERIOD_S
-    at = np.minimum(np.round(hands.stamps / PERIOD_S).astype(int), len(times) - 1)
+    ticks = np.minimum(np.round(hands.stamps / PERIOD_S).astype(int), len(times) - 1)
 
     def points(path: str, when: Any, positions: Any, colour: str, radius: float) -> None:
         stream.log(path, rr.Points3D.from_fields(colors=[rgb(colour)], radii=[radius]), static=True)
@@ -526,7 +526,7 @@ def _record(results: Results, hands: Moving, seen: Followed) -> None:
     for side, (name, colour) in enumerate((("left", LEFT), ("right", RIGHT))):
         part = slice(3 * side, 3 * side + 3)
         points(f"/{name}/truth", times, hands.truth[:, part], REFERENCE, 0.006)
-        points(f"/{name}/raw", times[at], hands.samples[:, part], OTHER, 0.004)
+        points(f"/{name}/raw", times[ticks], hands.samples[:, part], OTHER, 0.004)
         points(f"/{name}/estimate", times, seen.estimate[:, side], colour, 0.008)
     for name, path, colour in (
         ("target", seen.target, ADAPTED),

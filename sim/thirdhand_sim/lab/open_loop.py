@@ -29,13 +29,13 @@ def controller(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Con
 
 def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING) -> NDArray[np.void]:
     """The service's frames (T,) of ticks."""
-    made: list[Frame] = []
+    log: list[Frame] = []
     with threadpool_limits(1):
-        run(controller(skill, settings, tuning), ticks, [lambda tick, frame: made.append(frame)])
-    return np.array(made)
+        run(controller(skill, settings, tuning), ticks, [lambda tick, frame: log.append(frame)])
+    return np.array(log)
 
 
 def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:
     """Targets (T, 3) [m] of the service for hands (T, 6) [m] at rest."""
     still, reach = np.zeros(3), settings.reach
-    return np.array([clamp(at, still, still, box=skill.workspace, reach=reach).position for at in skill.mean(hands)])
+    return np.array([clamp(target, still, still, box=skill.workspace, reach=reach).position for target in skill.mean(hands)])

@@ -121,11 +121,11 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
     files = [path for path in sorted(data.glob("*.npz")) if path.name.startswith(RECORDED[task])]
     if len(files) < 2:
         raise ExperimentError(f"{len(files)} recordings of {task!r} in {data}: {RECORDED[task][0]}*.npz needed")
-    found = [
+    recordings = [
         left_out(path.stem, group, read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)))
         for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
     ]
-    return found, found
+    return recordings, recordings
 
 
 def _group(task: str, number: int, name: str) -> str:
@@ -136,24 +136,24 @@ def _group(task: str, number: int, name: str) -> str:
 
 def part(one: Part) -> Found:
     """The fold of one part."""
-    shown, asked = _takes(one.task, one.people, one.data)
+    training, asked = _takes(one.task, one.people, one.data)
     if one.out:
-        shown, asked = [t for t in shown if t.group != one.out], [t for t in asked if t.group == one.out]
-    named = bool(shown[0].demonstration.places)
-    found = Found({}, {})
+        training, asked = [t for t in training if t.group != one.out], [t for t in asked if t.group == one.out]
+    named = bool(training[0].demonstration.places)
+    result = Found({}, {})
     if one.task not in TASK_KINDS:
-        into_reach = RigidMap.of(shown, Settings().reach)
-        found = found._replace(moved=into_reach)
-        shown, asked = (list(map(into_reach.moved, some)) for some in (shown, asked))
-    for told in [False] * (one.task not in TASK_KINDS) + [True] * named:
+        into_reach = RigidMap.of(training, Settings().reach)
+        result = result._replace(moved=into_reach)
+        training, asked = (list(map(into_reach.moved, batch)) for batch in (training, asked))
+    for has_places in [False] * (one.task not in TASK_KINDS) + [True] * named:
         for name, rival in RIVALS.items():
-            said = left_out_by(rival, shown, asked, told=told)
-            found.rivals[name + TOLD * told] = [judged(*pair) for pair in zip(asked, said, strict=True)]
-        found.service[SERVICE + TOLD * told] = served(shown, asked, told=told)
+            predictions = left_out_by(rival, training, asked, told=has_places)
+            result.rivals[name + TOLD * has_places] = [judged(*pair) for pair in zip(asked, predictions, strict=True)]
+        result.service[SERVICE + TOLD * has_places] = served(training, asked, told=has_places)
     if one.task in PEOPLE:
-        skill, _ = as_command(shown, told=named)
-        found = found._replace(own=served(asked[:OWN], asked[OWN:], told=named, refined=skill))
-    return found
+        skill, _ = as_command(training, told=named)
+        result = result._replace(own=served(asked[:OWN], asked[OWN:], told=named, refined=skill))
+    return result
 
 
 def as_command(
@@ -165,8 +165,8 @@ def as_command(
     """
     try:
         skill = learn(
-            [one.demonstration if told else one.demonstration._replace(places=()) for one in shown],
-            names=[one.name for one in shown],
+            [take.demonstration if told else take.demonstration._replace(places=()) for take in shown],
+            names=[take.name for take in shown],
             refined=refined,
         )
     except SkillError as error:
@@ -195,9 +195,9 @@ def served(
     for take in asked:
         rounds: list[Judged] = []
         try:
-            there = taught(skill, take.demonstration.places) if told else skill
-            said = predicted_rounds(there, take, reach=None if refusals else Settings().reach)
-            rounds = [judged(take, one) for one in said]
+            placed_skill = taught(skill, take.demonstration.places) if told else skill
+            predictions = predicted_rounds(placed_skill, take, reach=None if refusals else Settings().reach)
+            rounds = [judged(take, prediction) for prediction in predictions]
         except SkillError as error:
             fold.take_refusals.append(str(error))
         if refusals:
@@ -220,10 +220,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     else:
         results.say("made tasks alone: --data DIR adds recordings")
     by_task: dict[str, list[Found]] = {}
-    for one, found in zip(parts, shared_out(part, parts, options.workers), strict=True):
-        by_task.setdefault(one.task, []).append(found)
-        *_, ours = found.service.values()
-        results.say(f"{one.task} {one.out}: {_line(ours)}")
+    for job, result in zip(parts, shared_out(part, parts, options.workers), strict=True):
+        by_task.setdefault(job.task, []).append(result)
+        *_, ours = result.service.values()
+        results.say(f"{job.task} {job.out}: {_line(ours)}")
     numbers: dict[str, Any] = {
         "judged_hz": JUDGED_HZ,
         "levels": LEVELS,
@@ -234,8 +234,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "made": {kind: numbers_of(by_task[kind]) for kind in TASK_KINDS if kind in by_task},
     }
     for kind in ("recorded", "made"):
-        folds = [fold for task in numbers[kind] for found in by_task[task] for fold in found.service.values()]
-        numbers[f"all_{kind}"] = summary([one for fold in folds for one in fold.accepted if one])
+        folds = [fold for task in numbers[kind] for result in by_task[task] for fold in result.service.values()]
+        numbers[f"all_{kind}"] = summary([row for fold in folds for row in fold.accepted if row])
     draw_numbers(results, numbers)
     return numbers
 
@@ -341,8 +341,8 @@ def _share(counts: Sequence[float | None], total: int) -> float | None:
 
 def _line(fold: Fold) -> str:
     """A fold as a line of progress."""
-    one = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
-    return f"refused ({fold.refusals[0]}), in spite of it {one}" if fold.refusals else one
+    text = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
+    return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
 
 
 class Verdict(NamedTuple):
@@ -366,13 +366,13 @@ def verdict(task: Mapping[str, Any], method: str) -> Verdict:
     In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
     or none.
     """
-    one, none = task["methods"][method], {"takes": 0}
-    folds_refused, takes = one.get("folds_refused", one["unsafe"]), one["takes"] + one["refuses"]
-    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{one['refuses']} of {takes} takes"
-    if "in_spite_of_refusal" not in one and folds_refused:
-        return Verdict(none, one, folds_refused, refused)
-    in_spite, at_risk = one.get("in_spite_of_refusal", none), one.get("folds_at_risk", 0)
-    return Verdict(one, in_spite, folds_refused, refused if one["refuses"] else "none", at_risk)
+    numbers, none = task["methods"][method], {"takes": 0}
+    folds_refused, takes = numbers.get("folds_refused", numbers["unsafe"]), numbers["takes"] + numbers["refuses"]
+    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{numbers['refuses']} of {takes} takes"
+    if "in_spite_of_refusal" not in numbers and folds_refused:
+        return Verdict(none, numbers, folds_refused, refused)
+    in_spite, at_risk = numbers.get("in_spite_of_refusal", none), numbers.get("folds_at_risk", 0)
+    return Verdict(numbers, in_spite, folds_refused, refused if numbers["refuses"] else "none", at_risk)
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
@@ -395,9 +395,9 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             ours = verdict(task, SERVICE + ending)
             labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
             ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
-            for who, (_, colour, marker) in SHOWN.items():
-                one = ours.accepted if who == SERVICE else task["methods"].get(who + ending, {})
-                ax.plot(one.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
+            for method, (_, colour, marker) in SHOWN.items():
+                scores = ours.accepted if method == SERVICE else task["methods"].get(method + ending, {})
+                ax.plot(scores.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
             ax.plot(ours.accepted.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
             ax.plot(ours.in_spite.get("rms_mm", np.nan), y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
         ax.set_yticks(range(len(rows)), labels)
@@ -419,22 +419,22 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
 def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of what a skill says of its own errors, set by set."""
     plt = pyplot()
-    figure, (inside, told) = plt.subplots(1, 2, figsize=(7.5, 3.6))
+    figure, (inside, warned) = plt.subplots(1, 2, figsize=(7.5, 3.6))
     inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
-    told.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
+    warned.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
     for part, colour, label in (("recorded", TOOL, "recorded partners"), ("made", ADAPTED, "made tasks")):
         for task in numbers[part].values():
             name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
-            one = task["methods"][name]
-            if one["takes"] and one["coverage"]:
+            scores = task["methods"][name]
+            if scores["takes"] and scores["coverage"]:
                 inside.plot(
-                    100 * np.array(numbers["levels"]), 100 * np.array(one["coverage"]), ".-", color=colour, lw=0.8
+                    100 * np.array(numbers["levels"]), 100 * np.array(scores["coverage"]), ".-", color=colour, lw=0.8
                 )
-            if one.get("falsely_told") is not None and one["told"] is not None:
-                told.plot(100 * one["falsely_told"], 100 * one["told"], "o", color=colour, ms=5)
+            if scores.get("falsely_told") is not None and scores["told"] is not None:
+                warned.plot(100 * scores["falsely_told"], 100 * scores["told"], "o", color=colour, ms=5)
         inside.plot([], [], ".-", color=colour, label=label)
     inside.set(xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]")
-    told.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
-    told.set_ylabel("wrong samples held or unsure [%]")
+    warned.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
+    warned.set_ylabel("wrong samples held or unsure [%]")
     inside.legend(fontsize=8)
     results.figure(figure, "reliability")

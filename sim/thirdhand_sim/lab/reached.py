@@ -49,9 +49,9 @@ def shown() -> list[SessionDemonstration]:
     places = places_in(Scene())
     return [
         SessionDemonstration(
-            np.arange(len(one.tool), dtype=np.float64) * one.period_s, one.hands, one.tool[:, :3], places
+            np.arange(len(demonstration.tool), dtype=np.float64) * demonstration.period_s, demonstration.hands, demonstration.tool[:, :3], places
         )
-        for one in demonstrated()
+        for demonstration in demonstrated()
     ]
 
 
@@ -60,12 +60,12 @@ def at_the_events(scene: Scene, seed: int) -> tuple[Array, Array]:
     (3, 3) [m].
     """
     script = HandScript(scene, seed=seed, offset_std=OFFSET_M)
-    at = [script.truth(end) for _, end in scene.dwells]
-    hands = np.array([np.concatenate([one.left.position, one.right.position]) for one in at])
-    return hands, np.array([at[0].left.position + TOOL_FROM_HAND, scene.glass, scene.carry])
+    motions = [script.truth(end) for _, end in scene.dwells]
+    hands = np.array([np.concatenate([motion.left.position, motion.right.position]) for motion in motions])
+    return hands, np.array([motions[0].left.position + TOOL_FROM_HAND, scene.glass, scene.carry])
 
 
 def open_loop_mm(skill: Skill, drawn: Drawn) -> Array:
     """Distances (3,) [mm] of a taught skill's target from the place of each event."""
-    hands, wanted = at_the_events(drawn.scene, drawn.seed)
-    return np.asarray(1000 * np.linalg.norm(targets(skill, hands) - wanted, axis=1))
+    hands, tool_places = at_the_events(drawn.scene, drawn.seed)
+    return np.asarray(1000 * np.linalg.norm(targets(skill, hands) - tool_places, axis=1))

@@ -76,12 +76,12 @@ def rehearse(
             nonlocal held
             held += bool(bench.time_s > 0 and frame["mode"] != Mode.FOLLOW)
             if keep:
-                seen = bench.observe()
-                x, y, z, w = seen.tool.orientation
+                observation = bench.observe()
+                x, y, z, w = observation.tool.orientation
                 axis = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
-                hands = np.stack([seen.hands.left.position, seen.hands.right.position])
-                joints = (seen.joints, seen.joint_velocities)
-                rows.append((frame, bench.time_s, hands, joints, seen.tool.position, axis))
+                hands = np.stack([observation.hands.left.position, observation.hands.right.position])
+                joints = (observation.joints, observation.joint_velocities)
+                rows.append((frame, bench.time_s, hands, joints, observation.tool.position, axis))
             look(bench)
 
         loop = ClosedLoop(bench)

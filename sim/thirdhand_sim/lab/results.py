@@ -98,16 +98,16 @@ class Results:
         }
         text = json.dumps(_plain(whole), indent=2)
         text = ROW.sub(lambda row: f"[{' '.join(row[1].split())}]", text)
-        beside = path.with_suffix(".new")
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(path)
+        new_path = path.with_suffix(".new")
+        new_path.write_text(text + "\n", encoding="utf-8")
+        new_path.replace(path)
         self.say(f"{path}")
         return path
 
     def measured(self) -> dict[str, Any]:
         """The numbers in the experiment's JSON, which an earlier run left."""
-        found: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
-        return found
+        numbers: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
+        return numbers
 
     def series(self, values: Mapping[str, Sequence[Any]], timeline: str, styles: Mapping[str, Any] = {}) -> None:
         """Records numbers by path, one a step of a timeline; a path may have a style of its own."""
@@ -147,7 +147,7 @@ def pyplot() -> Any:
 def brief(value: Any) -> str:
     """Numbers in one line of progress, by name, with three significant digits."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {brief(one)}" for name, one in value.items())
+        return ", ".join(f"{name} {brief(item)}" for name, item in value.items())
     if isinstance(value, (list, tuple)):
         return f"({' '.join(map(brief, value))})"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
@@ -180,9 +180,9 @@ def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:
 def _plain(value: Any) -> Any:
     """JSON's own types, numbers with five significant digits; infinite ones and NaN as text."""
     if isinstance(value, dict):
-        return {str(name): _plain(one) for name, one in value.items()}
+        return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, (bool, np.bool_)):

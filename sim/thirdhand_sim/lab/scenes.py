@@ -62,8 +62,8 @@ def draw(number: int, *, seed: int) -> Drawn:
     pauses: list[ScriptPause] = []
     stops, turns = random.random() < 2 / 3, random.random() < 1 / 2
     halves = [0, 1] if random.random() < 1 / 2 else [1, 0]
-    for half, wanted, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
-        if wanted:
+    for half, has_pause, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
+        if has_pause:
             # Each lies in its own half of the script; the second is delayed by the first.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
             pauses.append(ScriptPause(at_s, float(random.uniform(0.6, longest_s)), depth))

@@ -86,8 +86,8 @@ class Number(NamedTuple):
 
 def numbers() -> dict[str, Number]:
     """The tuned numbers of all stages by key."""
-    found = [Number(stage, *item) for stage, tuned in TUNING._asdict().items() for item in tuned._asdict().items()]
-    return {number.key: number for number in found}
+    all_numbers = [Number(stage, *item) for stage, tuned in TUNING._asdict().items() for item in tuned._asdict().items()]
+    return {number.key: number for number in all_numbers}
 
 
 @functools.cache
@@ -99,13 +99,13 @@ def _skill() -> Skill:
 def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
     """Figures of sequences of hands that the core alone follows."""
     follow = ours(_skill(), Settings(), tuning)
-    return [motion.figures("ours", one, targets(_skill(), one.truth), follow(one)) for one in hands]
+    return [motion.figures("ours", sequence, targets(_skill(), sequence.truth), follow(sequence)) for sequence in hands]
 
 
 def _person(seed: int) -> list[Moving]:
     middle = _skill().hands.mean(axis=0)
     people = moving_hands.modelled(middle, numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S)
-    return [one for one in people if one.group in motion.FLOOR_GROUPS]
+    return [sequence for sequence in people if sequence.group in motion.FLOOR_GROUPS]
 
 
 def moving(tuning: Tuning, seed: int) -> Figures:
@@ -149,15 +149,15 @@ def beside_a_box(tuning: Tuning, seed: int) -> Figures:
     script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=NOISE_M)
     settings = msgspec.structs.replace(Settings(), obstacles=Obstacles(boxes=(BOX,)))
     skill_for = reached.ours(Scene())
-    one = rehearse(script, skill_for, rate_hz=100, settings=settings, tuning=tuning, keep=True)
-    behind_m = np.linalg.norm(one.frames["setpoint"] - one.tool, axis=1)
+    rehearsal = rehearse(script, skill_for, rate_hz=100, settings=settings, tuning=tuning, keep=True)
+    behind_m = np.linalg.norm(rehearsal.frames["setpoint"] - rehearsal.tool, axis=1)
     return {
-        "handover_error_mm": one.errors_mm[0],
-        "nearest_hand_mm": 1000 * float(one.frames["hand_distance"].min()),
+        "handover_error_mm": rehearsal.errors_mm[0],
+        "nearest_hand_mm": 1000 * float(rehearsal.frames["hand_distance"].min()),
         "behind_mm": 1000 * float(behind_m.max()),
-        "joint_speed_rms_radps": float(np.sqrt(np.mean(one.joints[:, 1] ** 2))),
-        "held_s": one.held_s,
-        "stuck": float(np.mean(one.frames["flags"] & int(Flag.STUCK) > 0)),
+        "joint_speed_rms_radps": float(np.sqrt(np.mean(rehearsal.joints[:, 1] ** 2))),
+        "held_s": rehearsal.held_s,
+        "stuck": float(np.mean(rehearsal.frames["flags"] & int(Flag.STUCK) > 0)),
     }
 
 
@@ -203,10 +203,10 @@ def measured(task: tuple[str, float, int]) -> Figures | str:
     key, factor, seed = task
     tuning = numbers()[key].tuning(factor) if key else TUNING
     try:
-        found = {session.__name__: session(tuning, seed) for session in SESSIONS}
+        figures = {session.__name__: session(tuning, seed) for session in SESSIONS}
     except (ArithmeticError, ValueError) as error:
         return f"{type(error).__name__}: {error}"
-    return {f"{session}: {name}": float(value) for session, row in found.items() for name, value in row.items()}
+    return {f"{session}: {name}": float(value) for session, row in figures.items() for name, value in row.items()}
 
 
 def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
@@ -235,14 +235,14 @@ def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """Effect of each number, by its key and the factor; with fewer seeds for a quick look."""
-    known = numbers().values()
+    all_numbers = numbers().values()
     seeds, noise_seeds = range(math.ceil(options.share * CHANGED)), range(max(3, round(options.share * SEEDS)))
     tasks = [("", 1.0, seed) for seed in noise_seeds]
-    tasks += [(number.key, factor, seed) for number in known for factor in FACTORS for seed in seeds]
+    tasks += [(number.key, factor, seed) for number in all_numbers for factor in FACTORS for seed in seeds]
     outcomes = shared_out(measured, tasks, options.workers)
     tuned = [row for row in itertools.islice(outcomes, len(noise_seeds)) if isinstance(row, dict)]
     out: dict[str, Any] = {}
-    for number in known:
+    for number in all_numbers:
         effects = {f"{factor:g}": effect(list(itertools.islice(outcomes, len(seeds))), tuned) for factor in FACTORS}
         out[number.key] = {"value": number.value, "effects": effects}
         results.say(f"{number.key}: {brief(effects)}")

@@ -79,10 +79,10 @@ class ThrustScript(HandScript):
         begin = (t - self.at_s) / self.lasts_s
         back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
         share, rate = (a - b for a, b in zip(_reach(begin), _reach(back), strict=True))
-        motion, way = hands[self.side], self._place - hands[self.side].position
+        motion, offset_m = hands[self.side], self._place - hands[self.side].position
         hands[self.side] = PointMotion(
-            motion.position + share * way,
-            (1.0 - share) * motion.velocity + rate / self.lasts_s * way,
+            motion.position + share * offset_m,
+            (1.0 - share) * motion.velocity + rate / self.lasts_s * offset_m,
             motion.acceleration,
         )
         return HandMotions(*hands)
@@ -164,7 +164,7 @@ def _judged(
 ) -> Outcome:
     settings, dt = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), 1 / RATE_HZ
     people, body = settings.people, body_of(settings, robot_description(settings))
-    distance, speed, coming, own, table = nearest(settings, body, done.joints, done.hands)
+    distance, speed, coming, self_m, table = nearest(settings, body, done.joints, done.hands)
     reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
     allowed = np.empty_like(distance)
     _allow(distance, coming, people.brake, reaction_s, people.distance, allowed)
@@ -197,7 +197,7 @@ def _judged(
         dt * _longest(((speed - allowed > TUNING.separation.slip_speed_mps) & assumed)[began]),
         float(coming[began][distance[began] < SHOWN_M].max(initial=0.0)),
         float(((done.frames["flags"] & Flag.SEPARATION) > 0).sum() * dt),
-        1000 * float(own.min()),
+        1000 * float(self_m.min()),
         1000 * float(table.min()),
         picked[began][::SHOWN_TICKS],
     )
@@ -238,30 +238,30 @@ def _measure(joints: Array, hands: Array, body: Body, shape: Array, pairs: Array
     """
     frames, axes, capsules, kept_apart = body
     count, near, arm = len(capsules), np.empty(9), np.empty((2, 3))
-    here, then, fixed = np.empty((count, 2, 3)), np.empty((count, 2, 3)), count - pairs.shape[3]
+    segments, moved, fixed = np.empty((count, 2, 3)), np.empty((count, 2, 3)), count - pairs.shape[3]
     for t in range(len(joints)):
         q = joints[t, 0]
-        place(q, frames, axes, capsules, here)
-        place(q + STEP_S * joints[t, 1], frames, axes, capsules, then)
+        place(q, frames, axes, capsules, segments)
+        place(q + STEP_S * joints[t, 1], frames, axes, capsules, moved)
         for pair in range(len(kept_apart)):
-            one, other = kept_apart[pair, 0], kept_apart[pair, 1]
-            apart = between_segments(here[one], here[other], near) - capsules[one].radius - capsules[other].radius
-            least[0, t] = min(least[0, t], apart)
+            capsule, other = kept_apart[pair, 0], kept_apart[pair, 1]
+            distance_m = between_segments(segments[capsule], segments[other], near) - capsules[capsule].radius - capsules[other].radius
+            least[0, t] = min(least[0, t], distance_m)
         for c in range(fixed, count):
-            if max(here[c, 0, 0], here[c, 1, 0]) > 0.35:
-                least[1, t] = min(least[1, t], min(here[c, 0, 2], here[c, 1, 2]) - capsules[c].radius - shape[4])
+            if max(segments[c, 0, 0], segments[c, 1, 0]) > 0.35:
+                least[1, t] = min(least[1, t], min(segments[c, 0, 2], segments[c, 1, 2]) - capsules[c].radius - shape[4])
             for side in range(2):
                 arm[0] = hands[t, side, 0]
                 arm[1] = arm[0] + shape[1:4]
-                pairs[0, t, side, c - fixed] = between_segments(here[c], arm, near) - capsules[c].radius - shape[0]
+                pairs[0, t, side, c - fixed] = between_segments(segments[c], arm, near) - capsules[c].radius - shape[0]
                 long = whole = along = coming = 0.0
                 for i in range(3):
-                    way = here[c, 1, i] - here[c, 0, i]
-                    whole += way * way
-                    long += way * (near[i] - here[c, 0, i])
+                    extent = segments[c, 1, i] - segments[c, 0, i]
+                    whole += extent * extent
+                    long += extent * (near[i] - segments[c, 0, i])
                 share = long / whole if whole > 0.0 else 0.0
                 for i in range(3):
-                    first, second = then[c, 0, i] - here[c, 0, i], then[c, 1, i] - here[c, 1, i]
+                    first, second = moved[c, 0, i] - segments[c, 0, i], moved[c, 1, i] - segments[c, 1, i]
                     along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
                     coming -= near[6 + i] * hands[t, side, 1, i]
                 pairs[1, t, side, c - fixed], pairs[2, t, side, c - fixed] = along, max(coming, 0.0)
@@ -278,28 +278,28 @@ def _allow(distance: Array, coming: Array, brake: float, reaction: float, cleara
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     scenes = SCENES.share(options.share)
-    found: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
+    by_kind: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
     tasks = [(kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
-    for one in shared_out(run_one, tasks, options.workers):
-        found[one.kind].append(one)
-        if len(found[one.kind]) % max(1, len(scenes) // 5) == 0:
-            results.say(f"{one.kind}: {brief(_summary(found[one.kind]))}")
+    for row in shared_out(run_one, tasks, options.workers):
+        by_kind[row.kind].append(row)
+        if len(by_kind[row.kind]) % max(1, len(scenes) // 5) == 0:
+            results.say(f"{row.kind}: {brief(_summary(by_kind[row.kind]))}")
     recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
     results.series(
-        {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in found.items() for name in recorded}, "scene"
+        {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in by_kind.items() for name in recorded}, "scene"
     )
     numbers = {
         "scenes": len(scenes),
         "rate_hz": RATE_HZ,
         "slip_m_per_s": TUNING.separation.slip_speed_mps,
-        **{kind: _summary(rows) for kind, rows in found.items()},
-        "later_than_unheeded_s": _later(found["random"], found["unheeded"]),
-        "later_for_a_thrust_s": _later_for(found["thrust"], found["random"]),
+        **{kind: _summary(rows) for kind, rows in by_kind.items()},
+        "later_than_unheeded_s": _later(by_kind["random"], by_kind["unheeded"]),
+        "later_for_a_thrust_s": _later_for(by_kind["thrust"], by_kind["random"]),
         "worst_scene": {
-            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in found.items()
+            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in by_kind.items()
         },
-        "failed_scenes": {kind: [one.number for one in rows if not one.success] for kind, rows in found.items()},
-        "shown": {kind: _shown([one for one in rows if one.number < SHOWN_SCENES]) for kind, rows in found.items()},
+        "failed_scenes": {kind: [row.number for row in rows if not row.success] for kind, rows in by_kind.items()},
+        "shown": {kind: _shown([row for row in rows if row.number < SHOWN_SCENES]) for kind, rows in by_kind.items()},
     }
     draw_numbers(results, numbers)
     return numbers
@@ -307,25 +307,25 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 def _shown(rows: list[Outcome]) -> dict[str, Any]:
     """Content of the figure: points at distances [mm] and speeds [mm/s]."""
-    near = np.concatenate([one.near for one in rows])
+    near = np.concatenate([row.near for row in rows])
     return {
         "scenes": len(rows),
-        "closest_of_capsules_mm": min(one.capsules_mm for one in rows),
-        "closest_of_shapes_mm": min(one.shapes_mm for one in rows),
+        "closest_of_capsules_mm": min(row.capsules_mm for row in rows),
+        "closest_of_shapes_mm": min(row.shapes_mm for row in rows),
         "points": np.round(1000 * near[near[:, 0] < SHOWN_M]).astype(int).T,
     }
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:
-    closest = np.array([one.shapes_mm for one in rows])
+    closest = np.array([row.shapes_mm for row in rows])
     return {
-        "successes": sum(one.success for one in rows),
+        "successes": sum(row.success for row in rows),
         "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
         "overlaps": int((closest < 0).sum()),
-        "above_after_reaction": sum(one.excess_after_reaction > TUNING.separation.slip_speed_mps for one in rows),
-        "limited_s": float(np.mean([one.limited_s for one in rows])),
-        **{name: max(getattr(one, name) for one in rows) for name in GREATEST},
-        **{name: min(getattr(one, name) for one in rows) for name in ("self_mm", "table_mm")},
+        "above_after_reaction": sum(row.excess_after_reaction > TUNING.separation.slip_speed_mps for row in rows),
+        "limited_s": float(np.mean([row.limited_s for row in rows])),
+        **{name: max(getattr(row, name) for row in rows) for name in GREATEST},
+        **{name: min(getattr(row, name) for row in rows) for name in ("self_mm", "table_mm")},
     }
 
 
@@ -339,9 +339,9 @@ def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, A
     """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
     both runs succeed.
     """
-    both = [(one, other) for one, other in zip(thrust, undisturbed, strict=True) if one.success and other.success]
-    late = np.array([one.times_s[-1] - other.times_s[-1] - one.away_s for one, other in both])
-    away = float(np.mean([one.away_s for one in thrust]))
+    pairs = [(row, other) for row, other in zip(thrust, undisturbed, strict=True) if row.success and other.success]
+    late = np.array([row.times_s[-1] - other.times_s[-1] - row.away_s for row, other in pairs])
+    away = float(np.mean([row.away_s for row in thrust]))
     return {"away": away, "mean": float(late.mean()), "least": float(late.min()), "most": float(late.max())}
 
 
@@ -353,17 +353,17 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     titles = ("random scenes", "a hand thrust into the path", "random scenes, without separation")
     colours = (OTHER, ADAPTED, "#595959")
     for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
-        shown = numbers["shown"][kind]
-        distance_mm, speed_mm_s = np.array(shown["points"])
+        content = numbers["shown"][kind]
+        distance_mm, speed_mm_s = np.array(content["points"])
         ax.scatter(distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True)
         distances = np.linspace(-0.1, SHOWN_M, 200)
         for hand, style in ((0.0, "-"), (0.5, "--")):
             rule = [allowed_speed(d, hand, people.brake, reaction_s, people.distance) for d in distances]
             ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
-        closest = shown["closest_of_capsules_mm"]
+        closest = content["closest_of_capsules_mm"]
         ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"least distance: {closest:.0f} mm")
         ax.axvline(0, color="black", lw=0.6)
-        ax.set_title(f"{title} ({shown['scenes']} shown)", fontsize=9)
+        ax.set_title(f"{title} ({content['scenes']} shown)", fontsize=9)
         ax.set(xlim=(-100, 1000 * SHOWN_M), ylim=(-0.6, 0.9))
         ax.legend(frameon=False, fontsize=7.5, loc="lower right")
     axes[0].set(ylabel="speed toward the hand [m/s]")

@@ -79,34 +79,34 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     scenes = SCENES.share(options.share)
     count = len(scenes)
     tasks = [(method, number) for method in METHODS for number in scenes]
-    found: dict[str, list[Outcome]] = {method: [] for method in METHODS}
-    for one in shared_out(outcome, tasks, options.workers):
-        found[one.method].append(one)
-        done = found[one.method]
-        if not one.success and one.method == "ours":
-            results.say(f"scene {one.number} missed: {one.errors_mm} mm")
+    by_method: dict[str, list[Outcome]] = {method: [] for method in METHODS}
+    for row in shared_out(outcome, tasks, options.workers):
+        by_method[row.method].append(row)
+        done = by_method[row.method]
+        if not row.success and row.method == "ours":
+            results.say(f"scene {row.number} missed: {row.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
-            results.say(f"{one.method}: {sum(o.success for o in done)} of {len(done)} scenes")
-    paths = {f"/{name}/{method}": (method, i) for method in found for i, name in enumerate(EVENTS)}
-    styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(who))], names=[who]) for path, (who, _) in paths.items()}
-    values = {path: [one.errors_mm[i] for one in found[who]] for path, (who, i) in paths.items()}
+            results.say(f"{row.method}: {sum(o.success for o in done)} of {len(done)} scenes")
+    paths = {f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)}
+    styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(method))], names=[method]) for path, (method, _) in paths.items()}
+    values = {path: [row.errors_mm[i] for row in by_method[method]] for path, (method, i) in paths.items()}
     results.series(values, "scene", styles)
     numbers = {
         "scenes": count,
         "rate_hz": {"ours": OURS_HZ, "rivals": RIVALS_HZ},
         "within_mm": 1000 * GRASP_DISTANCE,
-        "methods": {method: _summary(rows) for method, rows in found.items()},
-        "failed_scenes_of_ours": [one.number for one in found["ours"] if not one.success],
-        "held_s_of_ours": max(one.held_s for one in found["ours"]),
-        "errors_mm_by_scene": {method: [one.errors_mm for one in rows] for method, rows in found.items()},
+        "methods": {method: _summary(rows) for method, rows in by_method.items()},
+        "failed_scenes_of_ours": [row.number for row in by_method["ours"] if not row.success],
+        "held_s_of_ours": max(row.held_s for row in by_method["ours"]),
+        "errors_mm_by_scene": {method: [row.errors_mm for row in rows] for method, rows in by_method.items()},
     }
     draw_numbers(results, numbers)
     return numbers
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:
-    errors = np.array([one.errors_mm for one in rows])
-    successes = sum(one.success for one in rows)
+    errors = np.array([row.errors_mm for row in rows])
+    successes = sum(row.success for row in rows)
     low, high = wilson(successes, len(rows))
     return {
         "successes": successes,
@@ -133,22 +133,22 @@ def wilson(successes: int, of: int) -> tuple[float, float]:
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers: a row a method."""
-    plt, found = pyplot(), numbers["methods"]
+    plt, methods = pyplot(), numbers["methods"]
     figure, (rates, *events) = plt.subplots(1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1))
     random = np.random.default_rng(DRAWING)
-    for i, (method, one) in enumerate(found.items()):
+    for i, (method, scores) in enumerate(methods.items()):
         colour = colour_of(method)
-        rate, (low, high) = 100 * one["successes"] / one["of"], one["rate_95_percent_interval"]
+        rate, (low, high) = 100 * scores["successes"] / scores["of"], scores["rate_95_percent_interval"]
         rates.barh(i, rate, color=colour, height=0.6)
         rates.plot((100 * low, 100 * high), (i, i), color="black", lw=1.2)
         rates.text(max(rate, 100 * high) + 2, i, f"{rate:.0f}", va="center")
         errors = np.array(numbers["errors_mm_by_scene"][method])
         for axes, name, error in zip(events, EVENTS, errors.T, strict=True):
-            at = i + random.uniform(-0.25, 0.25, len(error))
-            axes.scatter(np.maximum(error, LEAST_MM), at, s=5, color=colour, alpha=0.5, lw=0)
-            axes.plot([max(one[f"{name}_mm"]["median"], LEAST_MM)] * 2, (i - 0.38, i + 0.38), color="black", lw=1.6)
+            y = i + random.uniform(-0.25, 0.25, len(error))
+            axes.scatter(np.maximum(error, LEAST_MM), y, s=5, color=colour, alpha=0.5, lw=0)
+            axes.plot([max(scores[f"{name}_mm"]["median"], LEAST_MM)] * 2, (i - 0.38, i + 0.38), color="black", lw=1.6)
     rates.set(xlim=(0, 116), xticks=range(0, 101, 25), xlabel="scenes in which all three\nevents succeeded [%]")
-    rates.set_yticks(range(len(found)), [METHODS[method][0] for method in found])
+    rates.set_yticks(range(len(methods)), [METHODS[method][0] for method in methods])
     rates.invert_yaxis()
     titles = (
         "board handed over:\ntool to left hand",

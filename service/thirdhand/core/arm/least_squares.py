@@ -85,7 +85,7 @@ def least_squares(
             result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
     if inside:
         return
-    rest = np.empty(count)
+    residual = np.empty(count)
     for _ in range(BOUND_ROUNDS):
         _solve(tasks, wanted, posture, damping, free, result, best)
         blocked, least = -1, 1.0
@@ -104,16 +104,16 @@ def least_squares(
             continue
         result[:] = best
         for i in range(count):
-            rest[i] = -wanted[i]
+            residual[i] = -wanted[i]
             for j in range(joints):
-                rest[i] += tasks[i, j] * result[j]
+                residual[i] += tasks[i, j] * result[j]
         leaving, most = -1, ROUNDING  # the bound with the steepest descent to its inside
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
             slope = damping * (result[j] - posture[j])
             for i in range(count):
-                slope += tasks[i, j] * rest[i]
+                slope += tasks[i, j] * residual[i]
             gained = slope if result[j] >= bounds[1, j] else -slope
             if gained > most:
                 leaving, most = j, gained
@@ -282,19 +282,19 @@ def _farthest(bounds: Vector, rows: Vector, limits: Vector, x: Vector, least: fl
     Upper bounds have the numbers 0 ... J - 1, lower bounds J ... 2 J - 1, rows the numbers from 2
     J.
     """
-    joints, found, most = len(x), -1, least
+    joints, farthest, most = len(x), -1, least
     for j in range(joints):
         if x[j] - bounds[1, j] > most:
-            found, most = j, x[j] - bounds[1, j]
+            farthest, most = j, x[j] - bounds[1, j]
         if bounds[0, j] - x[j] > most:
-            found, most = joints + j, bounds[0, j] - x[j]
+            farthest, most = joints + j, bounds[0, j] - x[j]
     for k in range(len(limits)):
         beyond = -limits[k]
         for j in range(joints):
             beyond += rows[k, j] * x[j]
         if beyond > most:
-            found, most = 2 * joints + k, beyond
-    return found
+            farthest, most = 2 * joints + k, beyond
+    return farthest
 
 
 @compiled

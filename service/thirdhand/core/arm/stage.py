@@ -79,7 +79,7 @@ class Arm:
         )
         joints, acceleration = len(limits.names), np.array(limits.acceleration)
         scale = acceleration**numbers.sparing_power
-        scale /= exp(sum(log(float(one)) for one in scale) / len(scale))
+        scale /= exp(sum(log(float(factor)) for factor in scale) / len(scale))
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
         spared /= spared.mean(axis=1, keepdims=True)
@@ -146,12 +146,12 @@ class Arm:
 
     def at(self, q: Vector) -> Kinematics:
         """Kinematics of the arm at joints q (J,) [rad, m]."""
-        here = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
-        stand(here, self._turns, q)
-        jacobian = pin.computeFrameJacobian(self._model, self._data, here["configuration"][0], self._tool, AXES)
+        kinematics = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
+        stand(kinematics, self._turns, q)
+        jacobian = pin.computeFrameJacobian(self._model, self._data, kinematics["configuration"][0], self._tool, AXES)
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
-        describe(self.parameters, here, jacobian, placement.homogeneous)
-        return Kinematics(here)
+        describe(self.parameters, kinematics, jacobian, placement.homogeneous)
+        return Kinematics(kinematics)
 
     def costs(self, here: Kinematics) -> Vector:
         """Share of each joint's planned limit per unit of tool velocity, acceleration and jerk.

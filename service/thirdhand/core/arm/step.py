@@ -30,13 +30,13 @@ def stand(heres: Records, turns: NDArray[np.bool_], q: Vector) -> None:
     """Write joints q (J,) [rad, m], limited to ± MAX_JOINT_RAD, and their configuration: cosine and
     sine of each joint that `turns` (J,), the position of each other one.
     """
-    here, entry = heres[0], 0
+    kinematics, entry = heres[0], 0
     for joint in range(len(q)):
         position = min(max(q[joint], -MAX_JOINT_RAD), MAX_JOINT_RAD)
-        here.joints[joint] = here.configuration[entry] = position
+        kinematics.joints[joint] = kinematics.configuration[entry] = position
         if turns[joint]:
             sine, cosine = sin_cos(position)
-            here.configuration[entry], here.configuration[entry + 1] = cosine, sine
+            kinematics.configuration[entry], kinematics.configuration[entry + 1] = cosine, sine
             entry += 1
         entry += 1
 
@@ -57,9 +57,9 @@ def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> N
 
     With 5 tasks, the last row of R^T Jw is left out.
     """
-    arm, here = arms[0], heres[0]
-    joints, gram, tasks = jacobian.shape[1], np.empty((3, 3)), here.tasks
-    here.jacobian[:], here.position[:], here.rotation[:] = jacobian, pose[:3, 3], pose[:3, :3]
+    arm, kinematics = arms[0], heres[0]
+    joints, gram, tasks = jacobian.shape[1], np.empty((3, 3)), kinematics.tasks
+    kinematics.jacobian[:], kinematics.position[:], kinematics.rotation[:] = jacobian, pose[:3, 3], pose[:3, :3]
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
@@ -80,7 +80,7 @@ def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> N
         + gram[0, 2] * (gram[0, 1] * gram[1, 2] - gram[0, 2] * gram[1, 1])
     )
     shortage = max(1.0 - math.sqrt(max(determinant, 0.0)) / arm.singular_volume, 0.0)
-    here.damping = arm.damping + arm.singular_damping * shortage * shortage
+    kinematics.damping = arm.damping + arm.singular_damping * shortage * shortage
 
 
 @compiled
@@ -306,9 +306,9 @@ def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
     """
     arm, goal = arms[0], goals[0]
     for j in range(len(out)):
-        wanted = out[j] * arm.scale[j]
+        velocity = out[j] * arm.scale[j]
         change = goal.horizon_s * arm.acceleration[j]
-        if abs(wanted) > arm.max_velocity[j] or abs(wanted - goal.moving[j]) > change:
+        if abs(velocity) > arm.max_velocity[j] or abs(velocity - goal.moving[j]) > change:
             return False
     return True
 
@@ -325,14 +325,14 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
     """
     arm, goal, share = arms[0], goals[0], 1.0
     for j in range(len(out)):
-        there, more = free[j] * arm.scale[j], (out[j] - free[j]) * arm.scale[j]
+        free_velocity, more = free[j] * arm.scale[j], (out[j] - free[j]) * arm.scale[j]
         change, top = goal.horizon_s * arm.acceleration[j], arm.max_velocity[j]
-        low = min(max(-top, goal.moving[j] - change), there)
-        high = max(min(top, goal.moving[j] + change), there)
-        if there + more > high:
-            share = min(share, (high - there) / more)
-        elif there + more < low:
-            share = min(share, (low - there) / more)
+        low = min(max(-top, goal.moving[j] - change), free_velocity)
+        high = max(min(top, goal.moving[j] + change), free_velocity)
+        if free_velocity + more > high:
+            share = min(share, (high - free_velocity) / more)
+        elif free_velocity + more < low:
+            share = min(share, (low - free_velocity) / more)
     for j in range(len(out)):
         out[j] = free[j] + share * (out[j] - free[j])
 
@@ -346,10 +346,10 @@ def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector,
     e (3,) [rad] is the rotation vector to the orientation or, unless `about` is set, the shortest
     turn of +z to its +z. The result is 0 if it is not finite.
     """
-    here, max_speed = np.empty(4), arms[0].max_turn_speed
+    quaternion, max_speed = np.empty(4), arms[0].max_turn_speed
     if about:
-        quaternion_of(rotation, here)
-        turn_between(here, orientation, out)
+        quaternion_of(rotation, quaternion)
+        turn_between(quaternion, orientation, out)
     else:
         swing(rotation[:, 2].copy(), orientation, out)
     for i in range(3):

@@ -62,8 +62,8 @@ class WayOut:
         """
         if state["way_next"] >= state["way_count"]:
             return None
-        off: Vector = state["way"][state["way_next"]] - state["joints"][0]
-        far = float((np.abs(off) / self._per_rad).max())
-        velocity: Vector = off * (self._radps * min(1.0, far / self._start_rad) / max(far, self._near_rad))
+        difference: Vector = state["way"][state["way_next"]] - state["joints"][0]
+        far = float((np.abs(difference) / self._per_rad).max())
+        velocity: Vector = difference * (self._radps * min(1.0, far / self._start_rad) / max(far, self._near_rad))
         state["way_next"] += far < self._near_rad
         return velocity / max(1.0, norm(times(tasks[:3], velocity)) / self._mps)

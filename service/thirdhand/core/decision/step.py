@@ -262,13 +262,13 @@ def measured_error(states: Records, heres: Records, parameters: Records) -> tupl
     q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
     Jacobian there.
     """
-    state, here = states[0], heres[0]
+    state, kinematics = states[0], heres[0]
     error = speed = 0.0
-    for joint in range(len(here.joints)):
-        error = max(error, abs(here.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
+    for joint in range(len(kinematics.joints)):
+        error = max(error, abs(kinematics.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
     for axis in range(3):
         along = 0.0
-        for joint in range(len(here.joints)):
-            along += here.tasks[axis, joint] * state.measured_velocities[joint]
+        for joint in range(len(kinematics.joints)):
+            along += kinematics.tasks[axis, joint] * state.measured_velocities[joint]
         speed += along * along
     return error, math.sqrt(speed)

@@ -40,13 +40,13 @@ def compared(states: Records, parameters: Records, position: Vector, velocity: V
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
-    state, config, near, off, moved = states[0], parameters[0], True, 0.0, 0.0
+    state, config, near, deviation, moved = states[0], parameters[0], True, 0.0, 0.0
     for i in range(len(position)):
         near = near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
         near = near and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
-        off = max(off, abs(position[i] - state.measured[i]) / config.per_rad[i])
+        deviation = max(deviation, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
-    return near, off, moved
+    return near, deviation, moved
 
 
 @compiled

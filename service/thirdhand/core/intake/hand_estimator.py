@@ -121,7 +121,7 @@ def _update_noise(states: Records, parameters: Records, side: int, position: Vec
     used: when an interval differs by more than half from the one before, this sample and the next
     do not change r.
     """
-    state, config, past = states[0], parameters[0], states[0].past_samples[side]
+    state, config, history = states[0], parameters[0], states[0].past_samples[side]
     count, variance = state.even_samples[side], state.noise_variance[side]
     before_s = state.sample_interval_s[side]
     if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
@@ -130,17 +130,17 @@ def _update_noise(states: Records, parameters: Records, side: int, position: Vec
     if count >= 3:
         square = 0.0
         for axis in range(3):
-            third = position[axis] - 3.0 * past[0, axis] + 3.0 * past[1, axis] - past[2, axis]
+            third = position[axis] - 3.0 * history[0, axis] + 3.0 * history[1, axis] - history[2, axis]
             square += third * third
-        seen = min(square / 60.0, config.outlier_variances * variance)
+        sample_variance = min(square / 60.0, config.outlier_variances * variance)
         samples = min(state.noise_samples[side] + 1, config.noise_samples)
         state.noise_samples[side] = samples
-        variance += (seen - variance) / (samples + 1.0)
+        variance += (sample_variance - variance) / (samples + 1.0)
         state.noise_variance[side] = max(variance, config.least_noise_m**2)
     for axis in range(3):
-        past[2, axis] = past[1, axis]
-        past[1, axis] = past[0, axis]
-        past[0, axis] = position[axis]
+        history[2, axis] = history[1, axis]
+        history[1, axis] = history[0, axis]
+        history[0, axis] = position[axis]
     state.even_samples[side] = min(count + 1, 3)
 
 
@@ -173,9 +173,9 @@ def look_ahead(states: Records, models: Records, side: int) -> None:
     `onward` of `motion_model.models` for the time since then.
     """
     state, estimate = states[0], states[0].hands[side]
-    at = slot(states, side, 0)
-    means, modes = state.kept_means[side, at], state.kept_probabilities[side, at]
-    onward = models[min(state.tick - state.kept_ticks[side, at], len(models) - 1)].onward
+    newest = slot(states, side, 0)
+    means, modes = state.kept_means[side, newest], state.kept_probabilities[side, newest]
+    onward = models[min(state.tick - state.kept_ticks[side, newest], len(models) - 1)].onward
     for row in range(3):
         for axis in range(3):
             total = 0.0
@@ -188,8 +188,8 @@ def look_ahead(states: Records, models: Records, side: int) -> None:
 @compiled
 def is_fresh(states: Records, side: int, stale_ticks: int) -> bool:
     """True if a sample of this hand arrived less than `stale_ticks` ago."""
-    seen = states[0].hand_ticks[side]
-    return bool(seen >= 0 and states[0].tick - seen < stale_ticks)
+    sample_tick = states[0].hand_ticks[side]
+    return bool(sample_tick >= 0 and states[0].tick - sample_tick < stale_ticks)
 
 
 @compiled
@@ -200,9 +200,9 @@ def goes_on(states: Records, parameters: Records, side: int, position: Vector) -
     p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
     """
     state, config = states[0], parameters[0]
-    apart = squared_distance(position, state.hands[side, 0])
+    square_m2 = squared_distance(position, state.hands[side, 0])
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(is_fresh(states, side, config.unseen_ticks) and apart < config.outlier_variances * variance)
+    return bool(is_fresh(states, side, config.unseen_ticks) and square_m2 < config.outlier_variances * variance)
 
 
 @compiled
@@ -271,8 +271,8 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
     state, config, period_s = states[0], parameters[0], parameters[0].period_s
     longest_late_s = config.longest_late_s
     stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
-    known = state.clock_tick[side] >= 0
-    if not known or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s):
+    has_clock = state.clock_tick[side] >= 0
+    if not has_clock or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s):
         stamps[:], ticks[:] = stamp_ns, state.tick
         state.clock[side], state.clock_tick[side] = LEARNING, state.tick
         state.longest_delay_ticks[side] = 0
@@ -331,12 +331,12 @@ def take(
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
-    at = state.kept_newest[side]
-    state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, state.tick
-    state.kept_late[side, at], state.kept_restarts[side, at] = 0, restarts
-    state.kept_positions[side, at] = position
+    newest = state.kept_newest[side]
+    state.kept_stamps_ns[side, newest], state.kept_ticks[side, newest] = stamp_ns, state.tick
+    state.kept_late[side, newest], state.kept_restarts[side, newest] = 0, restarts
+    state.kept_positions[side, newest] = position
     interval_s = parameters[0].tracker_memory_s if ticks < 0 else ticks * parameters[0].period_s
-    filter_in(states, parameters, side, at, interval_s, restarts or ticks < 0)
+    filter_in(states, parameters, side, newest, interval_s, restarts or ticks < 0)
     settle(states, parameters, models, side)
     look_ahead(states, models, side)
 

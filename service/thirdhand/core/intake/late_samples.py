@@ -70,9 +70,9 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
     elif order == state.kept[side]:
         out[:] = state.kept_positions[side, slot(states, side, order - 1)]
     else:
-        at = slot(states, side, order)
-        means, modes = state.kept_means[side, at], state.kept_probabilities[side, at]
-        over = models[min(tick - state.kept_ticks[side, at], len(models) - 1)].transition
+        index = slot(states, side, order)
+        means, modes = state.kept_means[side, index], state.kept_probabilities[side, index]
+        over = models[min(tick - state.kept_ticks[side, index], len(models) - 1)].transition
         for axis in range(3):
             total = 0.0
             for mode in range(len(modes)):
@@ -92,15 +92,15 @@ def _fits(
 
     p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
     """
-    state, at, there, variance = states[0], slot(states, side, order), np.empty(3), 0.0
-    before = state.kept_covariances[side, at, CHANGE]
-    over = models[min(tick - state.kept_ticks[side, at], len(models) - 1)]
-    expected(states, models, side, order, tick, there)
+    state, index, expected_m, variance = states[0], slot(states, side, order), np.empty(3), 0.0
+    before = state.kept_covariances[side, index, CHANGE]
+    over = models[min(tick - state.kept_ticks[side, index], len(models) - 1)]
+    expected(states, models, side, order, tick, expected_m)
     for row in range(3):
         for column in range(3):
             variance += over.transition[CHANGE, 0, row] * before[row, column] * over.transition[CHANGE, 0, column]
-    variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, at, 0]
-    return bool(squared_distance(position, there) < parameters[0].outlier_variances * variance)
+    variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, index, 0]
+    return bool(squared_distance(position, expected_m) < parameters[0].outlier_variances * variance)
 
 
 @compiled
@@ -118,9 +118,9 @@ def wrong_samples(states: Records, parameters: Records, models: Records, side: i
             return 0
         wrong = _fits(states, parameters, models, side, order, tick, position)
         for newer in range(order):
-            at = slot(states, side, newer)
-            made, sample = state.kept_ticks[side, at], state.kept_positions[side, at]
-            wrong = wrong and not _fits(states, parameters, models, side, order, made, sample)
+            index = slot(states, side, newer)
+            made_tick, sample = state.kept_ticks[side, index], state.kept_positions[side, index]
+            wrong = wrong and not _fits(states, parameters, models, side, order, made_tick, sample)
         if wrong:
             return order
     return 0
@@ -134,8 +134,8 @@ def drop(states: Records, side: int, count: int) -> None:
     """
     state = states[0]
     state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
-    at = slot(states, side, 0)
-    state.kept_past[side, at], state.kept_noise[side, at, 2] = state.past_samples[side], 0.0
+    index = slot(states, side, 0)
+    state.kept_past[side, index], state.kept_noise[side, index, 2] = state.past_samples[side], 0.0
 
 
 @compiled
@@ -154,10 +154,10 @@ def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, pos
         state.kept_late[side, to] = state.kept_late[side, of]
         state.kept_restarts[side, to] = state.kept_restarts[side, of]
         state.kept_positions[side, to] = state.kept_positions[side, of]
-    at = slot(states, side, order)
-    state.kept_stamps_ns[side, at], state.kept_ticks[side, at] = stamp_ns, tick
-    state.kept_late[side, at], state.kept_restarts[side, at] = state.tick - tick, restarts
-    state.kept_positions[side, at] = position
+    index = slot(states, side, order)
+    state.kept_stamps_ns[side, index], state.kept_ticks[side, index] = stamp_ns, tick
+    state.kept_late[side, index], state.kept_restarts[side, index] = state.tick - tick, restarts
+    state.kept_positions[side, index] = position
 
 
 @compiled
@@ -178,19 +178,19 @@ def take_late(
     tick. If the sample `restarts` the filter (a confirmed jump), it starts from this sample alone.
     """
     state, config = states[0], parameters[0]
-    order, kept = order_of(states, side, stamp_ns), state.kept[side]
-    if kept > 0:
-        _recall(states, side, slot(states, side, min(order, kept - 1)))
-    first = order == kept
+    order, count = order_of(states, side, stamp_ns), state.kept[side]
+    if count > 0:
+        _recall(states, side, slot(states, side, min(order, count - 1)))
+    first = order == count
     insert(states, side, order, stamp_ns, tick, position, restarts)
     for newer in range(order, -1, -1):
-        at = slot(states, side, newer)
+        index = slot(states, side, newer)
         first = first and newer == order
-        ticks = 0 if first else state.kept_ticks[side, at] - state.kept_ticks[side, slot(states, side, newer + 1)]
-        anew = first or state.kept_restarts[side, at] > 0
+        ticks = 0 if first else state.kept_ticks[side, index] - state.kept_ticks[side, slot(states, side, newer + 1)]
+        anew = first or state.kept_restarts[side, index] > 0
         if not anew:
             _advance_by(states, models, side, ticks)
-        filter_in(states, parameters, side, at, config.tracker_memory_s if first else ticks * config.period_s, anew)
+        filter_in(states, parameters, side, index, config.tracker_memory_s if first else ticks * config.period_s, anew)
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
     settle(states, parameters, models, side)
@@ -201,8 +201,8 @@ def take_late(
 def _advance_by(states: Records, models: Records, side: int, ticks: int) -> None:
     """Advance all modes of one hand by some ticks; 0 ticks change nothing."""
     if ticks > 0:
-        at = min(ticks, len(models) - 1)
-        advance_hand(states, side, models[at : at + 1])
+        index = min(ticks, len(models) - 1)
+        advance_hand(states, side, models[index : index + 1])
 
 
 @compiled

@@ -125,18 +125,18 @@ def measure(mean: Vector, p: Vector, noise: float, position: Vector) -> tuple[fl
 
     Returns S and |z - H m|² / S before the update.
     """
-    seen, error = np.empty(STATES), 0.0
+    cross, error = np.empty(STATES), 0.0
     for row in range(STATES):
-        seen[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
-    variance = seen[0] + seen[3] + noise
+        cross[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
+    variance = cross[0] + cross[3] + noise
     for axis in range(3):
         innovation = position[axis] - mean[0, axis] - mean[3, axis]
         error += innovation * innovation
         for row in range(STATES):
-            mean[row, axis] += seen[row] / variance * innovation
+            mean[row, axis] += cross[row] / variance * innovation
     for row in range(STATES):
         for column in range(row, STATES):
-            p[row, column] -= seen[row] * seen[column] / variance
+            p[row, column] -= cross[row] * cross[column] / variance
             p[column, row] = p[row, column]
     return variance, error / variance
 
@@ -159,13 +159,13 @@ def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None
     in a second.
     """
     spread = parameters[0].rest_speed_std_mps
-    for known in range(1, 3):
-        row_of = covariance[known].copy()
-        variance = row_of[known] + spread * spread
+    for order in range(1, 3):
+        row_of = covariance[order].copy()
+        variance = row_of[order] + spread * spread
         for axis in range(3):
-            off = mean[known, axis]
+            residual = mean[order, axis]
             for row in range(STATES):
-                mean[row, axis] -= row_of[row] / variance * off
+                mean[row, axis] -= row_of[row] / variance * residual
         for row in range(STATES):
             for column in range(STATES):
                 covariance[row, column] -= row_of[row] * row_of[column] / variance

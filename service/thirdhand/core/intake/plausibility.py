@@ -33,14 +33,14 @@ def is_swapped(states: Records, parameters: Records, side: int, position: Vector
     was (`_is_at_other`). Later samples that continue it are rejected until `swapped_s` has passed.
     """
     state, config = states[0], parameters[0]
-    is_swap, seen = state.jump_is_swap[side], state.hand_ticks[side]
+    is_swap, sample_tick = state.jump_is_swap[side], state.hand_ticks[side]
     if is_swap and (state.tick - state.jump_first_tick[side]) * config.period_s >= config.swapped_s:
         return False
     if is_swap and _goes_on(states, parameters, side, position):
         return True
-    silent = state.tick - seen
+    silent = state.tick - sample_tick
     lately = config.stale_ticks <= silent and silent * config.period_s < config.swapped_s
-    return bool(seen >= 0 and lately and _is_at_other(states, parameters, side, position))
+    return bool(sample_tick >= 0 and lately and _is_at_other(states, parameters, side, position))
 
 
 @compiled
@@ -74,10 +74,10 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     elapsed time, at most `swapped_s`.
     """
     state, config = states[0], parameters[0]
-    seen = state.hand_ticks[1 - side]
-    here, there = state.hands[side, 0], state.hands[1 - side, 0]
-    near = config.jump_m + config.jump_speed_mps * min((state.tick - seen) * config.period_s, config.swapped_s)
-    return bool(seen >= 0 and distance(position, there) < min(near, 0.5 * distance(here, there)))
+    other_tick = state.hand_ticks[1 - side]
+    hand_m, other_m = state.hands[side, 0], state.hands[1 - side, 0]
+    near = config.jump_m + config.jump_speed_mps * min((state.tick - other_tick) * config.period_s, config.swapped_s)
+    return bool(other_tick >= 0 and distance(position, other_m) < min(near, 0.5 * distance(hand_m, other_m)))
 
 
 @compiled

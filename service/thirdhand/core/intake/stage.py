@@ -156,11 +156,11 @@ class Intake:
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""
-        if (known := self._mappings.get(sample.frame_id)) is None:
+        if (tracker := self._mappings.get(sample.frame_id)) is None:
             state["rejected"][Cause.WRONG_FRAME] += 1
             self._note(state, side, Cause.WRONG_FRAME, sample)
             return
-        mapping, is_left_handed = known
+        mapping, is_left_handed = tracker
         if is_left_handed:
             sample = z_reversed(sample)
         cause = take_hand(

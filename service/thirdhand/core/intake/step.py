@@ -122,12 +122,12 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     # have restarted. While it is commanded, its turns are counted on.
     if fresh or (state.arm_ready and state.mode != FAULT):
         unwrap(states, parameters, position)
-    near, off, moved = compared(states, parameters, position, velocity)
+    near, deviation, moved = compared(states, parameters, position, velocity)
     cause = -1 if near else OUT_OF_RANGE
     if near:
         cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if near and cause != REPEATED:
-        jumped = fresh and off > config.joint_jump_rad + config.joint_jump_speed * passed_s
+        jumped = fresh and deviation > config.joint_jump_rad + config.joint_jump_speed * passed_s
         note_arm(states, parameters, jumped)
         if jumped and cause < 0:
             cause = JUMPED
@@ -191,8 +191,8 @@ def _in_time(
         return OLDER, 0, state.tick
     if order < 0:
         return REPEATED, order, state.tick
-    made = tick_made(states, side, stamp_ns, order, late, period_s) if order > 0 or late > 0 else state.tick
-    return -1, order, made
+    made_tick = tick_made(states, side, stamp_ns, order, late, period_s) if order > 0 or late > 0 else state.tick
+    return -1, order, made_tick
 
 
 @compiled
@@ -264,12 +264,12 @@ def take_hand(
     fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
 
     # Is the sample accepted?
-    order, made, jumped, wrong = 0, state.tick, False, 0
+    order, made_tick, jumped, wrong = 0, state.tick, False, 0
     cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
-        cause, order, made = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
+        cause, order, made_tick = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
     if cause < 0:
-        jumped, wrong = _jump(states, parameters, models, side, order, made, in_base, fresh)
+        jumped, wrong = _jump(states, parameters, models, side, order, made_tick, in_base, fresh)
         if jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
             cause = SWAPPED if state.jump_is_swap[side] else JUMPED
     if cause >= 0:
@@ -280,11 +280,11 @@ def take_hand(
     before = state.hands[side, 0].copy()
     if wrong > 0:
         drop(states, side, wrong)
-    if order == 0 and made == state.tick and wrong == 0:
+    if order == 0 and made_tick == state.tick and wrong == 0:
         take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
     else:
         note_clock(states, parameters, side, stamp_ns, fresh)
-        take_late(states, parameters, models, side, stamp_ns, made, in_base, jumped)
+        take_late(states, parameters, models, side, stamp_ns, made_tick, in_base, jumped)
 
     # The newest sample is what later ones are compared with.
     if order == 0:
@@ -330,24 +330,24 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     else:
         frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
     for side in range(2):
-        seen = state.hand_ticks[side]
-        frame.hand_ages[side], frame.stale_ticks[side] = -1 if seen < 0 else state.tick - seen, state.stale_ticks[side]
+        sample_tick = state.hand_ticks[side]
+        frame.hand_ages[side], frame.stale_ticks[side] = -1 if sample_tick < 0 else state.tick - sample_tick, state.stale_ticks[side]
         frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    known, ages, stale = 0, frame.hand_ages, frame.stale_ticks
+    conditions, ages, stale = 0, frame.hand_ages, frame.stale_ticks
     is_seen = ages[0] < stale[0], ages[1] < stale[1]
     if ages.min() >= 0 and ages.max() < config.unseen_ticks and (is_seen[0] or is_seen[1]):
-        known = HANDS_KNOWN
+        conditions = HANDS_KNOWN
         for side in range(2):
             if not is_seen[side]:
-                known |= UNSEEN[side]
+                conditions |= UNSEEN[side]
     if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
-        known |= ARM_HEARD
+        conditions |= ARM_HEARD
         if state.tick - state.arm_still_tick >= config.still_ticks:
-            known |= ARM_STILL
+            conditions |= ARM_STILL
         if state.tick < state.guided_until_tick:
-            known |= ARM_GUIDED
+            conditions |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
-        known |= CLUTCH_RELEASED
-    return known | CONTESTED if is_contested(states, parameters) else known
+        conditions |= CLUTCH_RELEASED
+    return conditions | CONTESTED if is_contested(states, parameters) else conditions

@@ -92,17 +92,17 @@ class Limiter:
 
     def advance(self, state: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
         """`step` of the joints' state (3, J), which is not changed."""
-        moved, wanted = np.empty(state.shape), np.zeros((2, state.shape[1]))
+        moved, target = np.empty(state.shape), np.zeros((2, state.shape[1]))
         if acceleration is not None:
-            wanted[1] = acceleration
-        met = step(state, velocity, self._parameters, wanted, moved)
+            target[1] = acceleration
+        met = step(state, velocity, self._parameters, target, moved)
         if met == UNUSABLE:
             return _stuck(state[0])
         if met & CHASED:
-            self._chase(state, wanted, moved)
+            self._chase(state, target, moved)
             if forget_fast(state, moved, self._parameters):  # joints that become too fast: again, without the ramp
-                wanted[1] = 0.0
-                self._chase(state, wanted, moved)
+                target[1] = 0.0
+                self._chase(state, target, moved)
             make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=met > 0)
 
@@ -222,14 +222,14 @@ class LimiterStage:
                 other = self._brake(state, separation)[0]
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
-        here, excess_speed = self._arm.at(moved.position), 0.0
-        if self._largest_speed_in_stop(moved, here) > self._stop_speed:
+        kinematics, excess_speed = self._arm.at(moved.position), 0.0
+        if self._largest_speed_in_stop(moved, kinematics) > self._stop_speed:
             moved, limited = self._limiter.stop(*state["joints"]), True
-            here = self._arm.at(moved.position)
-            speed = tool_speeds(here.record, *moved[1:3], self._jerk)[0]
+            kinematics = self._arm.at(moved.position)
+            speed = tool_speeds(kinematics.record, *moved[1:3], self._jerk)[0]
             excess_speed = speed if speed > self._max_speed else 0.0
-        moving = take(as_array(state), as_array(frame), here.record, *moved[:3])
-        return Moved(here, limited, separated, excess_speed, moving)
+        moving = take(as_array(state), as_array(frame), kinematics.record, *moved[:3])
+        return Moved(kinematics, limited, separated, excess_speed, moving)
 
     def stop(self, state: Record, frame: Record, separation: Separation) -> Moved:
         """Move the joints one period further in a stop.
@@ -238,13 +238,13 @@ class LimiterStage:
         than in the stop without a correction.
         """
         moved, stop = self._brake(state, separation)
-        here = self._arm.at(moved.position)
+        kinematics = self._arm.at(moved.position)
         if moved is not stop:
-            there, speed = self._arm.at(stop.position), self._largest_speed_in_stop(moved, here)
-            if speed > max(self._max_speed, self._largest_speed_in_stop(stop, there)):
-                moved, here = stop, there
-        moving = take(as_array(state), as_array(frame), here.record, *moved[:3])
-        return Moved(here, limited=False, separated=False, excess_speed=0.0, moving=moving)
+            stop_kinematics, speed = self._arm.at(stop.position), self._largest_speed_in_stop(moved, kinematics)
+            if speed > max(self._max_speed, self._largest_speed_in_stop(stop, stop_kinematics)):
+                moved, kinematics = stop, stop_kinematics
+        moving = take(as_array(state), as_array(frame), kinematics.record, *moved[:3])
+        return Moved(kinematics, limited=False, separated=False, excess_speed=0.0, moving=moving)
 
     def _brake(self, state: Record, separation: Separation) -> tuple[Limited, Limited]:
         """Step of a stop in which all joints come to rest at the same time, corrected if necessary.

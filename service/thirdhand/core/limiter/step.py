@@ -98,14 +98,14 @@ def forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
     The velocity counts at the end of the period, on average over it, and once the acceleration has
     been brought to 0.
     """
-    config, found = parameters[0], False
+    config, is_fast = parameters[0], False
     for i in range(moved.shape[1]):
         v, a, on_the_way = moved[1, i], moved[2, i], (moved[0, i] - state[0, i]) / config.period_s
         crest = v + a * abs(a) / (2.0 * config.max_jerk[i])
         if max(abs(v), abs(crest), abs(on_the_way)) > config.max_velocity[i]:
-            found = True
+            is_fast = True
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
-    return found
+    return is_fast
 
 
 @compiled
@@ -199,12 +199,12 @@ def take(
 
     Returns True if the joints moved before.
     """
-    state, frame, here, moving = states[0], frames[0], heres[0], False
+    state, frame, kinematics, moving = states[0], frames[0], heres[0], False
     for joint in range(len(position)):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
     state.joints[0, :], state.joints[1, :], state.joints[2, :] = position, velocity, acceleration
     frame.joints[:], frame.joint_velocities[:], frame.joint_accelerations[:] = position, velocity, acceleration
     frame.commanded = moving or (state.arm_ready and state.mode != FAULT)
-    frame.tool[:] = here.position
-    quaternion_of(here.rotation, frame.tool_orientation)
+    frame.tool[:] = kinematics.position
+    quaternion_of(kinematics.rotation, frame.tool_orientation)
     return moving

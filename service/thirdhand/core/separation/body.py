@@ -54,29 +54,29 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
     urdf, names = Urdf(description), settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
     frames = np.array([_in_joint(urdf, names, joint.parent, _origin(joint))[1] for joint in chain])
-    found: list[tuple[int, Vector, float]] = []
+    parts: list[tuple[int, Vector, float]] = []
     for shape in urdf.shapes:
         if shape.size:
             ends, radius = _capsule(shape)
             link, placed = _in_joint(urdf, names, shape.link, np.eye(3, 4))
-            found.append((link, ends @ placed[:, :3].T + placed[:, 3], radius))
+            parts.append((link, ends @ placed[:, :3].T + placed[:, 3], radius))
     link, plate = _in_joint(urdf, names, settings.arm.plate, np.eye(3, 4))
-    known = {number for number, _, _ in found}
+    covered = {number for number, _, _ in parts}
     for number in range(len(chain) + 1):
-        if number not in known:
+        if number not in covered:
             end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
-            found.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
+            parts.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
             if number < len(chain) and chain[number].kind == "prismatic":  # the guide of the next link
                 travel = np.outer(
                     [chain[number].lower, chain[number].upper], frames[number][:, :3] @ chain[number].axis
                 )
-                found.append((number, end + travel, settings.arm.link_radius))
+                parts.append((number, end + travel, settings.arm.link_radius))
     tool = np.array(settings.tool.plate_from_tool[:3])
     if math.hypot(*tool) > TOLERANCE:
-        found.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
-    found.sort(key=lambda one: one[0])
-    capsules = structured(len(found), CAPSULE)
-    capsules[:] = [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in found]
+        parts.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
+    parts.sort(key=lambda one: one[0])
+    capsules = structured(len(parts), CAPSULE)
+    capsules[:] = [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in parts]
     axes = np.array([[*joint.axis, float(joint.kind == "prismatic")] for joint in chain])
     body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
     postures = np.array([settings.arm.posture, *_ends_of_motion(settings)])
@@ -87,9 +87,9 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
     links, radii = capsules["link"], capsules["radius"]
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
-            apart = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
+            gaps_m = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
             over = tuning.separation.planned_margin_m if meshes and links[j] - links[i] == 2 else 0.0
-            if apart[0] > own_clearance(settings, tuning) + over and np.ptp(apart) > TOLERANCE:
+            if gaps_m[0] > own_clearance(settings, tuning) + over and np.ptp(gaps_m) > TOLERANCE:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
 

@@ -30,19 +30,19 @@ def clearance(
         radius = capsules[capsule].radius
         for hand in range(len(hands)):
             forearm[0], forearm[1] = hands[hand], hands[hand] + config.forearm
-            apart = between_segments(placed[capsule], forearm, near) - radius - config.hand_radius
-            apart -= config.clearance[PEOPLE]
-            if apart < least:
-                least, part, thing = apart, capsule, NEAR_HAND
+            gap_m = between_segments(placed[capsule], forearm, near) - radius - config.hand_radius
+            gap_m -= config.clearance[PEOPLE]
+            if gap_m < least:
+                least, part, thing = gap_m, capsule, NEAR_HAND
         for box in range(len(boxes)):
             inner = nearest_to_box(placed[capsule], boxes[box])
-            apart = to_box(placed[capsule], inner, boxes[box], near) - radius - config.clearance[THINGS]
-            if apart < least:
-                least, part, thing = apart, capsule, box
+            gap_m = to_box(placed[capsule], inner, boxes[box], near) - radius - config.clearance[THINGS]
+            if gap_m < least:
+                least, part, thing = gap_m, capsule, box
     for pair in range(len(pairs)):
-        one, other = pairs[pair]
-        apart = between_segments(placed[one], placed[other], near) - config.clearance[ITSELF]
-        apart -= capsules[one].radius + capsules[other].radius
-        if apart < least:
-            least, part, thing = apart, other, NEAR_ITSELF
+        first, other = pairs[pair]
+        gap_m = between_segments(placed[first], placed[other], near) - config.clearance[ITSELF]
+        gap_m -= capsules[first].radius + capsules[other].radius
+        if gap_m < least:
+            least, part, thing = gap_m, other, NEAR_ITSELF
     return least, part, thing

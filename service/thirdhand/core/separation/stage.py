@@ -107,13 +107,13 @@ class Separation:
 
     def set_contacts(self, via_points: Iterable[ViaPoint]) -> None:
         """Allow the tool to touch a hand at the via-points where it goes with that hand."""
-        found = [
+        contacts = [
             (np.array([p.left, p.right]), p.radius, ("left", "right").index(p.follow))
             for p in via_points
             if p.follow != "none"
         ]
-        self._contacts = structured(len(found), CONTACT)
-        self._contacts[:] = found
+        self._contacts = structured(len(contacts), CONTACT)
+        self._contacts[:] = contacts
 
     def step(self, state: Record, frame: Record, here: Records) -> None:
         """Update the constraints for the state's hands and the arm's kinematics `here` (1,)."""
@@ -135,10 +135,10 @@ class Separation:
         People, things and the arm itself count. Also returns the number of the nearest capsule, and
         what it is nearest to: the number of a box (0 is the table), NEAR_HAND or NEAR_ITSELF.
         """
-        found: tuple[float, int, int] = clearance(
+        nearest: tuple[float, int, int] = clearance(
             joints, hands, self._parameters, self._capsules, self._pairs, self._boxes
         )
-        return found
+        return nearest
 
     def intrusion(self, joints: Vector) -> tuple[float, int, int]:
         """Depth [m] to which the arm is inside of a thing or of itself; below 0 if it is not.

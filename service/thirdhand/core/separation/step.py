@@ -420,7 +420,7 @@ def share_of(constraints: Records, count: int, velocity: Vector, parameters: Rec
 @compiled
 def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
     """`Separation.excess`, and the number of the constraint with the largest excess."""
-    most, which = -math.inf, 0
+    most, number = -math.inf, 0
     for k in range(count):
         constraint = constraints[k]
         now = crest = 0.0
@@ -428,5 +428,5 @@ def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: V
             now += constraint.row[j] * dq[j]
             crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
         if max(now, crest) - constraint.allowed > most:
-            most, which = max(now, crest) - constraint.allowed, k
-    return most, which
+            most, number = max(now, crest) - constraint.allowed, k
+    return most, number

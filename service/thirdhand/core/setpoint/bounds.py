@@ -159,8 +159,8 @@ def take_safe(
             if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + TOLERANCE:
                 is_kept = False
                 continue
-            here = farthest(setpoint, i, side, max_acceleration, max_jerk, return_speed)
-            if farthest(ahead, i, side, max_acceleration, max_jerk, return_speed) > here - required_return_m + ROUNDING:
+            farthest_m = farthest(setpoint, i, side, max_acceleration, max_jerk, return_speed)
+            if farthest(ahead, i, side, max_acceleration, max_jerk, return_speed) > farthest_m - required_return_m + ROUNDING:
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
                 is_mixed = True
     if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
@@ -224,8 +224,8 @@ def speed_to_come(velocity: Vector, acceleration: Vector, max_jerk: float, least
     """
     total = 0.0
     for i in range(3):
-        then = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * max_jerk)
-        total += max(abs(velocity[i]), abs(then), least) ** 2
+        crest = velocity[i] + acceleration[i] * abs(acceleration[i]) / (2.0 * max_jerk)
+        total += max(abs(velocity[i]), abs(crest), least) ** 2
     return math.sqrt(total)
 
 
@@ -297,12 +297,12 @@ def stopping(
     `growth` [m] is how much the length grows by itself in a period. A secant method finds the
     jerk, to STOP_SECANT_TOLERANCE_M of h'.
     """
-    (brake, change), (wanted, chosen) = brakes, jerks
+    (brake, change), (top_jerk, chosen) = brakes, jerks
     limit = length + growth - retained * (length - stop_distance(v, a, brake, change))
-    most, passed = _stop_after(v, a, wanted, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
+    most, passed = _stop_after(v, a, top_jerk, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
     for _ in range(STOP_SECANTS):
-        chosen = between(wanted, chosen, most, passed, limit)
-        if chosen >= wanted:
+        chosen = between(top_jerk, chosen, most, passed, limit)
+        if chosen >= top_jerk:
             break
         passed = _stop_after(v, a, chosen, brakes, dt)
         if limit - passed < STOP_SECANT_TOLERANCE_M:

@@ -70,7 +70,7 @@ def turn_orientation(
     of +z is followed, e is its shortest turn and target_turning loses its component about +z.
     """
     config, dt = parameters[0], parameters[0].period_s
-    error, wanted, axis = np.empty(3), np.empty(3), np.empty(3)
+    error, desired, axis = np.empty(3), np.empty(3), np.empty(3)
     axis_of(quaternion, axis)
     along = 0.0
     if config.about:
@@ -85,12 +85,12 @@ def turn_orientation(
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle
     for i in range(3):
-        wanted[i] = target_turning[i] - along * axis[i] + rate * error[i]
-    slower = min(1.0, config.max_speed / max(norm(wanted), ROUNDING))
+        desired[i] = target_turning[i] - along * axis[i] + rate * error[i]
+    slower = min(1.0, config.max_speed / max(norm(desired), ROUNDING))
     for i in range(3):
-        wanted[i] = slower * wanted[i] - turning[i]
-    share = min(1.0, config.max_acceleration * dt / max(norm(wanted), ROUNDING))
+        desired[i] = slower * desired[i] - turning[i]
+    share = min(1.0, config.max_acceleration * dt / max(norm(desired), ROUNDING))
     for i in range(3):
-        turning[i] = np.rint((turning[i] + share * wanted[i]) * ROUND_TO) / ROUND_TO
-        wanted[i] = dt * turning[i]
-    turn_on(quaternion, wanted)
+        turning[i] = np.rint((turning[i] + share * desired[i]) * ROUND_TO) / ROUND_TO
+        desired[i] = dt * turning[i]
+    turn_on(quaternion, desired)

@@ -176,8 +176,8 @@ class SetpointStage:
         met = self._position.step(state, target, box, self._costs, slow)
         closure = float(states["closure"][0])
         if closure != NO_GRIPPER:
-            off = math.dist(wanted.target.position.tolist(), tool.tolist())
-            self._grip(state, closure, off)
+            distance_m = math.dist(wanted.target.position.tolist(), tool.tolist())
+            self._grip(state, closure, distance_m)
         elif self._takes_wishes:
             self._grip(state, float(state["gripper_wish"]), 0.0)
         finish(states, frames, self._orientation.limits(state))

@@ -250,8 +250,8 @@ def _coasting(speed: float, a: float, jerk: float, change: float, dt: float) -> 
 
     v + dt (a + dt jerk / 2) + a' |a'| / (2 change),    a' = a + dt jerk
     """
-    then = a + dt * jerk
-    return speed + dt * (a + 0.5 * dt * jerk) + then * abs(then) / (2.0 * change)
+    a_end = a + dt * jerk
+    return speed + dt * (a + 0.5 * dt * jerk) + a_end * abs(a_end) / (2.0 * change)
 
 
 @compiled

@@ -34,8 +34,8 @@ def gains_for(settings: Settings, tuning: Tuning = TUNING) -> Vector:
     tool, numbers = settings.tool, tuning.setpoint
     # [1/m] jerk gain / max_jerk of a tool with little jerk
     stiffest_per_m = 3.0 / numbers.hull_margin_m
-    own = max(numbers.tracker_rate_share * tool.jerk / tool.acceleration, math.cbrt(stiffest_per_m * tool.jerk))
-    quickest = min(numbers.tracker_rate_share * acceleration_rate(settings.joints), own, 0.5 * settings.rate_hz)
+    tool_rate = max(numbers.tracker_rate_share * tool.jerk / tool.acceleration, math.cbrt(stiffest_per_m * tool.jerk))
+    quickest = min(numbers.tracker_rate_share * acceleration_rate(settings.joints), tool_rate, 0.5 * settings.rate_hz)
     return tracker_gains(max(numbers.jerk_weight, max(quickest, SLOWEST_PER_S) ** -6), tuning.intake)
 
 

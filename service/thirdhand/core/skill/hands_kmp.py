@@ -75,8 +75,8 @@ class HandsKMP:
     @property
     def order(self) -> int:
         """Number of rows of the hands' memory that are inputs."""
-        beside = TURN_INPUTS * self.turned + self.is_timed
-        return min(max((int(self.primitive.inputs.shape[1]) - beside) // 6 - 1, 0), ORDER)
+        extra_inputs = TURN_INPUTS * self.turned + self.is_timed
+        return min(max((int(self.primitive.inputs.shape[1]) - extra_inputs) // 6 - 1, 0), ORDER)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -117,14 +117,14 @@ class HandsKMP:
         The covariance, which takes as long as all else, is computed only if it is not `known`.
         """
         moving = self._moving(seen)
-        found = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
-        covariance = found.covariance if known is None else known
+        motion = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
+        covariance = motion.covariance if known is None else known
         assert covariance is not None
         out = np.empty((6, 3))
-        deviation = _rounded(found.mean, found.velocity, found.acceleration, covariance, out)
+        deviation = _rounded(motion.mean, motion.velocity, motion.acceleration, covariance, out)
         if known is None and self.errors is not None:
-            errors, at = self.errors, np.ascontiguousarray(moving[0])
-            local_scatter(at, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
+            errors, inputs = self.errors, np.ascontiguousarray(moving[0])
+            local_scatter(inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
         if known is not None and self.errors is not None:
             deviation = math.nan
@@ -150,9 +150,9 @@ class HandsKMP:
         usual = self._usual_turns
         out = [hands, np.zeros((len(hands), 6 * self.order)), np.tile(usual, (len(hands), 1))]
         if self.is_timed:
-            known = self.primitive.base.inputs
-            nearest = ((hands[:, None] - known[:, :6]) ** 2).sum(axis=2).argmin(axis=1)
-            out.append(known[nearest, -1:])
+            learned = self.primitive.base.inputs
+            nearest = ((hands[:, None] - learned[:, :6]) ** 2).sum(axis=2).argmin(axis=1)
+            out.append(learned[nearest, -1:])
         return np.hstack(out)
 
     @property

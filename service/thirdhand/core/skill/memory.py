@@ -70,12 +70,12 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
     width = moving.shape[1]
     for i in range(width):
         out[0, i], out[1, i], out[2, i] = moving[0, i], moving[1, i], moving[2, i]
-        at, velocity, acceleration = moving[0, i], moving[1, i], moving[2, i]
+        position, velocity, acceleration = moving[0, i], moving[1, i], moving[2, i]
         for row in range(len(memory)):
             value = memory[row, i]
-            acceleration = (velocity - (at - value) / MEMORY_LAG_S) / MEMORY_LAG_S
-            velocity = (at - value) / MEMORY_LAG_S
-            at = value
+            acceleration = (velocity - (position - value) / MEMORY_LAG_S) / MEMORY_LAG_S
+            velocity = (position - value) / MEMORY_LAG_S
+            position = value
             column = (row + 1) * width + i
             out[0, column] = value - moving[0, i]
             out[1, column] = velocity - moving[1, i]

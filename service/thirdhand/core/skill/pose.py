@@ -65,14 +65,14 @@ class LearnedOrientation:
         """Orientation at an input (I,) with its velocity (I,), rounded to 1 µrad. A `covariance`
         (3, 3) [rad²] that was predicted before may be given; it is then returned as it is.
         """
-        found = self.primitive.predict_motion(at, velocity, np.zeros_like(at), covariance=covariance is None)
+        motion = self.primitive.predict_motion(at, velocity, np.zeros_like(at), covariance=covariance is None)
         quaternion, turning = self.auxiliary.copy(), np.empty(3)
-        if found.covariance is None:
+        if motion.covariance is None:
             assert covariance is not None
-            _turned(found.mean, found.velocity, _NOTHING, quaternion, turning, np.empty((3, 3)))
+            _turned(motion.mean, motion.velocity, _NOTHING, quaternion, turning, np.empty((3, 3)))
             return Turn(quaternion, turning, covariance)
         turned = np.empty((3, 3))
-        _turned(found.mean, found.velocity, found.covariance, quaternion, turning, turned)
+        _turned(motion.mean, motion.velocity, motion.covariance, quaternion, turning, turned)
         return Turn(quaternion, turning, turned)
 
 
@@ -84,8 +84,8 @@ class LearnedGripper:
 
     def predict(self, at: Vector) -> float:
         """Closure at an input (I,), clipped to 0 ... 1 and rounded."""
-        found = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
-        return round(min(max(float(found.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
+        motion = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
+        return round(min(max(float(motion.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
 
 
 _NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be computed

@@ -115,8 +115,8 @@ class Placed(Immutable):
         else:
             sizes["clock_weight"] = clock.weight
         centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
-        apart = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
-        wrong = error_table(np.hstack([errors[:, :2], apart]), errors[:, 3:]) if len(errors) else NO_ERRORS
+        columns = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
+        wrong = error_table(np.hstack([errors[:, :2], columns]), errors[:, 3:]) if len(errors) else NO_ERRORS
         return cls(segments, sizes, centres, wrong, NO_PULLS)
 
     def pulled(self, pulls: Vector) -> Placed:
@@ -154,9 +154,9 @@ class Placed(Immutable):
         tempos, the hands are at rest.
         """
         out = np.empty((len(hands), 3))
-        for t, (one, belief) in enumerate(zip(hands, beliefs, strict=True)):
+        for t, (sample, belief) in enumerate(zip(hands, beliefs, strict=True)):
             tempo = RESTING_TEMPO if tempos is None else tempos[t]
-            expected(belief, self._tools(one, tempo, belief, self.pulls), out[t])
+            expected(belief, self._tools(sample, tempo, belief, self.pulls), out[t])
         return out
 
     def _tools(self, hands: Vector, tempo: Vector, belief: Vector, pulls: Vector) -> Vector:
@@ -164,13 +164,13 @@ class Placed(Immutable):
         LEAST_SEGMENT_PROBABILITY.
         """
         out = np.empty((1, len(self.segments), 3))
-        now, at = np.array(hands[None], order="C"), np.array(tempo[None], order="C")
-        tools_at(now, at, belief, self.segments, self.sizes, self.centres, pulls, out)
+        now, tempos = np.array(hands[None], order="C"), np.array(tempo[None], order="C")
+        tools_at(now, tempos, belief, self.segments, self.sizes, self.centres, pulls, out)
         return np.asarray(out[0])
 
     def gates_m(self, hands: Vector) -> Vector:
         """Distances (T,) [m] of hands (T, 6) from the task, see `segments.off_all`."""
-        return np.array([off_all(np.ascontiguousarray(one), self.segments) for one in hands])
+        return np.array([off_all(np.ascontiguousarray(sample), self.segments) for sample in hands])
 
     def covariance(self, hands: Vector, belief: Vector, tempo: Vector = RESTING_TEMPO) -> Vector:
         """Covariance (3, 3) [m²] of the tool, rounded, for hands (6 or 24,), a belief and a tempo
@@ -239,8 +239,8 @@ class SegmentedKMP:
     @cached_property
     def hands(self) -> Vector:
         """Hands (K + 1, 6) [m] at the via-points."""
-        begins, way = (self._unpulled.segments[name].reshape(-1, 6) for name in ("begins", "way"))
-        return np.concatenate([begins, begins[-1:] + way[-1:]])
+        begins, paths = (self._unpulled.segments[name].reshape(-1, 6) for name in ("begins", "way"))
+        return np.concatenate([begins, begins[-1:] + paths[-1:]])
 
     @cached_property
     def placed(self) -> Placed:
@@ -257,12 +257,12 @@ class SegmentedKMP:
     @cached_property
     def _unpulled(self) -> Placed:
         """Segments between the via-points in force, without pulls."""
-        at = self.nominal.moved(self.via_points)
-        return Placed.of(self.task, at, self.off, self.primitive, self.errors, self.clock, self.unknown)
+        points = self.nominal.moved(self.via_points)
+        return Placed.of(self.task, points, self.off, self.primitive, self.errors, self.clock, self.unknown)
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
-        return self._unpulled.mean(hands, np.array([self._unpulled.belief(one) for one in hands]), self._tempos(hands))
+        return self._unpulled.mean(hands, np.array([self._unpulled.belief(sample) for sample in hands]), self._tempos(hands))
 
     def belief(self, hands: Vector) -> Vector:
         return self.placed.belief(hands)
@@ -271,14 +271,14 @@ class SegmentedKMP:
         """Motion of the tool: equation (8) of Huang et al. 2019, differences along the hands'
         motion, and the covariance of errors in held-out demonstrations, see `segments.predicted`.
         """
-        at, out = self.placed, np.empty((6, 3))
-        errors = at.errors if known is None else NO_ERRORS
-        gate_m, ambiguity = predicted(seen, self.turned, at.segments, at.sizes, at.centres, at.pulls, errors, out)
+        placed, out = self.placed, np.empty((6, 3))
+        errors = placed.errors if known is None else NO_ERRORS
+        gate_m, ambiguity = predicted(seen, self.turned, placed.segments, placed.sizes, placed.centres, placed.pulls, errors, out)
         return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
 
     def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
-        at = self.placed
-        return elsewhere(now, stillness, period_s, belief, unprimed, at.segments, at.sizes, at.centres)
+        placed = self.placed
+        return elsewhere(now, stillness, period_s, belief, unprimed, placed.segments, placed.sizes, placed.centres)
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
@@ -294,7 +294,7 @@ class SegmentedKMP:
         """Beliefs (T, MOST_SEGMENTS) for hands (T, 6) at rest. At a via-point named in `names`, the
         belief is the segment that ends there; at the first one, the segment that begins there.
         """
-        out = np.array([self.placed.belief(one) for one in hands]).reshape(-1, MOST_SEGMENTS)
+        out = np.array([self.placed.belief(sample) for sample in hands]).reshape(-1, MOST_SEGMENTS)
         for row, name in zip(out, names, strict=bool(names)):
             if name in self.names:
                 row[:] = 0.0
@@ -313,7 +313,7 @@ class SegmentedKMP:
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         rows = zip(hands, self._beliefs(hands, names), self._tempos(hands, names)[:, 2], strict=True)
-        return np.array([self._input(one, belief, clock_s=float(clock_s)) for one, belief, clock_s in rows]).reshape(
+        return np.array([self._input(sample, belief, clock_s=float(clock_s)) for sample, belief, clock_s in rows]).reshape(
             -1, self.shape[0]
         )
 
@@ -370,10 +370,10 @@ class SegmentedKMP:
         }
         check_shapes(arrays, shapes)
         errors = np.hstack([arrays["seen"], arrays["errors"]])
-        off, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
+        distances_m, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
         nominal, unknown = NamedViaPoints(task.names, arrays["nominal"]), None
         clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
         if "unknown_std" in arrays:
             check_shapes(arrays, {"scatters": (count, 3, 3)})
             unknown = Unknown(float(arrays["unknown_std"]), np.ascontiguousarray(arrays["scatters"], np.float64))
-        return cls(from_arrays(arrays), task, nominal, off, errors, delay_s, via_points, clock, unknown)
+        return cls(from_arrays(arrays), task, nominal, distances_m, errors, delay_s, via_points, clock, unknown)

@@ -100,10 +100,10 @@ def on_way(hand: Vector, segment: Record, side: int) -> tuple[float, float]:
         for i in range(3):
             along += (hand[i] - begins[i]) * path[i]
         along = min(max(along / square, 0.0), 1.0)
-    off = 0.0
+    square_sum = 0.0
     for i in range(3):
-        off += (hand[i] - begins[i] - along * path[i]) ** 2
-    return along if square > STAYS else 1.0, math.sqrt(off)
+        square_sum += (hand[i] - begins[i] - along * path[i]) ** 2
+    return along if square > STAYS else 1.0, math.sqrt(square_sum)
 
 
 @compiled
@@ -124,8 +124,8 @@ def along_way(hand: Vector, still: float, segment: Record, side: int) -> float:
     from_end = min(along, 1.0 - along) * max(math.sqrt(square), FULL_PATH_M)
     near = min(max((PATH_MIDDLE_M - from_end) / (PATH_MIDDLE_M - PATH_END_M), 0.0), 1.0)
     power = 1.0 + (REST_SHARPNESS - 1.0) * near * still
-    one, other = along**power, (1.0 - along) ** power
-    return float(one / (one + other))
+    covered, other = along**power, (1.0 - along) ** power
+    return float(covered / (covered + other))
 
 
 @compiled
@@ -133,12 +133,12 @@ def along_both(hands: Vector, still: Vector, segment: Record) -> tuple[float, fl
     """Shares of the segment, by `along_way`, of both hands (6 or more,) with the stillness (2,). If
     one hand leads the segment, its share counts for both.
     """
-    one, other = along_way(hands[:3], still[0], segment, 0), along_way(hands[3:6], still[1], segment, 1)
+    left, other = along_way(hands[:3], still[0], segment, 0), along_way(hands[3:6], still[1], segment, 1)
     if segment["leads"] == LEFT:
-        other = one
+        other = left
     elif segment["leads"] == RIGHT:
-        one = other
-    return one, other
+        left = other
+    return left, other
 
 
 @compiled
@@ -165,10 +165,10 @@ def _likely(moving: Vector, segment: Record) -> float:
     """
     out = 0.0
     for side in range(2):
-        here = slice(3 * side, 3 * side + 3)
-        _, off = on_way(moving[0, here], segment, side)
-        out -= 0.5 * min((off / segment["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
-        length, velocity = segment["square"][side], moving[1, here]
+        columns = slice(3 * side, 3 * side + 3)
+        _, distance_m = on_way(moving[0, columns], segment, side)
+        out -= 0.5 * min((distance_m / segment["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
+        length, velocity = segment["square"][side], moving[1, columns]
         goes = dot(velocity, segment["way"][side]) / math.sqrt(length) if length > STAYS else -norm(velocity)
         out += tanh(goes / DIRECTION_SPEED_MPS)
     return out
@@ -265,10 +265,10 @@ def add_followed(hands: Vector, share: float, segment: Record, out: Vector) -> N
             goes = (share if end else 1.0 - share) ** power
             for i in range(3):
                 if turns:
-                    off = hands[3 * side + i] - segment["tool"][i] - end * segment["tool_way"][i]
+                    offset = hands[3 * side + i] - segment["tool"][i] - end * segment["tool_way"][i]
                     for j in range(3):
-                        off += hands[6 + 9 * side + 3 * i + j] * segment["levers"][end, j]
-                    out[i] += goes * off
+                        offset += hands[6 + 9 * side + 3 * i + j] * segment["levers"][end, j]
+                    out[i] += goes * offset
                 else:
                     out[i] += goes * (hands[3 * side + i] - segment["begins"][side, i] - end * segment["way"][side, i])
 
@@ -316,7 +316,7 @@ def tools_at(
         (s, δ) = prior + Σ_r exp(-scale |x - c_r|²) W_r
     """
     size, count, padded = sizes[0], len(segments), centres.shape[1]
-    x, found, values, room = np.empty(3 + count), np.empty(OUTPUTS), np.empty(padded), np.empty(padded)
+    x, outputs, values, room = np.empty(3 + count), np.empty(OUTPUTS), np.empty(padded), np.empty(padded)
     for k in range(count):
         if belief[k] >= LEAST_SEGMENT_PROBABILITY:
             x[:] = 0.0
@@ -324,9 +324,9 @@ def tools_at(
             for m in range(len(hands)):
                 x[0], x[1] = along_both(hands[m], tempos[m], segments[k])
                 x[2 + count] = size["clock_weight"] * tempos[m, 2]
-                found[:] = size["prior"]
-                add_table(x, centres, size["scale"], values, room, found)
-                out[m, k] = _tool_of(hands[m], found[0], found[1:], segments[k], size, pulls)
+                outputs[:] = size["prior"]
+                add_table(x, centres, size["scale"], values, room, outputs)
+                out[m, k] = _tool_of(hands[m], outputs[0], outputs[1:], segments[k], size, pulls)
 
 
 @compiled
@@ -450,12 +450,12 @@ def scatter(
         share = _tool_share(tools[k], segments[k]) if mass else 0.0
         for i in range(3):
             for j in range(i, 3):
-                found = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j]) + near[1 + 3 * i + j] / total
+                covariance = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j]) + near[1 + 3 * i + j] / total
                 if mass:
-                    found += mass * size["unknown_std"] ** 2 / total if i == j else 0.0
+                    covariance += mass * size["unknown_std"] ** 2 / total if i == j else 0.0
                     begin, end = segments[k]["scatter"][0, i, j], segments[k]["scatter"][1, i, j]
-                    found += (1.0 - share) ** 2 * begin + share**2 * end
-                out[i, j] += belief[k] * found
+                    covariance += (1.0 - share) ** 2 * begin + share**2 * end
+                out[i, j] += belief[k] * covariance
     for i in range(3):
         for j in range(i, 3):
             out[i, j] /= in_all
@@ -487,12 +487,12 @@ def elsewhere(
     if unprimed[0] == UNPRIMED_DECIDED:
         return 0.0
     recognise(unprimed, now, period_s, segments, 1.0)
-    count, most, apart = len(segments), 0, 0.0
+    count, most, difference = len(segments), 0, 0.0
     for k in range(count):
-        apart = max(apart, abs(unprimed[k] - belief[k]))
+        difference = max(difference, abs(unprimed[k] - belief[k]))
         if belief[k] > belief[most]:
             most = k
-    if apart < LEAST_SEGMENT_PROBABILITY:
+    if difference < LEAST_SEGMENT_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
     either, tools, tempos = np.empty(count), np.empty((1, count, 3)), np.zeros((1, 3))

@@ -212,9 +212,9 @@ class Skill(Immutable):
             delayed(now, behind, late_s, moving)
         if self.conductor is not None:
             stillness = stillness[[self.conductor] * 2]
-        told = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
+        rotations = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
         return self.predicted(
-            Seen(moving, stillness, behind, told, turn_lag_s(late_s), now, belief, period_s, clock), before
+            Seen(moving, stillness, behind, rotations, turn_lag_s(late_s), now, belief, period_s, clock), before
         )
 
     def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
@@ -224,13 +224,13 @@ class Skill(Immutable):
             motion = motion._replace(gate_m=before[3])
         if self.turn is None and self.gripper is None:
             return Prediction(*motion, self.constant_turn, NO_GRIPPER)
-        at, velocity = self.model.moving_inputs(seen)
+        inputs, velocity = self.model.moving_inputs(seen)
         turn = self.constant_turn
         if self.turn is not None:
-            turn = self.turn.predict(at, velocity, covariance=None if before is None else before[1])
+            turn = self.turn.predict(inputs, velocity, covariance=None if before is None else before[1])
         if self.gripper is None or before is not None:
             return Prediction(*motion, turn, NO_GRIPPER if before is None else before[2])
-        return Prediction(*motion, turn, self.gripper.predict(at))
+        return Prediction(*motion, turn, self.gripper.predict(inputs))
 
     def _conducting(self, both: Vector) -> Vector:
         """Arrays of both hands (M, 2, D). If one hand leads alone, the other hand's values are

@@ -32,10 +32,10 @@ class SkillStage:
         self.skill = skill
         late_s = skill.model.delay_s - self._lead_s
         delay_s = max(late_s, 0.0)
-        past, turns, still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
+        memory, turns, still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
         # `recall` writes to this; belief and clock are those of the state
         self._seen = Seen(
-            np.empty((3, 6)), still, past, turns, turn_lag_s(late_s), np.empty((3, 6)), np.empty(0), self._period_s
+            np.empty((3, 6)), still, memory, turns, turn_lag_s(late_s), np.empty((3, 6)), np.empty(0), self._period_s
         )
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
@@ -84,34 +84,34 @@ class SkillStage:
         """
         states, frames, rules = as_array(state), as_array(frame), self.rules
         self._count(state)
-        seen = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
-        is_new, before, known = recall(states, rules, seen), None, state["covariance"]
+        motion = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
+        is_new, before, covariance = recall(states, rules, motion), None, state["covariance"]
         if not is_new:
             before = (
-                known,
+                covariance,
                 state["orientation_covariance"],
                 float(states["closure"][0]),
                 float(states["known_gate_m"][0]),
             )
-        found = self.skill.predicted(seen, before)
+        prediction = self.skill.predicted(motion, before)
         if is_new:
-            state["known_gate_m"] = found.gate_m
-        off = 0.0
+            state["known_gate_m"] = prediction.gate_m
+        error_m = 0.0
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
-            again = found.covariance, found.turn.covariance, found.closure, found.gate_m  # need not be computed
+            earlier = prediction.covariance, prediction.turn.covariance, prediction.closure, prediction.gate_m  # need not be computed
             deviation = deviation_m(states, rules, unseen)
-            off = off_m(lambda hands: self.skill.predicted(hands, again).position, seen, columns, deviation)
+            error_m = off_m(lambda hands: self.skill.predicted(hands, earlier).position, motion, columns, deviation)
         doubt, unprimed = 0.0, state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
-            doubt = self.skill.model.elsewhere(seen.now, seen.stillness, self._period_s, seen.belief, unprimed)
-        outcome = conclude(states, frames, rules, found[:6], found.turn, found.closure, off, doubt)
-        target = Target(*found[:3], clamped=False)
+            doubt = self.skill.model.elsewhere(motion.now, motion.stillness, self._period_s, motion.belief, unprimed)
+        outcome = conclude(states, frames, rules, prediction[:6], prediction.turn, prediction.closure, error_m, doubt)
+        target = Target(*prediction[:3], clamped=False)
         if outcome & IS_OUTSIDE:
-            target = clamp(*found[:3], box=self.skill.workspace, reach=self._reach)
+            target = clamp(*prediction[:3], box=self.skill.workspace, reach=self._reach)
             frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
         is_ambiguous = bool(outcome & IS_AMBIGUOUS)
-        return Wanted(target, found.turn.orientation, found.turn.velocity, found.gate_m, is_ambiguous, off > UNSURE_M)
+        return Wanted(target, prediction.turn.orientation, prediction.turn.velocity, prediction.gate_m, is_ambiguous, error_m > UNSURE_M)
 
     def _count(self, state: Record) -> None:
         """Advance the clock of the task to this tick, if the skill has one. While a hand is not

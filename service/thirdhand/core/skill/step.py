@@ -47,8 +47,8 @@ def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, 
     """
     for i in range(3):
         for j in range(3):
-            found = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
-            out[i, j] = np.rint(found * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
+            variance = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
+            out[i, j] = np.rint(variance * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
     mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0  # from here on, the largest eigenvalue: Smith 1961
     a, b, c = out[0, 0] - mean, out[1, 1] - mean, out[2, 2] - mean
     d, e, f = out[0, 1], out[0, 2], out[1, 2]
@@ -92,8 +92,8 @@ def conclude(
     passed_s, state.trail_tick = (state.tick - state.trail_tick) * rule.period_s, state.tick
     moved = recent(position, passed_s, state.trail)
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
-    found = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
-    frame.error_probability = found + (1.0 - found) * doubt
+    probability = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
+    frame.error_probability = probability + (1.0 - probability) * doubt
     ease = rule.end_share if state.unsure else 1.0
     if rule.alarm > 0.0:
         state.unsure = frame.error_probability > ease * rule.alarm

@@ -58,8 +58,8 @@ class LocalErrors(Immutable):
     def covariances(self, inputs: Vector) -> Vector:
         """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
         out = np.empty((len(inputs), 3, 3))
-        for at, found in zip(np.array(inputs, order="C"), out, strict=True):
-            local_scatter(at, self.stretch, self.table, self.unknown_std_m, found)
+        for row, covariance in zip(np.array(inputs, order="C"), out, strict=True):
+            local_scatter(row, self.stretch, self.table, self.unknown_std_m, covariance)
         return out
 
 
@@ -105,15 +105,15 @@ def error_probability(covariance: Vector, added: float, ratios: Vector) -> float
         return 0.0
     ratio = UNSURE_M**2 / trace
     if ratio <= ratios[0]:
-        found = 1.0 - LEVELS[0] * ratio / ratios[0]
+        probability = 1.0 - LEVELS[0] * ratio / ratios[0]
     else:
         k = 1
         while k < len(ratios) - 1 and ratio > ratios[k]:
             k += 1
         width = max(log(ratios[k] / ratios[k - 1]), 1e-3)
         along = log(ratio / ratios[k - 1]) / width
-        found = exp(-(SURVIVAL[k - 1] + along * (SURVIVAL[k] - SURVIVAL[k - 1])))
-    return float(np.rint(found * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO)
+        probability = exp(-(SURVIVAL[k - 1] + along * (SURVIVAL[k] - SURVIVAL[k - 1])))
+    return float(np.rint(probability * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO)
 
 
 @compiled

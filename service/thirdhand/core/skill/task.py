@@ -63,19 +63,19 @@ class Task(NamedTuple):
         rests.
         """
         rows = [points.names.index(name) for name in self.names]
-        at, known = points.at[rows], np.array([not points.known or name in points.known for name in self.names])
+        positions, is_known = points.at[rows], np.array([not points.known or name in points.known for name in self.names])
         hands = np.empty((len(rows), 2, 3))
         for side in (0, 1):
             for corner in range(int(self.corners[:, side].max()) + 1):
-                here = self.corners[:, side] == corner
-                told = here & known if (here & known).any() else here
-                hands[here, side] = at[told, 3 * side : 3 * side + 3].mean(axis=0)
+                at_corner = self.corners[:, side] == corner
+                averaged = at_corner & is_known if (at_corner & is_known).any() else at_corner
+                hands[at_corner, side] = positions[averaged, 3 * side : 3 * side + 3].mean(axis=0)
         out = structured(len(rows) - 1, SEGMENT)
         out["begins"], out["way"] = hands[:-1], np.diff(hands, axis=0)
         square = (out["way"] ** 2).sum(axis=2)
         out["square"] = np.where(square > LEAST_PATH_M**2, square, STAYS)
         out["way"] *= (out["square"] > STAYS)[:, :, None]
-        out["off"], out["tool"], out["tool_way"] = off, at[:-1, 6:], np.diff(at[:, 6:], axis=0)
+        out["off"], out["tool"], out["tool_way"] = off, positions[:-1, 6:], np.diff(positions[:, 6:], axis=0)
         out["leads"] = NONE if self.leads == NONE else np.where(out["square"][:, self.leads] > STAYS, self.leads, NONE)
         out["follow"] = np.stack([self.follow[:-1], self.follow[1:]], axis=1)
         if self.levers is not None:
@@ -128,14 +128,14 @@ class NamedViaPoints(NamedTuple):
     @staticmethod
     def of(points: Sequence[ViaPoint]) -> NamedViaPoints:
         """Via-points of a list, with the largest of their standard deviations."""
-        at = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
+        positions = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
         return NamedViaPoints(
-            tuple(point.name for point in points), at, max((point.std for point in points), default=0.0)
+            tuple(point.name for point in points), positions, max((point.std for point in points), default=0.0)
         )
 
     def moved(self, points: Sequence[ViaPoint]) -> NamedViaPoints:
         """These via-points, each replaced by the given one of the same name, if there is one."""
         other = NamedViaPoints.of([point for point in points if point.name in self.names])
-        at = self.at.copy()
-        at[[self.names.index(name) for name in other.names]] = other.at
-        return NamedViaPoints(self.names, at, other.std, other.names)
+        positions = self.at.copy()
+        positions[[self.names.index(name) for name in other.names]] = other.at
+        return NamedViaPoints(self.names, positions, other.std, other.names)

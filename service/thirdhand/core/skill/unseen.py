@@ -43,13 +43,13 @@ def off_m(tool: Callable[[Seen], Vector], seen: Seen, columns: list[int], deviat
     """
     if not columns:
         return 0.0
-    at, off = np.zeros((3, 6)), np.empty((3, 3))
-    resting = seen._replace(moving=at, now=at, turn_lag_s=turn_lag_s(0.0), period_s=0.0)
-    at[0] = seen.now[0]
-    here = tool(resting)
+    motion, differences = np.zeros((3, 6)), np.empty((3, 3))
+    resting = seen._replace(moving=motion, now=motion, turn_lag_s=turn_lag_s(0.0), period_s=0.0)
+    motion[0] = seen.now[0]
+    reference_m = tool(resting)
     for axis in range(3):
-        at[0] = seen.now[0]
+        motion[0] = seen.now[0]
         for column in columns:
-            at[0, column + axis] += math.sqrt(REGION_95) * deviation
-        off[axis] = tool(resting) - here
-    return float(np.linalg.norm(off))
+            motion[0, column + axis] += math.sqrt(REGION_95) * deviation
+        differences[axis] = tool(resting) - reference_m
+    return float(np.linalg.norm(differences))

@@ -25,9 +25,9 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
     outputs: list[Vector] = []
     deviations: list[float] = []
     follow = {"none": np.zeros((3, 6)), "left": np.eye(3, 6), "right": np.eye(3, 6, 3)}
-    here, around = np.zeros((1, 6)), np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
+    centre, around = np.zeros((1, 6)), np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
     for point in via_points:
-        steps = point.radius * around if point.radius else here
+        steps = point.radius * around if point.radius else centre
         inputs.extend(np.array([*point.left, *point.right]) + steps)
         outputs.extend(np.array(point.tool) + steps @ follow[point.follow].T)
         deviations.extend([point.std] * len(steps))
@@ -77,8 +77,8 @@ def pulls_through(
     if not len(inputs):
         return inputs, outputs.reshape(0, 3)
     centres = np.concatenate([inputs, unchanged])
-    off = np.concatenate([outputs - mean(inputs), np.zeros((len(unchanged), 3))])
+    errors = np.concatenate([outputs - mean(inputs), np.zeros((len(unchanged), 3))])
     square = ((centres[:, None] - centres) ** 2).sum(axis=2)
     noise = np.concatenate([deviations**2, np.zeros(len(unchanged))]) + LEAST_PULL_VARIANCE_SHARE
-    weights = np.linalg.solve(np.exp(-sharpness * square) + np.diag(noise), off)
+    weights = np.linalg.solve(np.exp(-sharpness * square) + np.diag(noise), errors)
     return centres, np.asarray(np.round(weights, PULL_DECIMALS), np.float64)

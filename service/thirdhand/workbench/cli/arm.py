@@ -129,8 +129,8 @@ def text(proposal: Proposal, path: Path) -> str:
         f"{100 * proposal.margin:.0f} % of half a range away",
     ]
     where = "in this posture" if proposal.unmet else "where the demo's tool goes"
-    for number, (direction, one) in enumerate(proposal.tool_limits.items()):
-        lines.append(f"  {'' if number else 'can do':<9} {direction}, {where}: {one.text}")
+    for number, (direction, limit) in enumerate(proposal.tool_limits.items()):
+        lines.append(f"  {'' if number else 'can do':<9} {direction}, {where}: {limit.text}")
     allowed = f"{settings.tool.max_speed:g} m/s and {settings.tool.acceleration:g} m/s²"
     lines.append(f"            [tool] allows {allowed}; a joint in brackets allows less")
     if any(settings.tool.plate_from_tool[3:6]):

@@ -41,7 +41,7 @@ def bundle(args: argparse.Namespace) -> int:
     args.connect = list(reaching(args, settings).connect)
     path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
     check_writable(path)
-    installed = {(one.metadata["Name"], one.version) for one in metadata.distributions()}
+    installed = {(package.metadata["Name"], package.version) for package in metadata.distributions()}
     texts = {
         "status.json": _printed(status, args, json=True, watch=False, exit_code=False),
         "doctor.txt": _printed(doctor, args, json=False, seconds=2.0),
@@ -52,13 +52,13 @@ def bundle(args: argparse.Namespace) -> int:
     texts |= {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()} if settings else {}
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
         folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
-    found = named_after(args.cell, Path(folder)) if folder else []
-    recordings = [one for one in found if one.stat().st_mtime > time.time() - 60 * args.minutes] or found[-1:]
+    candidates = named_after(args.cell, Path(folder)) if folder else []
+    recordings = [file for file in candidates if file.stat().st_mtime > time.time() - 60 * args.minutes] or candidates[-1:]
     about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
-    about += "".join(f"recordings/{one.name}: {one.stat().st_size / MB:.1f} MB\n" for one in recordings)
+    about += "".join(f"recordings/{file.name}: {file.stat().st_size / MB:.1f} MB\n" for file in recordings)
     if not texts["status.json"].startswith("{"):
         about += f"no status: {without_keys(texts['status.json']).strip()}\n"
-    if not found:
+    if not candidates:
         unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
         about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
     texts["README.txt"] = HEAD + about

@@ -55,9 +55,9 @@ HINT_S = 5.0  # progress without a terminal is shown in this interval
 
 def calibrate(args: argparse.Namespace) -> int:
     """Calibrate, check, or both. Exit code 0; 1 if the check finds a hand too far away."""
-    given = points_given(args)
+    points = points_given(args)
     file = Path(args.config) if args.config and args.config not in ARMS else None
-    only_check = args.check and not (args.held or given)
+    only_check = args.check and not (args.held or points)
     if file is not None and not only_check:
         real_path(file)  # before the arm is led in vain
     settings = cell_of(args.config) if args.config else None
@@ -68,17 +68,17 @@ def calibrate(args: argparse.Namespace) -> int:
         if only_check:
             assert file is not None
             return _checked(led, settings, _last(led, file, settings, args.hand), args)
-        found = solved(led, settings, bench_corners(settings), args.hand)
-        record = _record(found.calibration, found.side, found.frame or settings.hands.frame, "held")
-        _show(record, args, found.remarks, lasts_s=float(np.ptp(found.held.hand_s)))
-        _write(file, record, found.frame, settings)
+        solution = solved(led, settings, bench_corners(settings), args.hand)
+        record = _record(solution.calibration, solution.side, solution.frame or settings.hands.frame, "held")
+        _show(record, args, solution.remarks, lasts_s=float(np.ptp(solution.held.hand_s)))
+        _write(file, record, solution.frame, settings)
         return _checked(led, settings, record, args) if args.check else 0
     settings = settings or Settings()
     with (
         inputs_session(args, CONNECT_TIMEOUT_S, settings) as session,
         contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
     ):
-        return _live(live, settings, file, given, only_check, args)
+        return _live(live, settings, file, points, only_check, args)
 
 
 def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:
@@ -131,8 +131,8 @@ def _live(
                 )
             except KeyboardInterrupt:
                 say("ended by Ctrl-C")
-            found = solved(live.led(), settings, corners, side)
-            calibration, frame, remarks = found.calibration, found.frame, list(found.remarks)
+            solution = solved(live.led(), settings, corners, side)
+            calibration, frame, remarks = solution.calibration, solution.frame, list(solution.remarks)
         remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
         record = _record(calibration, side, frame or settings.hands.frame, "points" if given else "held")
         _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
@@ -184,17 +184,17 @@ def _touched(
                 live.collect()
             live.collect()
             try:
-                at = live.touch(side)
+                position_m = live.touch(side)
             except CalibrationError as error:
                 say(f"not used: {error}")
                 continue
             base.append(np.array(given[len(hand)]))
-            hand.append(at)
+            hand.append(position_m)
             if len(hand) >= MIN_POINTS:
                 try:
-                    found = solve_points(np.array(hand), np.array(base), corners, section=section)
+                    calibration = solve_points(np.array(hand), np.array(base), corners, section=section)
                     say(
-                        f"residual {1e3 * found.rms_m:.1f} mm, accuracy {1e3 * found.std_m:.1f} mm; Ctrl-C ends it here"
+                        f"residual {1e3 * calibration.rms_m:.1f} mm, accuracy {1e3 * calibration.std_m:.1f} mm; Ctrl-C ends it here"
                     )
                 except CalibrationError as error:
                     say(f"not enough yet: {error}")
@@ -223,23 +223,23 @@ def _record(calibration: Calibration, hand: str, frame: str, method: str) -> Cal
 
 def _show(record: CalibrationRecord, args: argparse.Namespace, remarks: Sequence[str], *, lasts_s: float) -> None:
     """Print the calibration. Raises CalibrationError if it is less accurate than accepted."""
-    found, stds_mm = record.calibration, [1e3 * std for std in record.calibration.corner_std_m]
+    calibration, stds_mm = record.calibration, [1e3 * std for std in record.calibration.corner_std_m]
     for remark in remarks:
         say(f"remark: {remark}")
-    what = "samples" if record.method == "held" else "points"
-    print(f"{record.hand} hand     {record.method}, {lasts_s:.0f} s, {found.samples} {what}, {found.outliers} outliers")
-    print(f"residual       {1e3 * found.rms_m:.1f} mm rms, {1e3 * found.residual_95_m:.1f} mm (95 %)")
+    kind = "samples" if record.method == "held" else "points"
+    print(f"{record.hand} hand     {record.method}, {lasts_s:.0f} s, {calibration.samples} {kind}, {calibration.outliers} outliers")
+    print(f"residual       {1e3 * calibration.rms_m:.1f} mm rms, {1e3 * calibration.residual_95_m:.1f} mm (95 %)")
     print(
-        f"accuracy       {1e3 * found.std_m:.1f} mm: standard deviation at the corners of the bench, "
+        f"accuracy       {1e3 * calibration.std_m:.1f} mm: standard deviation at the corners of the bench, "
         f"{min(stds_mm):.1f} to {max(stds_mm):.1f} mm"
     )
     if record.method == "held":
-        print("hand in tool   ({:.3f}, {:.3f}, {:.3f}) m".format(*found.hand_in_tool))
-        print(f"delay          {round(1e3 * found.delay_s)} ms of the hand's stamps behind the arm's")
-    if found.std_m > args.accept / 1000:
+        print("hand in tool   ({:.3f}, {:.3f}, {:.3f}) m".format(*calibration.hand_in_tool))
+        print(f"delay          {round(1e3 * calibration.delay_s)} ms of the hand's stamps behind the arm's")
+    if calibration.std_m > args.accept / 1000:
         raise CalibrationError(
-            f"not accurate enough: {1e3 * found.std_m:.1f} mm at the corners of the bench, at most {args.accept:g} mm "
-            f"accepted (--accept). Nothing was written. To improve it, {found.remedy}"
+            f"not accurate enough: {1e3 * calibration.std_m:.1f} mm at the corners of the bench, at most {args.accept:g} mm "
+            f"accepted (--accept). Nothing was written. To improve it, {calibration.remedy}"
         )
 
 
@@ -252,31 +252,31 @@ def _write(file: Path | None, record: CalibrationRecord, frame: str, settings: S
     if file is None:
         print(f"\nWrite this into the cell's settings; --config FILE does it:\n{lines(values, tracker)}", end="")
         return
-    kept = write(file, values, record, tracker)
+    backup = write(file, values, record, tracker)
     print(f"\n{lines(values, tracker)}", end="")
-    print(f"written into {file}; the earlier file is {kept.name}. Start the daemon again to use it")
+    print(f"written into {file}; the earlier file is {backup.name}. Start the daemon again to use it")
 
 
 def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> CalibrationRecord:
     """The last calibration of the tracker in whose frame the hand of a side is; without a side, of
     the calibrated one among those of the hands. Raises CalibrationError.
     """
-    hands = [track for one, track in led.hands.items() if side in (None, one)]
+    hands = [track for hand, track in led.hands.items() if side in (None, hand)]
     if not hands:
         return recorded(file, settings)
-    found, errors = dict[str, CalibrationRecord](), list[CalibrationError]()
+    records, errors = dict[str, CalibrationRecord](), list[CalibrationError]()
     for track in hands:
         try:
             tracker = tracker_of(track, settings)
-            found[tracker] = recorded(file, settings, tracker)
+            records[tracker] = recorded(file, settings, tracker)
         except CalibrationError as error:
             errors.append(error)
-    if len(found) > 1:
-        frames = " and ".join(repr(one.frame) for one in found.values())
+    if len(records) > 1:
+        frames = " and ".join(repr(record.frame) for record in records.values())
         raise CalibrationError(f"the hands are of two trackers, {frames}: give the hand that holds the tool by --hand")
-    if not found:
+    if not records:
         raise errors[0]
-    return next(iter(found.values()))
+    return next(iter(records.values()))
 
 
 def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
@@ -294,6 +294,6 @@ def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args
         say(f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the tracker was recentred")
     is_far = bool(np.median(off_mm) > most_mm)
     advice = ". Does the hand hold the tool as before? Then the tracker has moved: calibrate again" * is_far
-    found = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
-    print(printable_lines(f"{found}; up to {most_mm:.0f} mm accepted{advice}"))
+    text = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
+    print(printable_lines(f"{text}; up to {most_mm:.0f} mm accepted{advice}"))
     return int(is_far)

@@ -29,8 +29,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
     option(c, "--config", "CELL", config)
     how = c.add_mutually_exclusive_group()
     flag(how, "--held", "the hand holds the tool while you lead the arm (the default)")
-    at = "instead, the tracked point of the hand touches this point, in frame base [m], then Enter; four or more points"
-    how.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=at)
+    point = "instead, the tracked point of the hand touches this point, in frame base [m], then Enter; four or more points"
+    how.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=METRES, action="append", help=point)
     check = (
         "measure for 10 s how far the hand is from where it should be while it holds the tool; with --held, after "
         "the calibration, else by the last one"

@@ -180,13 +180,13 @@ def _played_on_page(
 
     def heard(line: str) -> None:
         say(line)
-        if found := REACHED_LINE.fullmatch(line):
-            task.lines.append(f"{EVENT_TITLES[found[1]]}, the tool was {found[2]} off")
+        if match := REACHED_LINE.fullmatch(line):
+            task.lines.append(f"{EVENT_TITLES[match[1]]}, the tool was {match[2]} off")
 
     with Tracker(session) as tracker:
-        shown = MousePage(tracker, client, Latest(session, DEMO_CELL), cell=DEMO_CELL, task=task)
-        with page_served(shown.server, "--mouse", listen) as address:
-            url = f"http://{address}/?token={shown.server.token}"
+        page = MousePage(tracker, client, Latest(session, DEMO_CELL), cell=DEMO_CELL, task=task)
+        with page_served(page.server, "--mouse", listen) as address:
+            url = f"http://{address}/?token={page.server.token}"
             say(f"  {url}")
             invite(url, address, browser=browser)
             report: dict[str, Any] = json.loads(
@@ -213,21 +213,21 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
     recording = status.scribe["recording"]
     if recording is None:
         raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
-    found = reported(recording)
-    timing = found.columns.timing
+    recorded_report = reported(recording)
+    timing = recorded_report.columns.timing
     bench = too_busy(report)
-    begun_s = (report["begun_ns"] - found.columns.start_ns) / 1e9
+    begun_s = (report["begun_ns"] - recorded_report.columns.start_ns) / 1e9
     for name, event in report["events"].items():
         if event["error_mm"] is None:
             event["why"] = NEVER_THERE
         elif not event["reached"]:
-            event["why"] = _why(found, begun_s, report["events"], name)
+            event["why"] = _why(recorded_report, begun_s, report["events"], name)
     return {
         "success": report["success"],
         "events": report["events"],
-        "ticks": len(found.columns.frames),
-        "missed": found.missed,
-        "rate_hz": round(found.rate_hz, 3),
+        "ticks": len(recorded_report.columns.frames),
+        "missed": recorded_report.missed,
+        "rate_hz": round(recorded_report.rate_hz, 3),
         "latency_ms": report["latency_ms"],
         "lateness_us": _percentiles(timing["lateness_us"]),
         "work_us": _percentiles(timing["work_us"]),
@@ -240,12 +240,12 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 def too_busy(report: dict[str, Any]) -> str:
     """A message on a machine that was too busy for the bench; empty if it was not."""
     periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
-    found = []
+    messages = []
     if skipped > MISSED_SHARE * periods:
-        found.append(f"the bench missed {skipped} of its {periods} periods")
+        messages.append(f"the bench missed {skipped} of its {periods} periods")
     if pause_ms > LATE_LOOP_MS:
-        found.append(f"the bench paused for {pause_ms:.0f} ms")
-    return ", ".join(found)
+        messages.append(f"the bench paused for {pause_ms:.0f} ms")
+    return ", ".join(messages)
 
 
 def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
@@ -253,7 +253,7 @@ def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
     from thirdhand.workbench.report.report import why_missed
 
     names = list(events)
-    before = [events[one]["time_s"] for one in names[: names.index(name)]]
+    before = [events[event]["time_s"] for event in names[: names.index(name)]]
     until_s = events[name]["time_s"] + CAUSE_AFTER_S
     return why_missed(found, VIA_POINT_OF_EVENT[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
 
@@ -267,14 +267,14 @@ def _percentiles(values: Any) -> dict[str, float]:
 def text(report: dict[str, Any]) -> str:
     """The report in text, with each cause of a failure once."""
     lines, causes = list[str](), list[str]()
-    for name, what in EVENT_TITLES.items():
+    for name, title in EVENT_TITLES.items():
         event = report["events"][name]
         if event["error_mm"] is None:
-            lines.append(f"  {what:<26} {'MISSED':>27}")
+            lines.append(f"  {title:<26} {'MISSED':>27}")
             lines.append(f"      because {event['why']}")
             continue
         outcome = "reached" if event["reached"] else "MISSED"
-        lines.append(f"  {what:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
+        lines.append(f"  {title:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
         if why := event.get("why"):
             lines.append("      for the same reason" if why in causes else f"      because {why}")
             causes.append(why)

@@ -77,8 +77,8 @@ def _web(args: argparse.Namespace) -> int:
             page = HeadsetPage(tracker, client, Latest(session, args.cell), pinches=pinches, **served)
 
         def listening(address: Address) -> None:
-            shown = Address(certificate.name, address.port) if certificate else address
-            url = f"{page.server.scheme}://{shown}/?token={page.server.token}"
+            page_address = Address(certificate.name, address.port) if certificate else address
+            url = f"{page.server.scheme}://{page_address}/?token={page.server.token}"
             print(url, flush=True)
             if args.mouse:
                 invite(url, address, browser=args.open)
@@ -92,8 +92,8 @@ def _web(args: argparse.Namespace) -> int:
         try:
             serve_page(page.server, "--listen", listen, listening)
         finally:
-            found = page.hands
-            say(f"{found.published} messages with hands published, {found.lost} lost, {found.delayed} too late")
+            counters = page.hands
+            say(f"{counters.published} messages with hands published, {counters.lost} lost, {counters.delayed} too late")
     return 0
 
 
@@ -117,10 +117,10 @@ def _token() -> str:
             private = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with open(private, "w", encoding="utf-8") as file:
                 file.write(new)
-        found = path.read_text(encoding="utf-8").strip()
+        token = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         say(f"the token of this start is not kept ({in_words(error)}): open pages need the new address")
         return new
-    if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", found):
+    if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", token):
         raise ExplainedError(f"{path}: {TOKEN_LENGTH} or more small letters and digits needed; delete it for a new one")
-    return found
+    return token

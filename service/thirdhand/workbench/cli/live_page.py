@@ -59,8 +59,8 @@ class LivePage:
         return answer(200, text, kind=HTML, policy=policy)
 
     async def _status(self, _: web.Request) -> web.Response:
-        shown = self._latest.summary() | {"page": self._page}
-        return answer(200, json.dumps(shown), kind=JSON)
+        summary = self._latest.summary() | {"page": self._page}
+        return answer(200, json.dumps(summary), kind=JSON)
 
     async def _order(self, request: web.Request) -> web.Response:
         """Carry out hold, resume or reset, even if the browser disconnects meanwhile."""
@@ -75,14 +75,14 @@ def live_url(scribe: Callable[[], Mapping[str, Any]]) -> str:
     """The address of a live view, which is waited for while it starts; `scribe` is the part of the
     status. Raises UsageError for a daemon without one.
     """
-    found = scribe()
+    scribe_status = scribe()
     with progress("the live view is starting"):
-        while found.get("live") == "":
+        while scribe_status.get("live") == "":
             time.sleep(STARTING_POLL_S)
-            found = scribe()
-    if url := found.get("live"):
+            scribe_status = scribe()
+    if url := scribe_status.get("live"):
         return str(url)
-    errors = "; ".join(error for error in found["errors"] if "live view" in error)
+    errors = "; ".join(error for error in scribe_status["errors"] if "live view" in error)
     raise UsageError(errors or "this daemon serves no live view; start it with --live PORT")
 
 

@@ -27,7 +27,7 @@ def of_each(
     paths: list[Path] = args.files
     if len(paths) == 1:
         return [(paths[0], (alone or work)(paths[0]))]
-    found = []
+    results = []
     with progress(what, unit="files", total=len(paths)) as done:
         outcomes = spread(functools.partial(attempt, work), paths, args.workers or "1")
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True), start=1):
@@ -36,7 +36,7 @@ def of_each(
                 where = "" if path.name in str(outcome) else f"{path}: "
                 say(f"thirdhand {args.command}: {where}{in_file(str(outcome))}")
             else:
-                found.append((path, outcome))
-    if len(found) < len(paths):
-        say(f"thirdhand {args.command}: {len(paths) - len(found)} of {len(paths)} files cannot be used")
-    return found
+                results.append((path, outcome))
+    if len(results) < len(paths):
+        say(f"thirdhand {args.command}: {len(paths) - len(results)} of {len(paths)} files cannot be used")
+    return results

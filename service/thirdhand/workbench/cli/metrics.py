@@ -58,9 +58,9 @@ class CellCollector(Collector):
         self._session, self._seen = session, set[str]()
 
     def collect(self) -> Iterable[Metric]:
-        found = {cell.name: cell.status for cell in served_cells(self._session, timeout_s=SCRAPE_TIMEOUT_S)}
-        self._seen |= found.keys()
-        return exposed({name: found.get(name) for name in sorted(self._seen)})
+        statuses = {cell.name: cell.status for cell in served_cells(self._session, timeout_s=SCRAPE_TIMEOUT_S)}
+        self._seen |= statuses.keys()
+        return exposed({name: statuses.get(name) for name in sorted(self._seen)})
 
 
 def exposed(statuses: Mapping[str, Status | None]) -> Iterable[Metric]:

@@ -218,10 +218,10 @@ def arm(add: AddCommand) -> None:
     )
     option(c, "urdf", "URDF", "the arm's description", type=Path)
     option(c, "--plate", "LINK", "the link that carries the tool (default: the end of the chain, if it has only one)")
-    at = (
+    position = (
         "position of the arm's root in frame base [m] (default: 0 0 0, or nearby if only that reaches the demo's scene)"
     )
-    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=at)
+    c.add_argument("--at", metavar=("X", "Y", "Z"), nargs=3, type=within(float, -3.0, 3.0), help=position)
     option(c, "--packages", "DIR", "a folder with ROS packages, for the arm's meshes; may be repeated", action="append")
     output = "write the cell's settings to this file, and the picture to a .png beside it"
     option(c, "--output", "FILE", output, Path("cell.toml"), type=Path)

@@ -48,8 +48,8 @@ def record(args: argparse.Namespace) -> int:
     if args.delete:
         path = existing_path(args.folder, args.name)
         deleted = [path, *([uncut(path)] if uncut(path).exists() else [])]
-        for one in deleted:
-            one.unlink()
+        for file in deleted:
+            file.unlink()
         print(f"deleted: {', '.join(map(str, deleted))}")
         return 0
     if args.trim is not None:
@@ -61,10 +61,10 @@ def record(args: argparse.Namespace) -> int:
         print(trim(existing_path(args.folder, args.name), start_s, end_s), file=sys.stderr)
     elif not args.show:
         _capture(args, settings or Settings())
-    found = summary(existing_path(args.folder, args.name), settings=settings)
-    print(printable_lines(table(found)))
+    take_summary = summary(existing_path(args.folder, args.name), settings=settings)
+    print(printable_lines(table(take_summary)))
     if args.plot is not None:
-        draw(found, args.plot)
+        draw(take_summary, args.plot)
         print(f"{args.plot} drawn", file=sys.stderr)
     return 0
 
@@ -78,14 +78,14 @@ def _list(folder: Path, settings: Settings | None) -> int:
     paths, unusable = demonstration_paths(folder), 0
     for path in paths:
         try:
-            found = summary(path, settings=settings)
+            take_summary = summary(path, settings=settings)
         except RecordingError as error:
             unusable += 1
             print(printable(f"{path.stem:<20} {error}"))
             continue
-        rates = ", ".join(f"{one.name} {one.rate_hz:.0f} Hz" for one in found.streams)
-        gap = f"longest gap {1e3 * max(one.gap_s for one in found.streams):.0f} ms"
-        print(printable(f"{path.stem:<20} {found.lasts_s:6.1f} s   {'; '.join((rates, gap, *found.remarks))}"))
+        rates = ", ".join(f"{stream.name} {stream.rate_hz:.0f} Hz" for stream in take_summary.streams)
+        gap = f"longest gap {1e3 * max(stream.gap_s for stream in take_summary.streams):.0f} ms"
+        print(printable(f"{path.stem:<20} {take_summary.lasts_s:6.1f} s   {'; '.join((rates, gap, *take_summary.remarks))}"))
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
 

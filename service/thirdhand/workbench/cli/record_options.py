@@ -33,8 +33,8 @@ def add_options(c: argparse.ArgumentParser) -> None:
         "within 15 mm, joints within 0.02 rad (of the rest before and after, 0.3 s are then retained)"
     )
     option(c, "--until", None, until, "key", choices=("key", "rest"))
-    rest = "with --until rest, they must rest this long; slower motion than 15 mm in this time counts as rest"
-    option(c, "--rest", "S", rest, 1.0, type=within(float, 0.2, 60, " s"))
+    stillness = "with --until rest, they must rest this long; slower motion than 15 mm in this time counts as rest"
+    option(c, "--rest", "S", stillness, 1.0, type=within(float, 0.2, 60, " s"))
     seconds = within(float, 1, 3600, " s")
     option(c, "--seconds", "S", "end the take after this time at the latest", 600.0, type=seconds)
     wait = within(float, 0, 3600, " s")

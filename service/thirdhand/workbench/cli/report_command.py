@@ -43,10 +43,10 @@ def report(args: argparse.Namespace) -> int:
         raise UsageError(f"--lerobot {args.lerobot} exists already; a new folder needed")
     if len(args.files) > MANY and not args.lerobot:
         return _report_many(args)
-    reports = [one for _, one in of_each(args, "reading", reported, alone=_reported)]
+    reports = [report for _, report in of_each(args, "reading", reported, alone=_reported)]
     console = plain_console()
-    for one in reports:
-        _print(console, one)
+    for report in reports:
+        _print(console, report)
     if len(reports) > 1:
         for table in comparison(reports):
             print_table(console, table)
@@ -56,8 +56,8 @@ def report(args: argparse.Namespace) -> int:
     if args.lerobot and reports:
         from thirdhand.workbench.report import lerobot
 
-        columns = [one.columns for one in reports]
-        task = args.task or ", ".join({one.skill.name: one.tick for found in columns for one in found.skills})
+        columns = [report.columns for report in reports]
+        task = args.task or ", ".join({change.skill.name: change.tick for recording in columns for change in recording.skills})
         with whole(args.lerobot) as part:
             parts, rows = lerobot.write(columns, part, fps=args.fps, task=task)
         console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
@@ -72,23 +72,23 @@ def report(args: argparse.Namespace) -> int:
 
 def _report_many(args: argparse.Namespace) -> int:
     """Report on more recordings than anyone reads one by one: a row for each, and totals."""
-    recordings = [one for _, one in of_each(args, "reading", overview)]
+    recordings = [recording for _, recording in of_each(args, "reading", overview)]
     if not recordings:
         return 1
     console = plain_console()
-    shown = [*overviews(recordings)]
-    for table in shown:
+    overview_tables = [*overviews(recordings)]
+    for table in overview_tables:
         print_table(console, table)
     if args.csv:
         args.csv.mkdir(parents=True, exist_ok=True)
-        for table in (*shown, every_figure(recordings)):
+        for table in (*overview_tables, every_figure(recordings)):
             _write(args.csv / f"{table.name}.csv", table)
         console.print(Text(printable(f"tables in {args.csv}")))
     if args.html:
         from thirdhand.workbench.report.page import page_of_many  # its import is slow
 
         with whole(args.html) as part:
-            part.write_text(page_of_many(shown), encoding="utf-8")
+            part.write_text(page_of_many(overview_tables), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
     return 0 if len(recordings) == len(args.files) else 1
 
@@ -121,9 +121,9 @@ def _bar(one: Report) -> Text:
         modes = [span.mode for span in one.spans if span.start_s <= at_s < span.start_s + span.lasts_s]
         mark, style = MARKS[modes[0]] if modes else (" ", "")
         bar.append(mark, style)
-    shown = {span.mode for span in one.spans}
+    legend_modes = {span.mode for span in one.spans}
     for mode, (mark, style) in MARKS.items():
-        if mode in shown:
+        if mode in legend_modes:
             bar.append("  ").append(mark, style).append(f" {str(mode.name).lower()} {one.seconds(mode):.1f} s")
     return bar
 
@@ -146,12 +146,12 @@ def write_csv(reports: Sequence[Report], folder: Path) -> None:
     """Write each table of a report, and every tick in `ticks.csv`, to a folder with the report's
     name, and for several reports a comparison beside these folders.
     """
-    for name, one in zip(names_of([one.path for one in reports]), reports, strict=True):
+    for name, report in zip(names_of([report.path for report in reports]), reports, strict=True):
         inside = folder / name
         inside.mkdir(parents=True, exist_ok=True)
-        for table in tables(one):
+        for table in tables(report):
             _write(inside / f"{table.name}.csv", table)
-        _write_ticks(inside / "ticks.csv", one)
+        _write_ticks(inside / "ticks.csv", report)
     if len(reports) > 1:
         for table in comparison(reports):
             _write(folder / f"{table.name}.csv", table)

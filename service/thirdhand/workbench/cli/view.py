@@ -260,10 +260,10 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
                 return _fresh(client, Path(png).absolute())
-            at = moment(extent, time) if time is not None or live else last_followed(Path(source), extent[1])
-            client.set_time(TIMELINE, duration=np.timedelta64(at, "ns"), play_state="paused")
-            said = f"{(at - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
-            _settled(client, Path(png).absolute(), said)
+            time_ns = moment(extent, time) if time is not None or live else last_followed(Path(source), extent[1])
+            client.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"), play_state="paused")
+            caption = f"{(time_ns - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
+            _settled(client, Path(png).absolute(), caption)
             return None
     except ViewerError:
         raise
@@ -278,10 +278,10 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
     after the end.
     """
     start, end = extent
-    at = end if time is None else start + round(time * 1e9)
-    if at > end:
+    time_ns = end if time is None else start + round(time * 1e9)
+    if time_ns > end:
         raise UsageError(f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed")
-    return at
+    return time_ns
 
 
 def last_followed(rrd: Path, end: int) -> int:
@@ -324,8 +324,8 @@ def _picture(client: Any) -> Image.Image:
 
 def _save(picture: Image.Image, png: Path, said: str) -> None:
     """Save a picture with a caption at its top."""
-    at, font = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX), ImageFont.load_default(CAPTION_PX)
-    ImageDraw.Draw(picture).text(at, said, fill=palette.ARM_BODY, anchor="rm", font=font)
+    corner_px, font = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX), ImageFont.load_default(CAPTION_PX)
+    ImageDraw.Draw(picture).text(corner_px, said, fill=palette.ARM_BODY, anchor="rm", font=font)
     picture.save(png)
 
 
@@ -353,14 +353,14 @@ def _settled(client: Any, png: Path, said: str) -> None:
     """Save the picture once three successive ones are equal: everything is loaded, and
     notifications have disappeared.
     """
-    seen: list[Image.Image] = []
+    pictures: list[Image.Image] = []
 
     def same() -> bool:
-        seen.append(_picture(client))
-        return len(seen) >= 8 and seen[-1] == seen[-2] == seen[-3]
+        pictures.append(_picture(client))
+        return len(pictures) >= 8 and pictures[-1] == pictures[-2] == pictures[-3]
 
     _wait(same, timeout_s=10.0)
-    _save(seen[-1], png, said)
+    _save(pictures[-1], png, said)
 
 
 def _wait(done: Callable[[], bool], timeout_s: float = 30.0) -> None:

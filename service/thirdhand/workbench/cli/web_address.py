@@ -39,10 +39,10 @@ def page_served(server: WebServer, option: str, listen: Address) -> Iterator[Add
     thread = threading.Thread(target=serve, name="page", daemon=True)
     thread.start()
     try:
-        found = listening.get()
-        if isinstance(found, UsageError):
-            raise found
-        yield found
+        outcome = listening.get()
+        if isinstance(outcome, UsageError):
+            raise outcome
+        yield outcome
     finally:
         server.end()
         thread.join(END_TIMEOUT_S)

@@ -39,17 +39,17 @@ def draw(proposal: Proposal, path: Path) -> None:
             is_tool = body.capsules["link"][i] == len(settings.joints.names)
             colour = palette.TOOL if is_tool else palette.GREY
             axes.add_patch(Polygon(outline, facecolor=_rgb(colour), edgecolor="black", linewidth=0.6, alpha=0.8))
-        for name, at in DEMO_TOOL_M.items():
+        for name, point_m in DEMO_TOOL_M.items():
             colour = palette.VERMILLION if name in proposal.unmet else palette.BLUE
-            axes.plot(at[across], at[up], "o", color=_rgb(colour), markersize=7, zorder=5)
-            axes.annotate(name, (at[across], at[up]), (6, 5), textcoords="offset points", fontsize=9, zorder=6)
+            axes.plot(point_m[across], point_m[up], "o", color=_rgb(colour), markersize=7, zorder=5)
+            axes.annotate(name, (point_m[across], point_m[up]), (6, 5), textcoords="offset points", fontsize=9, zorder=6)
         axes.plot(0.0, 0.0, "k+", markersize=12, zorder=5)
         axes.annotate("frame base", (0.0, 0.0), (6, -12), textcoords="offset points", fontsize=9, zorder=6)
         axes.set(title=title, xlabel=label, ylabel=other, aspect="equal")
-        shown = np.vstack(
-            (placed[:, :, [across, up]].reshape(-1, 2), [(at[across], at[up]) for at in DEMO_TOOL_M.values()])
+        points_m = np.vstack(
+            (placed[:, :, [across, up]].reshape(-1, 2), [(point_m[across], point_m[up]) for point_m in DEMO_TOOL_M.values()])
         )
-        low, high = shown.min(axis=0) - AROUND_M, shown.max(axis=0) + AROUND_M
+        low, high = points_m.min(axis=0) - AROUND_M, points_m.max(axis=0) + AROUND_M
         centre, outer = proposal.shell.centre, proposal.shell.outer
         sideways = centre[across] - outer if across == 1 else -AROUND_M
         axes.set_xlim(min(low[0], sideways), max(high[0], centre[across] + outer))
@@ -66,14 +66,14 @@ def draw(proposal: Proposal, path: Path) -> None:
 def _reach(axes: Axes, proposal: Proposal, across: int, up: int) -> None:
     """The shell around the shoulder, cut by min_x and min_z."""
     shell, reach = proposal.shell, proposal.settings.reach
-    at = (shell.centre[across], shell.centre[up])
+    centre_m = (shell.centre[across], shell.centre[up])
     colour = _rgb(palette.SKY)
-    ring = Wedge(at, shell.outer, 0, 360, width=shell.outer - shell.inner, facecolor=colour, alpha=0.25)
+    ring = Wedge(centre_m, shell.outer, 0, 360, width=shell.outer - shell.inner, facecolor=colour, alpha=0.25)
     axes.add_patch(ring)
     lowest = {0: reach.min_x, 2: reach.min_z}
     size = 2.0 * shell.outer
-    corner = [at[0] - size, at[1] - size]
-    end = [at[0] + size, at[1] + size]
+    corner = [centre_m[0] - size, centre_m[1] - size]
+    end = [centre_m[0] + size, centre_m[1] + size]
     for i, axis in enumerate((across, up)):
         if axis in lowest:
             corner[i] = max(corner[i], lowest[axis])

@@ -91,7 +91,7 @@ def proposed(
     plate = plate or plate_of(urdf)
     moving = urdf.movable(plate)
     acceleration, jerk, efforts = rates(raw, moving)
-    given: dict[str, Any] = {
+    values: dict[str, Any] = {
         "arm": {
             "urdf": str(path.absolute()),
             "plate": plate,
@@ -101,11 +101,11 @@ def proposed(
         "joints": {"acceleration": acceleration, "jerk": jerk, **velocities(moving)},
         "tool": {"plate_from_tool": [0.0, 0.0, 0.0, *turn_of_tool(urdf.chain(plate))]},
     }
-    settings = converted(given, origin=str(path))
-    at = stand or _stand(settings)
+    settings = converted(values, origin=str(path))
+    position_m = stand or _stand(settings)
     robot, text = robot_description(settings), ""
-    if any(at):
-        robot, text = (standing(one, path, packages, at) for one in (robot, raw))
+    if any(position_m):
+        robot, text = (standing(xml, path, packages, position_m) for xml in (robot, raw))
     urdf = Urdf(robot, origin=str(path))
     chain, limits = urdf.chain(plate), settings.joints
     workspace = workspace_of(chain, limits.lower, limits.upper, settings.tool.plate_from_tool)
@@ -125,7 +125,7 @@ def proposed(
         workspace,
         shell,
         body_of(settings, robot),
-        at,
+        position_m,
         text,
         (-depth_m, "itself" if nearest == NEAR_ITSELF else "the table"),
         float(limit_margins(np.array(arm.posture), settings).min()),
@@ -141,8 +141,8 @@ def _limits(settings: Settings, robot: str, *, is_demo: bool) -> dict[str, ToolL
     arm, posture = Arm(settings, robot), np.array(settings.arm.posture)
     orientation = np.empty(4)
     quaternion_of(arm.at(posture).rotation, orientation)
-    found = limits_of_task(settings, robot, np.array([*DEMO_TOOL_M.values()]), orientation) if is_demo else {}
-    return found or {ANY_DIRECTION: tool_limits(arm, settings, posture[None])}
+    limits = limits_of_task(settings, robot, np.array([*DEMO_TOOL_M.values()]), orientation) if is_demo else {}
+    return limits or {ANY_DIRECTION: tool_limits(arm, settings, posture[None])}
 
 
 def _with_reach_of(settings: Settings, workspace: Workspace) -> Settings:
@@ -165,8 +165,8 @@ def _stand(settings: Settings) -> tuple[float, float, float]:
     x, y, z = settings.reach.centre
     inner, outer = settings.reach.inner, settings.reach.outer
     tried = sorted((STAND_STEP_M * i for i in range(-STAND_STEPS, STAND_STEPS + 1)), key=abs)
-    shells = {at: Shell((x + at, y, z), inner, outer) for at in tried}
-    best = next((at for at in tried if all(_is_in(place, shells[at]) for place in DEMO_TOOL_M.values())), 0.0)
+    shells = {offset_m: Shell((x + offset_m, y, z), inner, outer) for offset_m in tried}
+    best = next((offset_m for offset_m in tried if all(_is_in(place, shells[offset_m]) for place in DEMO_TOOL_M.values())), 0.0)
     return (round(best, 3), 0.0, 0.0)
 
 

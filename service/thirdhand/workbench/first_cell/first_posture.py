@@ -59,8 +59,8 @@ def first_posture(
     forward = (place - shell.centre)[:2] / max(float(np.linalg.norm((place - shell.centre)[:2])), 1e-9)
 
     def errors(q: Vector, direction: Vector) -> Vector:
-        here = arm.at(q)
-        position, turn = (here.position - place) / UNIT_ERROR_M, (here.rotation[:, 2] - direction) / UNIT_ERROR_RAD
+        pose = arm.at(q)
+        position, turn = (pose.position - place) / UNIT_ERROR_M, (pose.rotation[:, 2] - direction) / UNIT_ERROR_RAD
         shares = (q - middle) / half
         return np.concatenate(
             (position, turn, MIDDLE_WEIGHT * shares, END_WEIGHT * np.maximum(np.abs(shares) - 0.8, 0))
@@ -72,14 +72,14 @@ def first_posture(
         for i in np.argsort(away / (0.1 * workspace.extent) + turned)[:POSTURE_STARTS]:
             start = np.clip(workspace.postures[i], lower + 1e-6, upper - 1e-6)
             q = least_squares(errors, start, bounds=(lower, upper), max_nfev=60, args=(direction,)).x
-            here = arm.at(q)
+            pose = arm.at(q)
             if (
-                np.linalg.norm(here.position - place) > MAX_POSTURE_ERROR_M
-                or np.linalg.norm(here.rotation[:, 2] - direction) > MAX_POSTURE_ERROR_RAD
+                np.linalg.norm(pose.position - place) > MAX_POSTURE_ERROR_M
+                or np.linalg.norm(pose.rotation[:, 2] - direction) > MAX_POSTURE_ERROR_RAD
             ):
                 continue
             clear = separation.clearance(q, np.empty((0, 3)))[0]
-            volume = math.sqrt(max(np.linalg.det(here.jacobian[:3] @ here.jacobian[:3].T), 0.0))
+            volume = math.sqrt(max(np.linalg.det(pose.jacobian[:3] @ pose.jacobian[:3].T), 0.0))
             score = (
                 2.0 * min(limit_margins(q, settings).min() / ENOUGH_MARGIN, 1.0)
                 + min(clear / ENOUGH_M, 1.0)
@@ -87,7 +87,7 @@ def first_posture(
                 - float(np.abs((q - middle) / np.minimum(half, math.pi)).mean())
             )
             if best is None or score > best[0]:
-                best = (score, q, float(np.arccos(np.clip(-here.rotation[2, 2], -1.0, 1.0))))
+                best = (score, q, float(np.arccos(np.clip(-pose.rotation[2, 2], -1.0, 1.0))))
     if best is None:
         raise SettingsError(
             f"no posture found with the tool at {place.round(2).tolist()} m, pointing down: give another --plate "

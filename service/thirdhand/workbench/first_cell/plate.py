@@ -29,14 +29,14 @@ def turn_of_tool(chain: Sequence[UrdfJoint]) -> tuple[float, float, float, float
 
     It is the identity if the plate's +z does so. The tool points along the axis of the last joint.
     """
-    turn, at, turns, points, axis = Rotation.identity(), np.zeros(3), Rotation.identity(), [], np.zeros(3)
+    turn, position_m, turns, points, axis = Rotation.identity(), np.zeros(3), Rotation.identity(), [], np.zeros(3)
     for joint in chain:
-        at, turn = at + turn.apply(joint.translation), turn * Rotation.from_quat(joint.rotation)
+        position_m, turn = position_m + turn.apply(joint.translation), turn * Rotation.from_quat(joint.rotation)
         if joint.kind != "fixed":
             turns, axis = turn, np.array(joint.axis)
-            points.append(at)
+            points.append(position_m)
     axis = turn.inv().apply(turns.apply(axis))  # the last axis in the plate's frame
-    away = turn.inv().apply(at - points[max(len(points) - 2, 0)])
+    away = turn.inv().apply(position_m - points[max(len(points) - 2, 0)])
     along = float(axis @ away)
     if abs(along) < LEAST_ALONG * float(np.linalg.norm(away)):
         return (0.0, 0.0, 0.0, 1.0)

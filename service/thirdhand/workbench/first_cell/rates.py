@@ -28,12 +28,12 @@ def rates(text: str, moving: Sequence[UrdfJoint]) -> tuple[list[float], list[flo
     acceleration = velocity / RISE_S, reduced if the efforts are small for the masses. Values of
     the URDF itself are taken instead.
     """
-    wanted = np.array([min(_known(joint.velocity) / RISE_S, MAX_ACCELERATION) for joint in moving])
-    share = _torque_share(text, moving, wanted)
-    guess = wanted * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
-    given = np.array([(joint.acceleration, joint.jerk) for joint in moving])
-    acceleration = np.where(np.isfinite(given[:, 0]), given[:, 0], guess)
-    jerk = np.where(np.isfinite(given[:, 1]), given[:, 1], np.minimum(JERK_RATE * acceleration, MAX_JERK))
+    nominal = np.array([min(_known(joint.velocity) / RISE_S, MAX_ACCELERATION) for joint in moving])
+    share = _torque_share(text, moving, nominal)
+    guess = nominal * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
+    urdf_rates = np.array([(joint.acceleration, joint.jerk) for joint in moving])
+    acceleration = np.where(np.isfinite(urdf_rates[:, 0]), urdf_rates[:, 0], guess)
+    jerk = np.where(np.isfinite(urdf_rates[:, 1]), urdf_rates[:, 1], np.minimum(JERK_RATE * acceleration, MAX_JERK))
     return [float(f"{a:.3g}") for a in acceleration], [float(f"{j:.3g}") for j in jerk], share is not None
 
 

@@ -44,14 +44,14 @@ def tracker_noise_m(demonstrations: Iterable[Demonstration]) -> float:
     It is the residual of a parabola in the median of short windows, few of which contain a jerk.
     """
     variances = [np.zeros(0)]
-    for one in demonstrations:
-        hands, count = one.hands, max(LEAST_SAMPLES, round(WINDOW_S / one.period_s))
+    for demonstration in demonstrations:
+        hands, count = demonstration.hands, max(LEAST_SAMPLES, round(WINDOW_S / demonstration.period_s))
         parts = hands[: len(hands) // count * count].reshape(-1, count, 6)
         parabolas, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 3))
         left = parts - parabolas @ (parabolas.T @ parts)
         variances.append((left**2).sum(axis=(1, 2)) / (6 * (count - 3)))
-    found = np.concatenate(variances)
-    return float(np.sqrt(np.median(found))) if len(found) else 0.0
+    all_variances = np.concatenate(variances)
+    return float(np.sqrt(np.median(all_variances))) if len(all_variances) else 0.0
 
 
 def contradictions(
@@ -70,26 +70,26 @@ def contradictions(
     the tool (T,) by more than half of `different`. `distances` (M, N) are those between tools
     (M, O) and (N, O).
     """
-    at = [np.linspace(0, len(one.known) - 1, min(COMPARED, len(one.known))).round().astype(int) for one in held_out]
-    known, shown, off = (
-        np.concatenate([values[rows] for values, rows in zip(column, at, strict=True)])
-        for column in ([one.known for one in held_out], tools, missed)
+    sampled_rows = [np.linspace(0, len(result.known) - 1, min(COMPARED, len(result.known))).round().astype(int) for result in held_out]
+    known_m, outputs, errors = (
+        np.concatenate([values[rows] for values, rows in zip(column, sampled_rows, strict=True)])
+        for column in ([result.known for result in held_out], tools, missed)
     )
-    owner = [f"{one.take.name} (sample {i})" for one, rows in zip(held_out, at, strict=True) for i in rows]
-    squares = (known**2).sum(axis=1)
+    owner = [f"{result.take.name} (sample {i})" for result, rows in zip(held_out, sampled_rows, strict=True) for i in rows]
+    squares = (known_m**2).sum(axis=1)
     worst, pair, count = -1.0, (0, 0), 0
-    for first in range(0, len(known), ROWS):
+    for first in range(0, len(known_m), ROWS):
         rows = slice(first, first + ROWS)
-        hands = squares[rows, None] + squares - 2 * known[rows] @ known.T
-        same = (hands < near_m**2) | ((hands < ALIKE_M**2) & (off[rows] > different / 2)[:, None])
-        found = distances(shown[rows], shown) * same
-        count += int((found.max(axis=1) > different).sum())
-        if found.max() > worst:
-            worst, (row, column) = float(found.max()), divmod(int(found.argmax()), len(known))
+        hands = squares[rows, None] + squares - 2 * known_m[rows] @ known_m.T
+        is_alike = (hands < near_m**2) | ((hands < ALIKE_M**2) & (errors[rows] > different / 2)[:, None])
+        differences = distances(outputs[rows], outputs) * is_alike
+        count += int((differences.max(axis=1) > different).sum())
+        if differences.max() > worst:
+            worst, (row, column) = float(differences.max()), divmod(int(differences.argmax()), len(known_m))
             pair = first + row, column
     i, j = pair
     return Contradictions(
-        count / len(known), f"{owner[i]} and {owner[j]}", float(np.linalg.norm(known[i] - known[j])), worst
+        count / len(known_m), f"{owner[i]} and {owner[j]}", float(np.linalg.norm(known_m[i] - known_m[j])), worst
     )
 
 

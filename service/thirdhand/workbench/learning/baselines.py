@@ -23,7 +23,7 @@ def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
     return {
         LINEAR: held_out_errors(takes, linear),
         LOOK_UP: held_out_errors(takes, look_up),
-        SAME_TIME: [one.demonstration.tool[:, :3] - same_time(one, others) for one, others in _with_others(takes)],
+        SAME_TIME: [take.demonstration.tool[:, :3] - same_time(take, others) for take, others in _with_others(takes)],
     }
 
 
@@ -52,17 +52,17 @@ def look_up(hands: Vector, tool: Vector, queries: Vector) -> Vector:
 def held_out_errors(takes: Sequence[Take], predict: Predictor) -> list[Vector]:
     """The errors (T, 3) [m] of each take, predicted from other persons' takes."""
     errors = []
-    for one, others in _with_others(takes):
+    for take, others in _with_others(takes):
         hands, tool = (np.concatenate(parts) for parts in zip(*((o.hands, o.position) for o in others), strict=True))
-        errors.append(one.position - predict(hands, tool, one.hands))
+        errors.append(take.position - predict(hands, tool, take.hands))
     return errors
 
 
 def same_time(take: Take, others: Sequence[Take]) -> Vector:
     """The mean position (T, 3) [m] of the other takes' tool after the same time."""
-    seconds, found = take.demonstration.seconds, [one.demonstration for one in others]
+    seconds, demonstrations = take.demonstration.seconds, [other_take.demonstration for other_take in others]
     means = [
-        np.mean([np.interp(seconds, other.seconds, other.tool[:, axis]) for other in found], axis=0)
+        np.mean([np.interp(seconds, other.seconds, other.tool[:, axis]) for other in demonstrations], axis=0)
         for axis in range(3)
     ]
     return np.stack(means, axis=1)
@@ -70,4 +70,4 @@ def same_time(take: Take, others: Sequence[Take]) -> Vector:
 
 def _with_others(takes: Sequence[Take]) -> list[tuple[Take, list[Take]]]:
     """Each take, and those of other persons."""
-    return [(one, [other for other in takes if other.person != one.person]) for one in takes]
+    return [(take, [other for other in takes if other.person != take.person]) for take in takes]

@@ -50,14 +50,14 @@ def selection_of(
     noise, and are not judged.
     """
     counts = shared_counts(points, len(pairs) - earlier, earlier, LEAST_POINTS)
-    parts = [(even_in_time if rich else thinned)(*pair, each) for pair, each in zip(pairs, counts, strict=True)]
+    parts = [(even_in_time if rich else thinned)(*pair, count) for pair, count in zip(pairs, counts, strict=True)]
     numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    group = np.repeat(numbers, [len(one) for one, _ in parts])
+    group = np.repeat(numbers, [len(values) for values, _ in parts])
     scales = RICH_SCALES if rich else POSITION_SCALES
     if not earlier:
         return DirectSelection(inputs, outputs, group, scales, isotropic, joint=rich)
-    is_new = np.repeat(np.arange(len(pairs)) < len(pairs) - earlier, [len(one) for one, _ in parts])
+    is_new = np.repeat(np.arange(len(pairs)) < len(pairs) - earlier, [len(values) for values, _ in parts])
     factors = np.where(is_new, 1.0, factor)
     return DirectSelection(inputs, outputs, group, scales, isotropic, rich, factors, is_new)
 
@@ -77,11 +77,11 @@ def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
     """
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(hands, axis=0), axis=1))])
     along = path / max(path[-1], 1e-9) + DWELL_SHARE * np.linspace(0.0, 1.0, len(path))
-    kept = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1))
-    return hands[kept], tool[kept]
+    rows = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1))
+    return hands[rows], tool[rows]
 
 
 def even_in_time(inputs: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
     """About `count` samples of inputs (T, I) and tool (T, 3), evenly in time."""
-    kept = np.unique(np.linspace(0.0, len(inputs) - 1, count).round().astype(int))
-    return inputs[kept], tool[kept]
+    rows = np.unique(np.linspace(0.0, len(inputs) - 1, count).round().astype(int))
+    return inputs[rows], tool[rows]

@@ -48,7 +48,7 @@ FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     """The task of demonstrations, and why there is none although they name via-points."""
-    named = [tuple(point.name for point in one.places) for one in demonstrations]
+    named = [tuple(point.name for point in demonstration.places) for demonstration in demonstrations]
     if not any(named):
         return None, ""
     if len(set(map(frozenset, named))) > 1:
@@ -58,8 +58,8 @@ def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     names = Counter(named).most_common(1)[0][0]
     if not 2 <= len(names) <= MOST_SEGMENTS + 1:
         return None, f"{len(names)} named via-points: 2 to {MOST_SEGMENTS + 1} are learned between"
-    at = np.array([[[*p.left, *p.right] for p in ordered(one.places, names)] for one in demonstrations])
-    corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
+    hands_m = np.array([[[*p.left, *p.right] for p in ordered(demonstration.places, names)] for demonstration in demonstrations])
+    corners = np.stack([_corners(hands_m[:, :, :3]), _corners(hands_m[:, :, 3:])], axis=1)
     return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)])), ""
 
 
@@ -87,14 +87,14 @@ def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration]
     """
     warned = []
     for named, follow in zip(task.names, task.follow.tolist(), strict=True):
-        off = [float(off_via_point(one, next(ordered(one.places, (named,))), follow).min()) for one in demonstrations]
-        if min(off) > FAR_M:
+        distances_m = [float(off_via_point(demonstration, next(ordered(demonstration.places, (named,))), follow).min()) for demonstration in demonstrations]
+        if min(distances_m) > FAR_M:
             raise SkillError(
-                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} mm "
-                f"({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
+                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(distances_m):.0f} mm "
+                f"({names[int(np.argmin(distances_m))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
                 "where it was in these demonstrations?"
             )
-        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M]
+        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, distances_m, strict=True) if m > FAR_M]
         if missed:
             warned.append(f"via-point {named!r}: the tool never came near it in {', '.join(missed)}")
     return warned
@@ -104,12 +104,12 @@ def off_via_point(demonstration: Demonstration, point: ViaPoint, follow: int) ->
     """The tool's distances (T,) [m] from a via-point, or from it moved with the hand that the tool
     follows, whichever is smaller.
     """
-    off = demonstration.tool[:, :3] - point.tool
-    out: Vector = np.linalg.norm(off, axis=1)
+    offset_m = demonstration.tool[:, :3] - point.tool
+    out: Vector = np.linalg.norm(offset_m, axis=1)
     if follow == NONE:
         return out
     hand = demonstration.hands[:, 3 * follow : 3 * follow + 3] - (point.left, point.right)[follow]
-    return np.asarray(np.minimum(out, np.linalg.norm(off - hand, axis=1)))
+    return np.asarray(np.minimum(out, np.linalg.norm(offset_m - hand, axis=1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +136,10 @@ class Divided:
             demonstration.by_pieces(lambda x: np.gradient(x, period_s, axis=0), x) for x in (hands, smooth_tool)
         )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
-        at = NamedViaPoints.of(demonstration.places)
-        segments = _segments(task, at)
+        via_points = NamedViaPoints.of(demonstration.places)
+        segments = _segments(task, via_points)
         labels = _divided(segments, moving, (smooth_tool, tool_velocities), period_s)
-        return Divided(demonstration, at, segments, moving, stillness_of(velocities, period_s), labels)
+        return Divided(demonstration, via_points, segments, moving, stillness_of(velocities, period_s), labels)
 
     @property
     def tool(self) -> Vector:
@@ -171,16 +171,16 @@ class Divided:
             self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
         )
         hands = np.hstack([hands, self.turns(late_s)])
-        found = covered(hands, rested, labels, segments)
-        along, off = found[:, :2], found[:, 2:]
-        begins, way = segments["tool"][labels], segments["tool_way"][labels]
-        square = (way**2).sum(axis=1)
+        coverage = covered(hands, rested, labels, segments)
+        along, distances_m = coverage[:, :2], coverage[:, 2:]
+        begins, way_m = segments["tool"][labels], segments["tool_way"][labels]
+        square = (way_m**2).sum(axis=1)
         goes = square > SAME_M**2
-        share = np.where(goes, ((tool - begins) * way).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
-        wanted = np.column_stack([share.clip(0.0, 1.0), np.zeros_like(tool)])
-        one = Encoded(**vars(self), hands=hands, along=along, off=off, wanted=wanted)
-        wanted[:, 1:] = tool - one.tools(np.arange(len(tool)), wanted)
-        return one
+        share = np.where(goes, ((tool - begins) * way_m).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
+        outputs = np.column_stack([share.clip(0.0, 1.0), np.zeros_like(tool)])
+        encoded = Encoded(**vars(self), hands=hands, along=along, off=distances_m, wanted=outputs)
+        outputs[:, 1:] = tool - encoded.tools(np.arange(len(tool)), outputs)
+        return encoded
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +206,9 @@ class Encoded(Divided):
     def rows(self, count: int) -> Indices:
         """About `count` rows, evenly along the path of hands and tool, and a little along time."""
         steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(axis=1)
-        way = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
-        kept = np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(way) - 1)
-        return np.asarray(np.unique(kept), np.int64)
+        path = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
+        rows = np.searchsorted(path, np.linspace(0.0, path[-1], count)).clip(0, len(path) - 1)
+        return np.asarray(np.unique(rows), np.int64)
 
 
 def _segments(task: Task, at: NamedViaPoints) -> Records:
@@ -219,11 +219,11 @@ def encode(task: Task, shown: Sequence[Divided], late_s: Sequence[float]) -> tup
     """The demonstrations encoded for teachers who are late by `late_s` in each, and the task; if
     the tool turns with the hands there, with the levers that the demonstrations lead to.
     """
-    out = [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+    out = [demo.in_task(task).late(s) for demo, s in zip(shown, late_s, strict=True)]
     if task.levers is None:
         return task, out
     task = task._replace(levers=np.array([_lever(out, i, side) for i, side in enumerate(task.follow.tolist())]))
-    return task, [one.in_task(task).late(s) for one, s in zip(shown, late_s, strict=True)]
+    return task, [demo.in_task(task).late(s) for demo, s in zip(shown, late_s, strict=True)]
 
 
 def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
@@ -239,12 +239,12 @@ def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
     if side == NONE:
         return np.zeros(3)
     total, weight = np.zeros(3), 0.0
-    for one in shown:
-        share = one.wanted[:, 0]
-        near = np.where(one.labels == number, 1.0 - share, np.where(one.labels == number - 1, share, 0.0))
+    for demo in shown:
+        share = demo.wanted[:, 0]
+        near = np.where(demo.labels == number, 1.0 - share, np.where(demo.labels == number - 1, share, 0.0))
         weights = near**WITH_HAND_POWER + LEAST_WEIGHT
-        turned = one.hands[:, 6 + 9 * side :][:, :9].reshape(-1, 3, 3)
-        total += np.einsum("t,tji,tj->i", weights, turned, one.tool - one.hands[:, 3 * side : 3 * side + 3])
+        turned = demo.hands[:, 6 + 9 * side :][:, :9].reshape(-1, 3, 3)
+        total += np.einsum("t,tji,tj->i", weights, turned, demo.tool - demo.hands[:, 3 * side : 3 * side + 3])
         weight += float(weights.sum())
     return np.asarray(total / weight)
 
@@ -256,15 +256,15 @@ def _divided(segments: Records, moving: Vector, tool: tuple[Vector, Vector], per
     count, cost = len(segments), np.zeros((len(moving), len(segments)))
     ways = [(segments["begins"][:, i], segments["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
     ways.append((segments["tool"], segments["tool_way"], *tool, 0))
-    for begins, way, points, velocities, first in ways:
-        at, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
-        square = (way**2).sum(axis=1)
+    for begins, way_m, points, velocities, first in ways:
+        position_m, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
+        square = (way_m**2).sum(axis=1)
         moves = square > SAME_M**2
-        along = (((at - begins) * way).sum(axis=2) / np.where(moves, square, 1.0)).clip(0.0, 1.0) * moves
-        off = ((at - begins - along[:, :, None] * way) ** 2).sum(axis=2)
-        goes = np.where(moves, velocity @ way.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
+        along = (((position_m - begins) * way_m).sum(axis=2) / np.where(moves, square, 1.0)).clip(0.0, 1.0) * moves
+        distance_m2 = ((position_m - begins - along[:, :, None] * way_m) ** 2).sum(axis=2)
+        goes = np.where(moves, velocity @ way_m.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
         goes -= 0.7 * ~moves * np.linalg.norm(velocity, axis=1)[:, None]
-        cost += np.minimum(off / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / DIRECTION_SPEED_MPS)
+        cost += np.minimum(distance_m2 / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / DIRECTION_SPEED_MPS)
     cost *= period_s / CORRELATED_S
     change = np.where(np.eye(count, k=1) > 0, NEXT, ANOTHER) * (1.0 - np.eye(count))
     total, back = cost[0] + LATER * np.arange(count), []

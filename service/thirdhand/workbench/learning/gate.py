@@ -70,8 +70,8 @@ def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
     """
     steps = BESIDE_M * np.concatenate([np.eye(3), -np.eye(3)])
     none = np.zeros_like(steps)
-    both, one = np.hstack([steps, steps]), np.concatenate([np.hstack([steps, none]), np.hstack([none, steps])])
-    beside, one_beside = ((hands[:, None] + moved).reshape(-1, 6) for moved in (both, one))
+    both_steps, single_steps = np.hstack([steps, steps]), np.concatenate([np.hstack([steps, none]), np.hstack([none, steps])])
+    both_beside, one_beside = ((hands[:, None] + moved).reshape(-1, 6) for moved in (both_steps, single_steps))
     if np.array_equal(hands[:, :3], hands[:, 3:]):
-        return beside, beside, beside
-    return np.roll(hands, 3, axis=1), beside, one_beside
+        return both_beside, both_beside, both_beside
+    return np.roll(hands, 3, axis=1), both_beside, one_beside

@@ -44,30 +44,30 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
     """
     takes, held_out, gate, delay = division.takes, fitted.held_out, fitted.gate, fitted.delay
     persons = persons_of(takes)
-    timed = [one.timed or timed_errors(one) for one in held_out]
+    timed = [result.timed or timed_errors(result) for result in held_out]
     checked = calibrated_without(timed, persons)
     others = {**fitted.baselines, **baselines(takes)}
     rows = tuple(
         _row(
-            one.take.name,
-            one.errors,
-            one.gate_m > gate.threshold,
+            result.take.name,
+            result.errors,
+            result.gate_m > gate.threshold,
             checked[i : i + 1],
             {name: errors[i] for name, errors in others.items()},
         )
-        for i, one in enumerate(held_out)
+        for i, result in enumerate(held_out)
     )
     overall = _row(
         "all",
-        np.concatenate([one.errors for one in held_out]),
-        np.concatenate([one.gate_m for one in held_out]) > gate.threshold,
+        np.concatenate([result.errors for result in held_out]),
+        np.concatenate([result.gate_m for result in held_out]) > gate.threshold,
         checked,
         {name: np.concatenate(errors) for name, errors in others.items()},
     )
     contradicting = contradictions(
         held_out,
         [take.position for take in takes],
-        [np.linalg.norm(one.errors, axis=1) for one in held_out],
+        [np.linalg.norm(result.errors, axis=1) for result in held_out],
         lengths,
         different=CONTRADICTION_M,
         near_m=division.near_m,
@@ -103,9 +103,9 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
         float(np.median([row.error_mm for row in rows])),
         1000 * math.sqrt(3.0) * unknown_std(takes),
     )
-    found = [*verdicts(subject), *pose.verdicts]
+    findings = [*verdicts(subject), *pose.verdicts]
     warnings, residual, unsafe = (
-        tuple(one.text for one in found if one.severity == kind) for kind in ("warning", "residual", "unsafe")
+        tuple(finding.text for finding in findings if finding.severity == kind) for kind in ("warning", "residual", "unsafe")
     )
     figures = msgspec.structs.replace(
         figures,
@@ -120,8 +120,8 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
 
 def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:
     """The share of the tool's positions that are out of the arm's reach."""
-    some = (one.take.position[:: max(1, len(one.errors) // COMPARED)] for one in held_out)
-    return float(np.mean([not is_reachable(at, reach) for positions in some for at in positions]))
+    paths = (result.take.position[:: max(1, len(result.errors) // COMPARED)] for result in held_out)
+    return float(np.mean([not is_reachable(position, reach) for positions in paths for position in positions]))
 
 
 def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float | None:
@@ -131,7 +131,7 @@ def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float
     if not constant:
         return None
     missed, varies = (
-        float(sum((errors**2).sum() for errors in each)) for each in ([one.errors for one in held_out], constant)
+        float(sum((errors**2).sum() for errors in take_errors)) for take_errors in ([result.errors for result in held_out], constant)
     )
     return 100 * (1 - missed / varies) if varies > 0.0 else None
 

@@ -66,8 +66,8 @@ def learn(
     if odd_m := standing_out(fitted.held_out):
         named = {take.name: take.demonstration for take in division.takes}
         remarks = [_remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()]
-        kept = {name: one for name, one in named.items() if name not in odd_m}
-        division = divided(list(kept.values()), list(kept), options, before)
+        inliers = {name: demonstration for name, demonstration in named.items() if name not in odd_m}
+        division = divided(list(inliers.values()), list(inliers), options, before)
         division = division._replace(remarks=[*remarks, *division.remarks])
         fitted, pose = _fitted(division, progress)
     judgement = judged(division, fitted, pose, reach or Reach(), accepted_by=accepted_by)
@@ -82,7 +82,7 @@ def _remark(name: str, error_m: float, named: dict[str, Demonstration], options:
     errors_m = []
     for other in exchanged(named[name]):
         fitted, _ = _fitted(divided([*(named | {name: other}).values()], list(named), options), progress)
-        errors_m += [rms(one.errors) for one in fitted.held_out if one.take.name == name]
+        errors_m += [rms(result.errors) for result in fitted.held_out if result.take.name == name]
     text = f"{name} stands out, and is left out: its tool is {1000 * error_m:.0f} mm from where the others have it"
     if min(errors_m) < EXCHANGED_SHARE * error_m:
         text += f", and {1000 * min(errors_m):.0f} mm with its hands exchanged: put each tracker on its own hand"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
 GREYS = {"wrong: swapped": "0.7", "wrong: both beside": "0.5", "wrong: one beside": "0.3"}
-BANDS = [palette.written(one) for one in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]
+BANDS = [palette.written(colour) for colour in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]
 MOST_NAMED = 12  # segments in the legend
 LEAST_BAND = 0.02  # a segment's band has its number if it lasts for this share of the time
 
@@ -49,9 +49,9 @@ def drawn(evidence: Evidence) -> Figure:
         _draw_segments(evidence, parts["s"])
 
     above.set(title="the tool from above", xlabel="x [m]", ylabel="y [m]")
-    for i, one in enumerate(held_out):
-        tool = one.take.position
-        predicted = tool - one.errors
+    for i, result in enumerate(held_out):
+        tool = result.take.position
+        predicted = tool - result.errors
         above.plot(tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None)
         label = "predicted from the others" if i == 0 else None
         above.plot(predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label=label)
@@ -59,8 +59,8 @@ def drawn(evidence: Evidence) -> Figure:
     above.legend(frameon=False)
 
     grid = np.linspace(0.0, 1.0, 200)
-    lengths = np.array([_along(np.linalg.norm(one.errors, axis=1), grid) for one in held_out])
-    expected = np.array([_along(_deviation(one), grid) for one in held_out])
+    lengths = np.array([_along(np.linalg.norm(result.errors, axis=1), grid) for result in held_out])
+    expected = np.array([_along(_deviation(result), grid) for result in held_out])
     errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
     errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
     errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square of all")
@@ -78,11 +78,11 @@ def drawn(evidence: Evidence) -> Figure:
     regions.set(xlim=(0, 100), ylim=(0, 100))
     regions.legend(frameon=False)
 
-    hands = np.concatenate([every_few(one.take.hands) for one in held_out])
-    shown = {"held-out hands": (np.concatenate([one.gate_m for one in held_out]), OFF)}
+    hands = np.concatenate([every_few(result.take.hands) for result in held_out])
+    curves = {"held-out hands": (np.concatenate([result.gate_m for result in held_out]), OFF)}
     for (name, colour), wrong in zip(GREYS.items(), nonsense(hands), strict=True):
-        shown[name] = skill.model.gates_m(wrong), colour
-    for name, (values, colour) in shown.items():
+        curves[name] = skill.model.gates_m(wrong), colour
+    for name, (values, colour) in curves.items():
         gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
     gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
     gate.set(title="the arm holds right of the gate", ylabel="samples up to this distance [%]")
@@ -107,10 +107,10 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
     """
     names, rows = evidence.skill.model.names, evidence.figures.demonstrations
     h = int(np.argsort([row.error_mm for row in rows])[len(rows) // 2])
-    one = evidence.held_out[h]
-    assert one.belief is not None
-    most = one.belief.argmax(axis=1)
-    times = one.take.demonstration.period_s * np.arange(len(most))
+    result = evidence.held_out[h]
+    assert result.belief is not None
+    most = result.belief.argmax(axis=1)
+    times = result.take.demonstration.period_s * np.arange(len(most))
     changes = np.flatnonzero(np.diff(most)) + 1
     labelled: set[int] = set()
     for first, end in zip([0, *changes], [*changes, len(most)], strict=True):
@@ -122,7 +122,7 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
             middle = 0.5 * (float(times[first]) + until)
             axes.text(middle, 0.97, str(k + 1), transform=axes.get_xaxis_transform(), ha="center", va="top")
         labelled.add(k)
-    off_mm, predicted_mm = 1000 * np.linalg.norm(one.errors, axis=1), 1000 * _deviation(one)
+    off_mm, predicted_mm = 1000 * np.linalg.norm(result.errors, axis=1), 1000 * _deviation(result)
     axes.plot(times, off_mm, color=TOOL, lw=2, label="error of the predicted tool")
     axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration")
     highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))  # the first predictions are uncertain

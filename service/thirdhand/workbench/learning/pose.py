@@ -41,12 +41,12 @@ def learned_pose(held_out: Sequence[HeldOut], *, points: int, gripper_ell: float
 
     Raises ValueError if primitives cannot be fitted.
     """
-    unit = [one.take.tool[:, 3:] / np.linalg.norm(one.take.tool[:, 3:], axis=1)[:, None] for one in held_out]
-    mean, signed = _signed(mean_orientation(np.concatenate([one.take.tool[:, 3:] for one in held_out])), unit)
+    unit = [result.take.tool[:, 3:] / np.linalg.norm(result.take.tool[:, 3:], axis=1)[:, None] for result in held_out]
+    mean, signed = _signed(mean_orientation(np.concatenate([result.take.tool[:, 3:] for result in held_out])), unit)
     turn, turn_error_deg, missed = _learned_turn(mean, held_out, signed, points)
     verdicts: list[Verdict] = []
     if turn is not None:
-        found = contradictions(
+        conflicts = contradictions(
             held_out,
             unit,
             missed,
@@ -54,13 +54,13 @@ def learned_pose(held_out: Sequence[HeldOut], *, points: int, gripper_ell: float
             different=DIFFERENT_RAD,
             near_m=near_m,
         )
-        if found.share > NOTED_SHARE:
+        if conflicts.share > NOTED_SHARE:
             text = (
-                f"the tool's orientation contradicts itself in {100 * found.share:.0f} % of the samples, up to "
-                f"{100 * UNSAFE_SHARE:.0f} % accepted: {found.pair} have the hands {1000 * found.hands_m:.0f} mm from "
-                f"each other and the tools turned by {math.degrees(found.tools):.0f}°"
+                f"the tool's orientation contradicts itself in {100 * conflicts.share:.0f} % of the samples, up to "
+                f"{100 * UNSAFE_SHARE:.0f} % accepted: {conflicts.pair} have the hands {1000 * conflicts.hands_m:.0f} mm from "
+                f"each other and the tools turned by {math.degrees(conflicts.tools):.0f}°"
             )
-            verdicts.append(Verdict("unsafe" if found.share > UNSAFE_SHARE else "warning", text))
+            verdicts.append(Verdict("unsafe" if conflicts.share > UNSAFE_SHARE else "warning", text))
     if turn_error_deg is not None and turn_error_deg > NOTED_DEG:
         text = f"the tool's orientation in held-out demonstrations is missed by {turn_error_deg:.0f}° rms"
         if turn_error_deg > UNSAFE_DEG:
@@ -99,18 +99,18 @@ def _learned_turn(
     """
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None, []
-    persons = persons_of([one.take for one in held_out])
+    persons = persons_of([result.take for result in held_out])
     zetas = [log(q, mean) for q in unit]
-    pairs = [(one.inputs, zeta) for one, zeta in zip(held_out, zetas, strict=True)]
+    pairs = [(result.inputs, zeta) for result, zeta in zip(held_out, zetas, strict=True)]
     choice = selection_of(pairs, points, persons=persons, isotropic=True)
     several = len(np.unique(persons)) > 1
     parameters = choice.parameters() if several else SINGLE_TAKE
     residuals = choice.residuals(parameters.ell, parameters.noise)
     error_deg = math.degrees(2.0 * rms(residuals)) if several else None
     missed = []
-    for one, zeta in zip(held_out, zetas, strict=True):
-        others = choice.primitive(parameters, residuals, without=one.take.person if several else None)
-        missed.append(2.0 * np.linalg.norm(zeta - others.mean(one.inputs), axis=1))
+    for result, zeta in zip(held_out, zetas, strict=True):
+        others = choice.primitive(parameters, residuals, without=result.take.person if several else None)
+        missed.append(2.0 * np.linalg.norm(zeta - others.mean(result.inputs), axis=1))
     return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
 
 
@@ -125,7 +125,7 @@ def _signed(mean: Vector, unit: Sequence[Vector]) -> tuple[Vector, list[Vector]]
     if all((q @ mean > 0.0).all() for q in near):
         return mean, near
     along = [q[np.linspace(0, len(q) - 1, SIGN_SAMPLES).round().astype(int)] for q in smooth]
-    signed = [q if (at * along[0]).sum() >= 0.0 else -q for q, at in zip(smooth, along, strict=True)]
+    signed = [q if (samples * along[0]).sum() >= 0.0 else -q for q, samples in zip(smooth, along, strict=True)]
     total = np.concatenate(signed).sum(axis=0)
     size = float(np.linalg.norm(total))
     return (total / size, signed) if size > 0.0 else (mean, near)
@@ -135,15 +135,15 @@ def _learned_gripper(
     held_out: Sequence[HeldOut], *, points: int, ell: float
 ) -> tuple[LearnedGripper | None, float | None, list[str]]:
     """The gripper, the share of held-out samples [%] in which it is right, and warnings."""
-    known = [(one.inputs, one.take.closure[:, None]) for one in held_out if one.take.closure is not None]
-    if not known:
+    pairs = [(result.inputs, result.take.closure[:, None]) for result in held_out if result.take.closure is not None]
+    if not pairs:
         return None, None, []
-    unknown = [one.take.name for one in held_out if one.take.closure is None]
+    unknown = [result.take.name for result in held_out if result.take.closure is None]
     remarks = [f"{', '.join(unknown)} without gripper: it is learned from the others"] * bool(unknown)
-    choice = selection_of(known, points)
+    choice = selection_of(pairs, points)
     right, prior = None, np.array([UNDECIDED])
-    if len(known) > 1:
-        right = 100.0 * float(np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(known))]).mean())
+    if len(pairs) > 1:
+        right = 100.0 * float(np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(pairs))]).mean())
         if right < 100.0 * (1.0 - GRIPPER_WRONG_SHARE):
             remarks.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it via-points")
     primitive = even(choice.inputs, choice.outputs, GaussianKernel(ell), prior)
@@ -154,8 +154,8 @@ def _is_right(choice: DirectSelection, take: int, prior: Vector, ell: float) -> 
     """Return whether the gripper that the other takes lead to is right at a take's points (N,)."""
     mine = choice.group == take
     others = even(choice.inputs[~mine], choice.outputs[~mine], GaussianKernel(ell), prior)
-    gripper, found = UNKNOWN, []
+    gripper, is_closed = UNKNOWN, []
     for closure in others.mean(choice.inputs[mine])[:, 0].tolist():
         gripper = decided(gripper, closure)
-        found.append(gripper == CLOSED)
-    return np.asarray(np.array(found) == (choice.outputs[mine, 0] > UNDECIDED))
+        is_closed.append(gripper == CLOSED)
+    return np.asarray(np.array(is_closed) == (choice.outputs[mine, 0] > UNDECIDED))

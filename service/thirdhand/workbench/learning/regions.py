@@ -98,11 +98,11 @@ def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regi
     if len(blocks) < LEAST_BLOCKS:
         return NORMAL
     std_s = min(TIMINGS_S, key=lambda candidate_s: _cost(errors, candidate_s))
-    squares = [one.squares(std_s) for one in errors]
+    squares = [take_errors.squares(std_s) for take_errors in errors]
     radii = np.maximum.accumulate([_radius(squares, blocks, level) for level in LEVELS])
     scale = float(radii[LEVELS.index(0.95)]) / REGION_95
     regions = Regions(scale, std_s, tuple((radii / scale).tolist()))
-    relative = [(one.errors**2).sum(axis=1) / np.trace(one.published(regions), axis1=1, axis2=2) for one in errors]
+    relative = [(take_errors.errors**2).sum(axis=1) / np.trace(take_errors.published(regions), axis1=1, axis2=2) for take_errors in errors]
     ratios = np.maximum.accumulate([max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS])
     regions = regions._replace(ratios=tuple(ratios.tolist()))
     return regions._replace(alarm=_alarm(errors, regions))
@@ -110,10 +110,10 @@ def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regi
 
 def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
     """The error probability above which a skill with these errors is unsure."""
-    found, wrong = [one.probabilities(regions) for one in errors], [one.is_wrong for one in errors]
-    right = [values[~is_wrong] for values, is_wrong in zip(found, wrong, strict=True) if not is_wrong.all()]
+    probabilities, wrong = [take_errors.probabilities(regions) for take_errors in errors], [take_errors.is_wrong for take_errors in errors]
+    right = [values[~is_wrong] for values, is_wrong in zip(probabilities, wrong, strict=True) if not is_wrong.all()]
     alarm = _quantile(right, 1.0 - FALSE_ALARM_SHARE) if right else ALARMS[0]
-    among = np.concatenate(found)[np.concatenate(wrong)]
+    among = np.concatenate(probabilities)[np.concatenate(wrong)]
     if len(among) >= LEAST_WRONG:
         alarm = max(alarm, float(np.quantile(among, 1.0 - ALARM_SHARE)))
     return min(max(alarm, ALARMS[0]), ALARMS[1])
@@ -125,22 +125,22 @@ def local_errors(
     """The errors of takes with inputs (T, I), each with covariances by the errors of the other
     blocks; and those that a model with this primitive keeps.
     """
-    each, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
-    at = [values[_rows(len(values))] for values in inputs]
-    kept = [np.unique(np.linspace(0, len(values) - 1, min(each, len(values))).round().astype(int)) for values in at]
+    count, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
+    used_inputs = [values[_rows(len(values))] for values in inputs]
+    retained_rows = [np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int)) for values in used_inputs]
     unknown_std_m = unknown_std(takes)
 
     def of(numbers: Sequence[int]) -> LocalErrors:
-        some, errors = (
-            np.concatenate([values[i][kept[i]] for i in numbers]) for values in (at, [one.errors for one in timed])
+        retained_inputs, errors = (
+            np.concatenate([values[i][retained_rows[i]] for i in numbers]) for values in (used_inputs, [take_errors.errors for take_errors in timed])
         )
-        return LocalErrors.of(primitive, some, errors, unknown_std_m)
+        return LocalErrors.of(primitive, retained_inputs, errors, unknown_std_m)
 
     out = list(timed)
     for block in blocks_of(persons):
         others = of([i for i in range(len(takes)) if i not in block])
         for i in block:
-            out[i] = timed[i]._replace(covariance=others.covariances(at[i]))
+            out[i] = timed[i]._replace(covariance=others.covariances(used_inputs[i]))
     return out, of(range(len(takes)))
 
 
@@ -153,8 +153,8 @@ def calibrated_without(errors: Sequence[TimedErrors], persons: NDArray[np.intp])
     """The errors of each take, and the regions that the other blocks lead to."""
     out: dict[int, tuple[TimedErrors, Regions]] = {}
     for block in blocks_of(persons):
-        kept = [i for i in range(len(errors)) if i not in block]
-        regions = calibrated([errors[i] for i in kept], persons[kept])
+        numbers = [i for i in range(len(errors)) if i not in block]
+        regions = calibrated([errors[i] for i in numbers], persons[numbers])
         out |= {i: (errors[i], regions) for i in block}
     return [out[i] for i in range(len(errors))]
 
@@ -190,8 +190,8 @@ def _through_places(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:
 
 def _cost(errors: Sequence[TimedErrors], std_s: float) -> float:
     """The negative log likelihood of the errors at the best scale, but for constants."""
-    each = [(np.linalg.slogdet(one.with_timing(std_s))[1].mean(), one.squares(std_s).mean()) for one in errors]
-    size, square = np.mean(each, axis=0)
+    terms = [(np.linalg.slogdet(take_errors.with_timing(std_s))[1].mean(), take_errors.squares(std_s).mean()) for take_errors in errors]
+    size, square = np.mean(terms, axis=0)
     return float(size + 3.0 * np.log(max(square, LEAST_SQUARE)))
 
 
@@ -199,7 +199,7 @@ def _radius(squares: Sequence[Vector], blocks: Sequence[Sequence[int]], level: f
     """The squared radius of a level's region for squared distances (T,) of each take."""
     relative: list[Vector] = [np.empty(0)] * len(squares)
     for block in blocks:
-        others = _quantile([one for i, one in enumerate(squares) if i not in block], level)
+        others = _quantile([values for i, values in enumerate(squares) if i not in block], level)
         for i in block:
             relative[i] = squares[i] / max(others, LEAST_SQUARE)
     widened = min(max(_quantile(relative, level), 1.0), WIDEST)
@@ -210,5 +210,5 @@ def _quantile(groups: Sequence[Vector], level: float) -> float:
     """The quantile of values (T,) in groups that count equally."""
     values = np.concatenate(groups)
     order = np.argsort(values)
-    share = np.cumsum(np.concatenate([np.full(len(one), 1.0 / len(one)) for one in groups])[order])
+    share = np.cumsum(np.concatenate([np.full(len(group), 1.0 / len(group)) for group in groups])[order])
     return float(np.interp(level, share / share[-1], values[order]))

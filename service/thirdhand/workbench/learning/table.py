@@ -10,20 +10,20 @@ OTHER_MM = 1.0  # the error at the moment has a column if it differs from the er
 
 def table(found: Figures) -> str:
     """The figures as a table of demonstrations, an explanation of its columns, and the verdicts."""
-    which = "held out" if len(found.demonstrations) > 1 else "learned from"
-    which += " by person" if found.by_person else ""
-    width = max(len(text) for text in (which, *(row.name for row in (*found.demonstrations, found.all))))
-    ways = "".join(f"   {way}" for way in found.all.other_mm)
+    basis = "held out" if len(found.demonstrations) > 1 else "learned from"
+    basis += " by person" if found.by_person else ""
+    width = max(len(text) for text in (basis, *(row.name for row in (*found.demonstrations, found.all))))
+    ways = "".join(f"   {baseline}" for baseline in found.all.other_mm)
     rows = (*found.demonstrations, found.all)
     is_other = any(abs(row.moment_mm - row.error_mm) >= OTHER_MM for row in rows)
     moment = "  of blocks" if is_other else ""
-    lines = [f"{which:<{width}}   error   worst{moment}   expected   in 50 %  in 95 %   held{ways}"]
+    lines = [f"{basis:<{width}}   error   worst{moment}   expected   in 50 %  in 95 %   held{ways}"]
     for row in rows:
         moment = f"    {row.moment_mm:4.0f} mm" if is_other else ""
         lines.append(
             f"{row.name:<{width}}  {row.error_mm:4.0f} mm {row.worst_mm:4.0f} mm{moment}"
             f"    {row.predicted_mm:4.0f} mm   {row.within_50:5.0f} %  {row.within_95:5.0f} %  {row.held:4.1f} %"
-            + "".join(f"   {f'{mm:.0f} mm':>{len(way)}}" for way, mm in row.other_mm.items())
+            + "".join(f"   {f'{mm:.0f} mm':>{len(baseline)}}" for baseline, mm in row.other_mm.items())
         )
     helds = [row.held for row in found.demonstrations]
     lines += [
@@ -55,10 +55,10 @@ def table(found: Figures) -> str:
         lines.append(f"the gripper is right in {found.gripper_right:.0f} % of the samples")
     if found.delay_s is not None:
         late = f"{found.delay_s:.2f} s" if found.delay_s >= LEAST_DELAY_S else "not"
-        then = ": the tool is as late; [skill] lead_s makes it earlier" if found.delay_s >= LEAST_DELAY_S else ""
+        advice = ": the tool is as late; [skill] lead_s makes it earlier" if found.delay_s >= LEAST_DELAY_S else ""
         lines.append(
             f"the teacher was {late} late, which predicts held-out demonstrations best (standard deviation "
-            f"{found.delay_std_s:.2f} s over demonstrations){then}"
+            f"{found.delay_std_s:.2f} s over demonstrations){advice}"
         )
     if found.tried_mm:
         wide = max(map(len, found.tried_mm))
@@ -78,8 +78,8 @@ def _told(found: Figures) -> list[str]:
     if not (found.all.wrong or found.all.falsely_told):
         return []
     wrong = f"{found.all.wrong:.1f} % of the samples are missed by more than 10 cm"
-    told = "" if found.all.told is None else f"; the skill is unsure at {found.all.told:.0f} % of these"
-    return [f"{wrong}{told}, and at {found.all.falsely_told:.0f} % of the others"]
+    unsure_text = "" if found.all.told is None else f"; the skill is unsure at {found.all.told:.0f} % of these"
+    return [f"{wrong}{unsure_text}, and at {found.all.falsely_told:.0f} % of the others"]
 
 
 def _caught(found: Figures) -> str:

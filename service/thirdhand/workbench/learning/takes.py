@@ -61,19 +61,19 @@ def divided(
     names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
     # In the order of recording, so that the order of the files makes no difference.
     in_order = sorted(zip(names, demonstrations, strict=True), key=lambda one: (int(one[1].stamps_ns[0]), one[0]))
-    names, demonstrations = [name for name, _ in in_order], [one for _, one in in_order]
-    for name, one in zip(names, demonstrations, strict=True):
+    names, demonstrations = [name for name, _ in in_order], [demonstration for _, demonstration in in_order]
+    for name, demonstration in zip(names, demonstrations, strict=True):
         try:
-            check(one)
+            check(demonstration)
         except SkillError as error:
             raise SkillError(f"{name}: {error}") from None
     named = [*refined, *map(NamedDemonstration, names, demonstrations)]
-    repeats = _repeats([one.demonstration for one in named])
+    repeats = _repeats([entry.demonstration for entry in named])
     repeated = [f"{named[i].name} repeats {named[j].name}, and is left out" for i, j in repeats.items()]
-    known = {one.person for one in demonstrations if one.person}
-    of_others = [i for i, one in enumerate(refined) if one.demonstration.person not in known]
+    new_persons = {demonstration.person for demonstration in demonstrations if demonstration.person}
+    of_others = [i for i, entry in enumerate(refined) if entry.demonstration.person not in new_persons]
     earlier = [named[i] for i in of_others if i not in repeats]
-    names, demonstrations = _columns([one for i, one in enumerate(named) if i not in {*repeats, *of_others}])
+    names, demonstrations = _columns([entry for i, entry in enumerate(named) if i not in {*repeats, *of_others}])
     if not demonstrations:
         raise SkillError("all demonstrations repeat those of the skill that is refined: there is nothing new to learn")
     if max(map(moved_m, demonstrations)) < LEAST_M:
@@ -88,8 +88,8 @@ def divided(
     conductor = None if hand == "both" else SIDES.index(hand)
     if conductor is not None:
         demonstrations, before = (
-            [one._replace(places=tuple(of_one(point, conductor) for point in one.places)) for one in some]
-            for some in (demonstrations, before)
+            [demonstration._replace(places=tuple(of_one(point, conductor) for point in demonstration.places)) for demonstration in group]
+            for group in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
     if options.delay_s is not None and not isinstance(method, Segmented):
@@ -103,7 +103,7 @@ def divided(
 
 
 def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[str], list[Demonstration]]:
-    return [one.name for one in named], [one.demonstration for one in named]
+    return [entry.name for entry in named], [entry.demonstration for entry in named]
 
 
 def _check_alike(
@@ -113,11 +113,11 @@ def _check_alike(
     needed = [point.name for point in earlier[0].places]
     if not needed:
         return
-    for name, one in zip(names, demonstrations, strict=True):
-        given = [point.name for point in one.places]
-        if set(given) != set(needed):
+    for name, demonstration in zip(names, demonstrations, strict=True):
+        point_names = [point.name for point in demonstration.places]
+        if set(point_names) != set(needed):
             raise SkillError(
-                f"{name} has the via-points {', '.join(given) or '(none)'}: {', '.join(needed)} needed, as in "
+                f"{name} has the via-points {', '.join(point_names) or '(none)'}: {', '.join(needed)} needed, as in "
                 "the skill that is refined; take them with the demonstration (record --places), or name them (--places)"
             )
 
@@ -125,13 +125,13 @@ def _check_alike(
 def _conducting(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> Hands:
     """The hands that conduct all demonstrations. Raises SkillError if they differ."""
     by_hand: dict[str, list[str]] = {}
-    for name, one in zip(names, demonstrations, strict=True):
-        by_hand.setdefault(one.conducts, []).append(name)
+    for name, demonstration in zip(names, demonstrations, strict=True):
+        by_hand.setdefault(demonstration.conducts, []).append(name)
     if len(by_hand) > 1:
-        which = "; ".join(f"{hand}: {', '.join(by_hand[hand])}" for hand in sorted(by_hand))
+        groups = "; ".join(f"{hand}: {', '.join(by_hand[hand])}" for hand in sorted(by_hand))
         raise SkillError(
             f"demonstrations that are conducted by different hands: {', '.join(sorted(by_hand))}; take them alike, or "
-            f"leave out those of one kind ({which})"
+            f"leave out those of one kind ({groups})"
         )
     return demonstrations[0].conducts
 
@@ -163,15 +163,15 @@ def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> l
     if count > BLOCKS:
         means_m = np.zeros((count, 3))
         for person in range(count):
-            theirs = [one for one, number in zip(demonstrations, person_of, strict=True) if number == person]
-            means_m[person] = np.mean([one.tool[:, :3].mean(axis=0) for one in theirs], axis=0)
+            theirs = [demonstration for demonstration, number in zip(demonstrations, person_of, strict=True) if number == person]
+            means_m[person] = np.mean([demonstration.tool[:, :3].mean(axis=0) for demonstration in theirs], axis=0)
         along = np.argsort(means_m[:, means_m.var(axis=0).argmax()], kind="stable").tolist()
         dealt = sorted(range(count), key=lambda rank: (rank % BLOCKS, rank))
         for number, rank in enumerate(dealt):
             number_of[along[rank]] = number
     return [
-        Take(name, number_of[person], one, one.hands, one.tool, one.gripper)
-        for name, person, one in zip(names, person_of, demonstrations, strict=True)
+        Take(name, number_of[person], demonstration, demonstration.hands, demonstration.tool, demonstration.gripper)
+        for name, person, demonstration in zip(names, person_of, demonstrations, strict=True)
     ]
 
 
@@ -179,7 +179,7 @@ def standing_out(held_out: Sequence[HeldOut]) -> dict[str, float]:
     """The held-out errors [m] of the takes that stand out, by name: above STANDS_OUT_TIMES the
     median, and above UNSURE_M; none of fewer than LEAST_COMPARED takes, or of more than a third.
     """
-    errors_m = {one.take.name: rms(one.errors) for one in held_out}
+    errors_m = {result.take.name: rms(result.errors) for result in held_out}
     limit_m = max(UNSURE_M, STANDS_OUT_TIMES * float(np.median(list(errors_m.values()))))
     out = {name: error_m for name, error_m in errors_m.items() if error_m > limit_m}
     return out if len(errors_m) >= LEAST_COMPARED and 3 * len(out) <= len(errors_m) else {}
@@ -189,10 +189,10 @@ def _repeats(demonstrations: Sequence[Demonstration]) -> dict[int, int]:
     """The demonstrations that repeat an earlier one, at any sampling rate, and which one."""
     paths: list[Vector] = []
     out: dict[int, int] = {}
-    for i, one in enumerate(demonstrations):
-        both = np.hstack([one.hands, one.tool[:, :3]])
-        at, known = np.linspace(0.0, 1.0, COMPARED_TIMES), np.linspace(0.0, 1.0, len(both))
-        paths.append(np.stack([np.interp(at, known, column) for column in both.T], axis=1))
+    for i, demonstration in enumerate(demonstrations):
+        motion = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
+        grid, shares = np.linspace(0.0, 1.0, COMPARED_TIMES), np.linspace(0.0, 1.0, len(motion))
+        paths.append(np.stack([np.interp(grid, shares, column) for column in motion.T], axis=1))
         twins = (j for j in range(i) if j not in out and rms(paths[i] - paths[j]) < REPEATED_M)
         if (twin := next(twins, None)) is not None:
             out[i] = twin

@@ -50,16 +50,16 @@ class Subject(NamedTuple):
 
     def parts(self, of: str) -> Mapping[str, float]:
         """The names and figures of the parts of a kind; of the kind "" there is one."""
-        found = self.figures
+        figures = self.figures
         if of == "demonstrations":
-            return {row.name: row.error_mm for row in found.demonstrations}
+            return {row.name: row.error_mm for row in figures.demonstrations}
         if of == "baselines":
-            return found.all.other_mm
+            return figures.all.other_mm
         if of == "regions":
-            return {"50": found.all.within_50, "95": found.all.within_95}
-        if of == "wrong samples" and found.alone is True:
-            return {"the hand 30 cm beside": found.beside}
-        return {"hands swapped": found.swapped, "hands 30 cm beside": found.beside} if of else {"": 0.0}
+            return {"50": figures.all.within_50, "95": figures.all.within_95}
+        if of == "wrong samples" and figures.alone is True:
+            return {"the hand 30 cm beside": figures.beside}
+        return {"hands swapped": figures.swapped, "hands 30 cm beside": figures.beside} if of else {"": 0.0}
 
 
 MORE = "; more demonstrations along the same paths, or named via-points (record --places), help"

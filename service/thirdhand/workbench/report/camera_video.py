@@ -46,7 +46,7 @@ class _Video:
 
     def begin(self, episodes: Sequence[CameraRows]) -> None:
         """Begin a recording with these episodes, whose images follow."""
-        self.rows = [(time_ns, i) for one in episodes for i, time_ns in enumerate(one.times_ns.tolist())][::-1]
+        self.rows = [(time_ns, i) for episode in episodes for i, time_ns in enumerate(episode.times_ns.tolist())][::-1]
         self._newest: CompressedImage | None = None
         self._picture: Image.Image | None = None  # the last one that could be decoded
 
@@ -55,9 +55,9 @@ class _Video:
         ends the recording. In place of an image that cannot be decoded, the one before it is
         written, or else the next one.
         """
-        shown, picture = self._newest or image, None
-        if shown is not None and self.rows and self.rows[-1][0] < at_ns:
-            picture = _opened(shown.data)
+        newest, picture = self._newest or image, None
+        if newest is not None and self.rows and self.rows[-1][0] < at_ns:
+            picture = _opened(newest.data)
             self.has_damaged = self.has_damaged or picture is None
             self._picture = picture = picture or self._picture
         while picture is not None and self.rows and self.rows[-1][0] < at_ns:
@@ -68,12 +68,12 @@ class _Video:
         if self._size is None:
             self._size = max(2, picture.width // 2 * 2), max(2, picture.height // 2 * 2)  # even, for the colours
             self._stream.width, self._stream.height = self._size
-        shown = picture if picture.size == self._size else picture.resize(self._size)
+        frame = picture if picture.size == self._size else picture.resize(self._size)
         if row == 0:
             self.sampled.append([])
         if row % SAMPLED == 0:
-            self.sampled[-1].append(np.asarray(shown, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255)
-        self.container.mux(self._stream.encode(self._encoded(shown)))
+            self.sampled[-1].append(np.asarray(frame, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255)
+        self.container.mux(self._stream.encode(self._encoded(frame)))
 
     def feature(self) -> dict[str, Any]:
         """End the stream; the feature of the data set's description."""
@@ -107,19 +107,19 @@ def write_videos(
     videos: dict[str, _Video] = {}
     with contextlib.ExitStack() as closing:
         for number, (_, group) in enumerate(itertools.groupby(episodes, lambda one: id(one.recording))):
-            parts, seen = list(group), set[str]()
+            parts, begun_keys = list(group), set[str]()
             for key, image, at_ns in parts[0].recording.images():
                 if number == 0 and key not in videos:
                     videos[key] = _Video(path_of(key), fps)
                     closing.enter_context(videos[key].container)
                 if key in videos:
-                    if key not in seen:
-                        seen.add(key)
+                    if key not in begun_keys:
+                        begun_keys.add(key)
                         videos[key].begin(parts)
                     videos[key].show(image, at_ns)
-            for key in seen:
+            for key in begun_keys:
                 videos[key].show(None, math.inf)
-            for key in [key for key in videos if key not in seen or videos[key].rows]:
+            for key in [key for key in videos if key not in begun_keys or videos[key].rows]:
                 video = videos.pop(key)
                 video.container.close()
                 video.path.unlink(missing_ok=True)

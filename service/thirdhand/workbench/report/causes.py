@@ -24,12 +24,12 @@ def why(columns: Columns, begin: int, end: int) -> Explanation:
     """
     frame, last = columns.frames[begin], int(columns.frames["tick"][end - 1])
     named = word(Mode(int(frame["mode"]))), word(Reason(int(frame["reason"])))
-    found = _by_frame(columns, begin)
+    explanation = _by_frame(columns, begin)
     first = bisect.bisect_left(columns.statuses, int(frame["tick"]), key=lambda said: said.tick)
-    for said in itertools.takewhile(lambda said: said.tick <= last, columns.statuses[first:]):
-        if (said.mode, said.reason) == named:
-            return Explanation(said.because or found.why, said.remedy)
-    return found
+    for status in itertools.takewhile(lambda said: said.tick <= last, columns.statuses[first:]):
+        if (status.mode, status.reason) == named:
+            return Explanation(status.because or explanation.why, status.remedy)
+    return explanation
 
 
 def _by_frame(columns: Columns, row: int) -> Explanation:
@@ -41,15 +41,15 @@ def _by_frame(columns: Columns, row: int) -> Explanation:
         side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < limit_ms)
         for side, age_ms, limit_ms in zip(SIDES, ages_ms, stale_ms, strict=True)
     }
-    skill = next((one.skill for one in reversed(columns.skills) if one.tick <= tick), None)
-    seen = Evidence(
+    skill = next((change.skill for change in reversed(columns.skills) if change.tick <= tick), None)
+    evidence = Evidence(
         sources=sources,
         settings=settings,
         gate_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
         measure="" if skill is None else skill.model.measure,
-        failure=next((one.text for one in reversed(columns.orders) if one.kind == "fault" and one.tick <= tick), ""),
+        failure=next((order.text for order in reversed(columns.orders) if order.kind == "fault" and order.tick <= tick), ""),
     )
-    return explained(Reason(int(frame["reason"])), seen)
+    return explained(Reason(int(frame["reason"])), evidence)
 
 
 def before(columns: Columns, begin: int) -> Iterator[str]:
@@ -70,21 +70,21 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
         missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
         if missed or late_us >= LATE_US:
             yield f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} ms late"
-    for one in columns.orders:
-        ago_s = (tick - one.tick) * columns.period_s
-        if one.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
-            yield f"{f'{ago_s:.2f} s before: ' if ago_s > 0.005 else ''}{ORDERS[one.kind]}"
+    for order in columns.orders:
+        ago_s = (tick - order.tick) * columns.period_s
+        if order.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
+            yield f"{f'{ago_s:.2f} s before: ' if ago_s > 0.005 else ''}{ORDERS[order.kind]}"
 
 
 def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, str]]:
     """Source, cause and description of the rejected samples in the statuses between two ticks, the
     newest of each source and cause.
     """
-    said = [one for one in columns.statuses if first <= one.tick <= last]
+    statuses = [status for status in columns.statuses if first <= status.tick <= last]
     newest = {
         (name, source.cause): source.refused
-        for one in said
-        for name, source in (one.sources | one.streams).items()
+        for status in statuses
+        for name, source in (status.sources | status.streams).items()
         if source.refused
     }
     return [(*of, refused) for of, refused in newest.items()]

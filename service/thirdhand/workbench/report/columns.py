@@ -112,8 +112,8 @@ class Columns:
     def stale_ticks(self) -> Records:
         """Age from which each hand is stale (T, 2); `stale_ms` where it was not recorded."""
         settings = self.recording.settings
-        found: Records = np.maximum(self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000))
-        return found
+        ticks: Records = np.maximum(self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000))
+        return ticks
 
     @property
     def times(self) -> Vector:
@@ -124,7 +124,7 @@ class Columns:
 
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
     """The columns of a recording. Raises RecordingError if it cannot be read."""
-    found, last, gaps = Columns(recording), None, list[Gap]()
+    columns, last, gaps = Columns(recording), None, list[Gap]()
     layout = frame_layout(len(recording.settings.joints.names))
     blocks: list[Records] = []
     block: list[Record] = []
@@ -137,7 +137,7 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
     def kept() -> Records:
         return repack_fields(np.array(block, layout)[list(KEPT)])
 
-    _take_skill(found, recording.skill, 0)
+    _take_skill(columns, recording.skill, 0)
     for step in recording.steps():
         if step.lost or step.damage:
             gaps.append(Gap(last, step.tick, step.lost, step.damage))
@@ -147,9 +147,9 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
         if step.frame is not None:
             mode = step.frame["mode"]
         followed = step.tick if mode == Mode.FOLLOW else followed
-        _take_events(found, step, followed)
+        _take_events(columns, step, followed)
         if step.lost or step.damage:
-            found.breaks.append(len(ticks))
+            columns.breaks.append(len(ticks))
         ticks.append(step.tick)
         times_ns.append(step.time_ns)
         if step.frame is not None:
@@ -161,16 +161,16 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             block.clear()
         if len(ticks) % BLOCK == 0:
             progress(len(ticks))
-    found.frames, found.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
-    found.ticks, found.times_ns = np.array(ticks, np.int64), np.array(times_ns, np.int64)
-    _fill(found, found.ticks)
+    columns.frames, columns.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
+    columns.ticks, columns.times_ns = np.array(ticks, np.int64), np.array(times_ns, np.int64)
+    _fill(columns, columns.ticks)
     for _, text, _ in recording.notes("status"):
         with contextlib.suppress(msgspec.MsgspecError):  # of another version
-            found.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
-    found.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
-    if found.skills and len(found.frames):
-        found.skills[0] = found.skills[0]._replace(tick=int(found.frames["tick"][0]))
-    return found
+            columns.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
+    columns.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
+    if columns.skills and len(columns.frames):
+        columns.skills[0] = columns.skills[0]._replace(tick=int(columns.frames["tick"][0]))
+    return columns
 
 
 def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
@@ -186,9 +186,9 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
     parts = np.cumsum(parts)
     part_of = parts[np.searchsorted(ticks, frames["tick"])]
     row = np.searchsorted(frames["tick"], ticks, side="right") - 1
-    known = (row >= 0) & (part_of[row] == parts)  # after damage, those before the next frame are unknown
-    found.breaks = (np.flatnonzero(np.diff(parts[known])) + 1).tolist()
-    ticks, row = ticks[known], row[known]
+    is_known = (row >= 0) & (part_of[row] == parts)  # after damage, those before the next frame are unknown
+    found.breaks = (np.flatnonzero(np.diff(parts[is_known])) + 1).tolist()
+    ticks, row = ticks[is_known], row[is_known]
     after = np.minimum(row + 1, len(frames) - 1)
     begin, end = frames["tick"][row], frames["tick"][after]
     motion = np.where(part_of[row] == part_of[after], (ticks - begin) / np.maximum(end - begin, 1), 0.0)

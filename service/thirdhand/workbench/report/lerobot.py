@@ -40,22 +40,22 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
     """
     joint_settings = found.recording.settings.joints
     frames, names = found.frames, joint_settings.names
-    told = {-1: [np.nan] * len(names)}
+    states = {-1: [np.nan] * len(names)}
     for step in found.recording.steps(outputs=False):
         for state in (cdr.decode_joints(payload) for kind, payload in step.events if kind == "joints/state"):
             by_name = dict(zip(state.names, state.position, strict=False))
-            told[step.tick] = [by_name.get(name, np.nan) for name in names]
-    ticks, joints = np.array([*told]), np.array([*told.values()])
+            states[step.tick] = [by_name.get(name, np.nan) for name in names]
+    ticks, joints = np.array([*states]), np.array([*states.values()])
     parts = np.repeat(np.arange(len(found.breaks) + 1), np.diff([0, *found.breaks, len(frames)]))
     ready = (frames["commanded"] != 0) & (frames["hand_ages"] >= 0).all(axis=1)
     for begin, end in runs(np.where(ready, parts, -1)):
         if ready[begin]:
             times = found.times[begin:end] - found.times[begin]
             rows = begin - 1 + times.searchsorted(np.arange(0.0, times[-1] + 1e-6, 1 / fps) + 1e-6, side="right")
-            seen = joints[ticks.searchsorted(frames["tick"][rows], side="right") - 1]
-            seen = np.where(np.isnan(seen), frames["joints"][np.maximum(rows - 1, begin)], seen)
-            seen = in_turn(joint_settings, seen, frames["joints"][rows])
-            values = (seen, frames["hands"][rows].reshape(-1, len(HANDS)), frames["joints"][rows])
+            measured_joints = joints[ticks.searchsorted(frames["tick"][rows], side="right") - 1]
+            measured_joints = np.where(np.isnan(measured_joints), frames["joints"][np.maximum(rows - 1, begin)], measured_joints)
+            measured_joints = in_turn(joint_settings, measured_joints, frames["joints"][rows])
+            values = (measured_joints, frames["hands"][rows].reshape(-1, len(HANDS)), frames["joints"][rows])
             part: Episode = {name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)}
             part["action.gripper"] = frames["closure"][rows].astype(np.float32)
             part["observation.segment"] = np.where(frames["segment_belief"][rows] > 0, frames["segment"][rows], -1)
@@ -67,11 +67,11 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
 
     Raises ExplainedError if arms differ, or if there is no episode.
     """
-    found = [(one.recording, part) for one in recordings for part in episodes(one, fps=fps)]
-    parts = [part for _, part in found]
-    shown = [CameraRows(recording, part.pop("times_ns").astype(np.int64)) for recording, part in found]
-    told = [(one.recording.urdf, one.recording.settings.joints.names) for one in recordings]
-    arms = {(ElementTree.fromstring(urdf).get("name"), names) for urdf, names in told}
+    pairs = [(columns.recording, part) for columns in recordings for part in episodes(columns, fps=fps)]
+    parts = [part for _, part in pairs]
+    camera_rows = [CameraRows(recording, part.pop("times_ns").astype(np.int64)) for recording, part in pairs]
+    arm_specs = [(columns.recording.urdf, columns.recording.settings.joints.names) for columns in recordings]
+    arms = {(ElementTree.fromstring(urdf).get("name"), names) for urdf, names in arm_specs}
     if len(arms) > 1 or not parts:
         why = "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
         raise ExplainedError(f"no data set is written: {why}")
@@ -88,7 +88,7 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     def video_of(key: str) -> Path:
         return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)
 
-    videos = {_named(key): video for key, video in write_videos(shown, video_of, fps=fps).items()}
+    videos = {_named(key): video for key, video in write_videos(camera_rows, video_of, fps=fps).items()}
     info = {
         "codebase_version": "v3.0", "robot_type": arm, "fps": fps, "splits": {"train": f"0:{len(parts)}"},
         "total_episodes": len(parts), "total_frames": ends[-1], "total_tasks": 1, "chunks_size": 1000,
@@ -149,21 +149,21 @@ def _table(part: Episode) -> pa.Table:
 
 
 def _statistics(columns: Episode) -> dict[str, dict[str, list[float]]]:
-    found: dict[str, dict[str, list[float]]] = {}
+    statistics: dict[str, dict[str, list[float]]] = {}
     for name, column in columns.items():
         rows = column.reshape(len(column), -1).astype(np.float64)
-        found[name] = {kind: getattr(rows, kind)(axis=0).tolist() for kind in ("min", "max", "mean", "std")}
-        found[name] |= {f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0).tolist() for q in QUANTILES}
-        found[name]["count"] = [len(rows)]
-    return found
+        statistics[name] = {kind: getattr(rows, kind)(axis=0).tolist() for kind in ("min", "max", "mean", "std")}
+        statistics[name] |= {f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0).tolist() for q in QUANTILES}
+        statistics[name]["count"] = [len(rows)]
+    return statistics
 
 
 def _video_statistics(videos: Mapping[str, tuple[Any, list[Any]]], episodes: slice) -> dict[str, dict[str, Any]]:
     """Statistics of the colours, 0 to 1, as (3, 1, 1) of sampled pictures."""
-    found: dict[str, dict[str, Any]] = {}
+    statistics: dict[str, dict[str, Any]] = {}
     for name, (_, sampled) in videos.items():
         pictures = [picture for episode in sampled[episodes] for picture in episode]
         kinds = _statistics({name: np.concatenate(pictures)})[name]
-        found[name] = {kind: [[[value]] for value in values] for kind, values in kinds.items()}
-        found[name]["count"] = [len(pictures)]
-    return found
+        statistics[name] = {kind: [[[value]] for value in values] for kind, values in kinds.items()}
+        statistics[name]["count"] = [len(pictures)]
+    return statistics

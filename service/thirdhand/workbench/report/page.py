@@ -115,8 +115,8 @@ def _over_time(report: Report) -> Figure:
     for mode, colour in MODE_COLOURS.items():
         modes.plot([], [], color=colour, lw=6, label=str(mode.name).lower())
 
-    seen = (frames["hand_ages"] >= 0).any(axis=1)
-    _curve(near, times, np.where(seen, 100 * frames["hand_distance"], np.nan), NEAREST, "nearest hand to the arm")
+    is_seen = (frames["hand_ages"] >= 0).any(axis=1)
+    _curve(near, times, np.where(is_seen, 100 * frames["hand_distance"], np.nan), NEAREST, "nearest hand to the arm")
     near.set(ylabel="distance [cm]", ylim=(0, None))
 
     following = frames["mode"] == Mode.FOLLOW
@@ -134,21 +134,21 @@ def _over_time(report: Report) -> Figure:
     doubt.set(ylabel="probability [%]", ylim=(0, 100))
 
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
-        found = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
-        _curve(speed, times, found, colour, f"{side} hand")
+        hand_speed = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
+        _curve(speed, times, hand_speed, colour, f"{side} hand")
     _curve(speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint")
     speed.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
     for late in others[4:]:
-        at = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
+        tick_s = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
         for name, colour, label in (
             ("latency_us", LATENCY, "hand stamped to command published"),
             ("work_us", WORK, "work of a tick"),
             ("lateness_us", LATENESS, "later than its deadline"),
         ):
-            told = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
-            late.plot(*thinned(at, told), ".", color=colour, ms=2, label=label)
+            durations_us = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
+            late.plot(*thinned(tick_s, durations_us), ".", color=colour, ms=2, label=label)
         late.set(yscale="log", ylabel="time [µs]")
         late.yaxis.set_major_formatter("{x:g}")
     others[-1].set(xlabel="time since the first tick [s]")
@@ -210,6 +210,6 @@ def thinned(x: Vector, y: Vector, *, points: int = POINTS) -> tuple[Vector, Vect
     edges = np.linspace(0, len(x), points // 2 + 1).astype(int)
     rows = []
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        there = np.flatnonzero(~np.isnan(y[begin:end])) + begin
-        rows += sorted((int(there[y[there].argmin()]), int(there[y[there].argmax()]))) if len(there) else [begin, begin]
+        valid = np.flatnonzero(~np.isnan(y[begin:end])) + begin
+        rows += sorted((int(valid[y[valid].argmin()]), int(valid[y[valid].argmax()]))) if len(valid) else [begin, begin]
     return x[rows], y[rows]

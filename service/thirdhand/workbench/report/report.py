@@ -182,8 +182,8 @@ class Report:
         self.tool_limits = _tool_limits(columns, following)
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
-        seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] < columns.stale_ticks)
-        seen_s = np.maximum(seen.sum(axis=0), 1) * columns.period_s  # time in which each hand was seen
+        is_seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] < columns.stale_ticks)
+        seen_s = np.maximum(is_seen.sum(axis=0), 1) * columns.period_s  # time in which each hand was seen
         self.hands_hz = {side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)}
 
     @property
@@ -202,7 +202,7 @@ class Report:
     def overview(self) -> Overview:
         """The figures of this recording, and where they belong among those of many."""
         cell = self.columns.recording.settings.cell
-        return Overview(Path(self.path), cell, self.week, self.begins, {one.name: one for one in self.figures()})
+        return Overview(Path(self.path), cell, self.week, self.begins, {figure.name: figure for figure in self.figures()})
 
     def figures(self) -> Iterator[Figure]:
         """The numbers for a comparison of recordings."""
@@ -215,14 +215,14 @@ class Report:
         yield Figure("faults", len(self.faults), "times", 0)
         yield Figure("rate", self.rate_hz, "Hz", 2)
         yield Figure("deadlines missed", self.missed, "", 0)
-        for name, found, unit, digits in (
+        for name, percentiles, unit, digits in (
             ("latency", self.latency_ms, "ms", 2),
             ("lateness", self.lateness_us, "µs", 0),
             ("work of a tick", self.work_us, "µs", 0),
             ("tool to target, initial approach", self.initial_mm, "mm", 1),
             ("tool to target", self.lag_mm, "mm", 1),
         ):
-            for share, value in zip(("median", "99 %", "largest"), found or (None,) * 3, strict=False):
+            for share, value in zip(("median", "99 %", "largest"), percentiles or (None,) * 3, strict=False):
                 yield Figure(f"{name}, {share}", value, unit, digits)
         yield Figure("closest approach", self.approach and 1000 * self.approach.distance_m, "mm", 0)
         touched = {limit.name: limit.lasts_s for limit in self.limits}
@@ -265,7 +265,7 @@ def _ended(columns: Columns, fault: Span) -> str:
     if fault.end_s > columns.times[-1]:
         return "not ended in this recording"
     resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
-    by = "a `reset`" if any(abs(at - fault.end_s) < 0.1 for at in resets) else "a cause that is not recorded"
+    by = "a `reset`" if any(abs(reset_s - fault.end_s) < 0.1 for reset_s in resets) else "a cause that is not recorded"
     return f"ended by {by} after {fault.lasts_s:.1f} s"
 
 
@@ -273,10 +273,10 @@ def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
     """The closest approach of a hand that was seen; None without any."""
     frames = columns.frames
     ages = frames["hand_ages"]
-    known = np.flatnonzero(((ages >= 0) & (ages < columns.stale_ticks)).any(axis=1))
-    if not len(known):
+    seen_rows = np.flatnonzero(((ages >= 0) & (ages < columns.stale_ticks)).any(axis=1))
+    if not len(seen_rows):
         return None
-    row = int(known[frames["hand_distance"][known].argmin()])
+    row = int(seen_rows[frames["hand_distance"][seen_rows].argmin()])
     at_s = float(columns.times[row])
     doing = next(span.doing for span in reversed(spans) if span.start_s <= at_s)
     return Approach(float(frames["hand_distance"][row]), at_s, doing, float(frames["hand_limit"][row]))
@@ -317,8 +317,8 @@ def _binding(columns: Columns) -> Iterator[Limit]:
     """The limits that the motion met, the one that bound longest first."""
     from thirdhand.core.tool_limits import binding  # its import is slow, and other parts of this module need none
 
-    found = [_limit(columns, *one) for one in binding(columns.recording.settings, columns.frames)]
-    yield from sorted(found, key=lambda limit: -limit.lasts_s)
+    limits = [_limit(columns, *entry) for entry in binding(columns.recording.settings, columns.frames)]
+    yield from sorted(limits, key=lambda limit: -limit.lasts_s)
 
 
 def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
@@ -373,14 +373,14 @@ def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]
 def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Names and both values of what differs."""
     values = ((name, a.get(name, "unknown"), b.get(name, "unknown")) for name in sorted({*a, *b}))
-    return [found for found in values if found[1] != found[2]]
+    return [entry for entry in values if entry[1] != entry[2]]
 
 
 def flat(value: Any, path: str = "") -> dict[str, Any]:
     """Values in nested tables, by their path with dots."""
     if isinstance(value, dict):
         inner = (flat(inside, f"{path}.{name}" if path else name) for name, inside in value.items())
-        return {name: found for one in inner for name, found in one.items()}
+        return {name: leaf for table in inner for name, leaf in table.items()}
     return {path: value}
 
 
@@ -392,10 +392,10 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     stops = [s for s in found.spans if s.mode is not Mode.FOLLOW and s.start_s < until_s and s.end_s > begin_s]
     if stops:
         worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
-        what, at_s = "was at fault" if worst.mode is Mode.FAULT else "held", worst.start_s - begun_s
+        outcome, at_s = "was at fault" if worst.mode is Mode.FAULT else "held", worst.start_s - begun_s
         since = f"from {at_s:.1f} s on" if at_s > 0 else "from before the script began"
-        return f"the arm {what} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: {worst.why}"
-    hands_m = [one.hands_m for one in found.places if one.name == place]
+        return f"the arm {outcome} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: {worst.why}"
+    hands_m = [point.hands_m for point in found.places if point.name == place]
     if not hands_m:
         return f"no place {place!r} was taught"
     if best := found.best_m(place):

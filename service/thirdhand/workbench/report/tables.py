@@ -60,7 +60,7 @@ def _tables(report: Report) -> Iterator[Table]:
         "segments",
         "Segments of the task",
         ("from [s]", "for [s]", "segment", "probability [%]"),
-        tuple((_s(one.start_s), _s(one.lasts_s), one.name, f"{100 * one.probable:.0f}") for one in report.segments),
+        tuple((_s(segment.start_s), _s(segment.lasts_s), segment.name, f"{100 * segment.probable:.0f}") for segment in report.segments),
         numbers=0,
     )
     yield Table(
@@ -91,9 +91,9 @@ def _tables(report: Report) -> Iterator[Table]:
         "Timing and accuracy",
         ("what", "median", "99 %", "largest", "unit", "values"),
         tuple(
-            (name, *(f"{value:.{digits}f}" for value in found[:3]), unit, str(found.samples))
-            for name, found, unit, digits in _times(report)
-            if found is not None
+            (name, *(f"{value:.{digits}f}" for value in percentiles[:3]), unit, str(percentiles.samples))
+            for name, percentiles, unit, digits in _times(report)
+            if percentiles is not None
         ),
     )
     if report.approach is not None:
@@ -110,8 +110,8 @@ def _tables(report: Report) -> Iterator[Table]:
         "Active limits",
         ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
         tuple(
-            (one.name, _s(one.lasts_s), str(one.times), _s(one.first_s), what_happened(one.name))
-            for one in report.limits
+            (limit.name, _s(limit.lasts_s), str(limit.times), _s(limit.first_s), what_happened(limit.name))
+            for limit in report.limits
         ),
         numbers=0,
     )
@@ -121,8 +121,8 @@ def _tables(report: Report) -> Iterator[Table]:
         "What limited the tool while it followed",
         ("limit", "for [s]", "share [%]", "times", "first at [s]"),
         tuple(
-            (one.name, _s(one.lasts_s), f"{100 * one.lasts_s / followed_s:.1f}", str(one.times), _s(one.first_s))
-            for one in report.binding
+            (limit.name, _s(limit.lasts_s), f"{100 * limit.lasts_s / followed_s:.1f}", str(limit.times), _s(limit.first_s))
+            for limit in report.binding
         ),
     )
     yield Table(
@@ -132,12 +132,12 @@ def _tables(report: Report) -> Iterator[Table]:
         tuple(
             (
                 where,
-                f"{one.speed:.2f}",
-                one.speed_joint or "[tool] max_speed",
-                f"{one.acceleration:.1f}",
-                one.acceleration_joint or "[tool] max_acceleration",
+                f"{limit.speed:.2f}",
+                limit.speed_joint or "[tool] max_speed",
+                f"{limit.acceleration:.1f}",
+                limit.acceleration_joint or "[tool] max_acceleration",
             )
-            for where, one in report.tool_limits.items()
+            for where, limit in report.tool_limits.items()
         ),
         numbers=0,
     )
@@ -146,14 +146,14 @@ def _tables(report: Report) -> Iterator[Table]:
         "Use of the joints' limits",
         ("joint", "from a limit [rad]", "speed [% of limit]", "acceleration [% of limit]"),
         tuple(
-            (one.name, _margin(one), f"{100 * one.speed:.0f}", f"{100 * one.acceleration:.0f}") for one in report.joints
+            (joint.name, _margin(joint), f"{100 * joint.speed:.0f}", f"{100 * joint.acceleration:.0f}") for joint in report.joints
         ),
     )
     yield Table(
         "rejections",
         "Rejected samples",
         ("cause", "count [samples]", "first at [s]", "what to do"),
-        tuple((one.cause, str(one.samples), _s(one.first_s), what_to_do(one.cause)) for one in report.rejections),
+        tuple((rejection.cause, str(rejection.samples), _s(rejection.first_s), what_to_do(rejection.cause)) for rejection in report.rejections),
         numbers=0,
     )
 
@@ -169,8 +169,8 @@ def _margin(joint: Joint) -> str:
 
 
 def _fault(fault: Span) -> tuple[str, str, str]:
-    told = (fault.why, *fault.before, fault.ended, f"what to do: {fault.remedy}")
-    return _s(fault.start_s), word(fault.reason), "\n".join(told)
+    sentences = (fault.why, *fault.before, fault.ended, f"what to do: {fault.remedy}")
+    return _s(fault.start_s), word(fault.reason), "\n".join(sentences)
 
 
 def _times(report: Report) -> Iterator[tuple[str, Percentiles | None, str, int]]:
@@ -203,8 +203,8 @@ def verdict(report: Report) -> str:
     else:
         most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
         if initial := report.initial_mm:
-            way = f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
-            most = f"{most}, after an {way}" if report.lag_mm else f"an {way} and did not reach the target"
+            approach = f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
+            most = f"{most}, after an {approach}" if report.lag_mm else f"an {approach} and did not reach the target"
     lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
     since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
@@ -235,10 +235,10 @@ def comparison(reports: Sequence[Report]) -> Iterator[Table]:
     if len(reports) != 2:
         yield from overviews([report.overview() for report in reports])
         return
-    one, other = reports
-    names = names_of([one.path, other.path])
-    yield side_by_side(names, one.overview().figures, other.overview().figures)
-    settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(one, other))
+    first, other = reports
+    names = names_of([first.path, other.path])
+    yield side_by_side(names, first.overview().figures, other.overview().figures)
+    settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(first, other))
     if settings:
         yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
 
@@ -246,23 +246,23 @@ def comparison(reports: Sequence[Report]) -> Iterator[Table]:
 def side_by_side(names: Sequence[str], one: Mapping[str, Figure], other: Mapping[str, Figure]) -> Table:
     """Figures of two recordings and their differences, without those that are 0 in both."""
     rows = []
-    for name, known in {**other, **one}.items():
+    for name, figure in {**other, **one}.items():
         values = [figures[name].value if name in figures else None for figures in (one, other)]
         if any(values):
-            row = (_with_unit(known), *(_value(known, value) for value in values))
-            rows.append((*row, _difference(known, *values)))
+            row = (_with_unit(figure), *(_value(figure, value) for value in values))
+            rows.append((*row, _difference(figure, *values)))
     return Table("comparison", "Side by side", ("figure", *names, "difference"), tuple(rows))
 
 
 def overviews(recordings: Sequence[Overview]) -> Iterator[Table]:
     """A row for each of many recordings, and totals by cell and week."""
     rows = []
-    names = names_of([one.path for one in recordings])
-    for name, one in zip(names, recordings, strict=True):
-        lasts_s = one.value("duration")
-        followed = _share(one.value("follow"), lasts_s)
-        held = f"{sum(one.holds_s.values()):.1f}"
-        figures = [one.figures[shown] for shown in IN_A_ROW]
+    names = names_of([recording.path for recording in recordings])
+    for name, recording in zip(names, recordings, strict=True):
+        lasts_s = recording.value("duration")
+        followed = _share(recording.value("follow"), lasts_s)
+        held = f"{sum(recording.holds_s.values()):.1f}"
+        figures = [recording.figures[key] for key in IN_A_ROW]
         others = [_value(figure, figure.value) for figure in figures]
         rows.append((name, f"{lasts_s:.1f}", followed, held, *others))
     heads = ("recording", "for [s]", "follow [%]", "hold [s]", *IN_A_ROW.values())
@@ -273,42 +273,42 @@ def overviews(recordings: Sequence[Overview]) -> Iterator[Table]:
 def _totals(recordings: Sequence[Overview]) -> Table:
     """Time recorded and followed, faults, and holds by reason, for each cell and week."""
     groups: dict[tuple[str, str], list[Overview]] = {}
-    for one in recordings:
-        groups.setdefault((one.cell, one.week), []).append(one)
+    for recording in recordings:
+        groups.setdefault((recording.cell, recording.week), []).append(recording)
     rows = []
-    for (cell, week), those in sorted(groups.items()):
-        lasts_s = sum(one.value("duration") for one in those)
-        followed_s = sum(one.value("follow") for one in those)
-        faults = sum(one.value("faults") for one in those)
+    for (cell, week), group in sorted(groups.items()):
+        lasts_s = sum(recording.value("duration") for recording in group)
+        followed_s = sum(recording.value("follow") for recording in group)
+        faults = sum(recording.value("faults") for recording in group)
         held_s: Counter[str] = Counter()
-        for one in those:
-            held_s.update(one.holds_s)
+        for recording in group:
+            held_s.update(recording.holds_s)
         holds = ", ".join(f"{reason} {seconds:.1f} s" for reason, seconds in held_s.most_common())
         share = _share(followed_s, lasts_s)
-        rows.append((cell, week, str(len(those)), f"{lasts_s / 3600:.2f}", share, f"{faults:.0f}", holds or NONE))
+        rows.append((cell, week, str(len(group)), f"{lasts_s / 3600:.2f}", share, f"{faults:.0f}", holds or NONE))
     heads = ("cell", "week", "recordings [1]", "recorded [h]", "followed [%]", "faults [1]", "holds")
     return Table("totals", "Totals by cell and week", heads, tuple(rows), numbers=0)
 
 
 def every_figure(recordings: Sequence[Overview]) -> Table:
     """A row for each recording with all its figures."""
-    known = {name: figure for one in recordings for name, figure in one.figures.items()}
+    figures = {name: figure for recording in recordings for name, figure in recording.figures.items()}
     rows = []
-    for one in recordings:
-        values = (_value(known[name], one.figures[name].value if name in one.figures else None) for name in known)
-        rows.append((str(one.path), one.cell, one.week, one.begins, *values))
-    heads = ("recording", "cell", "week", "begins", *map(_with_unit, known.values()))
+    for recording in recordings:
+        values = (_value(figures[name], recording.figures[name].value if name in recording.figures else None) for name in figures)
+        rows.append((str(recording.path), recording.cell, recording.week, recording.begins, *values))
+    heads = ("recording", "cell", "week", "begins", *map(_with_unit, figures.values()))
     return Table("figures", "All figures", heads, tuple(rows), numbers=4)
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
     """A unique name for each recording: that of its file, with a number if it is not the first."""
-    seen: dict[str, int] = {}
+    counts: dict[str, int] = {}
     names = []
     for path in paths:
         stem = printable(path.stem)
-        seen[stem] = seen.get(stem, 0) + 1
-        names.append(stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")
+        counts[stem] = counts.get(stem, 0) + 1
+        names.append(stem if counts[stem] == 1 else f"{stem}-{counts[stem]}")
     return names
 
 

@@ -49,14 +49,14 @@ class Place(NamedTuple):
 def places(columns: Columns) -> list[Place]:
     """Every via-point that was in force at some time, in the order of teaching."""
     ticks, times = columns.frames["tick"], columns.times
-    found: list[Place] = []
+    results: list[Place] = []
     for point, conductor, begin, end in _taught(columns):
         within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
         frames = columns.frames[within]
         if len(frames):
             nearest, visits = _visits(point, conductor, frames, times[within], columns.period_s)
-            found.append(Place(point.name, float(times[within][0]), float(times[within][-1]), nearest, tuple(visits)))
-    return found
+            results.append(Place(point.name, float(times[within][0]), float(times[within][-1]), nearest, tuple(visits)))
+    return results
 
 
 def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
@@ -66,11 +66,11 @@ def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
     begun: dict[tuple[ViaPoint, int | None], int] = {}
     over: list[tuple[ViaPoint, int | None, int, float]] = []
     for tick, skill in columns.skills:
-        there = {(point, skill.conductor) for point in skill.via_points}
-        over += [(*one, begun.pop(one), tick) for one in list(begun) if one not in there]
+        in_force = {(point, skill.conductor) for point in skill.via_points}
+        over += [(*key, begun.pop(key), tick) for key in list(begun) if key not in in_force]
         for point in skill.via_points:
             begun.setdefault((point, skill.conductor), tick)
-    return sorted([*over, *((*one, tick, np.inf) for one, tick in begun.items())], key=lambda one: one[2])
+    return sorted([*over, *((*key, tick, np.inf) for key, tick in begun.items())], key=lambda one: one[2])
 
 
 def _visits(
@@ -79,23 +79,23 @@ def _visits(
     """The least distance of the hands, and their visits."""
     sides = [0, 1] if conductor is None else [conductor] * 2
     taught, hands = np.array([point.left, point.right])[sides], frames["hands"][:, sides]
-    seen = (frames["hand_ages"][:, sides] >= 0).all(axis=1)
-    away = np.where(seen, np.linalg.norm(hands - taught, axis=2).max(axis=1), np.inf)
-    wanted = np.array(point.tool)
+    is_seen = (frames["hand_ages"][:, sides] >= 0).all(axis=1)
+    away = np.where(is_seen, np.linalg.norm(hands - taught, axis=2).max(axis=1), np.inf)
+    target_m = np.array(point.tool)
     if point.follow != "none":
         side = ("left", "right").index(point.follow)
-        wanted = wanted + hands[:, side] - taught[side]
-    off = np.linalg.norm(frames["tool"] - wanted, axis=1)
-    there = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
+        target_m = target_m + hands[:, side] - taught[side]
+    error_m = np.linalg.norm(frames["tool"] - target_m, axis=1)
+    is_near = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
     visits, least, settled = [], round(LEAST_S / period_s), max(1, round(SETTLED_S / period_s))
-    for begin, end in runs(there):
-        if there[begin] and end - begin >= least:
+    for begin, end in runs(is_near):
+        if is_near[begin] and end - begin >= least:
             visits.append(
                 Visit(
                     float(times[begin]),
                     (end - begin) * period_s,
-                    float(off[begin:end].min()),
-                    float(off[max(begin, end - settled) : end].mean()),
+                    float(error_m[begin:end].min()),
+                    float(error_m[max(begin, end - settled) : end].mean()),
                 )
             )
     return float(away.min(initial=np.inf)), visits

@@ -75,8 +75,8 @@ def existing_path(folder: Path, name: str) -> Path:
     """The path of a take that exists. Raises DemonstrationNameError."""
     path = path_of(folder, name)
     if not path.is_file():
-        found = demonstration_paths(folder) if folder.is_dir() else []
-        names = ", ".join(one.stem for one in found) or "none"
+        paths = demonstration_paths(folder) if folder.is_dir() else []
+        names = ", ".join(take_path.stem for take_path in paths) or "none"
         raise DemonstrationNameError(f"no take {path.stem!r} in {folder}; its takes: {names}")
     return path
 
@@ -96,16 +96,16 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     remarks = [line.removeprefix(f"{path}: ") for line in remarks]
     recorded = PoseRecording(path)
     tracks = chosen(recorded, {}, settings or recorded.settings or Settings()).tracks
-    shown = [side for side in TRACK_NAMES if side == "tool" or demonstration.conducts in ("both", side)]
-    streams = tuple(_stream(side, track) for side, track in zip(TRACK_NAMES, tracks, strict=True) if side in shown)
-    remarks += [*_still(demonstration), *_in_motion(demonstration, shown), *remarks_on_places(demonstration)]
+    sides = [side for side in TRACK_NAMES if side == "tool" or demonstration.conducts in ("both", side)]
+    streams = tuple(_stream(side, track) for side, track in zip(TRACK_NAMES, tracks, strict=True) if side in sides)
+    remarks += [*_still(demonstration), *_in_motion(demonstration, sides), *remarks_on_places(demonstration)]
     return Summary(path, demonstration, streams, tuple(remarks))
 
 
 def _still(demonstration: Demonstration) -> list[str]:
     """Remarks on hands or a tool that do not move."""
-    found = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
-    moved = [(name, float(np.ptp(at, axis=0).max())) for name, at in found]
+    motions = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
+    moved = [(name, float(np.ptp(positions_m, axis=0).max())) for name, positions_m in motions]
     return [
         f"{name}: only {1000 * m:.1f} mm of motion; nothing can be learned if all takes have less than "
         f"{1000 * LEAST_M:g} mm"
@@ -135,8 +135,8 @@ def _stream(side: str, track: Track) -> StreamSummary:
     logged = np.sort(track.logged_ns) / 1e9
     gaps = np.diff(logged, prepend=logged[:1])
     worst = int(np.argmax(gaps))
-    seen = gaps[1:][gaps[1:] <= max(GAP_S, GAP_RATIO * float(np.median(gaps[1:])))] if len(gaps) > 1 else gaps[1:]
-    rate = len(seen) / float(seen.sum()) if seen.any() else 0.0
+    usual_gaps = gaps[1:][gaps[1:] <= max(GAP_S, GAP_RATIO * float(np.median(gaps[1:])))] if len(gaps) > 1 else gaps[1:]
+    rate = len(usual_gaps) / float(usual_gaps.sum()) if usual_gaps.any() else 0.0
     began = float(logged[max(0, worst - 1)] - logged[0])
     return StreamSummary(side, len(logged), rate, float(gaps[worst]), began, track.frame)
 
@@ -145,16 +145,16 @@ def table(found: Summary) -> str:
     """The content of a take as lines of text, with a plot of speeds."""
     lines = [f"{found.path}: {found.lasts_s:.1f} s"]
     lines += [
-        f"  {one.name:<6}{one.poses:>7} poses  {one.rate_hz:6.1f} Hz  longest gap {1e3 * one.gap_s:.0f} ms at "
-        f"{one.gap_at_s:.1f} s  frame {one.frame or 'not named'}"
-        for one in found.streams
+        f"  {stream.name:<6}{stream.poses:>7} poses  {stream.rate_hz:6.1f} Hz  longest gap {1e3 * stream.gap_s:.0f} ms at "
+        f"{stream.gap_at_s:.1f} s  frame {stream.frame or 'not named'}"
+        for stream in found.streams
     ]
     if found.demonstration.person:
         lines.append(f"  by {found.demonstration.person}")
     if found.demonstration.places:
         lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
     lines += [f"  {remark}" for remark in found.remarks]
-    speeds = {one.name: _speed(found.demonstration, one.name) for one in found.streams}
+    speeds = {stream.name: _speed(found.demonstration, stream.name) for stream in found.streams}
     lines += [
         f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s" for side, speed in speeds.items()
     ]
@@ -165,13 +165,13 @@ def table(found: Summary) -> str:
 
 def _speed(demonstration: Demonstration, side: str) -> Vector:
     """Speeds (PLOT_COLUMNS,) [m/s] of equal parts of a take, each averaged over 0.1 s."""
-    at: Vector = getattr(demonstration, side)[:, :3]
+    positions_m: Vector = getattr(demonstration, side)[:, :3]
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
     edges = np.linspace(0.0, seconds[-1], PLOT_COLUMNS + 1)
     window = min(0.1, float(seconds[-1]))
     grid = np.arange(0.0, max(seconds[-1] - window, window), window / 2)
     begin, end = (
-        np.stack([np.interp(grid + late, seconds, column) for column in at.T], axis=1) for late in (0.0, window)
+        np.stack([np.interp(grid + late, seconds, column) for column in positions_m.T], axis=1) for late in (0.0, window)
     )
     speeds = np.linalg.norm(end - begin, axis=1) / window
     return np.asarray(np.interp((edges[:-1] + edges[1:]) / 2, grid + window / 2, speeds))
@@ -179,7 +179,7 @@ def _speed(demonstration: Demonstration, side: str) -> Vector:
 
 def _blocks(speed: Vector) -> str:
     greatest = max(float(np.max(speed)), 0.05)  # noise at rest is drawn flat
-    return "".join(BLOCKS[min(int(len(BLOCKS) * one / greatest), len(BLOCKS) - 1)] for one in speed)
+    return "".join(BLOCKS[min(int(len(BLOCKS) * value / greatest), len(BLOCKS) - 1)] for value in speed)
 
 
 def draw(found: Summary, path: Path) -> None:
@@ -194,18 +194,18 @@ def draw(found: Summary, path: Path) -> None:
     axes = [first, *(figure.add_subplot(grid[i, 0], sharex=first) for i in (1, 2))]
     above = figure.add_subplot(grid[:, 1])
     begins = list(demonstration.begins)
-    for side in (one.name for one in found.streams):
-        at = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)  # breaks the line where a part is left out
+    for side in (stream.name for stream in found.streams):
+        positions_m = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)  # breaks the line where a part is left out
         for i, axis in enumerate(axes):
-            axis.plot(np.insert(seconds, begins, np.nan), at[:, i], color=TRACK_COLOURS[side], lw=1.2, label=side)
-        above.plot(at[:, 0], at[:, 1], color=TRACK_COLOURS[side], lw=1.2, label=side)
-        above.plot(at[0, 0], at[0, 1], "o", color=TRACK_COLOURS[side], ms=5)
+            axis.plot(np.insert(seconds, begins, np.nan), positions_m[:, i], color=TRACK_COLOURS[side], lw=1.2, label=side)
+        above.plot(positions_m[:, 0], positions_m[:, 1], color=TRACK_COLOURS[side], lw=1.2, label=side)
+        above.plot(positions_m[0, 0], positions_m[0, 1], "o", color=TRACK_COLOURS[side], ms=5)
     for i, axis in enumerate(axes):
         axis.set_ylabel(f"{'xyz'[i]} [m]")
         axis.label_outer()
-        for one in found.streams:
-            if one.gap_s > GAP_S:
-                axis.axvspan(one.gap_at_s, one.gap_at_s + one.gap_s, color=TRACK_COLOURS[one.name], alpha=0.15, lw=0)
+        for stream in found.streams:
+            if stream.gap_s > GAP_S:
+                axis.axvspan(stream.gap_at_s, stream.gap_at_s + stream.gap_s, color=TRACK_COLOURS[stream.name], alpha=0.15, lw=0)
     axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base", parse_math=False)
     axes[-1].set_xlabel("time [s]")
     above.set(title="from above; dots mark the start", xlabel="x [m]", ylabel="y [m]")

@@ -58,19 +58,19 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
         )
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
     gripper, count = demonstration.gripper, len(stamps_ns)
-    given: list[tuple[str, Vector, tuple[int, ...]]]
-    given = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
+    arrays: list[tuple[str, Vector, tuple[int, ...]]]
+    arrays = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
     if demonstration.conducts != "both":
-        given = [one for one in given if one[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])]
-    given += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
-    for name, stream, shape in given:
+        arrays = [entry for entry in arrays if entry[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])]
+    arrays += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
+    for name, stream, shape in arrays:
         if stream.shape != shape or not np.isfinite(stream).all():
             raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
     with McapFile(Path(path), joints=0, attached=False) as file:
         about = {"hands": demonstration.conducts, "person": demonstration.person}
         if about := {name: word for name, word in about.items() if word not in ("both", "")}:
             file.writer.add_metadata("thirdhand", about)
-        streams = [(name, stream) for name, stream, shape in given if shape == (count, 7)]
+        streams = [(name, stream) for name, stream, shape in arrays if shape == (count, 7)]
         for i, (stamp, *rows) in enumerate(
             zip(stamps_ns.tolist(), *(stream.tolist() for _, stream in streams), strict=True)
         ):
@@ -113,29 +113,29 @@ def read_demonstration(
         readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
         faults = "; ".join(map(str, recorded.faults))
         raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
-    found = chosen(recorded, topics or {}, settings)
+    selection = chosen(recorded, topics or {}, settings)
     for fault in recorded.faults:
-        read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in found.tracks)
+        read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in selection.tracks)
         say(f"{path}: {fault}; {read} were read")
-    one_clock = by_one_clock(found.tracks)
+    one_clock = by_one_clock(selection.tracks)
     tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
-    tracks = [_near(recorded, *both, settings) for both in zip(tracks, one_clock.tracks, strict=True)]
-    remarks = [*found.guessed, *_invalid_in(tracks), *mapped]
+    tracks = [_near(recorded, *pair, settings) for pair in zip(tracks, one_clock.tracks, strict=True)]
+    remarks = [*selection.guessed, *_invalid_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
     if one_clock.remark:
         say(f"{path}: {one_clock.remark}")
     tracks = [_in_order(path, track) for track in tracks]
-    seen = CommonPart.of(path, tracks, found.conducts, settings)
-    for line in seen.remarks:
+    common = CommonPart.of(path, tracks, selection.conducts, settings)
+    for line in common.remarks:
         say(f"{path}: {line}")
-    left, right, tool = (_resampled(seen.stamps_ns, track.stamps_ns, track.poses) for track in seen.tracks)
-    closure = recorded.closures(seen.stamps_ns, logged=one_clock.logged, part=one_clock.part)
+    left, right, tool = (_resampled(common.stamps_ns, track.stamps_ns, track.poses) for track in common.tracks)
+    closure = recorded.closures(common.stamps_ns, logged=one_clock.logged, part=one_clock.part)
     for line in recorded.unused:
         say(f"{path}: {line}")
-    seen.stamps_ns.setflags(write=False)
+    common.stamps_ns.setflags(write=False)
     return Demonstration(
-        seen.stamps_ns, left, right, tool, BASE, recorded.places, closure, seen.conducts, recorded.person, seen.begins
+        common.stamps_ns, left, right, tool, BASE, recorded.places, closure, common.conducts, recorded.person, common.begins
     )
 
 
@@ -165,25 +165,25 @@ class CommonPart(NamedTuple):
         (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
         remarks: list[str] = []
         if conducts == "both":
-            shares = [one.seen_share for one in hands]
+            shares = [hand.seen_share for hand in hands]
             if min(shares) < MIN_SEEN_SHARE <= max(shares):
                 side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
                 hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
                 remarks.append(f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the time")
         rows = [*hands, tool]
-        start_ns, end_ns = max(one.start_ns for one in rows), min(one.end_ns for one in rows)
+        start_ns, end_ns = max(row.start_ns for row in rows), min(row.end_ns for row in rows)
         if start_ns >= end_ns:
             raise RecordingError(
                 f"{path}: hands and tool have fewer than two stamps of the tool in common: "
                 "were they stamped by different clocks?"
             )
-        named = [one for row in rows for one in row.stretches if one.begin_ns < end_ns and one.end_ns > start_ns]
-        remarks += [one.remark for one in rows if one.remark]
+        named = [stretch for row in rows for stretch in row.stretches if stretch.begin_ns < end_ns and stretch.end_ns > start_ns]
+        remarks += [row.remark for row in rows if row.remark]
         stamps, begins = _left_in(tool.track.stamps_ns, rows)
         kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
         origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
         named.sort(key=lambda one: one.begin_ns)
-        bad = "; ".join(one.text(origin_ns) for one in named[:MAX_NAMED_STRETCHES])
+        bad = "; ".join(stretch.text(origin_ns) for stretch in named[:MAX_NAMED_STRETCHES])
         bad += f"; and {len(named) - MAX_NAMED_STRETCHES} more" * (len(named) > MAX_NAMED_STRETCHES)
         if kept_s < MIN_USABLE_SHARE * span_s:
             raise RecordingError(
@@ -192,8 +192,8 @@ class CommonPart(NamedTuple):
             )
         if bad:
             remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
-        both = [hands[0].track, hands[-1].track, tool.track]
-        return CommonPart(both, conducts, stamps, tuple(begins), remarks)
+        common_tracks = [hands[0].track, hands[-1].track, tool.track]
+        return CommonPart(common_tracks, conducts, stamps, tuple(begins), remarks)
 
 
 def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
@@ -290,9 +290,9 @@ def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
     """Message and remedy for a stream in an unknown frame; empty for known frames."""
     if frame in ("", BASE, hands.frame):
         return ""
-    known = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
+    frame_text = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
     return (
-        f"{name} is in frame {frame!r}: {BASE!r}{known} needed, or a configuration (--config) with this [hands] frame "
+        f"{name} is in frame {frame!r}: {BASE!r}{frame_text} needed, or a configuration (--config) with this [hands] frame "
         f"and its pose, [hands] base_from_tracker, or with a table [trackers.{frame}]"
     )
 
@@ -315,11 +315,11 @@ def in_base(path: str | Path, tracks: Sequence[Track], settings: Settings) -> tu
         is_changed = is_left_handed or not np.array_equal(base_from(hands), np.eye(3, 4))
         if is_by_tracker(track.name, track.frame, hands) and is_changed:
             turn = Rotation.from_matrix(rotation(hands.base_from_tracker[3:]))
-            poses, some = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
-            if some.any():
-                poses[some, :3] = from_tracker(track.poses[some, :3], hands)
-                given = track.poses[some, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
-                poses[some, 3:] = (turn * Rotation.from_quat(given)).as_quat()
+            poses, is_finite = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
+            if is_finite.any():
+                poses[is_finite, :3] = from_tracker(track.poses[is_finite, :3], hands)
+                quaternions = track.poses[is_finite, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
+                poses[is_finite, 3:] = (turn * Rotation.from_quat(quaternions)).as_quat()
             out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
             sections[settings.tracker_section(track.frame)] = None

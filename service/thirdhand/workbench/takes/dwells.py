@@ -19,17 +19,17 @@ def remarks_on_places(demonstration: Demonstration) -> list[str]:
     points = demonstration.places
     if not points:
         return []
-    off = np.array([off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points])
+    distances_m = np.array([off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points])
     remarks = [
         f"via-point {point.name!r} was never reached: the tool's smallest distance was {1000 * least:.0f} mm, "
         f"{1000 * FAR_M:.0f} mm needed"
-        for point, least in zip(points, off.min(axis=1).tolist(), strict=True)
+        for point, least in zip(points, distances_m.min(axis=1).tolist(), strict=True)
         if least > FAR_M
     ]
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
     for begin_s, end_s in dwells(demonstration):
         during = (seconds >= begin_s) & (seconds <= end_s)
-        near = off[:, during].min(axis=1, initial=np.inf)
+        near = distances_m[:, during].min(axis=1, initial=np.inf)
         if near.min() > FAR_M:
             remarks.append(
                 f"hands and tool rest from {begin_s:.1f} to {end_s:.1f} s, {1000 * near.min():.0f} mm from the nearest "
@@ -41,9 +41,9 @@ def remarks_on_places(demonstration: Demonstration) -> list[str]:
 def dwells(demonstration: Demonstration) -> Iterator[tuple[float, float]]:
     """Begin and end [s] of each rest of both hands and the tool that lasts at least DWELL_S."""
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
-    at = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
+    positions_m = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
     grid = np.arange(0.0, float(seconds[-1]), GRID_S)
-    path = np.stack([np.interp(grid, seconds, column) for column in at.T], axis=1)
+    path = np.stack([np.interp(grid, seconds, column) for column in positions_m.T], axis=1)
     for begin in demonstration.begins:
         path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = (
             np.nan

@@ -107,8 +107,8 @@ def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
         return PoseTopic(topic, wanted.part)
     if len(parts) == 1 and not wanted.part:
         return PoseTopic(topic, parts[0])
-    which = "an index" if recorded.topics[topic] == POSE_ARRAY else "a child frame"
-    needed = f"{which} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
+    part_kind = "an index" if recorded.topics[topic] == POSE_ARRAY else "a child frame"
+    needed = f"{part_kind} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
     raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
 
 
@@ -116,17 +116,17 @@ def by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
     """The stream of PoseStamped with the name of the service's own topic, in any cell. Raises
     RecordingError.
     """
-    found = [
+    topics = [
         topic
         for topic, kind in recorded.topics.items()
         if kind == POSE.type and f"/{topic}".endswith(f"/{TAKE_KEYS[name]}") and "" in recorded.tracks(topic)
     ]
-    if len(found) > 1:
+    if len(topics) > 1:
         raise RecordingError(
-            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {found[0]} and {found[1]}; one needed, as --{name} "
+            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {topics[0]} and {topics[1]}; one needed, as --{name} "
             "of `thirdhand learn` names it"
         )
-    return PoseTopic(found[0]) if found else None
+    return PoseTopic(topics[0]) if topics else None
 
 
 def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:

@@ -58,7 +58,7 @@ def read_motive(path: Path) -> Captured:
         if head[0] in POSED_TYPES and head[2:] in POSE_COLUMNS:
             columns.setdefault(head[1], {})[head[2:]] = i
     table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
-    numeric = [1, *(i for found in columns.values() for i in found.values())]  # others may hold text, as a time code
+    numeric = [1, *(i for body_columns in columns.values() for i in body_columns.values())]  # others may hold text, as a time code
     for values, row in zip(table, rows[axes_at + 1 :], strict=True):
         try:
             for i in numeric:
@@ -67,12 +67,12 @@ def read_motive(path: Path) -> Captured:
         except ValueError as error:
             raise RecordingError(f"{path}: frame {row[0]}: {error}; numbers and empty cells needed") from None
     stamps, out = _stamps(path, table[:, 1]), Captured()
-    for name, found in columns.items():
-        if all(one in found for one in POSE_COLUMNS[:3]):
+    for name, body_columns in columns.items():
+        if all(column in body_columns for column in POSE_COLUMNS[:3]):
             poses = np.tile([np.nan] * 3 + list(NO_ROTATION), (len(table), 1))
-            for k, one in enumerate(POSE_COLUMNS):
-                if one in found:
-                    poses[:, k] = table[:, found[one]] * (UNITS_M[unit] if k < 3 else 1.0)
+            for k, column in enumerate(POSE_COLUMNS):
+                if column in body_columns:
+                    poses[:, k] = table[:, body_columns[column]] * (UNITS_M[unit] if k < 3 else 1.0)
             out[name] = stamps, poses
     return out
 
@@ -82,10 +82,10 @@ def read_c3d(path: Path) -> Captured:
     import ezc3d  # its import is slow, and few recordings need it
 
     try:
-        found = ezc3d.c3d(str(path))
-        about = found["parameters"]["POINT"]
+        content = ezc3d.c3d(str(path))
+        about = content["parameters"]["POINT"]
         labels, units = about["LABELS"]["value"], about["UNITS"]["value"]
-        rate_hz, points = float(about["RATE"]["value"][0]), np.asarray(found["data"]["points"], np.float64)
+        rate_hz, points = float(about["RATE"]["value"][0]), np.asarray(content["data"]["points"], np.float64)
     except Exception as error:  # the library raises many kinds of exceptions
         raise RecordingError(f"{path} is not a C3D file that can be read: {in_words(error, named=False)}") from None
     unit = str(units[0]).strip().lower() if units else ""

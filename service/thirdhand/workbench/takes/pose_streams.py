@@ -179,11 +179,11 @@ class PoseRecording:
                     self._read_sqlite(file)
                 return
             with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
-                self.topics = {one.topic: one.msgtype for one in bag.connections}
+                self.topics = {connection.topic: connection.msgtype for connection in bag.connections}
                 self._ros_1_topics = set(self.topics) if is_ros_1 else set()
-                wanted = [one for one in bag.connections if one.msgtype in (*POSE_TYPES, JOINTS.type)]
-                for one, logged_ns, data in bag.messages(connections=wanted) if wanted else ():
-                    self._raw.setdefault(one.topic, []).append((logged_ns, bytes(data)))
+                connections = [connection for connection in bag.connections if connection.msgtype in (*POSE_TYPES, JOINTS.type)]
+                for connection, logged_ns, data in bag.messages(connections=connections) if connections else ():
+                    self._raw.setdefault(connection.topic, []).append((logged_ns, bytes(data)))
         except Exception as error:  # the exceptions of the bags' storages have no common base
             raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
 
@@ -228,8 +228,8 @@ class PoseRecording:
             return self._read[topic]
         out = dict[str, Parts]()
         rejected: list[str] = []
-        for logged_ns, found in self._decoded(topic, functools.partial(_poses, self.topics[topic], rejected)):
-            for part, pose in found:
+        for logged_ns, pairs in self._decoded(topic, functools.partial(_poses, self.topics[topic], rejected)):
+            for part, pose in pairs:
                 stamps, logged, poses, frames = out.setdefault(part, Parts([], [], [], []))
                 if pose.frame_id not in frames:
                     frames.append(pose.frame_id)
@@ -256,13 +256,13 @@ class PoseRecording:
         """The tool in frame `base`, computed from joint states by the URDF. Raises
         RecordingError.
         """
-        states = [one for one in self._joint_states(topic, settings.joints.names) if np.isfinite(one[2]).all()]
+        states = [state for state in self._joint_states(topic, settings.joints.names) if np.isfinite(state[2]).all()]
         if not states:
             raise RecordingError(f"{self.path}: {topic}: no joint state is finite")
         logged, stamps, joints = zip(*states, strict=True)
-        poses, kept = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
+        poses, rows = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
         source = f"{topic}, by the URDF"
-        return Track(TAKE_KEYS["tool"], source, np.array(stamps)[kept], np.array(logged)[kept], poses, BASE)
+        return Track(TAKE_KEYS["tool"], source, np.array(stamps)[rows], np.array(logged)[rows], poses, BASE)
 
     def closures(self, stamps: NDArray[np.int64], *, logged: bool = False, part: int | None = None) -> Vector | None:
         """Closure of the gripper (T,), 0 open to 1 closed, at stamps (T,) [ns]; None if no topic
@@ -290,9 +290,9 @@ class PoseRecording:
             )
         if not closure_at:
             return None
-        at = np.array(sorted(closure_at), np.int64)
-        times = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
-        out: Vector = np.interp(*times, [closure_at[i] for i in at.tolist()])
+        state_ns = np.array(sorted(closure_at), np.int64)
+        times = (stamps - state_ns[0]).astype(np.float64), (state_ns - state_ns[0]).astype(np.float64)
+        out: Vector = np.interp(*times, [closure_at[i] for i in state_ns.tolist()])
         out.setflags(write=False)
         return out
 
@@ -322,14 +322,14 @@ class PoseRecording:
 
     def joint_topic(self, settings: Settings) -> str:
         """The topic with joint states of the arm's joints; empty if there are none or several."""
-        found = []
+        topics = []
         for topic in self._raw:
             if self.topics[topic] == JOINTS.type:
                 with contextlib.suppress(RecordingError):
                     next(self._joint_states(topic, settings.joints.names))
-                    found.append(topic)
-        exact = [topic for topic in found if f"/{topic}".endswith(f"/{JOINT_STATES}")]
-        return exact[0] if len(exact) == 1 else found[0] if len(found) == 1 else ""
+                    topics.append(topic)
+        exact = [topic for topic in topics if f"/{topic}".endswith(f"/{JOINT_STATES}")]
+        return exact[0] if len(exact) == 1 else topics[0] if len(topics) == 1 else ""
 
     def streams(self) -> Iterator[tuple[PoseTopic, int]]:
         """Every readable stream of poses, and its number of poses."""
@@ -357,12 +357,12 @@ def _whole(data: bytes) -> bytes:
         return data
     try:
         with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-            found: bytes = stream.read(MAX_MESSAGE_BYTES + 1)
+            content: bytes = stream.read(MAX_MESSAGE_BYTES + 1)
     except zstandard.ZstdError as error:
         raise WireError(f"it cannot be decompressed: {error}") from None
-    if len(found) > MAX_MESSAGE_BYTES:
+    if len(content) > MAX_MESSAGE_BYTES:
         raise WireError(f"it has more than {MAX_MESSAGE_BYTES} bytes after decompression")
-    return found
+    return content
 
 
 @functools.cache

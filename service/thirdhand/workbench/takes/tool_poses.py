@@ -21,8 +21,8 @@ def tool_poses(
     """
     lasts_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
     step = max(1, int(len(stamps_ns) / lasts_s / MOST_HZ + 0.01)) if lasts_s else 1
-    kept = np.arange(0, len(stamps_ns), step)
+    rows = np.arange(0, len(stamps_ns), step)
     arm = Arm(settings, urdf)
-    poses = [arm.at(q) for q in joints[kept]]
+    poses = [arm.at(q) for q in joints[rows]]
     quaternions = Rotation.from_matrix([pose.rotation for pose in poses]).as_quat()
-    return np.hstack([[pose.position for pose in poses], quaternions]), kept
+    return np.hstack([[pose.position for pose in poses], quaternions]), rows

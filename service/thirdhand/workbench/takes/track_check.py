@@ -99,7 +99,7 @@ class Checked(NamedTuple):
     @property
     def seen_share(self) -> float:
         """Share of the time in which the hand or tool is seen, 0 to 1."""
-        unseen_ns = sum(one.end_ns - one.begin_ns for one in self.stretches)
+        unseen_ns = sum(stretch.end_ns - stretch.begin_ns for stretch in self.stretches)
         return 1.0 - unseen_ns / max(self.end_ns - self.start_ns, 1)
 
     @property
@@ -121,12 +121,12 @@ def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) ->
     out = []
     for track, verdict in zip(tracks, _intake_verdicts(tracks, settings), strict=True):
         why = _lost(track, verdict, settings.hands)
-        kept = _kept(track, why, verdict.restarts, settings.hands)
+        is_kept = _kept(track, why, verdict.restarts, settings.hands)
         first, last = int(track.stamps_ns[0]), int(track.stamps_ns[-1])
-        stretches = _stretches(track, kept, why, longest_s)
-        some = int(np.isfinite(track.poses[:, 0]).sum())
+        stretches = _stretches(track, is_kept, why, longest_s)
+        pose_count = int(np.isfinite(track.poses[:, 0]).sum())
         rejected = sum(bool(reason) for reason in verdict.why)
-        out.append(Checked(track.at(kept), stretches, first, last, some, rejected))
+        out.append(Checked(track.at(is_kept), stretches, first, last, pose_count, rejected))
     return out
 
 
@@ -198,7 +198,7 @@ def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[Distrust
     bounds = np.concatenate([[0], changes, [len(poses)]])
     is_long = seconds[bounds[1:] - 1] - seconds[bounds[:-1]] >= hands.stale_ms / 1000
     repeats = [(int(bounds[i]), int(bounds[i + 1])) for i in np.flatnonzero(is_long)]
-    lost = [one for one in repeats if _is_lost(poses, seconds, *one)]
+    lost = [repeat for repeat in repeats if _is_lost(poses, seconds, *repeat)]
     for begin, end in lost if 2 * len(lost) >= len(repeats) else ():
         around = slice(max(begin - 1, 0), begin + 1)
         came_by_leap = _leaps(poses[around, :3], np.diff(seconds[around])).any()
@@ -222,31 +222,31 @@ def _distance(poses: Vector, a: int, b: int) -> float:
 def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSettings) -> Mask:
     """A mask (N,) of the samples in the sequence of runs that has the most of them."""
     in_runs = (Distrust.NONE, Distrust.JUMPED, Distrust.SWAPPED)
-    usable = np.array([i for i, one in enumerate(why) if one in in_runs], np.intp)
+    usable = np.array([i for i, reason in enumerate(why) if reason in in_runs], np.intp)
     mask = np.zeros(len(why), bool)
     if not len(usable):
         return mask
     seconds = (track.stamps_ns[usable] - track.stamps_ns[usable[0]]) / 1e9
-    at, pauses = track.poses[usable, :3], np.diff(seconds)
+    positions_m, pauses = track.poses[usable, :3], np.diff(seconds)
     accepted = np.array([not why[i] for i in usable.tolist()])
     doubted = (accepted[1:] != accepted[:-1]) | restarts[usable[1:]]
-    is_leap = doubted & _leaps(at, pauses)
+    is_leap = doubted & _leaps(positions_m, pauses)
     is_pause = (pauses > hands.stale_ms / 1000) | (np.diff(usable) > 1)
     bounds = np.concatenate([[0], np.flatnonzero(is_leap | is_pause) + 1, [len(usable)]])
     begins, ends = bounds[:-1], bounds[1:] - 1
-    own = (ends - begins + 1).astype(np.float64)
-    total, before = own.copy(), [(-1, 0, 0)] * len(begins)
+    counts = (ends - begins + 1).astype(np.float64)
+    total, before = counts.copy(), [(-1, 0, 0)] * len(begins)
     for run in range(1, len(begins)):
-        off = np.linalg.norm(at[begins[run]] - at[ends[:run]], axis=1)
-        possible = off <= TUNING.intake.jump_m + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
+        distances_m = np.linalg.norm(positions_m[begins[run]] - positions_m[ends[:run]], axis=1)
+        possible = distances_m <= TUNING.intake.jump_m + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
         possible[-1] &= not is_leap[ends[run - 1]]
         links = {(int(i), 0, 0): total[i] for i in np.flatnonzero(possible)}
         if not possible[-1]:
             links |= {
                 (run - 1, last, first): total[run - 1] - last - first
                 for last, first in TRIMMED
-                if _continues(at, seconds, int(ends[run - 1]) - last, int(begins[run]) + first)
-                and min(own[run - 1] - last, own[run] - first) >= LEAST_CONTINUED
+                if _continues(positions_m, seconds, int(ends[run - 1]) - last, int(begins[run]) + first)
+                and min(counts[run - 1] - last, counts[run] - first) >= LEAST_CONTINUED
             }
         if links:
             before[run] = max(links, key=links.__getitem__)
@@ -257,8 +257,8 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
         mask[usable[begins[run] + first : ends[run] + 1 - dropped]] = True
         run, dropped = previous, last
     rows = np.flatnonzero(mask)
-    shown = (track.stamps_ns[rows] - track.stamps_ns[0]) / 1e9
-    mask[rows[displaced(shown, track.poses[rows, :3])]] = False
+    times_s = (track.stamps_ns[rows] - track.stamps_ns[0]) / 1e9
+    mask[rows[displaced(times_s, track.poses[rows, :3])]] = False
     return mask
 
 
@@ -275,10 +275,10 @@ def _leaps(at: Vector, pauses: Vector) -> Mask:
     ends.
     """
     steps = np.diff(at, axis=0)
-    off = np.linalg.norm(steps, axis=1)
+    distances_m = np.linalg.norm(steps, axis=1)
     turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
     acceleration = np.minimum(np.concatenate([[np.inf], turns]), np.concatenate([turns, [np.inf]]))
-    is_leap: Mask = (off > TUNING.intake.jump_m + TUNING.intake.jump_speed_mps * pauses) & (
+    is_leap: Mask = (distances_m > TUNING.intake.jump_m + TUNING.intake.jump_speed_mps * pauses) & (
         acceleration > MAX_HAND_MPS2
     )
     return is_leap

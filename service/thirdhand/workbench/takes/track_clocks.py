@@ -43,21 +43,21 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
         logged = [track._replace(stamps_ns=track.logged_ns) for track in tracks]
         return OneClock(logged, logged=True, remark=f"{why}; the times of recording are used instead")
     parts = [clock_parts(track.stamps_ns) for track in tracks]
-    counts = [len(one) for one in parts]
+    counts = [len(track_parts) for track_parts in parts]
     if max(counts) == 1:
         return OneClock(list(tracks))
     part = 0  # in the first part, no clock has restarted
     if len(set(counts)) == 1:
-        part = int(np.argmax([sum(len(one[i]) for one in parts) for i in range(counts[0])]))
-    kept = [track.at(one[part]) for track, one in zip(tracks, parts, strict=True)]
-    left = sum(len(track.stamps_ns) for track in tracks) - sum(len(track.stamps_ns) for track in kept)
+        part = int(np.argmax([sum(len(track_parts[i]) for track_parts in parts) for i in range(counts[0])]))
+    part_tracks = [track.at(track_parts[part]) for track, track_parts in zip(tracks, parts, strict=True)]
+    left = sum(len(track.stamps_ns) for track in tracks) - sum(len(track.stamps_ns) for track in part_tracks)
     whose = ", ".join(dict.fromkeys(track.name for track, count in zip(tracks, counts, strict=True) if count > 1))
-    lasts_s = max(float(np.ptp(track.stamps_ns)) for track in kept) / 1e9
+    lasts_s = max(float(np.ptp(track.stamps_ns)) for track in part_tracks) / 1e9
     remark = (
         f"the clock of {whose} restarts, and the times of recording do too: part {part + 1} of {max(counts)} is "
         f"used, which lasts {lasts_s:.1f} s; {left} poses are left out"
     )
-    return OneClock(kept, part=part, remark=remark)
+    return OneClock(part_tracks, part=part, remark=remark)
 
 
 def _is_steady(track: Track) -> bool:

@@ -83,8 +83,8 @@ def _without_glitches(positions: Vector, around: int) -> Vector:
     farther from it than usual among so many neighbours.
     """
     medians = median_filter(positions, (GLITCH_WINDOW, 1), mode="nearest")
-    off = np.linalg.norm(positions - medians, axis=1)
-    return np.where((off > GLITCH_RATIO * _usual(off, around))[:, None], medians, positions)
+    distances_m = np.linalg.norm(positions - medians, axis=1)
+    return np.where((distances_m > GLITCH_RATIO * _usual(distances_m, around))[:, None], medians, positions)
 
 
 def _usual(sizes: Vector, around: int) -> Vector:
@@ -97,12 +97,12 @@ def _steps(seconds: Vector, positions: Vector) -> Vector:
     than HALF_WINDOW samples, or if a pause hides the step.
     """
     times = np.lib.stride_tricks.sliding_window_view(seconds, 2 * HALF_WINDOW)
-    rest = _without_line(times - times.mean(axis=1, keepdims=True))
-    scale = rest @ _side()  # h' . h
+    residual = _without_line(times - times.mean(axis=1, keepdims=True))
+    scale = residual @ _side()  # h' . h
     windows = np.lib.stride_tricks.sliding_window_view(positions, 2 * HALF_WINDOW, axis=0)
-    found = np.einsum("ij,ikj->ik", rest, windows) / scale[:, None]
-    found[scale < 0.5 * np.median(scale)] = 0.0
-    return np.pad(found, ((HALF_WINDOW - 1, HALF_WINDOW - 1), (0, 0)))
+    steps_m = np.einsum("ij,ikj->ik", residual, windows) / scale[:, None]
+    steps_m[scale < 0.5 * np.median(scale)] = 0.0
+    return np.pad(steps_m, ((HALF_WINDOW - 1, HALF_WINDOW - 1), (0, 0)))
 
 
 def _side(beside: int = 0) -> Vector:
@@ -125,10 +125,10 @@ def _unusual(steps: Vector, around: int) -> NDArray[np.intp]:
     size = np.linalg.norm(steps, axis=1)
     usual = _usual(size, around)
     largest = maximum_filter(size, 2 * HALF_WINDOW - 1)
-    (rest,) = _without_line(np.arange(0.5 - HALF_WINDOW, HALF_WINDOW)[None])
-    share = (rest @ _side(1)) / (rest @ _side())
+    (residual,) = _without_line(np.arange(0.5 - HALF_WINDOW, HALF_WINDOW)[None])
+    share = (residual @ _side(1)) / (residual @ _side())
     padded = np.pad(steps, ((1, 1), (0, 0)))
-    off = np.linalg.norm(0.5 * (padded[:-2] + padded[2:]) - share * steps, axis=1)
+    deviations_m = np.linalg.norm(0.5 * (padded[:-2] + padded[2:]) - share * steps, axis=1)
     return np.flatnonzero(
-        (size > np.maximum(STEP_M, UNUSUAL_RATIO * usual)) & (size >= largest) & (off < MAX_BESIDE * size)
+        (size > np.maximum(STEP_M, UNUSUAL_RATIO * usual)) & (size >= largest) & (deviations_m < MAX_BESIDE * size)
     )

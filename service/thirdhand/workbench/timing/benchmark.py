@@ -65,7 +65,7 @@ def run(
     part_s = seconds / DURATION_PARTS
     skill = str(recordings() / SHIPPED_SKILL)
     kinds = {"empty": (rate_hz, part_s), "core": (skill, rate_hz, part_s, arm)}
-    found: dict[str, list[dict[str, Any]]] = {"empty": [], "core": []}
+    results: dict[str, list[dict[str, Any]]] = {"empty": [], "core": []}
     whole: dict[str, Any] = {}
     for kind in ("empty", "core", "whole", "core", "empty"):
         if kind == "whole":
@@ -73,9 +73,9 @@ def run(
             whole = _whole(rate_hz, 2 * part_s, skill, arm, program, keep)
         else:
             say(f"{kind}: {part_s:g} s")
-            found[kind].append(probe(kind, *kinds[kind]))
+            results[kind].append(probe(kind, *kinds[kind]))
     report = {"rate_hz": rate_hz, "cores": len(os.sched_getaffinity(0)), "granted": whole.pop("granted")}
-    report |= {kind: _joined(parts) for kind, parts in found.items()} | {"whole": whole}
+    report |= {kind: _joined(parts) for kind, parts in results.items()} | {"whole": whole}
     return report | {"ratios": _ratios(report)}
 
 
@@ -98,11 +98,11 @@ def _whole(
             with open_session(connect=[service.endpoint]) as session:
                 status = Client(session).status()
             processes = {
-                who: {
+                process_name: {
                     "cpu_s": round(sum(process.cpu_times()[:2]), 2),
                     "memory_mb": round(process.memory_info().rss / 1e6, 1),
                 }
-                for who, process in family(service.process.pid).items()
+                for process_name, process in family(service.process.pid).items()
             }
             if service.stop() != 0:
                 raise ProbeError(f"the service failed: {service.log.read_text()[-500:]}")
@@ -138,7 +138,7 @@ def _ratios(report: dict[str, Any]) -> dict[str, float]:
     empty, whole = report["empty"], report["whole"]
     work_ms = whole["work_us"]["p50"] / 1e3
     least_ms = 500.0 / report["rate_hz"] + whole["round_trip_ms"]["p50"] + work_ms
-    found = {
+    ratios = {
         "missed_more": whole["missed"] / max(1, whole["ticks"]) - empty["missed"] / max(1, empty["ticks"]),
         "lateness_p50": (whole["lateness_us"]["p50"] + NOTHING_US) / (empty["lateness_us"]["p50"] + NOTHING_US),
         "lateness_p99": whole["lateness_us"]["p99"] / max(1.0, empty["lateness_us"]["p99"]),
@@ -147,29 +147,29 @@ def _ratios(report: dict[str, Any]) -> dict[str, float]:
         "work_to_fixed_work": whole["work_us"]["p50"] / empty["work_us"]["p50"],
         "core_to_fixed_work": report["core"]["work_us"]["p50"] / empty["work_us"]["p50"],
     }
-    return {name: round(value, 4) for name, value in found.items()}
+    return {name: round(value, 4) for name, value in ratios.items()}
 
 
 def text(report: dict[str, Any]) -> str:
     """The report for people to read."""
     names = ("p50", "p99", "p99.9", "max")
     rows = [f"{report['rate_hz']} Hz on {report['cores']} cores {'':>18}{''.join(f'{name:>9}' for name in names)}"]
-    for kind, what in LOOP_KINDS:
-        one = report[kind]
-        share = 100 * one["missed"] / max(1, one["ticks"])
-        rows.append(f"  {what:<11} {one['missed']} of {one['ticks']} deadlines missed ({share:.2f} %)")
+    for kind, label in LOOP_KINDS:
+        loop = report[kind]
+        share = 100 * loop["missed"] / max(1, loop["ticks"])
+        rows.append(f"  {label:<11} {loop['missed']} of {loop['ticks']} deadlines missed ({share:.2f} %)")
         for name, unit in (("lateness_us", "late µs"), ("work_us", "work µs")):
-            rows.append(f"    {unit:<34}" + "".join(f"{one[name][share]:9.1f}" for share in names))
+            rows.append(f"    {unit:<34}" + "".join(f"{loop[name][share]:9.1f}" for share in names))
     whole, ratios = report["whole"], report["ratios"]
-    for name, what in (("latency_ms", "hand to command ms"), ("round_trip_ms", "there and back by Zenoh ms")):
-        rows.append(f"    {what:<34}" + "".join(f"{whole[name][share]:9.2f}" for share in names))
+    for name, label in (("latency_ms", "hand to command ms"), ("round_trip_ms", "there and back by Zenoh ms")):
+        rows.append(f"    {label:<34}" + "".join(f"{whole[name][share]:9.2f}" for share in names))
     rows += [
-        f"    {f'of it, {name} µs':<34}" + "".join(f"{one[share]:9.1f}" for share in names)
-        for name, one in whole["stages_us"].items()
+        f"    {f'of it, {name} µs':<34}" + "".join(f"{stage[share]:9.1f}" for share in names)
+        for name, stage in whole["stages_us"].items()
     ]
     rows += [
-        f"    {who:<12}{one['memory_mb']:6.0f} MB, {one['cpu_s']:5.1f} s of processor"
-        for who, one in whole["processes"].items()
+        f"    {process:<12}{usage['memory_mb']:6.0f} MB, {usage['cpu_s']:5.1f} s of processor"
+        for process, usage in whole["processes"].items()
     ]
     granted = report["granted"]
     rows += [
@@ -193,9 +193,9 @@ def draw(report: dict[str, Any], path: Path) -> None:
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2, sharey=True), ("lateness", "work"), strict=True):
-        for (kind, what), colour in zip(LOOP_KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True):
+        for (kind, label), colour in zip(LOOP_KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True):
             counts = np.array(report[kind][f"{name}_counts"])
-            axes.stairs(counts / max(1, counts.sum()), EDGES_US, label=what, color=colour, linewidth=1.4)
+            axes.stairs(counts / max(1, counts.sum()), EDGES_US, label=label, color=colour, linewidth=1.4)
         axes.axvline(1e6 / report["rate_hz"], color="black", linestyle=":", linewidth=1)
         axes.set(xscale="log", yscale="log", xlabel=f"{name} [µs], dotted: the period", xlim=(1, 2e4))
         axes.grid(alpha=0.3)
@@ -223,12 +223,12 @@ def _verdict(report: dict[str, Any]) -> str:
 
 def _kernel() -> list[str]:
     """Messages on kernel settings that disturb a loop's timing."""
-    found = []
+    messages = []
     for path, good, advice in KERNEL:
         try:
             value = Path(path).read_text().strip()
         except OSError:
             continue
         if value != good:
-            found.append(f"{path} is {value}, {advice}")
-    return found or ["No readable setting of the kernel disturbs the loop"]
+            messages.append(f"{path} is {value}, {advice}")
+    return messages or ["No readable setting of the kernel disturbs the loop"]

@@ -47,17 +47,17 @@ UNCOUNTED_S = 1.0  # the first second is not counted
 
 def percentiles(values: Any) -> dict[str, float]:
     """The percentiles PERCENTS of values, by name; zeros without values."""
-    found = np.percentile(values, PERCENTS).round(2).tolist() if len(values) else [0.0] * len(PERCENTS)
-    return dict(zip(("p50", "p99", "p99.9", "max"), found, strict=True))
+    quantiles = np.percentile(values, PERCENTS).round(2).tolist() if len(values) else [0.0] * len(PERCENTS)
+    return dict(zip(("p50", "p99", "p99.9", "max"), quantiles, strict=True))
 
 
 def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
     """Percentiles and histograms of a loop's lateness and work [µs]."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, values in (("lateness", lateness_us), ("work", work_us)):
-        found[f"{name}_us"] = percentiles(values)
-        found[f"{name}_counts"] = np.histogram(np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US)[0].tolist()
-    return found
+        results[f"{name}_us"] = percentiles(values)
+        results[f"{name}_counts"] = np.histogram(np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US)[0].tolist()
+    return results
 
 
 def fixed_work(array: Vector) -> float:

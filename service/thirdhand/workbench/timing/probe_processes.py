@@ -48,6 +48,6 @@ def echo() -> Iterator[str]:
 
 def family(pid: int) -> dict[str, psutil.Process]:
     """The processes of a daemon, `daemon` and its children, by name."""
-    found = {"daemon": psutil.Process(pid)}
-    found |= {child.name(): child for child in found["daemon"].children()}
-    return found
+    processes = {"daemon": psutil.Process(pid)}
+    processes |= {child.name(): child for child in processes["daemon"].children()}
+    return processes

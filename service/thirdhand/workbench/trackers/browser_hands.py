@@ -175,8 +175,8 @@ class BrowserHands:
         else:
             name = self._name if order in BY_HANDS else ""
             carry_out = functools.partial(carried_out, self._client, BY_HANDS.get(order, order), by=name)
-            if found := CORRECTION.fullmatch(order):
-                carry_out = functools.partial(corrected, self._client, found[1])
+            if match := CORRECTION.fullmatch(order):
+                carry_out = functools.partial(corrected, self._client, match[1])
             is_done, text = await asyncio.get_running_loop().run_in_executor(self._ordering, carry_out)
         with contextlib.suppress(ConnectionError):
             await page.send_str(json.dumps({"order": order, "answer": text, "done": is_done}))

@@ -68,16 +68,16 @@ class HandCamera(AbstractContextManager["HandCamera"]):
         self._last_ms = max(at_ms, self._last_ms + 1)
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
         with quiet:
-            seen = self._landmarker.detect_for_video(image, self._last_ms)
-        hands = zip(seen.handedness, seen.hand_landmarks, seen.hand_world_landmarks, strict=True)
-        found = dict[str, HandPoints]()
+            detection = self._landmarker.detect_for_video(image, self._last_ms)
+        hands = zip(detection.handedness, detection.hand_landmarks, detection.hand_world_landmarks, strict=True)
+        hand_points = dict[str, HandPoints]()
         for kinds, *parts in sorted(hands, key=lambda hand: hand[0][0].score, reverse=True):
             points, shape = (np.array([[point.x, point.y, point.z] for point in part]) for part in parts)
             side = kinds[0].category_name.lower()
-            if side in found:
+            if side in hand_points:
                 (side,) = set(SIDES) - {side}
-            found.setdefault(side, HandPoints(points[:, :2], shape))
-        return found
+            hand_points.setdefault(side, HandPoints(points[:, :2], shape))
+        return hand_points
 
     def palms(self, picture: Any, at_ms: int) -> dict[str, PalmPose]:
         """The palms by side, in a picture as `hands` takes it."""
@@ -125,30 +125,30 @@ def publish(tracker: Tracker, camera: HandCamera, source: str, say: Callable[[st
     """
     count, since, last = 0, time.monotonic(), dict[str, PalmPose]()
     for stamp_ns, picture in pictures(source):
-        found = camera.palms(picture, stamp_ns // 1_000_000)
-        for side, pose in found.items():
+        palms = camera.palms(picture, stamp_ns // 1_000_000)
+        for side, pose in palms.items():
             x, y, z = pose.position.tolist()
             qx, qy, qz, qw = pose.orientation.as_quat().tolist()
             tracker.publish(side, (x, y, z), (qx, qy, qz, qw), stamp_ns=stamp_ns, frame_id=CAMERA_FRAME)
-        count, last = count + 1, last | found
+        count, last = count + 1, last | palms
         if (passed_s := time.monotonic() - since) > REPORT_S:
-            seen = ", ".join(
+            summary = ", ".join(
                 f"{side} {last[side].position[2]:.2f} m away" if side in last else f"{side} not seen" for side in SIDES
             )
-            say(f"{seen}; {count / passed_s:.0f} pictures a second")
+            say(f"{summary}; {count / passed_s:.0f} pictures a second")
             count, since, last = 0, time.monotonic(), {}
 
 
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
     """A context in which MediaPipe's libraries cannot write their notes on standard error."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr_copy, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr_copy, 2)
+        os.close(stderr_copy)
         os.close(nowhere)
 
 

@@ -139,10 +139,10 @@ class Capture:
         if state is None:
             return None
         received = payload if state is message else cdr.encode_joints(state)
-        at = np.array(measured(state, self.settings.joints.names)[0])
+        joints = np.array(measured(state, self.settings.joints.names)[0])
         if before := self.samples[key]:
-            at = in_turn(self.settings.joints, at, before[-1].at)
-        return Sample(arrived_ns, received, at)
+            joints = in_turn(self.settings.joints, joints, before[-1].at)
+        return Sample(arrived_ns, received, joints)
 
     def _sample(self, key: str, arrived_ns: int, payload: bytes) -> Sample:
         """The sample of a hand, the tool or the gripper."""
@@ -152,8 +152,8 @@ class Capture:
                 raise WireError("a pose that is not finite")
             hands = self.settings.hands_in(message.frame_id)
             is_scaled = is_by_tracker(key, message.frame_id, hands)
-            at = UNIT_M[hands.unit if is_scaled else "m"] * np.array(message.position)
-            return Sample(arrived_ns, payload, at)
+            position_m = UNIT_M[hands.unit if is_scaled else "m"] * np.array(message.position)
+            return Sample(arrived_ns, payload, position_m)
         return Sample(arrived_ns, payload, np.array(message.position[:1]))
 
     @property
@@ -168,12 +168,12 @@ class Capture:
             for sample in self.samples[key][-1:]:
                 pose = channels.POSE.decode(sample.payload)
                 hands = self.settings.hands_in(pose.frame_id)
-                at = np.array(pose.position)
+                position = np.array(pose.position)
                 if problem := unknown_frame(key, pose.frame_id, hands):
                     raise CaptureError(f"{problem}. Nothing was recorded")
                 if is_by_tracker(key, pose.frame_id, hands):
-                    at = from_tracker(at, hands)
-                if np.linalg.norm(at) > TUNING.intake.max_hand_distance_m:
+                    position = from_tracker(position, hands)
+                if np.linalg.norm(position) > TUNING.intake.max_hand_distance_m:
                     why = far_away(key, pose.frame_id, pose.position, self.settings)
                     raise CaptureError(f"{key} is {why}. Nothing was recorded")
 
@@ -215,22 +215,22 @@ class Capture:
         """Delete the rest before and after the motion, and return the deleted times [s].
         RETAINED_REST_S of each is retained.
         """
-        times_ns = [one.arrived_ns for samples in self.streams.values() for one in samples]
+        times_ns = [sample.arrived_ns for samples in self.streams.values() for sample in samples]
         start_ns, end_ns = self.span_of_motion()
         for key, samples in self.samples.items():
-            self.samples[key] = [one for one in samples if start_ns <= one.arrived_ns <= end_ns]
+            self.samples[key] = [sample for sample in samples if start_ns <= sample.arrived_ns <= end_ns]
         return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
         """Begin and end of the motion [ns], with RETAINED_REST_S of rest before and after."""
         begins, ends = [], []
         for key, samples in self.streams.items():
-            at = np.array([sample.at for sample in samples])
+            positions = np.array([sample.at for sample in samples])
             margin = REST_RAD if key == JOINT_STATES else REST_M
-            away = [np.abs(at - at[end]).max(axis=1) > margin for end in (0, -1)]
+            away = [np.abs(positions - positions[end]).max(axis=1) > margin for end in (0, -1)]
             if away[0].any():
                 begins.append(samples[int(np.argmax(away[0]))].arrived_ns)
-                ends.append(samples[len(at) - 1 - int(np.argmax(away[1][::-1]))].arrived_ns)
+                ends.append(samples[len(positions) - 1 - int(np.argmax(away[1][::-1]))].arrived_ns)
         if not begins:
             return 0, time.time_ns()
         return min(begins) - int(1e9 * RETAINED_REST_S), max(ends) + int(1e9 * RETAINED_REST_S)
@@ -249,8 +249,8 @@ class Capture:
         if not self.samples[TOOL_KEY]:
             tool = self.tool_by(self.samples[JOINT_STATES])
             rows = zip(tool.logged_ns.tolist(), tool.stamps_ns.tolist(), tool.poses.tolist(), strict=True)
-            for arrived_ns, stamp_ns, at in rows:
-                pose = PoseStamped(stamp_ns, BASE, tuple(at[:3]), tuple(at[3:]))
+            for arrived_ns, stamp_ns, pose_row in rows:
+                pose = PoseStamped(stamp_ns, BASE, tuple(pose_row[:3]), tuple(pose_row[3:]))
                 messages.append((arrived_ns, TOOL_KEY, channels.POSE.encode(pose)))
         if places:
             text = cdr.encode_string(encode_json(tuple(places)).decode())
@@ -270,8 +270,8 @@ class Capture:
         logged = np.array([state.arrived_ns for state in states], np.int64)
         stamps = np.array([channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64)
         stamps, joints = np.where(stamps == 0, logged, stamps), np.array([state.at for state in states])
-        poses, kept = tool_poses(self.settings, self._urdf, stamps, joints)
-        return Track("tool", "", stamps[kept], logged[kept], poses, BASE)
+        poses, rows = tool_poses(self.settings, self._urdf, stamps, joints)
+        return Track("tool", "", stamps[rows], logged[rows], poses, BASE)
 
     def not_received(self, missing: Sequence[str], more: str = "") -> str:
         """A message on streams that do not arrive, and what to check."""

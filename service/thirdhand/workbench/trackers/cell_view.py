@@ -50,7 +50,7 @@ class Latest:
         the position is in a frame of the arm, which holds it.
         """
         fields = ("name", "shape", "position", "size", "colour")
-        return [{name: getattr(one, name) for name in fields} | {"held": one.frame_id != BASE} for one in self._objects]
+        return [{name: getattr(item, name) for name in fields} | {"held": item.frame_id != BASE} for item in self._objects]
 
     def summary(self) -> dict[str, Any]:
         """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
@@ -63,13 +63,13 @@ class Latest:
         hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
         near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
         facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
-        shown = {name: getattr(now, name) for name in SHOWN_FIELDS} | {"title": title(now.reason)}
+        values = {name: getattr(now, name) for name in SHOWN_FIELDS} | {"title": title(now.reason)}
         remedy = _COMMAND.sub(
             lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
             now.remedy,
         )
         live = [now.scribe.get("live"), now.scribe.get("pid")]
-        return shown | {"remedy": remedy, "age_s": age_s, "live": live, "facts": facts}
+        return values | {"remedy": remedy, "age_s": age_s, "live": live, "facts": facts}
 
 
 def corrected(client: Client, given: str) -> tuple[bool, str]:
@@ -84,8 +84,8 @@ def corrected(client: Client, given: str) -> tuple[bool, str]:
             reply = client.correct((x, y, z), hands="now")
     except (ExplainedError, ValueError) as error:
         return False, _failed("correct", error)
-    found = reply.correction
-    text = "" if found is None else f"{found.name} {'undone' if found.undone else 'in force'}: {found.text}"
+    correction = reply.correction
+    text = "" if correction is None else f"{correction.name} {'undone' if correction.undone else 'in force'}: {correction.text}"
     return True, f"{text}. Resume lets the tool go there" + f"; {reply.note}" * bool(reply.note)
 
 

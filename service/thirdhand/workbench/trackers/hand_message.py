@@ -74,8 +74,8 @@ def decode_hands(data: bytes, now_ns: int) -> PageHands:
     """
     if len(data) != HANDS_LAYOUT.size:
         raise WireError(f"a message of {len(data)} bytes, {HANDS_LAYOUT.size} needed")
-    magic, seen, epoch, number, at_ms, ahead_ms, *values = HANDS_LAYOUT.unpack(data)
-    if magic != HANDS_MAGIC or not 1 <= seen <= 3:
+    magic, seen_bits, epoch, number, at_ms, ahead_ms, *values = HANDS_LAYOUT.unpack(data)
+    if magic != HANDS_MAGIC or not 1 <= seen_bits <= 3:
         raise WireError("not a message of hands")
     if not 0.0 <= ahead_ms <= MAX_AHEAD_MS:
         raise WireError(f"poses predicted {ahead_ms:g} ms ahead, 0 to {MAX_AHEAD_MS:g} accepted")
@@ -83,7 +83,7 @@ def decode_hands(data: bytes, now_ns: int) -> PageHands:
     if not -MAX_CLOCK_ERROR_MS <= age_ms <= MAX_AGE_MS:
         raise WireError(f"hands of {_ago(age_ms)}: the page's clock is wrong")
     hands = tuple(
-        _hand(side, values[HAND_FLOATS * i : HAND_FLOATS * (i + 1)]) for i, side in enumerate(SIDES) if seen >> i & 1
+        _hand(side, values[HAND_FLOATS * i : HAND_FLOATS * (i + 1)]) for i, side in enumerate(SIDES) if seen_bits >> i & 1
     )
     return PageHands(epoch, number, min(int((at_ms + ahead_ms) * 1e6), now_ns), hands)
 

@@ -90,11 +90,11 @@ def _made(model: Path, wheel: Path) -> Path:
             raise HandModelError(f"{wheel}: its {NETWORKS[name][0]} is not that of {PACKAGE}")
     try:
         model.parent.mkdir(parents=True, exist_ok=True)
-        beside = model.with_suffix(f".{os.getpid()}")
-        with zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as task:
+        part_file = model.with_suffix(f".{os.getpid()}")
+        with zipfile.ZipFile(part_file, "w", zipfile.ZIP_STORED) as task:
             for name, network in networks.items():
                 task.writestr(name, network)
-        beside.replace(model)
+        part_file.replace(model)
     except OSError as error:
         raise HandModelError(f"{model} cannot be written: {in_words(error, named=False)}") from None
     return model

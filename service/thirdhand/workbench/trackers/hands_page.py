@@ -54,8 +54,8 @@ class HandsPage:
     ) -> None:
         self._fields = {"cell": html.escape(cell), "frame": self.frame} | fields
         self.hands = BrowserHands(tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches)
-        own = [("/", self._front), (f"/{WORKER}", self._worker), ("/hands", self.hands.socket)]
-        routes = [*(web.get(path, handler) for path, handler in own), *more]
+        page_routes = [("/", self._front), (f"/{WORKER}", self._worker), ("/hands", self.hands.socket)]
+        routes = [*(web.get(path, handler) for path, handler in page_routes), *more]
         self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 
     def has_token(self, given: str) -> bool:

@@ -77,10 +77,10 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
     palm = hand_length * (AVERAGE_PALM - AVERAGE_PALM.mean(axis=0))
     roughly = shape[list(PALM)] - shape[list(PALM)].mean(axis=0)
     turn = Rotation.align_vectors(roughly, palm)[0]
-    at = where_seen(turn.apply(palm), u)
+    position_m = where_seen(turn.apply(palm), u)
     for _ in range(NEWTON_STEPS):
         turned = turn.apply(palm)
-        x, y, z = (turned + at).T
+        x, y, z = (turned + position_m).T
         if z.min() < hand_length / 2:
             return None  # a hand as near as this does not fit into a picture
         errors = np.stack([x, y], 1) / z[:, None] - u
@@ -90,12 +90,12 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
         jacobian = np.concatenate([of_point @ _crossed(turned), of_point], axis=2)
         step = np.linalg.lstsq(jacobian.reshape(-1, 6), -errors.ravel(), rcond=RANK_SHARE)[0]
         step *= min(1.0, MAX_TURN_RAD / max(float(np.linalg.norm(step[:3])), 1e-9))
-        turn, at = Rotation.from_rotvec(step[:3]) * turn, at + step[3:]
+        turn, position_m = Rotation.from_rotvec(step[:3]) * turn, position_m + step[3:]
     if np.sqrt(np.mean(errors**2)) > MAX_ERROR:
         return None
     back = np.array([0.0, 0.0, 1.0 if side == "right" else -1.0])
     axes = np.stack([np.cross(back, -_AHEAD), back, -_AHEAD], axis=1)
-    return PalmPose((turn.apply(palm) + at)[PALM_CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
+    return PalmPose((turn.apply(palm) + position_m)[PALM_CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
 
 
 def _crossed(vectors: Array) -> Array:
@@ -108,8 +108,8 @@ def where_seen(points: Array, u: Array) -> Array:
     """The translation t (3,) for which points (N, 3) are seen at u (N, 2), by linear least squares:
     (x + t_x) - u_x (z + t_z) = 0, and the same in y.
     """
-    one, none = np.ones(len(u)), np.zeros(len(u))
-    left = np.concatenate([np.stack([one, none, -u[:, 0]], 1), np.stack([none, one, -u[:, 1]], 1)])
+    ones, none = np.ones(len(u)), np.zeros(len(u))
+    left = np.concatenate([np.stack([ones, none, -u[:, 0]], 1), np.stack([none, ones, -u[:, 1]], 1)])
     right = (u * points[:, 2:] - points[:, :2]).T.ravel()
     moved: Array = np.linalg.lstsq(left, right, rcond=None)[0]
     return moved

@@ -91,13 +91,13 @@ def server_certificate(name: str, folder: Path) -> ServerCertificate:
     except (OSError, subprocess.CalledProcessError) as error:  # an SSLError too
         words = error.stderr.decode().strip() if isinstance(error, subprocess.CalledProcessError) else in_words(error)
         raise ExplainedError(f"no certificate for {name} in {file}: {words}; delete the file for a new one") from None
-    found = ServerCertificate(context, name, names)
-    if not found.is_for(_same_address(name)):
+    certificate = ServerCertificate(context, name, names)
+    if not certificate.is_for(_same_address(name)):
         raise ExplainedError(
             f"--https {name}: the certificate in {file} is for {', '.join(names) or 'no host'}; one of these needed, "
             "with any word for *; or delete the file for a new one"
         )
-    return found
+    return certificate
 
 
 def _names_in(file: Path) -> tuple[str, ...]:
@@ -148,7 +148,7 @@ class _Listener(socket.socket):
     def accept(self) -> tuple[socket.socket, Any]:
         """The next connection. Raises ConnectionAbortedError if it was closed at once."""
         connection, address = super().accept()
-        if sum(one.fileno() >= 0 for one in self._accepted) >= MAX_CONNECTIONS:
+        if sum(client.fileno() >= 0 for client in self._accepted) >= MAX_CONNECTIONS:
             connection.close()
             raise ConnectionAbortedError
         self._accepted.add(connection)
@@ -192,10 +192,10 @@ class WebServer:
         answering = runner.server
 
         def connection() -> web.RequestHandler:
-            made = answering()
-            self._silent.add(made)
-            loop.call_later(REQUEST_WITHIN_S, self._close_if_silent, made)
-            return made
+            handler = answering()
+            self._silent.add(handler)
+            loop.call_later(REQUEST_WITHIN_S, self._close_if_silent, handler)
+            return handler
 
         self._host = listen.host
         server = None

@@ -149,10 +149,10 @@ class Recorded:
 
     def first_stop(self, after: int) -> tuple[int, str] | None:
         """The first tick after a given one that did not follow, and its reason."""
-        found = np.flatnonzero((self.ticks > after) & (self.modes != Mode.FOLLOW))
-        if not len(found):
+        indices = np.flatnonzero((self.ticks > after) & (self.modes != Mode.FOLLOW))
+        if not len(indices):
             return None
-        return int(self.ticks[found[0]]), Reason(int(self.reasons[found[0]])).name.lower()
+        return int(self.ticks[indices[0]]), Reason(int(self.reasons[indices[0]])).name.lower()
 
     def stopped(self, after: int, until: int) -> int:
         """The number of ticks that did not follow."""
@@ -164,8 +164,8 @@ def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
     (T, 3) from an event until the point surely rests.
     """
     far = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) > STANDS_M)
-    rest = min(int(far[-1]) + 1, len(times) - 1) if len(far) else 0
-    return float(times[rest]), float(np.linalg.norm(np.diff(places[: rest + 1], axis=0), axis=1).sum())
+    rest_index = min(int(far[-1]) + 1, len(times) - 1) if len(far) else 0
+    return float(times[rest_index]), float(np.linalg.norm(np.diff(places[: rest_index + 1], axis=0), axis=1).sum())
 
 
 def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorded, steps: Array) -> dict[str, Any]:
@@ -173,12 +173,12 @@ def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorde
     period_ms = 1e3 * cell.settings.period_s
     until = event.mended_s if fault.stops else event.ended_s
     mine = steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= until)]
-    told = [command for command in cell.commands if event.struck_s <= command[0] <= until]
+    commands = [command for command in cell.commands if event.struck_s <= command[0] <= until]
     stop = recorded.first_stop(event.tick)
     hold_ms = None if stop is None else (stop[0] - event.tick) * period_ms
     if hold_ms is not None and hold_ms > 1e3 * (until - event.struck_s):
         hold_ms = None  # it belongs to a later event
-    found: dict[str, Any] = {
+    numbers: dict[str, Any] = {
         "hold_ms": hold_ms,
         "reason": None if stop is None or hold_ms is None else stop[1],
         "lost_ticks": event.lost
@@ -189,24 +189,24 @@ def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorde
         "arm_largest_gap_ms": 1e3 * float(np.diff(mine[:, 0]).max()),
     }
     if fault.stops:
-        at_s, way = way_to_rest(mine[:, 0], mine[:, 1:4])
-        found |= {
+        at_s, path_m = way_to_rest(mine[:, 0], mine[:, 1:4])
+        numbers |= {
             "rest_ms": 1e3 * (at_s - event.struck_s),
-            "travelled_mm": 1e3 * way,
-            "commanded_mm": 1e3 * _commanded(told, cell.settings),
+            "travelled_mm": 1e3 * path_m,
+            "commanded_mm": 1e3 * _commanded(commands, cell.settings),
             "speed_at_the_end_m_per_s": float(mine[-1, 4]),
             "moves_again_ms": 1e3 * (event.moving_s - event.mended_s),
         }
     else:
-        gaps = np.diff([event.struck_s, *(command[0] for command in told)])
+        gaps = np.diff([event.struck_s, *(command[0] for command in commands)])
         before = np.diff([command[0] for command in cell.commands if 0 < event.struck_s - command[0] < BEFORE_S])
-        found |= {
+        numbers |= {
             "command_largest_gap_ms": 1e3 * float(gaps.max()),
             "command_mean_gap_ms": 1e3 * float(gaps.mean()),
             "command_mean_gap_before_ms": 1e3 * float(before.mean()),
-            "held_ms": period_ms * recorded.stopped(event.tick, told[-1][1]),
+            "held_ms": period_ms * recorded.stopped(event.tick, commands[-1][1]),
         }
-    return found
+    return numbers
 
 
 def _commanded(told: list[Command], settings: Settings) -> float:
@@ -282,8 +282,8 @@ def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Calla
         result.figures[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
         near = steps[(steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)]
         result.speeds[event.fault] = np.column_stack([near[:, 0] - event.struck_s, near[:, 4]])
-    known = set(recorded.ticks.tolist())
-    missing = sum(tick not in known for _, tick, _ in cell.commands)
+    recorded_ticks = set(recorded.ticks.tolist())
+    missing = sum(tick not in recorded_ticks for _, tick, _ in cell.commands)
     result.unaccounted += max(0, missing - sum(result.figures[name]["lost_ticks"] for name in names))
 
 
@@ -291,9 +291,9 @@ def table(found: dict[str, dict[str, Any]]) -> str:
     """The figures for people to read."""
     rows = [f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'commanded':>11}{'lost':>7}{'moves again':>13}"]
     rows += [f"{'':<32}{'ms':>8}{'ms':>9}{'mm':>11}{'mm':>11}{'ticks':>7}{'ms':>13}"]
-    for name, one in found.items():
+    for name, numbers in found.items():
         values = (
-            one.get(key)
+            numbers.get(key)
             for key in ("hold_ms", "rest_ms", "travelled_mm", "commanded_mm", "lost_ticks", "moves_again_ms")
         )
         cells = ("-" if value is None else f"{value:.0f}" for value in values)
@@ -322,12 +322,12 @@ def _draw(results: Results, came: Suffered) -> None:
         -(-len(stopping) // 3), 3, figsize=(9, 1.9 * -(-len(stopping) // 3)), sharex=True, sharey=True, squeeze=False
     )
     for axes, name in zip(grid.flat, stopping, strict=False):
-        speed, one = came.speeds[name], came.figures[name]
+        speed, numbers = came.speeds[name], came.figures[name]
         axes.plot(1e3 * speed[:, 0], speed[:, 1], color=TOOL)
         axes.axvline(0, color=REFERENCE, linewidth=0.8)
-        if one["hold_ms"] is not None:
-            axes.axvline(one["hold_ms"], color=DESIRED, linewidth=0.8, linestyle="--")
-        axes.set_title(f"{name}: {one['travelled_mm']:.0f} mm", fontsize=9)
+        if numbers["hold_ms"] is not None:
+            axes.axvline(numbers["hold_ms"], color=DESIRED, linewidth=0.8, linestyle="--")
+        axes.set_title(f"{name}: {numbers['travelled_mm']:.0f} mm", fontsize=9)
     for axes in grid.flat[len(stopping) :]:
         axes.set_visible(False)
     figure.supxlabel("ms after the fault; dashed: the service decides to stop", fontsize=9)

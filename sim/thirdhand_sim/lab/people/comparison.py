@@ -68,8 +68,8 @@ METHODS = {
     "gaussian_process": Entry(
         "Gaussian process",
         tuple(
-            GaussianProcess(each, own_m)
-            for each, own_m in ((15, 0.0), (30, 0.0), (30, 0.05), (30, 0.1), (15, 0.05), (15, 0.1))
+            GaussianProcess(count, own_m)
+            for count, own_m in ((15, 0.0), (30, 0.0), (30, 0.05), (30, 0.1), (15, 0.05), (15, 0.1))
         ),
     ),
     "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
@@ -121,8 +121,8 @@ def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | N
     if hands is not None and group == "tuning":
         everyone += recorded_people(hands)
     return [
-        seen(session(who, number, group=group, sigma_m=SIGMAS_M[number % 2]))
-        for who in everyone
+        seen(session(subject, number, group=group, sigma_m=SIGMAS_M[number % 2]))
+        for subject in everyone
         for number in range(scenes)
     ]
 
@@ -131,42 +131,42 @@ def outcomes(task: Task) -> list[Outcome]:
     """The outcomes of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
-        return [judge(None, one) for one in runs]
+        return [judge(None, trial) for trial in runs]
     model = _learned(task.method, task.candidate)
-    return [judge(model.place(one.session.told), one) for one in runs]
+    return [judge(model.place(trial.session.told), trial) for trial in runs]
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
     group = options.group
     people, scenes = max(2, round(PEOPLE[group] * options.share)), SCENES[group]
-    each = max(2, round(BREAKING_SCENES[group] * options.share))
+    breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
     tasks = [Task(TEACHER, 0, group, "", people, scenes, options.hands)]
     for method, entry in METHODS.items():
         tried = range(len(entry.candidates)) if group == "tuning" and options.share == 1 else range(1)
         tasks += [Task(method, number, group, "", people, scenes, options.hands) for number in tried]
-        tasks += [Task(method, 0, group, kind, 0, each, None) for kind in BREAKING]
-    found: dict[Task, list[Outcome]] = {}
+        tasks += [Task(method, 0, group, kind, 0, breaking_scenes, None) for kind in BREAKING]
+    by_task: dict[Task, list[Outcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
-        found[task] = rows
+        by_task[task] = rows
         if task.kind:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
         else:
             results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
-    main = {task.method: rows for task, rows in found.items() if not task.kind and task.candidate == 0}
+    main = {task.method: rows for task, rows in by_task.items() if not task.kind and task.candidate == 0}
     broken = {
-        method: {kind: _broken(found[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
+        method: {kind: _broken(by_task[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
         for method in METHODS
     }
     for method, entry in METHODS.items():
-        compared = [rows for task, rows in found.items() if task.method == method and not task.kind]
+        compared = [rows for task, rows in by_task.items() if task.method == method and not task.kind]
         if (best := chosen(compared)) > 0:
             results.say(f"{method}: {entry.candidates[best]} is better than what is chosen; put it first")
     numbers = {
         "set": group,
-        "people": len({one.person for one in main["ours"]}),
+        "people": len({row.person for row in main["ours"]}),
         "scenes_of_each": scenes,
-        "breaking_scenes_of_each": each,
+        "breaking_scenes_of_each": breaking_scenes,
         "demonstrations": len(_taught()),
         "rate_hz": RATE_HZ,
         "success_is": {
@@ -188,7 +188,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "breaking": broken,
         "candidates": {
             f"{task.method} {METHODS[task.method].candidates[task.candidate]!r}": summary(rows)
-            for task, rows in found.items()
+            for task, rows in by_task.items()
             if not task.kind and task.method != TEACHER and group == "tuning"
         },
     }
@@ -216,14 +216,14 @@ def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
     """The mean of each measure with its 95 % interval by bootstrap over people, and more."""
     out: dict[str, Any] = {}
     for name, measure in MEASURES.items():
-        mean, low, high = _resampled(rows, np.array([float(measure(one)) for one in rows]))
+        mean, low, high = _resampled(rows, np.array([float(measure(row)) for row in rows]))
         out[name] = {"mean": mean, "low": low, "high": high}
-    out["coverage"] = np.mean([one.inside for one in rows], axis=0).tolist()
+    out["coverage"] = np.mean([row.inside for row in rows], axis=0).tolist()
     for name in ("predicted_mm", "error_mm"):
-        out[f"{name[:-3]}_rms_mm"] = float(np.sqrt(np.mean([getattr(one, name) ** 2 for one in rows])))
-    swapped = sum(one.swapped for one in rows)
-    out["swapped_held"] = sum(one.swapped_held for one in rows) / swapped if swapped else None
-    out["events"] = [float(np.mean([one.events[i].reached for one in rows])) for i in range(3)]
+        out[f"{name[:-3]}_rms_mm"] = float(np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows])))
+    swapped = sum(row.swapped for row in rows)
+    out["swapped_held"] = sum(row.swapped_held for row in rows) / swapped if swapped else None
+    out["events"] = [float(np.mean([row.events[i].reached for row in rows])) for i in range(3)]
     for name in ("error_mm", "true_error_mm"):
         out[f"event_{name}_median"] = [float(np.median([getattr(o.events[i], name) for o in rows])) for i in range(3)]
     return out
@@ -233,15 +233,15 @@ def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
     """The chosen candidate: among those whose success is within SAME of the best, the one whose
     target is nearest to the teacher's tool.
     """
-    success = [float(np.mean([one.success for one in rows])) for rows in tried]
-    path = [float(np.mean([one.path_mm for one in rows])) for rows in tried]
+    success = [float(np.mean([row.success for row in rows])) for rows in tried]
+    path = [float(np.mean([row.path_mm for row in rows])) for rows in tried]
     return min((p, i) for i, p in enumerate(path) if success[i] >= max(success) - SAME)[1]
 
 
 def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, float]:
     """The mean of values (M,), and its 95 % interval by drawing people with replacement."""
-    names = sorted({one.person for one in rows})
-    index = np.array([names.index(one.person) for one in rows])
+    names = sorted({row.person for row in rows})
+    index = np.array([names.index(row.person) for row in rows])
     total, count = np.bincount(index, values), np.bincount(index)
     drawn = np.random.default_rng(DRAWING).integers(len(names), size=(RESAMPLED, len(names)))
     means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
@@ -251,12 +251,12 @@ def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, fl
 def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
     """Successes, and failures in which the tool held through each event that it missed."""
     held = [not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near for o in rows]
-    return {"successes": sum(one.success for one in rows), "held": sum(held), "of": len(rows)}
+    return {"successes": sum(row.success for row in rows), "held": sum(held), "of": len(rows)}
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
-    found = numbers["methods"]
+    methods = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
     labels = {TEACHER: "teacher who knows\nthe scene", **{name: entry.label for name, entry in METHODS.items()}}
@@ -267,30 +267,30 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         ("falsely_followed", 100.0, "time falsely\nfollowed [%]"),
     )
     for ax, (name, scale, label) in zip(axes, bars, strict=False):
-        for i, (method, one) in enumerate(found.items()):
-            mean, low, high = (scale * one[name][value] for value in ("mean", "low", "high"))
+        for i, (method, scores) in enumerate(methods.items()):
+            mean, low, high = (scale * scores[name][value] for value in ("mean", "low", "high"))
             dark = mean
             if name == "success":
-                dark = scale * one["success_on_the_way"]["mean"]
+                dark = scale * scores["success_on_the_way"]["mean"]
                 ax.barh(i, mean, color=colours[method], height=0.65, alpha=0.4)
             ax.barh(i, dark, color=colours[method], height=0.65)
             ax.plot((low, high), (i, i), color="black", lw=1.2)
             ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
         ax.set(xlabel=label)
-        ax.set_yticks(range(len(found)), [labels[m] for m in found] if ax is axes[0] else [""] * len(found), fontsize=8)
+        ax.set_yticks(range(len(methods)), [labels[m] for m in methods] if ax is axes[0] else [""] * len(methods), fontsize=8)
         ax.invert_yaxis()
     levels = 100 * np.array(LEVELS)
     axes[3].plot((0, 100), (0, 100), "--", color="black", lw=0.8)
-    at = 104.0
-    for method, one in sorted(found.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]):
+    label_y = 104.0
+    for method, scores in sorted(methods.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]):
         if method != TEACHER:
-            inside = 100 * np.array(one["coverage"])
+            inside = 100 * np.array(scores["coverage"])
             axes[3].plot(levels, inside, "o-", ms=3, lw=1.2, color=colours[method], zorder=3 if method == "ours" else 2)
-            at = min(at - 4.5, inside[-1])  # below the one before it
+            label_y = min(label_y - 4.5, inside[-1])  # below the one before it
             axes[3].annotate(
                 labels[method].partition(",\n")[0].partition(":")[0].replace("\n", " "),
                 (levels[-1], inside[-1]),
-                (106, at),
+                (106, label_y),
                 va="center",
                 fontsize=7.5,
                 color=colours[method],

@@ -58,7 +58,7 @@ class RigidMap(NamedTuple):
     @staticmethod
     def of(shown: Sequence[LeftOut], reach: Reach) -> RigidMap:
         """The map that brings the tool of these takes best into the reach."""
-        tool = np.concatenate([one.tool[:: max(1, len(one.tool) // SAMPLES)] for one in shown])
+        tool = np.concatenate([take.tool[:: max(1, len(take.tool) // SAMPLES)] for take in shown])
         mean = tool.mean(axis=0)
         low, high = np.array(reach.centre) - reach.outer, np.array(reach.centre) + reach.outer
         low = np.maximum(low, (reach.min_x, low[1], reach.min_z))
@@ -67,12 +67,12 @@ class RigidMap(NamedTuple):
         grid = grid[depth_m(grid, reach) > 0]
         best = (-np.inf, RigidMap(0, (0.0,) * 3, (0.0,) * 3))
         for turns in range(4):
-            at = RigidMap(turns, tuple(mean.tolist()), (0.0,) * 3)
-            off = at.positions(tool)
-            depths = [float(np.quantile(depth_m(off + centre, reach), SHALLOW_SHARE)) for centre in grid]
+            turn_map = RigidMap(turns, tuple(mean.tolist()), (0.0,) * 3)
+            offsets_m = turn_map.positions(tool)
+            depths = [float(np.quantile(depth_m(offsets_m + centre, reach), SHALLOW_SHARE)) for centre in grid]
             deepest = int(np.argmax(depths))
-            found = at._replace(centre=tuple(np.round(grid[deepest], 3).tolist()))
-            best = max(best, (depths[deepest], found), key=lambda one: one[0])
+            candidate = turn_map._replace(centre=tuple(np.round(grid[deepest], 3).tolist()))
+            best = max(best, (depths[deepest], candidate), key=lambda one: one[0])
         return best[1]
 
     def positions(self, points: Array) -> Array:

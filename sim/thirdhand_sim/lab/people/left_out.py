@@ -107,13 +107,13 @@ def predicted_rounds(
     `session_of`.
     """
     hands, begins = session_of(take.demonstration, broken_share)
-    said, count = _through_core(hands, skill, reach)[2], len(take.times)
-    assert said.covariance is not None
-    assert said.held is not None
-    assert said.uncertain is not None
+    prediction, count = _through_core(hands, skill, reach)[2], len(take.times)
+    assert prediction.covariance is not None
+    assert prediction.held is not None
+    assert prediction.uncertain is not None
     parts = [slice(begin, begin + count) for begin in begins]
     return [
-        Predicted(said.mean[part], said.covariance[part], said.held[part], said.uncertain[part], said.radii)
+        Predicted(prediction.mean[part], prediction.covariance[part], prediction.held[part], prediction.uncertain[part], prediction.radii)
         for part in parts
     ]
 
@@ -177,23 +177,23 @@ def _through_core(
     every = RATE_HZ // JUDGED_HZ
     moving, means, covariances, held, unsure = [], [], [], [], []
     for tick, inbox in enumerate(received):
-        known = intake.step(state, frame, 1, inbox)
+        intake_flags = intake.step(state, frame, 1, inbox)
         hands = state["hands"]
         if alone is not None:
-            known = HANDS_KNOWN * bool(frame["hand_ages"][alone] < frame["stale_ticks"][alone])
+            intake_flags = HANDS_KNOWN * bool(frame["hand_ages"][alone] < frame["stale_ticks"][alone])
             hands = hands[[alone, alone]]
-        goes = bool(known & HANDS_KNOWN)
+        goes = bool(intake_flags & HANDS_KNOWN)
         if skill is not None and goes:
-            wanted = stage.step(state, frame)
-            goes = wanted.gate_m <= used.threshold and not wanted.is_ambiguous
+            prediction = stage.step(state, frame)
+            goes = prediction.gate_m <= used.threshold and not prediction.is_ambiguous
         if tick % every == 0:
             moving.append(hands[:, :2].transpose(1, 0, 2).reshape(2, 6))
             means.append(frame["target"].copy())
             covariances.append(frame["covariance"].copy())
             held.append(not goes)
             unsure.append(bool(state["unsure"]))
-    times, told = np.arange(len(moving)) / JUDGED_HZ, (np.array(held), np.array(unsure))
-    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *told, used.regions.radii)
+    times, flags = np.arange(len(moving)) / JUDGED_HZ, (np.array(held), np.array(unsure))
+    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *flags, used.regions.radii)
 
 
 def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
@@ -214,9 +214,9 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
     shifted = []
     for shift in range(-round(LONGEST_SHIFT_S * JUDGED_HZ), round(LONGEST_SHIFT_S * JUDGED_HZ) + 1):
         if abs(shift) <= count // 2:
-            wanted = take.tool[max(0, shift) : count + min(0, shift)]
-            off = wanted - said.mean[max(0, -shift) : count - max(0, shift)]
-            shifted.append((float(np.mean(np.sum(off**2, axis=1))), abs(shift), shift))
+            target_m = take.tool[max(0, shift) : count + min(0, shift)]
+            error_m = target_m - said.mean[max(0, -shift) : count - max(0, shift)]
+            shifted.append((float(np.mean(np.sum(error_m**2, axis=1))), abs(shift), shift))
     least, _, shift = min(shifted)
     inside = None
     if said.covariance is not None:
@@ -224,7 +224,7 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
     lengths = np.linalg.norm(errors, axis=1)
     held, unsure, wrong = said.held, said.uncertain, lengths > UNSURE_M
-    told = None if held is None or unsure is None else held | unsure
+    warned = None if held is None or unsure is None else held | unsure
     return Judged(
         count,
         float(np.sum(errors**2)),
@@ -235,8 +235,8 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         None if held is None else int(held.sum()),
         None if unsure is None else int(unsure.sum()),
         int(wrong.sum()),
-        None if told is None else int((wrong & told).sum()),
-        None if told is None else int((~wrong & told).sum()),
+        None if warned is None else int((wrong & warned).sum()),
+        None if warned is None else int((~wrong & warned).sum()),
     )
 
 

@@ -139,10 +139,10 @@ def _unseen(stamps: Array, random: np.random.Generator) -> Array:
 
 def _seen(t: Array, hand: Array) -> Array:
     """A hand's path (T, 3), straight where it was not seen; at rest where it never was."""
-    known = np.isfinite(hand).all(axis=1)
-    if not known.any():
+    is_seen = np.isfinite(hand).all(axis=1)
+    if not is_seen.any():
         return np.zeros_like(hand)
-    return np.stack([np.interp(t, t[known], column[known]) for column in hand.T], axis=1)
+    return np.stack([np.interp(t, t[is_seen], column[is_seen]) for column in hand.T], axis=1)
 
 
 def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
@@ -178,14 +178,14 @@ def person(seed: int, middle: Array, seconds: float) -> Array:
     t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
     x = np.zeros((len(t), 6))
     for hand in (0, 3):
-        at, here, before = 0.5, np.zeros(3), np.zeros(3)
-        while at < seconds - 1.5:
+        start_s, position_m, before = 0.5, np.zeros(3), np.zeros(3)
+        while start_s < seconds - 1.5:
             goal = before if random.random() < 0.2 else random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.6)
-            before, way, here = here, goal - here, goal
-            lasts = random.uniform(0.4, 0.8) + 3.5 * float(np.linalg.norm(way))
-            u = np.clip((t - at) / lasts, 0.0, 1.0)
-            x[:, hand : hand + 3] += way * (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
-            at += lasts * random.uniform(0.7, 1.0) + (random.exponential(0.6) if random.random() < 0.5 else 0.0)
+            before, reach_m, position_m = position_m, goal - position_m, goal
+            lasts = random.uniform(0.4, 0.8) + 3.5 * float(np.linalg.norm(reach_m))
+            u = np.clip((t - start_s) / lasts, 0.0, 1.0)
+            x[:, hand : hand + 3] += reach_m * (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
+            start_s += lasts * random.uniform(0.7, 1.0) + (random.exponential(0.6) if random.random() < 0.5 else 0.0)
     sway = sosfiltfilt(butter(2, 1.2, fs=1 / PERIOD_S, output="sos"), random.standard_normal((len(t), 6)), axis=0)
     return np.asarray(middle + x + 0.004 * sway / sway.std(axis=0))
 
@@ -196,8 +196,8 @@ def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Gen
     for hand in (0, 3):
         hit = random.random(len(stamps)) < 0.002
         samples[hit, hand : hand + 3] += 0.05 * random.standard_normal((int(hit.sum()), 3))
-    for at in np.flatnonzero(random.random(len(stamps)) < 0.03 / rate_hz):
-        keep[at : at + int(random.uniform(0.03, 0.09) * rate_hz)] = False
+    for begin in np.flatnonzero(random.random(len(stamps)) < 0.03 / rate_hz):
+        keep[begin : begin + int(random.uniform(0.03, 0.09) * rate_hz)] = False
     return stamps[keep], samples[keep]
 
 
@@ -208,15 +208,15 @@ def stops(
     out = []
     for number in numbers:
         random = np.random.default_rng([number, 7])
-        way = np.zeros(6)
-        way[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (1.0, 1.0, 0.5)
-        way /= np.linalg.norm(way)
+        direction = np.zeros(6)
+        direction[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (1.0, 1.0, 0.5)
+        direction /= np.linalg.norm(direction)
         t = np.arange(round(2.1 / PERIOD_S)) * PERIOD_S
         stop_s = 1.15 + 0.15 * random.random()
         up, down = np.clip((t - 0.5) / 0.3, 0.0, 1.0), np.clip((t - stop_s) / STOP_S, 0.0, 1.0)
-        gone = np.cumsum(STOP_SPEED * up**2 * (3 - 2 * up) * (1 - down**2 * (3 - 2 * down))) * PERIOD_S
+        travel_m = np.cumsum(STOP_SPEED * up**2 * (3 - 2 * up) * (1 - down**2 * (3 - 2 * down))) * PERIOD_S
         end = middle + random.uniform(-0.05, 0.05, 6) * (1.0, 1.0, 0.5, 1.0, 1.0, 0.3)
-        truth = end + way * (gone - gone[-1])[:, None]
+        truth = end + direction * (travel_m - travel_m[-1])[:, None]
         stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
         samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
         samples += noise * random.standard_normal(samples.shape)
@@ -246,12 +246,12 @@ def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Movin
     t = np.arange(round(SMALL_S / PERIOD_S)) * PERIOD_S
     rise = np.clip(t / SMALL_RISE_S, 0.0, 1.0)
     rise = rise**2 * (3 - 2 * rise)
-    gone = np.cumsum(drift_mps * rise) * PERIOD_S
-    way = (gone - gone[-1] / 2)[:, None] * drift + (amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t))[
+    travel_m = np.cumsum(drift_mps * rise) * PERIOD_S
+    motion_m = (travel_m - travel_m[-1] / 2)[:, None] * drift + (amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t))[
         :, None
     ] * shake
     truth = np.tile(middle, (len(t), 1))
-    truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += way
+    truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += motion_m
     stamps = np.arange(0.0, t[-1], 0.01)
     samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
     samples += 0.0005 * random.standard_normal(samples.shape)

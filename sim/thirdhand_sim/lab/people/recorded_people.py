@@ -35,7 +35,7 @@ def _of_file(path: Path, number: int) -> Person | None:
     rate = 1 / float(np.mean(np.diff(t)))
     sos = butter(4, cut_hz, fs=rate, output="sos")
     smooth = np.asarray(sosfiltfilt(sos, hands, axis=0))
-    reaches = [one for side in (0, 3) for one in _reaches(smooth[:, side : side + 3], rate)]
+    reaches = [reach for side in (0, 3) for reach in _reaches(smooth[:, side : side + 3], rate)]
     if not reaches:
         return None
     tracker = TrackerModel(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
@@ -51,11 +51,11 @@ def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
     out = []
     for begin, end in moving.reshape(-1, 2):
         part = x[begin:end]
-        way = part[-1] - part[0]
-        length = float(np.linalg.norm(way))
+        chord = part[-1] - part[0]
+        length = float(np.linalg.norm(chord))
         if length < LEAST_REACH_M:
             continue
-        along = way / length
+        along = chord / length
         side = np.cross([0.0, 0.0, 1.0], along)
         side /= max(float(np.linalg.norm(side)), 1e-9)
         u = np.linspace(0, len(part) - 1, SHAPE_STEPS)

@@ -64,8 +64,8 @@ class Process(NamedTuple):
 
     def log_likelihood(self, t: Array, x: Array) -> float:
         """Logarithm of the probability density of samples (M, 3) [m] at times (M,) [s]."""
-        covariance, off = self.covariance(t[None])[0], x - x.mean(axis=0)
-        squared = float(np.sum(off * np.linalg.solve(covariance, off)))
+        covariance, centred = self.covariance(t[None])[0], x - x.mean(axis=0)
+        squared = float(np.sum(centred * np.linalg.solve(covariance, centred)))
         return -0.5 * (squared + 3 * (float(np.linalg.slogdet(covariance)[1]) + len(t) * math.log(2 * math.pi)))
 
     def best(self, t: Array, x: Array) -> tuple[float, Process]:
@@ -120,8 +120,8 @@ def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
 
     straight = np.minimum(moved(left, left), moved(right, right))
     crossed = np.maximum(moved(left, right), moved(right, left))
-    at = (straight > EXCHANGE_MPS * np.diff(t)) & (crossed < straight / 3)
-    exchanged = np.concatenate([[False], np.cumsum(at) % 2 == 1])
+    is_switch = (straight > EXCHANGE_MPS * np.diff(t)) & (crossed < straight / 3)
+    exchanged = np.concatenate([[False], np.cumsum(is_switch) % 2 == 1])
     return ~exchanged if exchanged.mean() > 0.5 else exchanged
 
 
@@ -131,12 +131,12 @@ def jumped_samples(t: Array, x: Array, quick: Process) -> NDArray[np.bool_]:
     """
     wrong = np.zeros(len(t), bool)
     while True:
-        kept = np.flatnonzero(~wrong)
-        runs = _improbable_runs(t[kept], x[kept], quick)
+        valid = np.flatnonzero(~wrong)
+        runs = _improbable_runs(t[valid], x[valid], quick)
         if not runs:
             return wrong
         for begin, end in runs:
-            wrong[kept[begin:end]] = True
+            wrong[valid[begin:end]] = True
 
 
 def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]]:
@@ -151,14 +151,14 @@ def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]
         begins = np.flatnonzero((excess > 0) & (off_m > LEAST_JUMP_M))
         rows.append(np.stack([excess[begins], begins, begins + length], axis=1))
         length = max(length + 1, round(RUN_GROWTH * length))
-    found, runs, reach = np.concatenate(rows), [], longest + SAMPLES_BESIDE
-    while len(found):
-        excess, first, last = found[np.argmax(found[:, 0])]
-        alike = found[(found[:, 0] >= ALIKE * excess) & (found[:, 1] < last) & (found[:, 2] > first)]
+    candidates, runs, reach = np.concatenate(rows), [], longest + SAMPLES_BESIDE
+    while len(candidates):
+        excess, first, last = candidates[np.argmax(candidates[:, 0])]
+        alike = candidates[(candidates[:, 0] >= ALIKE * excess) & (candidates[:, 1] < last) & (candidates[:, 2] > first)]
         alike = alike[np.argsort(alike[:, 2] - alike[:, 1], kind="stable")[:CANDIDATES]]
         begin, end = _most_probable(t, x, alike[:, 1:].astype(int), quick)
         runs.append((begin, end))
-        found = found[(found[:, 1] >= max(last, end) + reach) | (found[:, 2] <= min(first, begin) - reach)]
+        candidates = candidates[(candidates[:, 1] >= max(last, end) + reach) | (candidates[:, 2] <= min(first, begin) - reach)]
     return runs
 
 
@@ -168,7 +168,7 @@ def _most_probable(t: Array, x: Array, runs: NDArray[np.int_], quick: Process) -
     """
     around = np.arange(max(0, runs[:, 0].min() - SAMPLES_BESIDE), min(len(t), runs[:, 1].max() + SAMPLES_BESIDE))
     right = [around[(around < begin) | (around >= end)] for begin, end in runs]
-    begin, end = runs[np.argmax([quick.best(t[one], x[one])[0] for one in right])]
+    begin, end = runs[np.argmax([quick.best(t[indices], x[indices])[0] for indices in right])]
     return int(begin), int(end)
 
 
@@ -182,15 +182,15 @@ def _off_prediction(t: Array, x: Array, length: int, quick: Process) -> tuple[Ar
     squared, off_m = np.empty((2, len(begins)))
     for offset in np.unique(begins - firsts):
         of = np.flatnonzero(begins - firsts == offset)
-        at = firsts[of, None] + np.arange(size)
-        spans, which = np.unique(np.round((t[at] - t[at[:, :1]]) / STAMP_S), axis=0, return_inverse=True)
+        windows = firsts[of, None] + np.arange(size)
+        spans, span_index = np.unique(np.round((t[windows] - t[windows[:, :1]]) / STAMP_S), axis=0, return_inverse=True)
         precision = np.linalg.inv(quick.covariance(STAMP_S * spans))
         run = slice(offset, offset + length)
         # For y ~ N(0, P^-1) the run is off by r = P_rr^-1 (P y)_r, whose covariance is P_rr^-1.
-        pull = precision[which.ravel(), run] @ x[at]
-        off = np.linalg.solve(precision[which.ravel(), run, run], pull)
-        squared[of] = np.sum(off * pull, axis=(1, 2))
-        off_m[of] = np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1))
+        pull = precision[span_index.ravel(), run] @ x[windows]
+        residual = np.linalg.solve(precision[span_index.ravel(), run, run], pull)
+        squared[of] = np.sum(residual * pull, axis=(1, 2))
+        off_m[of] = np.sqrt(np.mean(np.sum(residual**2, axis=2), axis=1))
     return squared, off_m
 
 
@@ -198,10 +198,10 @@ def _bridged(t: Array, x: Array, wrong: NDArray[np.bool_], quick: Process) -> Ar
     """A path (T, 3) [m] with its wrong samples predicted from the right ones around them, by the
     process that makes these most probable; hardly beyond where these are.
     """
-    out, kept = x.copy(), np.flatnonzero(~wrong)
+    out, valid = x.copy(), np.flatnonzero(~wrong)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):
-        around = np.concatenate([kept[kept < begin][-SAMPLES_BESIDE:], kept[kept >= end][:SAMPLES_BESIDE]])
+        around = np.concatenate([valid[valid < begin][-SAMPLES_BESIDE:], valid[valid >= end][:SAMPLES_BESIDE]])
         process = quick.best(t[around], x[around])[1]
         covariance = process.covariance(t[None, np.concatenate([around, np.arange(begin, end)])])[0]
         middle, size = x[around].mean(axis=0), len(around)

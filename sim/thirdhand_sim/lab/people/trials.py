@@ -77,17 +77,17 @@ def ticks(session: Session) -> Iterator[Tick]:
 
 def seen(session: Session) -> Seen:
     """The session through tracker and service, which holds only because of the hands."""
-    known = tuple(ticks(session))
+    all_ticks = tuple(ticks(session))
     core = controller(replace(shipped_skill(), threshold=np.inf), settings())
-    times = np.arange(len(known)) / RATE_HZ
-    estimates, rest, fresh = np.zeros((len(known), 3, 6)), np.zeros((len(known), 2)), np.zeros(len(known), bool)
-    for k, tick in enumerate(known):
+    times = np.arange(len(all_ticks)) / RATE_HZ
+    estimates, stillness, fresh = np.zeros((len(all_ticks), 3, 6)), np.zeros((len(all_ticks), 2)), np.zeros(len(all_ticks), bool)
+    for k, tick in enumerate(all_ticks):
         fresh[k] = core.step(tick)["mode"] == Mode.FOLLOW
         state = core.state
-        estimates[k], rest[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["hand_stillness"]
+        estimates[k], stillness[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["hand_stillness"]
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(session, known, times, estimates, rest, fresh, swapped, session.hands(times), session.tool(times))
+    return Seen(session, all_ticks, times, estimates, stillness, fresh, swapped, session.hands(times), session.tool(times))
 
 
 class EventOutcome(NamedTuple):
@@ -130,22 +130,22 @@ class Outcome(NamedTuple):
 
 def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
     """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
-    found = served(placed, one)
-    target, tool, held = found["target"], found["tool"], found["mode"] != Mode.FOLLOW
+    served_frames = served(placed, one)
+    target, tool, held = served_frames["target"], served_frames["tool"], served_frames["mode"] != Mode.FOLLOW
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
     events = tuple(_event(one, tool, speed, held, i) for i in range(3))
-    apart = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
-    too_near = bool(((apart < NEAR_M) & (speed > FAST_MPS)).any())
+    hand_distance_m = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
+    too_near = bool(((hand_distance_m < NEAR_M) & (speed > FAST_MPS)).any())
     judged = one.times > 0.5
     good = judged & ~one.due
     delay, _ = _delayed(target, one.tool, good)
     tool_delay, _ = _delayed(tool, one.tool, good & ~held)
-    wanted = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
-    errors, covariance = (wanted - target)[good], found["covariance"][good]
+    teacher_tool = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
+    errors, covariance = (teacher_tool - target)[good], served_frames["covariance"][good]
     squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
     radii = placed.regions.radii if isinstance(placed, Skill) else CHI_SQUARE
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
-    wrong = np.linalg.norm(target - wanted, axis=1) > WRONG_M
+    wrong = np.linalg.norm(target - teacher_tool, axis=1) > WRONG_M
     planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
     return Outcome(
         one.session.person.name,
@@ -201,10 +201,10 @@ def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
         count, as_told = len(one.times), replace(one.session, places=one.session.told)
         predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)))
     else:
-        seen = Observed(one.times, s, v, one.rest)
-        predicted = placed.predict(seen)
+        observed = Observed(one.times, s, v, one.rest)
+        predicted = placed.predict(observed)
         if placed.depends_on is DependsOn.HANDS:
-            return predicted, along_hands(lambda hands: placed.mean(seen._replace(hands=hands)), s, v, a)
+            return predicted, along_hands(lambda hands: placed.mean(observed._replace(hands=hands)), s, v, a)
     before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
     velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
     return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)
@@ -214,27 +214,27 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOut
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
     if i == 0:  # the board belongs where the hand is seen
-        told = one.estimates[window, 0, :3] + TOOL_FROM_HAND
+        perceived = one.estimates[window, 0, :3] + TOOL_FROM_HAND
         true = one.hands[window, :3] + TOOL_FROM_HAND
     else:
         places = one.session.told, one.session.places
-        told, true = (np.broadcast_to(p.glass if i == 1 else p.carry, (int(window.sum()), 3)) for p in places)
-    off = np.linalg.norm(tool[window] - told, axis=1)
-    there = (off <= WITHIN_M) & (speed[window] < SLOW_MPS)
+        perceived, true = (np.broadcast_to(p.glass if i == 1 else p.carry, (int(window.sum()), 3)) for p in places)
+    distance_m = np.linalg.norm(tool[window] - perceived, axis=1)
+    is_within = (distance_m <= WITHIN_M) & (speed[window] < SLOW_MPS)
     steps = int(FOR_S * RATE_HZ)
-    runs = np.convolve(there, np.ones(steps), mode="valid") if len(there) >= steps else np.zeros(1)
-    best = int(np.argmin(uniform_filter1d(off, steps, mode="nearest")))
+    runs = np.convolve(is_within, np.ones(steps), mode="valid") if len(is_within) >= steps else np.zeros(1)
+    best = int(np.argmin(uniform_filter1d(distance_m, steps, mode="nearest")))
     true_off = np.linalg.norm(tool[window] - true, axis=1)
     reached, was_held = bool((runs >= steps - 0.5).any()), bool(held[window].mean() > 0.8)
-    return EventOutcome(reached, 1000 * float(off[best]), 1000 * float(true_off[best]), was_held)
+    return EventOutcome(reached, 1000 * float(distance_m[best]), 1000 * float(true_off[best]), was_held)
 
 
 def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:
     """Delay [ticks] of `x` (T, 3) behind `wanted`, and the mean square distance at it [m²]."""
     count = len(x)
-    found = []
+    candidates = []
     for delay in range(0, int(LONGEST_DELAY_S * RATE_HZ), 2):
-        off = np.sum((x[delay:] - wanted[: count - delay]) ** 2, axis=1)[good[delay:]]
-        found.append((float(off.mean()) if len(off) else np.inf, delay))
-    least, delay = min(found)
+        squares = np.sum((x[delay:] - wanted[: count - delay]) ** 2, axis=1)[good[delay:]]
+        candidates.append((float(squares.mean()) if len(squares) else np.inf, delay))
+    least, delay = min(candidates)
     return delay, least

@@ -82,17 +82,17 @@ def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
         if variant.bare:
             via_points = tuple(msgspec.structs.replace(point, radius=0.0, follow="none") for point in via_points)
         try:
-            there = taught(variant.skill, via_points)
+            skill = taught(variant.skill, via_points)
         except SkillError:
             refused += 1
             continue
-        errors.append(open_loop_mm(there, drawn))
+        errors.append(open_loop_mm(skill, drawn))
         hands, _ = at_the_events(drawn.scene, drawn.seed)
-        steepness.append([np.linalg.norm(_slope(there, row), ord=2) for row in hands])
+        steepness.append([np.linalg.norm(_slope(skill, row), ord=2) for row in hands])
     return Reached(np.array(errors).reshape(-1, 3), np.array(steepness).reshape(-1, 3), refused)
 
 
 def _slope(skill: Skill, hands: Array) -> Array:
     """The tool's velocities (6, 3) for 1 m/s of each axis of the hands, at hands (6,) [m]."""
-    at, still = hands.reshape(2, 3), np.zeros((2, 3))
-    return np.array([skill.predict(at, way.reshape(2, 3), still).velocity for way in np.eye(6)])
+    positions, still = hands.reshape(2, 3), np.zeros((2, 3))
+    return np.array([skill.predict(positions, axis.reshape(2, 3), still).velocity for axis in np.eye(6)])

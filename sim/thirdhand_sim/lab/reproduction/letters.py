@@ -51,7 +51,7 @@ def learned(name: str, demonstrations: Array) -> Letter:
     """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the
     paper's numbers.
     """
-    samples = np.concatenate([np.column_stack([TIMES, one]) for one in demonstrations])
+    samples = np.concatenate([np.column_stack([TIMES, demonstration]) for demonstration in demonstrations])
     mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION)
     primitive = KMP.fit(TIMES[:, None], mixture.regress(TIMES[:, None]), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA)
     return Letter(name, demonstrations, mixture, primitive)
@@ -92,14 +92,14 @@ class Line(NamedTuple):
     @property
     def misses(self) -> Array:
         """Distances (V,) [cm] from the desired points at their times."""
-        at = [int(np.argmin(np.abs(TIMES - t))) for t in self.case.times]
-        return np.asarray(np.linalg.norm(self.points[at] - self.case.points, axis=1))
+        indices = [int(np.argmin(np.abs(TIMES - t))) for t in self.case.times]
+        return np.asarray(np.linalg.norm(self.points[indices] - self.case.points, axis=1))
 
     @property
     def rms_deviation_elsewhere_cm(self) -> float:
         """Distance from the demonstrations' mean, far from every desired point."""
-        off = np.linalg.norm(self.points - self.letter.demonstrations.mean(axis=0), axis=1)
-        return _rms(off[elsewhere(self.case)])
+        deviation_cm = np.linalg.norm(self.points - self.letter.demonstrations.mean(axis=0), axis=1)
+        return _rms(deviation_cm[elsewhere(self.case)])
 
 
 def _rms(x: Array) -> float:
@@ -118,14 +118,14 @@ def by_kmp(letter: Letter, case: Case) -> Array:
 
 def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
     """The letters of each set: the model's, and the recorded ones where a folder is given."""
-    some = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
-    sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in some}}
+    names = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
+    sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in names}}
     if options.letters is not None:
         real = recorded(options.letters)
         sets["recorded"] = {name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]}
-    found = {name: [learned(*one) for one in letters.items()] for name, letters in sets.items()}
-    results.say(", ".join(f"{len(rows)} letters learned ({name})" for name, rows in found.items()))
-    return found
+    learned_sets = {name: [learned(*item) for item in letters.items()] for name, letters in sets.items()}
+    results.say(", ".join(f"{len(rows)} letters learned ({name})" for name, rows in learned_sets.items()))
+    return learned_sets
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
@@ -141,11 +141,11 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     sets = gathered(results, options)
     for name, rows in sets.items():
         numbers[name] = {row.name: [_measured(row, case) for case in cases(row)] for row in rows}
-        flat = [one for per in numbers[name].values() for one in per]
+        flat = [entry for per in numbers[name].values() for entry in per]
         numbers[f"{name}_summary"] = {
-            "largest_miss_at_desired_points_cm": max(one["miss_cm"] for one in flat),
-            "rms_deviation_elsewhere_cm": float(np.sqrt(np.mean([one["rms_elsewhere_cm"] ** 2 for one in flat]))),
-            "largest_deviation_elsewhere_cm": max(one["largest_elsewhere_cm"] for one in flat),
+            "largest_miss_at_desired_points_cm": max(entry["miss_cm"] for entry in flat),
+            "rms_deviation_elsewhere_cm": float(np.sqrt(np.mean([entry["rms_elsewhere_cm"] ** 2 for entry in flat]))),
+            "largest_deviation_elsewhere_cm": max(entry["largest_elsewhere_cm"] for entry in flat),
             "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
         }
         for row in rows:

@@ -34,17 +34,17 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "gmm": lambda letter, _: letter.reference,
     }
     numbers: dict[str, Any] = {"unit": "cm", "dmp_weights_per_output": WEIGHTS}
-    shown: list[dict[str, Line]] = []
+    examples: list[dict[str, Line]] = []
     for name, rows in gathered(results, options).items():
-        found = [
-            {who: Line(row, case, method(row, case)) for who, method in methods.items()}
+        line_sets = [
+            {key: Line(row, case, method(row, case)) for key, method in methods.items()}
             for row in rows
             for case in cases(row)
         ]
-        numbers[SETS[name]] = {who: _summary([one[who] for one in found]) for who in methods}
-        last = [one for one in found if len(one["kmp"].case.times) == 3]
-        shown += [one for one in last if one["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
-    _draw(results, shown)
+        numbers[SETS[name]] = {key: _summary([lines[key] for lines in line_sets]) for key in methods}
+        last = [lines for lines in line_sets if len(lines["kmp"].case.times) == 3]
+        examples += [lines for lines in last if lines["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
+    _draw(results, examples)
     return numbers
 
 
@@ -70,7 +70,7 @@ def configured(letter: Letter, case: Case) -> Array:
     points = {float(t): point for t, point in zip(case.times, case.points, strict=True)}
     primitive.configure(start_y=points.get(TIMES[0], mean[0]), goal_y=points.get(TIMES[-1], mean[-1]))
     times, line = primitive.open_loop()
-    return np.column_stack([np.interp(TIMES, times, one) for one in line.T])
+    return np.column_stack([np.interp(TIMES, times, column) for column in line.T])
 
 
 def _summary(lines: list[Line]) -> dict[str, float]:
@@ -87,9 +87,9 @@ def _summary(lines: list[Line]) -> dict[str, float]:
 
 def _draw(results: Results, shown: list[dict[str, Line]]) -> None:
     figure, grid = pyplot().subplots(1, len(shown), figsize=(2.6 * len(shown), 3.2), squeeze=False)
-    for axes, one in zip(grid[0], shown, strict=True):
-        lines = {label: (one[who].points, colour) for who, (label, colour) in METHODS.items()}
-        draw_lines(axes, one["kmp"].letter, one["kmp"].case, lines, "black")
+    for axes, example in zip(grid[0], shown, strict=True):
+        lines = {label: (example[key].points, colour) for key, (label, colour) in METHODS.items()}
+        draw_lines(axes, example["kmp"].letter, example["kmp"].case, lines, "black")
     grid[0][0].set_ylabel("cm")
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure)

@@ -65,15 +65,15 @@ def _written(targets: Array, random: np.random.Generator) -> Array:
     d, dd = spline(u, 1), spline(u, 2)
     rate = np.linalg.norm(d, axis=1)
     curvature = np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / rate**3
-    way = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(u))])
-    share = way / way[-1]
+    travel_cm = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(u))])
+    share = travel_cm / travel_cm[-1]
     ends = np.sqrt(np.minimum(1.0, (np.minimum(share, 1 - share) + 0.002) / STARTING_SHARE))
     speed = ends * np.maximum(curvature, SMALLEST_CURVATURE) ** (-1 / 3)
-    times = np.concatenate([[0.0], np.cumsum(np.diff(way) * (1 / speed[1:] + 1 / speed[:-1]) / 2)])
+    times = np.concatenate([[0.0], np.cumsum(np.diff(travel_cm) * (1 / speed[1:] + 1 / speed[:-1]) / 2)])
     knots = np.linspace(0.0, 1.0, 6)
     warp = np.cumsum(np.concatenate([[0.0], np.exp(TEMPO_STD * random.standard_normal(5))]))
-    at = PchipInterpolator(knots, warp / warp[-1])(times / times[-1]) * DURATION_S
-    return np.asarray(spline(np.interp(TIMES, at, u)))
+    warped_s = PchipInterpolator(knots, warp / warp[-1])(times / times[-1]) * DURATION_S
+    return np.asarray(spline(np.interp(TIMES, warped_s, u)))
 
 
 def recorded(folder: Path, *, count: int = DEMONSTRATIONS) -> dict[str, Array]:
@@ -97,5 +97,5 @@ def recorded(folder: Path, *, count: int = DEMONSTRATIONS) -> dict[str, Array]:
 
 
 def _resampled(points: Array) -> Array:
-    at = np.linspace(0.0, DURATION_S, len(points))
-    return np.stack([np.interp(TIMES, at, points[:, axis]) for axis in range(2)], axis=1)
+    times = np.linspace(0.0, DURATION_S, len(points))
+    return np.stack([np.interp(TIMES, times, points[:, axis]) for axis in range(2)], axis=1)

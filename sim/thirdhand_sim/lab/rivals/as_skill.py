@@ -33,7 +33,7 @@ def along_hands(law: HandsToTool, hands: Array, velocities: Array, accelerations
     speed = np.repeat(np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2), 3, axis=1)
     goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
     step, bend = MOTION_STEP_S * goes * velocities, 0.5 * MOTION_STEP_S**2 * goes * accelerations
-    return differences(*(law(hands + way * step + abs(way) * bend) for way in STEPS))
+    return differences(*(law(hands + sign * step + abs(sign) * bend) for sign in STEPS))
 
 
 def differences(behind: Array, now: Array, ahead: Array) -> Array:
@@ -63,17 +63,17 @@ class Rival(Skill):
 
     def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
-        said = self.says(*seen.now.copy())
-        position, velocity, acceleration = np.round(said.motion, 6)
-        turn, gate_m = self.constant_turn, float(said.far)
-        return Prediction(position, velocity, acceleration, said.covariance, gate_m, 0.0, turn, NO_GRIPPER)
+        prediction = self.says(*seen.now.copy())
+        position, velocity, acceleration = np.round(prediction.motion, 6)
+        turn, gate_m = self.constant_turn, float(prediction.far)
+        return Prediction(position, velocity, acceleration, prediction.covariance, gate_m, 0.0, turn, NO_GRIPPER)
 
 
 def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:
     """The skill with another law, and with other changed fields."""
-    own = {one.name: getattr(skill, one.name) for one in fields(Skill)}
+    values = {attribute.name: getattr(skill, attribute.name) for attribute in fields(Skill)}
     # The digest is of the name alone: nothing is recorded that would need the rest.
-    return Rival(**{**own, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed}, says=says)
+    return Rival(**{**values, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed}, says=says)
 
 
 def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:

@@ -60,11 +60,11 @@ def ours(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Follower:
     )
 
     def follow(hands: Moving) -> Followed:
-        seen = frames(skill, _ticks(hands), settings, tuning)[SETTLE_TICKS:]
-        speed = np.linalg.norm(np.diff(seen["tool"], axis=0), axis=1) / PERIOD_S
-        limited = float(np.mean(seen["flags"] & Flag.SPEED_LIMITED > 0))
-        shown = (seen[name] for name in ("hands", "target", "setpoint"))
-        return Followed(seen["tool"], seen["joint_velocities"], float(speed.max()), limited, *shown)
+        records = frames(skill, _ticks(hands), settings, tuning)[SETTLE_TICKS:]
+        speed = np.linalg.norm(np.diff(records["tool"], axis=0), axis=1) / PERIOD_S
+        limited = float(np.mean(records["flags"] & Flag.SPEED_LIMITED > 0))
+        paths = (records[name] for name in ("hands", "target", "setpoint"))
+        return Followed(records["tool"], records["joint_velocities"], float(speed.max()), limited, *paths)
 
     return follow
 
@@ -82,11 +82,11 @@ def _ticks(hands: Moving) -> Iterator[Tick]:
     for stamp, position, waits in zip(stamps, samples, late, strict=True):
         for side, part, wait in zip(SIDES, (position[:3], position[3:]), waits, strict=True):
             came = stamp + wait
-            at = SETTLE_TICKS + math.ceil(came / PERIOD_S - 1e-9) if came < math.inf else len(inboxes)
-            if at < len(inboxes):
+            tick = SETTLE_TICKS + math.ceil(came / PERIOD_S - 1e-9) if came < math.inf else len(inboxes)
+            if tick < len(inboxes):
                 x, y, z = part.tolist()
                 since_ns = round(1e9 * (stamp + SETTLE_TICKS * PERIOD_S))
-                inboxes[at].append(hand_event(side, (x, y, z), START_NS + since_ns))
+                inboxes[tick].append(hand_event(side, (x, y, z), START_NS + since_ns))
     for k, inbox in enumerate(inboxes):
         yield Tick(k, tuple(inbox))
 
@@ -111,8 +111,8 @@ class _Chain:
         q = np.array(self.settings.arm.posture)
         dq, ddq = np.zeros((2, len(q)))
         for _ in range(2000):
-            wanted = self.arm.step(q, position, np.zeros(3), self.orientation)
-            q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
+            solution = self.arm.step(q, position, np.zeros(3), self.orientation)
+            q, dq, ddq = self.limiter.step(q, dq, ddq, solution.velocity)[:3]
         return q, 0 * dq, 0 * ddq
 
     def follow(self, setpoints: Array) -> Followed:
@@ -121,10 +121,10 @@ class _Chain:
         tool, joints, limited = np.empty((len(setpoints), 3)), np.empty((len(setpoints), len(q))), 0
         for k, (position, velocity) in enumerate(setpoints):
             # Without the acceleration that ours passes on: a time-optimal one jumps.
-            wanted = self.arm.step(q, position, velocity, self.orientation, moving=dq)
-            q, dq, ddq = self.limiter.step(q, dq, ddq, wanted.velocity)[:3]
+            solution = self.arm.step(q, position, velocity, self.orientation, moving=dq)
+            q, dq, ddq = self.limiter.step(q, dq, ddq, solution.velocity)[:3]
             tool[k], joints[k] = self.arm.at(q).position, dq
-            limited += wanted.speed_limited
+            limited += solution.speed_limited
         return _followed(tool, joints, limited)._replace(setpoint=setpoints[:, 0])
 
 
@@ -135,8 +135,8 @@ def _followed(tool: Array, joints: Array, limited: int) -> Followed:
 
 def _newest(hands: Moving) -> Array:
     """Index of the newest sample at each tick (N,)."""
-    at = np.ceil(hands.stamps / PERIOD_S - 1e-9)
-    return np.maximum(np.searchsorted(at, np.arange(len(hands.truth)), side="right") - 1, 0)
+    arrival_ticks = np.ceil(hands.stamps / PERIOD_S - 1e-9)
+    return np.maximum(np.searchsorted(arrival_ticks, np.arange(len(hands.truth)), side="right") - 1, 0)
 
 
 def one_euro(hands: Moving, least_hz: float, beta: float) -> Array:
@@ -186,14 +186,14 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
         chain = _Chain(skill, settings)
         targets = chain.targets(hands.samples)[_newest(hands)]
         q = chain.start(targets[0])[0]
-        before, low, wanted, limited = q, q.copy(), np.empty((len(targets), len(q))), 0
+        before, low, setpoints, limited = q, q.copy(), np.empty((len(targets), len(q))), 0
         for k, target in enumerate(targets):
             solution = chain.arm.step(q, target, np.zeros(3), chain.orientation)
             limited += solution.speed_limited
             q = q + PERIOD_S * solution.velocity
             low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)
-            before, wanted[k] = q, low
-        moved = _by_ruckig(wanted, limits)
+            before, setpoints[k] = q, low
+        moved = _by_ruckig(setpoints, limits)
         return _followed(np.array([chain.arm.at(q).position for q in moved[:, 0]]), moved[:, 1], limited)
 
     return follow

@@ -93,7 +93,7 @@ class PlacedProcess:
         threshold: float = np.inf,
     ) -> PlacedProcess:
         """The process of groups of data: inputs (N, 6), outputs (N, 3) [m], noise (N,) [m²]."""
-        s, owner = np.concatenate(inputs), np.repeat(np.arange(len(inputs)), [len(one) for one in inputs])
+        s, owner = np.concatenate(inputs), np.repeat(np.arange(len(inputs)), [len(group) for group in inputs])
         k = kernels[0](s, s)
         for kernel in kernels[1:]:
             k += (owner[:, None] == owner) * kernel(s, s)
@@ -114,8 +114,8 @@ class PlacedProcess:
         """As `Placed.predict`."""
         rows = self._rows(seen.hands)
         prior = sum(kernel.variance for kernel in self.kernels)
-        some = np.maximum(prior - self.posterior.explained(rows[::COVARIANCE_EVERY]), 1e-6)
-        variance = np.repeat(some, COVARIANCE_EVERY)[: len(rows)]
+        sparse_variance = np.maximum(prior - self.posterior.explained(rows[::COVARIANCE_EVERY]), 1e-6)
+        variance = np.repeat(sparse_variance, COVARIANCE_EVERY)[: len(rows)]
         covariance = variance[:, None, None] * np.eye(3)
         return Predicted(self.posterior.mean(rows), covariance, np.sqrt(variance) > self.threshold)
 
@@ -136,21 +136,21 @@ class GaussianProcess:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedProcess:
         """The process with its kernels."""
-        rows = [np.linspace(0, len(one.times) - 1, self.each).astype(int) for one in demonstrations]
-        inputs = np.concatenate([one.hands[some] for one, some in zip(demonstrations, rows, strict=True)])
-        outputs = np.concatenate([one.tool[some] for one, some in zip(demonstrations, rows, strict=True)])
+        rows = [np.linspace(0, len(demo.times) - 1, self.each).astype(int) for demo in demonstrations]
+        inputs = np.concatenate([demo.hands[index] for demo, index in zip(demonstrations, rows, strict=True)])
+        outputs = np.concatenate([demo.tool[index] for demo, index in zip(demonstrations, rows, strict=True)])
         owner = np.repeat(np.arange(len(demonstrations)), self.each)
-        same = owner[:, None] == owner
+        same_owner = owner[:, None] == owner
         centre = outputs.mean(axis=0)
         left, right = (cdist(part, part, "sqeuclidean") for part in (inputs[:, :3], inputs[:, 3:]))
 
         def cost(log: Array) -> tuple[float, Array]:
-            shared, own, l_s, r_s, l_o, r_o, noise = np.exp(log)
+            shared, individual, l_s, r_s, l_o, r_o, noise = np.exp(log)
             first = shared**2 * np.exp(-0.5 * (left / l_s**2 + right / r_s**2))
-            second = same * own**2 * np.exp(-0.5 * (left / l_o**2 + right / r_o**2))
-            root = cho_factor(first + second + (noise**2 + 1e-8) * np.eye(len(same)), lower=True)
+            second = same_owner * individual**2 * np.exp(-0.5 * (left / l_o**2 + right / r_o**2))
+            root = cho_factor(first + second + (noise**2 + 1e-8) * np.eye(len(same_owner)), lower=True)
             weights = cho_solve(root, outputs - centre)
-            outer = 0.5 * (3.0 * cho_solve(root, np.eye(len(same))) - weights @ weights.T)
+            outer = 0.5 * (3.0 * cho_solve(root, np.eye(len(same_owner))) - weights @ weights.T)
             by_first, by_second = outer * first, outer * second
             slopes = [2.0 * by_first.sum(), 2.0 * by_second.sum()]
             slopes += [(by_first * left).sum() / l_s**2, (by_first * right).sum() / r_s**2]
@@ -162,10 +162,10 @@ class GaussianProcess:
         begin = np.log([0.2, max(0.05, self.own_m), 0.3, 0.3, 0.3, 0.3, 0.005])
         bounds = [(0.02, 2.0), (max(self.own_m, 0.02), 2.0)] + [(0.05, 3.0)] * 4 + [(0.001, 0.05)]
         limits: list[tuple[float, float]] = np.log(bounds).tolist()
-        found = np.exp(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 100}).x)
-        kernels = [Kernel(found[i] ** 2, np.repeat(found[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)]
-        base = LearnedProcess(kernels[0], kernels[1], float(found[6]), inputs, outputs, owner, centre, np.inf)
-        variances = [base.without(i).variances(one.hands) for i, one in enumerate(demonstrations)]
+        optimum = np.exp(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 100}).x)
+        kernels = [Kernel(optimum[i] ** 2, np.repeat(optimum[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)]
+        base = LearnedProcess(kernels[0], kernels[1], float(optimum[6]), inputs, outputs, owner, centre, np.inf)
+        variances = [base.without(i).variances(demo.hands) for i, demo in enumerate(demonstrations)]
         return replace(base, threshold=self.gate * float(np.sqrt(np.concatenate(variances).max())))
 
 
@@ -184,8 +184,8 @@ class LearnedProcess:
 
     def without(self, number: int) -> LearnedProcess:
         """With one demonstration left out."""
-        kept = self.owner != number
-        return replace(self, inputs=self.inputs[kept], outputs=self.outputs[kept], owner=self.owner[kept])
+        mask = self.owner != number
+        return replace(self, inputs=self.inputs[mask], outputs=self.outputs[mask], owner=self.owner[mask])
 
     def variances(self, hands: Array) -> Array:
         """Predicted variances (T,) [m²] at hands (T, 6) [m] in an unknown scene."""
@@ -195,10 +195,10 @@ class LearnedProcess:
 
     def place(self, places: Places | None) -> PlacedProcess:
         """The process in a scene with these places, or in an unknown scene."""
-        at, wanted, std = neighbourhoods(() if places is None else places_of(places)[1:])
+        via_hands, via_tools, std = neighbourhoods(() if places is None else places_of(places)[1:])
         groups = [self.owner == number for number in np.unique(self.owner)]
-        inputs = [self.inputs[group] for group in groups] + [at]
-        outputs = [self.outputs[group] for group in groups] + [wanted]
+        inputs = [self.inputs[group] for group in groups] + [via_hands]
+        outputs = [self.outputs[group] for group in groups] + [via_tools]
         noise = [np.full(int(group.sum()), self.noise**2) for group in groups] + [std**2]
         return PlacedProcess.of(
             [self.shared, self.own], inputs, outputs, noise, centre=self.centre, threshold=self.threshold
@@ -230,9 +230,9 @@ class SampleProcess:
         else:
             lengths = RBF(np.full(6, (2 * self.ell) ** -0.5), "fixed")
             kernel = ConstantKernel(0.05) * lengths + WhiteKernel(1e-4, "fixed")
-        found = GaussianProcessRegressor(kernel, random_state=SEED).fit(inputs, outputs - centre).kernel_
-        shared = Kernel(float(found.k1.k1.constant_value), np.asarray(found.k1.k2.length_scale))
-        return LearnedSamples(shared, float(found.k2.noise_level), inputs, outputs, centre)
+        fitted = GaussianProcessRegressor(kernel, random_state=SEED).fit(inputs, outputs - centre).kernel_
+        shared = Kernel(float(fitted.k1.k1.constant_value), np.asarray(fitted.k1.k2.length_scale))
+        return LearnedSamples(shared, float(fitted.k2.noise_level), inputs, outputs, centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,13 +247,13 @@ class LearnedSamples:
 
     def place(self, places: Places) -> PlacedProcess:
         """The process in a scene with these places."""
-        at, wanted, _ = neighbourhoods(places_of(places)[1:])
-        kept = cdist(self.inputs, at).min(axis=1) >= TOLERANCE_M
-        inputs, outputs = np.concatenate([self.inputs[kept], at]), np.concatenate([self.outputs[kept], wanted])
-        noise = np.concatenate([np.full(int(kept.sum()), self.noise), np.full(len(at), VIA_STD_M**2)])
+        via_hands, via_tools, _ = neighbourhoods(places_of(places)[1:])
+        is_far = cdist(self.inputs, via_hands).min(axis=1) >= TOLERANCE_M
+        inputs, outputs = np.concatenate([self.inputs[is_far], via_hands]), np.concatenate([self.outputs[is_far], via_tools])
+        noise = np.concatenate([np.full(int(is_far.sum()), self.noise), np.full(len(via_hands), VIA_STD_M**2)])
         # Closed loops amplify rounding: another triangle moves the events of a scene by 0.8 mm.
-        known = self.kernel(inputs, inputs) + np.diag(noise)
-        posterior = Posterior.of(known, outputs, self.centre, lower=False)
+        covariance = self.kernel(inputs, inputs) + np.diag(noise)
+        posterior = Posterior.of(covariance, outputs, self.centre, lower=False)
         return PlacedProcess([self.kernel], inputs, slice(None), posterior, np.inf)
 
 
@@ -263,14 +263,14 @@ def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
     """
 
     def learn(shown: Sequence[LeftOut]) -> Law:
-        each = max(2, PROCESS_SAMPLES // len(shown))
-        rows = [np.unique(np.linspace(0, len(one.tool) - 1, each).round().astype(int)) for one in shown]
-        tool = np.concatenate([one.tool[some] for one, some in zip(shown, rows, strict=True)])
-        thin = [[x[some] for x in inputs(one)] for one, some in zip(shown, rows, strict=True)]
+        count = max(2, PROCESS_SAMPLES // len(shown))
+        rows = [np.unique(np.linspace(0, len(take.tool) - 1, count).round().astype(int)) for take in shown]
+        tool = np.concatenate([take.tool[index] for take, index in zip(shown, rows, strict=True)])
+        thin = [[x[index] for x in inputs(take)] for take, index in zip(shown, rows, strict=True)]
         groups = [np.concatenate(parts) for parts in zip(*thin, strict=True)]
         squares = [cdist(x, x, "sqeuclidean") for x in groups]
         usual = [max(float(np.median(d)), 1e-6) for d in squares]
-        fold_of = np.repeat(np.arange(len(shown)) % FOLDS, [len(some) for some in rows])
+        fold_of = np.repeat(np.arange(len(shown)) % FOLDS, [len(index) for index in rows])
 
         def solved(known: Array, noise: float, kept: Any = slice(None)) -> Posterior:
             return Posterior.of(known + noise * np.eye(len(known)), tool[kept], tool[kept].mean(axis=0))
@@ -278,20 +278,20 @@ def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
         tried = []
         for length, other, noise in itertools.product(LENGTHS, OTHERS if len(groups) > 1 else OTHERS[:1], NOISES):
             lengths = length**2 * np.array(usual) * [1.0, *[other**2] * (len(groups) - 1)]
-            known = np.exp(-0.5 * np.sum([d / square for d, square in zip(squares, lengths, strict=True)], axis=0))
+            gram = np.exp(-0.5 * np.sum([d / square for d, square in zip(squares, lengths, strict=True)], axis=0))
             errors, variances = [], []
             for fold in np.unique(fold_of):
-                rest, held = fold_of != fold, fold_of == fold
-                posterior, across = solved(known[np.ix_(rest, rest)], noise, rest), known[np.ix_(held, rest)]
+                training, held = fold_of != fold, fold_of == fold
+                posterior, across = solved(gram[np.ix_(training, training)], noise, training), gram[np.ix_(held, training)]
                 errors.append(np.sum((tool[held] - posterior.mean(across)) ** 2, axis=1))
                 variances.append(1.0 + noise - posterior.explained(across))
-            off, left = np.concatenate(errors), np.concatenate(variances)
-            tried.append((float(off.mean()), lengths, noise, float(np.mean(off / left)) / 3.0))
+            squared_errors, left = np.concatenate(errors), np.concatenate(variances)
+            tried.append((float(squared_errors.mean()), lengths, noise, float(np.mean(squared_errors / left)) / 3.0))
         _, lengths, noise, scale = min(tried, key=lambda one: one[0])
 
         def kernel(a: list[Array], b: list[Array]) -> Array:
-            apart = [cdist(x, y, "sqeuclidean") / square for x, y, square in zip(a, b, lengths, strict=True)]
-            return np.asarray(np.exp(-0.5 * np.sum(apart, axis=0)))
+            distances = [cdist(x, y, "sqeuclidean") / square for x, y, square in zip(a, b, lengths, strict=True)]
+            return np.asarray(np.exp(-0.5 * np.sum(distances, axis=0)))
 
         posterior = solved(kernel(groups, groups), noise)
 

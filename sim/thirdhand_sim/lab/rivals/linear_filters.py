@@ -40,11 +40,11 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     square, cross, jerk, push = np.zeros((size, size)), np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
     energy = wanted_jerk = wanted_push = 0.0
     count = 0
-    for one in sequences:
-        truth = skill.mean(one.truth)
-        samples = skill.mean(one.samples)
+    for sequence in sequences:
+        truth = skill.mean(sequence.truth)
+        samples = skill.mean(sequence.samples)
         outputs = np.arange(size, up * len(samples))
-        times = one.stamps[0] + outputs * step
+        times = sequence.stamps[0] + outputs * step
         outputs, times = outputs[times < len(truth) * PERIOD_S - step], times[times < len(truth) * PERIOD_S - step]
         for axis in range(3):
             mean = samples[:, axis].mean()
@@ -58,19 +58,19 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
             energy, count = energy + float(x @ x), count + len(x)
     scale = float(np.trace(square)) / size
     whole = np.kron(np.eye(up), np.ones(taps))  # what rests is met
-    found = []
+    floors = []
     for weight in WEIGHTS:
         left = square + weight * jerk + 1e3 * scale * whole.T @ whole + 1e-9 * scale * np.eye(size)
         w = np.linalg.solve(left, cross + 1e3 * scale * whole.T @ np.ones(up))
         error = max(float(w @ square @ w - 2 * w @ cross + energy), 0.0) / count * 3
         ratios = (float(np.sqrt(w @ matrix @ w / of)) for matrix, of in ((push, wanted_push), (jerk, wanted_jerk)))
-        found.append(Floor(1000 * float(np.sqrt(error)), *ratios))
-    return found
+        floors.append(Floor(1000 * float(np.sqrt(error)), *ratios))
+    return floors
 
 
 def error_at(floors: list[Floor], jerk_ratio: float) -> float:
     """The error [mm] of the best filter with a jerk ratio, interpolated in its logarithm."""
-    rows = sorted((math.log(one.jerk_ratio), one.error_rms_mm) for one in floors)
+    rows = sorted((math.log(floor.jerk_ratio), floor.error_rms_mm) for floor in floors)
     jerks, errors = zip(*rows, strict=True)
     return float(np.interp(math.log(jerk_ratio), jerks, errors))
 

@@ -43,8 +43,8 @@ def path_share(shown: SessionDemonstration) -> Array:
     window = np.ones(13) / 13  # half a second
     x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
     speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
-    gone = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] below 2 cm/s they rest
-    return np.asarray((gone - gone[0]) / (gone[-1] - gone[0]))
+    travel_m = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] below 2 cm/s they rest
+    return np.asarray((travel_m - travel_m[0]) / (travel_m[-1] - travel_m[0]))
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class MixtureRegression:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedMixture:
         """The mixture, by EM."""
-        samples = np.concatenate([joined(one) for one in demonstrations])
+        samples = np.concatenate([joined(demonstration) for demonstration in demonstrations])
         mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
-        return LearnedMixture(mixture, threshold([log_density(mixture, one.hands) for one in demonstrations]))
+        return LearnedMixture(mixture, threshold([log_density(mixture, demonstration.hands) for demonstration in demonstrations]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +78,8 @@ class LearnedMixture:
 
     def predict(self, seen: Observed) -> Predicted:
         """As `Placed.predict`; it holds where such hands were not demonstrated."""
-        found = self.mixture.regress(seen.hands)
-        return Predicted(found.mean, found.covariance, log_density(self.mixture, seen.hands) < self.threshold)
+        regression = self.mixture.regress(seen.hands)
+        return Predicted(regression.mean, regression.covariance, log_density(self.mixture, seen.hands) < self.threshold)
 
 
 def log_density(mixture: GaussianMixture, hands: Array) -> Array:

@@ -79,15 +79,15 @@ def left_out_by(learn: Learn, shown: Sequence[LeftOut], asked: Sequence[LeftOut]
     for take in asked:
         placed = model.place(None)
         assert not isinstance(placed, Skill)
-        said = placed.predict(in_mean_scene(take, mean).seen)
-        back = said.mean if mean is None else carried(said.mean, mean[2], scene_of(take)[2])
-        out.append(said._replace(mean=back))
+        prediction = placed.predict(in_mean_scene(take, mean).seen)
+        back = prediction.mean if mean is None else carried(prediction.mean, mean[2], scene_of(take)[2])
+        out.append(prediction._replace(mean=back))
     return out
 
 
 def mean_of_all(shown: Sequence[LeftOut]) -> Law:
     """The tool's mean."""
-    mean = np.concatenate([one.tool for one in shown]).mean(axis=0)
+    mean = np.concatenate([take.tool for take in shown]).mean(axis=0)
     return Law(lambda seen: Predicted(np.tile(mean, (len(seen.hands), 1))))
 
 
@@ -95,26 +95,26 @@ def same_time(shown: Sequence[LeftOut]) -> Law:
     """The mean tool after the same elapsed time; after the end of a take, its last one."""
 
     def predict(seen: Observed) -> Predicted:
-        at = [one.tool[np.minimum(np.arange(len(seen.times)), len(one.tool) - 1)] for one in shown]
-        return Predicted(np.mean(at, axis=0))
+        tools = [take.tool[np.minimum(np.arange(len(seen.times)), len(take.tool) - 1)] for take in shown]
+        return Predicted(np.mean(tools, axis=0))
 
     return Law(predict)
 
 
 def linear_in_hands(shown: Sequence[LeftOut]) -> Law:
     """The linear function of the hands that fits best."""
-    hands, tool = (np.concatenate(parts) for parts in zip(*((one.hands, one.tool) for one in shown), strict=True))
+    hands, tool = (np.concatenate(parts) for parts in zip(*((take.hands, take.tool) for take in shown), strict=True))
     return Law(lambda seen: Predicted(linear(hands, tool, seen.hands)))
 
 
 def neighbours(shown: Sequence[LeftOut]) -> Law:
     """The mean of the tools at the nearest hands of each take, weighted by distance."""
-    trees = [cKDTree(one.hands) for one in shown]
+    trees = [cKDTree(take.hands) for take in shown]
 
     def predict(seen: Observed) -> Predicted:
-        found = [tree.query(seen.hands) for tree in trees]
-        weights = np.array([1.0 / (off + OFF_PLACE_M) ** 4 for off, _ in found])
-        tools = np.array([one.tool[at] for one, (_, at) in zip(shown, found, strict=True)])
+        nearest = [tree.query(seen.hands) for tree in trees]
+        weights = np.array([1.0 / (distance_m + OFF_PLACE_M) ** 4 for distance_m, _ in nearest])
+        tools = np.array([take.tool[index] for take, (_, index) in zip(shown, nearest, strict=True)])
         return Predicted(np.einsum("kt,kti->ti", weights / weights.sum(axis=0), tools))
 
     return Law(predict)
@@ -124,11 +124,11 @@ def hmm(shown: Sequence[LeftOut]) -> Law:
     """The mean of the tools, weighted by the probability that the hands are at each sample of each
     demonstration. They proceed along one at about its pace, or are anywhere.
     """
-    total = sum(len(one.tool) for one in shown)
+    total = sum(len(take.tool) for take in shown)
     step = max(1, -(-total // HMM_STATES))
-    thin = [(one.hands[::step], one.velocities[::step], one.tool[::step]) for one in shown]
+    thin = [(take.hands[::step], take.velocities[::step], take.tool[::step]) for take in shown]
     hands, velocities, tool = (np.concatenate(parts) for parts in zip(*thin, strict=True))
-    counts = [len(one) for one, *_ in thin]
+    counts = [len(part) for part, *_ in thin]
     last, owner = np.cumsum(counts) - 1, np.repeat(np.arange(len(thin)), counts)
     place, pace = (_scatter(x, owner) for x in (hands, velocities))
     features = np.hstack([hands / place, velocities / pace])
@@ -161,11 +161,11 @@ def hmm(shown: Sequence[LeftOut]) -> Law:
 
 def _scatter(x: Array, owner: NDArray[np.int_]) -> float:
     """Rms distance, on each axis, of samples (N, D) from the nearest ones of other takes."""
-    off = []
-    for one in np.unique(owner):
-        mine = x[owner == one]
-        off.append(cKDTree(x[owner != one]).query(mine[:: max(1, len(mine) // 100)])[0])
-    return max(float(np.sqrt(np.mean(np.concatenate(off) ** 2) / x.shape[1])), 1e-3)
+    distances_m = []
+    for number in np.unique(owner):
+        mine = x[owner == number]
+        distances_m.append(cKDTree(x[owner != number]).query(mine[:: max(1, len(mine) // 100)])[0])
+    return max(float(np.sqrt(np.mean(np.concatenate(distances_m) ** 2) / x.shape[1])), 1e-3)
 
 
 RIVALS: dict[str, Learn] = {

@@ -32,9 +32,9 @@ class NoDemonstrations:
 
     def place(self, places: Places) -> PlacedProcess:
         """The regression through these places."""
-        at, wanted, std = neighbourhoods(places_of(places))
+        via_hands, via_tools, std = neighbourhoods(places_of(places))
         kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
-        return PlacedProcess.of([kernel], [at], [wanted], [std**2], centre=wanted.mean(axis=0))
+        return PlacedProcess.of([kernel], [via_hands], [via_tools], [std**2], centre=via_tools.mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class PlacedLookUp:
     def predict(self, seen: Observed) -> Predicted:
         """As `Placed.predict`; the covariance is that of the weighted tools, and a constant."""
         mean, weights, tools = self._weighed(seen.hands)
-        off = tools - mean[:, None]
-        covariance = np.einsum("tp,tpi,tpj->tij", weights, off, off) + self.method.deviation_m**2 * np.eye(3)
+        offsets = tools - mean[:, None]
+        covariance = np.einsum("tp,tpi,tpj->tij", weights, offsets, offsets) + self.method.deviation_m**2 * np.eye(3)
         return Predicted(mean, covariance, np.zeros(len(mean), bool))
 
     def _weighed(self, hands: Array) -> tuple[Array, Array, Array]:
-        at = np.array([[*p.left, *p.right] for p in self.points])
-        away = hands[:, None] - at
+        via_hands = np.array([[*p.left, *p.right] for p in self.points])
+        away = hands[:, None] - via_hands
         tools = np.array([p.tool for p in self.points]) + np.stack(
             [away[:, i] @ (FOLLOW.T if p.follow == "left" else np.zeros((6, 3))) for i, p in enumerate(self.points)],
             axis=1,

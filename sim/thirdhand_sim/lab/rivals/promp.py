@@ -63,21 +63,21 @@ class InteractionProMP:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedInteraction:
         """The distribution of the weights."""
-        weights, residuals, at = [], [], []
-        for one in demonstrations:
-            x, phase = joined(one), self.phase(one)
+        weights, residuals, phases = [], [], []
+        for demonstration in demonstrations:
+            x, phase = joined(demonstration), self.phase(demonstration)
             basis = self.basis(phase)
             w = np.linalg.solve(basis.T @ basis + 1e-3 * np.eye(self.bases), basis.T @ x)
             residuals.append(np.mean((x - basis @ w) ** 2, axis=0))
             weights.append(w.T.ravel())
-            order = np.argmin(np.linalg.norm(x[:, None] - frames(one.places), axis=2), axis=0)
-            at.append(phase[order])
+            order = np.argmin(np.linalg.norm(x[:, None] - frames(demonstration.places), axis=2), axis=0)
+            phases.append(phase[order])
         w = np.array(weights)
         covariance = np.cov(w.T)
         covariance += self.ridge * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
         noise = np.mean(residuals, axis=0)
-        base = LearnedInteraction(self, w.mean(axis=0), covariance, noise, np.median(at, axis=0), -np.inf)
-        usual = [base.place(one.places).evidence(one.hands)[::5] for one in demonstrations]
+        base = LearnedInteraction(self, w.mean(axis=0), covariance, noise, np.median(phases, axis=0), -np.inf)
+        usual = [base.place(demonstration.places).evidence(demonstration.hands)[::5] for demonstration in demonstrations]
         return replace(base, threshold=threshold(usual))
 
     def basis(self, phase: Array) -> Array:
@@ -110,10 +110,10 @@ class LearnedInteraction:
         method, mean, covariance = self.method, self.mean, self.covariance
         std = max(places.std_m / np.sqrt(3.0), LEAST_STD_M)
         noise = np.concatenate([np.full(6, std**2 + method.hands_m**2), np.full(3, std**2)])
-        for phase, wanted in zip(self.at, frames(places), strict=True):
+        for phase, frame in zip(self.at, frames(places), strict=True):
             rows = np.kron(np.eye(9), method.basis(np.array([phase])))
             gain = np.linalg.solve(rows @ covariance @ rows.T + np.diag(noise), rows @ covariance).T
-            mean = mean + gain @ (wanted - rows @ mean)
+            mean = mean + gain @ (frame - rows @ mean)
             covariance = covariance - gain @ rows @ covariance
         grid = np.linspace(0.0, 1.0, method.cells)
         basis = method.basis(grid)
@@ -154,9 +154,9 @@ class PlacedInteraction:
         constant = self.means[:, 6:] - np.einsum("zi,zio->zo", self.means[:, :6], gains)
         tools = constant + np.einsum("ti,zio->tzo", seen.hands, gains, optimize=True)
         mean = np.einsum("tz,tzo->to", beliefs, tools)
-        off = tools - mean[:, None]
+        offsets = tools - mean[:, None]
         covariance = np.einsum("tz,zop->top", beliefs, left) + np.einsum(
-            "tz,tzo,tzp->top", beliefs, off, off, optimize=True
+            "tz,tzo,tzp->top", beliefs, offsets, offsets, optimize=True
         )
         return Predicted(mean, covariance, logs.max(axis=1) < self.threshold)
 

@@ -27,7 +27,7 @@ class Service:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """By `thirdhand.workbench.learning`."""
-        return LearnedByService(learn([recorded(one) for one in demonstrations]), start=True)
+        return LearnedByService(learn([recorded(demonstration) for demonstration in demonstrations]), start=True)
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ServiceAsPaper:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """The skill with these parameters."""
-        taken = [recorded(one) for one in demonstrations]
+        taken = [recorded(demonstration) for demonstration in demonstrations]
         return LearnedByService(
             learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
         )
@@ -61,4 +61,4 @@ class LearnedByService:
 
 def joined(demonstrations: Sequence[SessionDemonstration]) -> Array:
     """Hands and tool (T, 9) [m] of all demonstrations."""
-    return np.concatenate([np.hstack([one.hands, one.tool]) for one in demonstrations])
+    return np.concatenate([np.hstack([demonstration.hands, demonstration.tool]) for demonstration in demonstrations])

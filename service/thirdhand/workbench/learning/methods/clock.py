@@ -46,18 +46,18 @@ class Tempo(NamedTuple):
         settings = Settings()
         intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
         intake.begin(state)
-        state["tick"], ticked, found = 0, 0, []
+        state["tick"], ticked, samples = 0, 0, []
         since_ns = demonstration.stamps_ns - demonstration.stamps_ns[0] + FIRST_STAMP_NS
         left, right = demonstration.left[::step].tolist(), demonstration.right[::step].tolist()
-        for stamp_ns, *both in zip(since_ns[::step].tolist(), left, right, strict=True):
+        for stamp_ns, *poses in zip(since_ns[::step].tolist(), left, right, strict=True):
             tick = round((stamp_ns - FIRST_STAMP_NS) * 1e-9 / settings.period_s)
             intake.advance(state, tick - ticked)
             ticked = tick
-            for side, row in enumerate(both):
+            for side, row in enumerate(poses):
                 intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
-            found.append(np.hstack([np.linalg.norm(state["hand_velocity_lowpass"], axis=1), state["hand_stillness"]]))
-        at, known = demonstration.seconds, (since_ns[::step] - FIRST_STAMP_NS) * 1e-9
-        columns = np.stack([np.interp(at, known, column) for column in np.array(found).T], axis=1)
+            samples.append(np.hstack([np.linalg.norm(state["hand_velocity_lowpass"], axis=1), state["hand_stillness"]]))
+        times_s, sampled_s = demonstration.seconds, (since_ns[::step] - FIRST_STAMP_NS) * 1e-9
+        columns = np.stack([np.interp(times_s, sampled_s, column) for column in np.array(samples).T], axis=1)
         return cls(demonstration.hands, columns[:, :2], columns[:, 2:], demonstration.period_s)
 
     def seconds(self, clock: TaskClock, alone: int | None) -> Vector:
@@ -102,13 +102,13 @@ class Tempo(NamedTuple):
 
 def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
     """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
-    begins, ends = (np.array([_conducting(one.hands[row], alone) for one in tempos]) for row in (0, -1))
+    begins, ends = (np.array([_conducting(tempo.hands[row], alone) for tempo in tempos]) for row in (0, -1))
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
     ends_m = np.linalg.norm((ends - begin).reshape(-1, 2, 3), axis=2).max(axis=1)
     near_m = max(LEAST_NEAR_M, min(NEAR_TIMES * off_m, HALF_WAY * float(np.median(ends_m))))
     free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(begin=tuple(begin.tolist()))
-    ends_s = [float(one.seconds(free, alone)[-1]) for one in tempos]
+    ends_s = [float(tempo.seconds(free, alone)[-1]) for tempo in tempos]
     return free._replace(longest_s=max(ends_s), over_s=min(ends_s))
 
 
@@ -123,10 +123,10 @@ def _endless(
     """A clock that does not stop by itself, whose rests are longer than those of demonstrations
     that begin with these hands (6,) [m].
     """
-    rested_s = [one.rested_s(alone) for one in tempos]
+    rested_s = [tempo.rested_s(alone) for tempo in tempos]
     is_home = [tempo.has_returned(begin, near_m, alone) for tempo, begin in zip(tempos, begins, strict=True)]
-    rest_s = LONGER * max(float(one.max()) for one in rested_s)
-    home_s = LONGER * max(float(one[inside].max(initial=0.0)) for one, inside in zip(rested_s, is_home, strict=True))
+    rest_s = LONGER * max(float(times_s.max()) for times_s in rested_s)
+    home_s = LONGER * max(float(times_s[inside].max(initial=0.0)) for times_s, inside in zip(rested_s, is_home, strict=True))
     rest_s, home_s = max(rest_s, LEAST_REST_S), max(home_s, LEAST_HOME_S)
     return TaskClock(waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6)
 

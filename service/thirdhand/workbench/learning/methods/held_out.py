@@ -38,13 +38,13 @@ def held_out_takes(takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, pr
 
 def gate_of(primitive: KMP, held_out: Sequence[HeldOut], order: int, ceiling_m: float) -> Gate:
     """The gate on the primitive's standard deviation; its inputs hold `order` rows of memory."""
-    some = np.concatenate([every_few(one.inputs) for one in held_out])
-    beyond = (swapped(some, order)[:, 6:], some[:, 6:], some[:, 6:])  # the inputs beyond the positions
+    inputs = np.concatenate([every_few(result.inputs) for result in held_out])
+    beyond = (swapped(inputs, order)[:, 6:], inputs[:, 6:], inputs[:, 6:])  # the inputs beyond the positions
     wrong = [
-        _deviations(primitive, np.hstack([hands, rest.repeat(len(hands) // len(some), axis=0)]))
-        for hands, rest in zip(nonsense(some[:, :6]), beyond, strict=True)
+        _deviations(primitive, np.hstack([hands, tail.repeat(len(hands) // len(inputs), axis=0)]))
+        for hands, tail in zip(nonsense(inputs[:, :6]), beyond, strict=True)
     ]
-    return gate_between(np.concatenate([one.gate_m for one in held_out]), wrong, ceiling=min(ceiling_m, HIGHEST_GATE_M))
+    return gate_between(np.concatenate([result.gate_m for result in held_out]), wrong, ceiling=min(ceiling_m, HIGHEST_GATE_M))
 
 
 def swapped(inputs: Vector, order: int) -> Vector:
@@ -54,8 +54,8 @@ def swapped(inputs: Vector, order: int) -> Vector:
     out, turns = inputs.copy(), 6 * (1 + order)
     end = turns + (inputs.shape[1] - turns) // TURN_INPUTS * TURN_INPUTS  # a clock has no side
     for columns, width in ((slice(6, turns), 3), (slice(turns, end), 9)):
-        both = inputs[:, columns].reshape(len(inputs), -1, 2, width)
-        out[:, columns] = both[:, :, ::-1].reshape(len(inputs), -1)
+        pairs = inputs[:, columns].reshape(len(inputs), -1, 2, width)
+        out[:, columns] = pairs[:, :, ::-1].reshape(len(inputs), -1)
     return out
 
 

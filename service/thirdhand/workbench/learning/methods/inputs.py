@@ -66,11 +66,11 @@ class Inputs(NamedTuple):
         if self.alone is not None:
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
             turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
-        found = features(hands, demonstration.period_s, self.order, turns)
+        inputs = features(hands, demonstration.period_s, self.order, turns)
         if self.clock is None or not self.is_timed:
-            return found
+            return inputs
         assert tempo is not None
-        return np.column_stack([found, self.clock.weight * tempo.seconds(self.clock, self.alone)])
+        return np.column_stack([inputs, self.clock.weight * tempo.seconds(self.clock, self.alone)])
 
 
 POSITIONS = Inputs("positions")
@@ -106,8 +106,8 @@ class HandInputs:
         remarks = [self.why_not_segmented] if self.why_not_segmented else []
         points, ell = self.options.points, self.options.ell
         tempos = [Tempo.of(take.demonstration) for take in taught.all]
-        found = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
-        kind = found.kind
+        outcome = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
+        kind = outcome.kind
         if kind.order and kind.clock is None:
             kind = kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
         elif kind.clock is not None:
@@ -125,7 +125,7 @@ class HandInputs:
             for take, tempo in zip(taught.all, tempos, strict=True)
         ]
         inputs, before = inputs[: len(takes)], inputs[len(takes) :]
-        weight, weights = chosen(found.by_weight_m)
+        weight, weights = chosen(outcome.by_weight_m)
         if math.isinf(weight):
             earlier, before = [], []
         progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
@@ -139,19 +139,19 @@ class HandInputs:
             progress("calibrating the covariance")
 
             def refitted(kept: list[int]) -> HandsKMP:
-                some, known = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
-                others = refit(kind, some, known, points, ell, earlier=len(earlier), weight=weight)
+                used_takes, used_inputs = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
+                others = refit(kind, used_takes, used_inputs, points, ell, earlier=len(earlier), weight=weight)
                 return HandsKMP(others(None), kind.turned, kind.clock)
 
             timed, errors = local_errors(refitted_errors(takes, inputs, refitted), inputs, takes, primitive)
-            held_out = [one._replace(timed=found) for one, found in zip(held_out, timed, strict=True)]
+            held_out = [result._replace(timed=take_errors) for result, take_errors in zip(held_out, timed, strict=True)]
         return Fitted(
             HandsKMP(primitive, kind.turned, kind.clock, errors),
             held_out,
             gate,
             conductor=kind.alone,
             taken=kind.name,
-            tried_m=found.tried_m,
+            tried_m=outcome.tried_m,
             remarks=remarks,
             weights=weights if taught.earlier else None,
         )
@@ -171,7 +171,7 @@ def _weighted(
 
 def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
     """The kinds of inputs that these demonstrations have, from simple to rich."""
-    turns = np.concatenate([one.turns for one in demonstrations])
+    turns = np.concatenate([demonstration.turns for demonstration in demonstrations])
     is_turned = bool(np.ptp(turns, axis=0).max() > math.sin(LEAST_TURN_RAD))
     kinds = [kind for kind in KINDS if is_turned or not kind.turned]
     if demonstrations[0].conducts != "both":
@@ -199,7 +199,7 @@ def refit(
     The last `earlier` takes are of a skill that is refined; a new one has this weight against them.
     """
     is_rich = kind.is_rich
-    pairs = [(known, take.position) for known, take in zip(inputs, takes, strict=True)]
+    pairs = [(take_inputs, take.position) for take_inputs, take in zip(inputs, takes, strict=True)]
     count, persons = RICH_TIMES * points if is_rich else points, persons_of(takes)
     choice = selection_of(
         pairs, count, persons=persons, isotropic=is_rich, rich=is_rich, earlier=earlier, factor=weight
@@ -238,7 +238,7 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     for kind in kinds:
         progress(f"trying {kind.name}")
         errors_m[kind.name] = by_weight_m(kind)
-    tried_m = {name: min(found.values()) for name, found in errors_m.items()}
+    tried_m = {name: min(kind_errors_m.values()) for name, kind_errors_m in errors_m.items()}
     simplest = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
     if not blocks.any():
         return Chosen(simplest, tried_m, errors_m[simplest.name])
@@ -252,7 +252,7 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
             progress(f"trying {kind.name}{name}")
             clock = clock_of(tempos, kind.alone, waits=waits)
             weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
-            with_clock_m = [error_m(one, weights[kind], blocks) for one in weighted]
+            with_clock_m = [error_m(candidate, weights[kind], blocks) for candidate in weighted]
             weighed = preferred(weighted, with_clock_m, AS_GOOD * min(with_clock_m))
             tried_m[weighed.name] = error_m(weighed, weights[kind], persons)
             timed += [weighed] * (min(with_clock_m) < limit_m)

@@ -41,7 +41,7 @@ class Mixture:
         progress(f"learning from all {len(takes)}")
         primitive = self._primitive(takes)
         held_out = held_out_takes(
-            takes, inputs, lambda person: self._primitive([one for one in takes if one.person != person]), progress
+            takes, inputs, lambda person: self._primitive([take for take in takes if take.person != person]), progress
         )
         ceiling_m = CEILING_M * _calibration(held_out)
         return Fitted(HandsKMP(primitive), held_out, gate_of(primitive, held_out, 0, ceiling_m))
@@ -63,6 +63,6 @@ class Mixture:
 
 def _calibration(held_out: Sequence[HeldOut]) -> float:
     """The root mean square of predicted deviations over that of the errors, at least 1."""
-    errors = np.concatenate([one.errors for one in held_out])
-    predicted = np.concatenate([one.gate_m for one in held_out])
+    errors = np.concatenate([result.errors for result in held_out])
+    predicted = np.concatenate([result.gate_m for result in held_out])
     return max(1.0, float(np.sqrt((predicted**2).mean() / max(float((errors**2).mean()), 1e-12))))

@@ -119,19 +119,19 @@ class Samples(NamedTuple):
         """The samples of demonstrations, of which the first `new` are new, without a clock."""
         count = len(encoded[0].segments)
         counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
-        each = [one.rows(its) for one, its in zip(encoded, counts, strict=True)]
+        sampled_rows = [demo.rows(row_count) for demo, row_count in zip(encoded, counts, strict=True)]
         shares, labels, outputs = (
-            np.concatenate([values[rows] for values, rows in zip(column, each, strict=True)])
-            for column in zip(*((one.along, one.labels, one.wanted) for one in encoded), strict=True)
+            np.concatenate([values[rows] for values, rows in zip(column, sampled_rows, strict=True)])
+            for column in zip(*((demo.along, demo.labels, demo.wanted) for demo in encoded), strict=True)
         )
-        owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in each])
-        return cls(encoded, each, inputs_of(shares, labels, count), outputs, owner, new)
+        owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in sampled_rows])
+        return cls(encoded, sampled_rows, inputs_of(shares, labels, count), outputs, owner, new)
 
     def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The samples with a clock as the last input."""
         times = [
-            tempo.in_segments(clock.rows(begins_of(one.segments)), one.labels)[rows]
-            for tempo, one, rows in zip(tempos, self.encoded, self.rows, strict=True)
+            tempo.in_segments(clock.rows(begins_of(demo.segments)), demo.labels)[rows]
+            for tempo, demo, rows in zip(tempos, self.encoded, self.rows, strict=True)
         ]
         inputs = np.column_stack([self.inputs, clock.weight * np.concatenate(times)])
         return self._replace(inputs=inputs, clock=clock)
@@ -156,36 +156,36 @@ class Samples(NamedTuple):
         # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
         kernel, targets = np.exp(-ell * squares) / (roots * roots.T), (self.outputs - PRIOR) / roots
         missed = roots * held_out_residuals(kernel, np.array(noises), held_out, lambda _: targets)
-        found = (self.outputs - missed)[:, is_new]
-        errors = np.empty((*found.shape[:2], 3))
-        for h, (one, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
+        predictions = (self.outputs - missed)[:, is_new]
+        errors = np.empty((*predictions.shape[:2], 3))
+        for h, (demo, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
             mine = self.owner[is_new] == h
-            errors[:, mine] = [one.tool[rows] - one.tools(rows, outputs) for outputs in found[:, mine]]
+            errors[:, mine] = [demo.tool[rows] - demo.tools(rows, outputs) for outputs in predictions[:, mine]]
         return errors
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
         """The KMP of all demonstrations except those in `without`, adapted to where the tool is
         known to be.
         """
-        kept = ~np.isin(self.owner, without)
-        weights = np.where(self.owner[kept] < self.new, 1.0, parameters.weight)
+        is_used = ~np.isin(self.owner, without)
+        weights = np.where(self.owner[is_used] < self.new, 1.0, parameters.weight)
         covariance = parameters.noise * weights[:, None, None] * np.eye(OUTPUTS)
         primitive = KMP.fit(
-            self.inputs[kept],
-            Gaussians(self.outputs[kept], covariance),
+            self.inputs[is_used],
+            Gaussians(self.outputs[is_used], covariance),
             kernel=GaussianKernel(parameters.ell),
             lambda_mean=1.0,
             prior_mean=PRIOR,
             representation="dense",
         )
-        at, shares = self._known([one for i, one in enumerate(self.encoded) if i not in without])
+        known_inputs, shares = self._known([demo for i, demo in enumerate(self.encoded) if i not in without])
         if self.clock is not None:
-            at, shares = self._timed(at, shares, self.clock)
-        wanted = np.column_stack([shares, np.zeros((len(at), OUTPUTS - 1))])
-        known = Gaussians(wanted, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(at), 1, 1)))
+            known_inputs, shares = self._timed(known_inputs, shares, self.clock)
+        means = np.column_stack([shares, np.zeros((len(known_inputs), OUTPUTS - 1))])
+        known_outputs = Gaussians(means, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(known_inputs), 1, 1)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)
-            return primitive.adapt(at, known, tolerance=0.0)
+            return primitive.adapt(known_inputs, known_outputs, tolerance=0.0)
 
     def _timed(self, at: Vector, shares: Vector, clock: TaskClock) -> tuple[Vector, Vector]:
         """The inputs (V, 2 + K) and shares (V,) of `_known` at the times at which they are known.
@@ -197,14 +197,14 @@ class Samples(NamedTuple):
         segments = self.encoded[0].segments[at[:, 2:].argmax(axis=1)]
         moves = (segments["square"] > STAYS) | (segments["leads"] != NONE)[:, None]
         ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
-        found = [
+        timed_rows = [
             (row, share, time)
             for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
             for time in KNOWN_TIMES
             if clock.waits or not (is_end or is_begin) or time == float(is_end)
         ]
-        rows, kept, times = (np.array(column) for column in zip(*found, strict=True))
-        return np.column_stack([rows, clock.weight * clock.longest_s * times]), kept
+        rows, known_shares, times = (np.array(column) for column in zip(*timed_rows, strict=True))
+        return np.column_stack([rows, clock.weight * clock.longest_s * times]), known_shares
 
     @staticmethod
     def _known(shown: Sequence[Encoded]) -> tuple[Vector, Vector]:
@@ -214,29 +214,29 @@ class Samples(NamedTuple):
         tool usually was at that end, and 0 if no demonstration has the corner.
         """
         squares, leads = shown[0].segments["square"], shown[0].segments["leads"]
-        both = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
-        known: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
+        moving_segments = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
+        rows: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
         begins = np.where((squares > STAYS) | (leads != NONE)[:, None], 0.0, 1.0)
-        known += [(*begins[k], k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
+        rows += [(*begins[k], k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
         for corner in CORNERS:
-            is_unseen = _seen(shown, corner, both)[0] < LEAST_SEEN_S
-            for k in both:
+            is_unseen = _seen(shown, corner, moving_segments)[0] < LEAST_SEEN_S
+            for k in moving_segments:
                 lasts_s, shares = _seen(shown, corner, [k])
                 usual = 0.0 if is_unseen else float(np.median(shares)) if lasts_s >= LEAST_SEEN_S else 0.5
                 if usual < NEAR:
                     waits = UNSEEN_SHARES if is_unseen else SEEN_SHARES
-                    known += [(share * corner[0], share * corner[1], k, 0.0) for share in waits]
+                    rows += [(share * corner[0], share * corner[1], k, 0.0) for share in waits]
                 elif usual > 1.0 - NEAR:
-                    known.append((*corner, k, 1.0))
-        found = np.array(known)
-        return inputs_of(found[:, :2], found[:, 2].astype(np.int64), len(squares)), found[:, 3]
+                    rows.append((*corner, k, 1.0))
+        table = np.array(rows)
+        return inputs_of(table[:, :2], table[:, 2].astype(np.int64), len(squares)), table[:, 3]
 
 
 def _seen(shown: Sequence[Encoded], corner: tuple[float, float], segments: Sequence[int]) -> tuple[float, Vector]:
     """The time [s] that hands were near a corner of these segments, and the tool's shares then."""
-    rows = [one.near(corner, segments) for one in shown]
-    lasts_s = sum(float(its.sum()) * one.period_s for one, its in zip(shown, rows, strict=True))
-    return lasts_s, np.concatenate([one.wanted[its, 0] for one, its in zip(shown, rows, strict=True)])
+    rows = [demo.near(corner, segments) for demo in shown]
+    lasts_s = sum(float(mask.sum()) * demo.period_s for demo, mask in zip(shown, rows, strict=True))
+    return lasts_s, np.concatenate([demo.wanted[mask, 0] for demo, mask in zip(shown, rows, strict=True)])
 
 
 def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
@@ -249,12 +249,12 @@ def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
     A hand qualifies if it was ahead of the other one in the demonstrations, so that they show
     whether the tool waits, or if it is the only hand that the tool follows.
     """
-    if any(one.demonstration.conducts != "both" for one in shown):
+    if any(demo.demonstration.conducts != "both" for demo in shown):
         return {}
-    both = np.flatnonzero((shown[0].segments["square"] > STAYS).all(axis=1)).tolist()
+    moving_segments = np.flatnonzero((shown[0].segments["square"] > STAYS).all(axis=1)).tolist()
     followed = set(task.follow.tolist()) - {NONE}
     sides = [
-        side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], both)[0] >= LEAST_SEEN_S
+        side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], moving_segments)[0] >= LEAST_SEEN_S
     ]
     return {f"positions, shares of the {SIDES[side]} hand alone": task._replace(leads=side) for side in sides}
 
@@ -263,7 +263,7 @@ def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[s
     """Tasks in which the tool turns with hands that turn in the demonstrations, by name: with the
     hands that it follows, or with one hand that it then follows everywhere.
     """
-    turns = np.concatenate([one.turns for one in demonstrations]).reshape(-1, 2, 9)
+    turns = np.concatenate([demonstration.turns for demonstration in demonstrations]).reshape(-1, 2, 9)
     sides = np.flatnonzero(np.ptp(turns, axis=0).max(axis=1) > math.sin(LEAST_TURN_RAD)).tolist()
     levers = np.zeros((len(task.names), 3))
     out: dict[str, Task] = {}
@@ -304,9 +304,9 @@ class _Prediction(NamedTuple):
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
         belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
         errors = one.tool[::step] - placed.mean(hands, belief, tempos)
-        found = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.segments)
-        beside = SEGMENT_DISTANCE_BESIDE * belief[:, : len(one.segments)]
-        inputs = [found[:, :2], beside, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
+        coverage = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.segments)
+        segment_inputs = SEGMENT_DISTANCE_BESIDE * belief[:, : len(one.segments)]
+        inputs = [coverage[:, :2], segment_inputs, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
@@ -357,20 +357,20 @@ class Candidate(NamedTuple):
         """The predictions of a block's demonstrations at one of every `step` samples, by a
         primitive that was learned without them.
         """
-        clock, found = self.samples.clock, dict[int, _Prediction]()
+        clock, predictions = self.samples.clock, dict[int, _Prediction]()
         for h in block:
             placed = Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS, clock)
             tempo = None if clock is None else self.tempos[h]
-            found[h] = _Prediction.of(self.encoded[h], placed, self.delay_s, tempo, clock, step)
-        return found
+            predictions[h] = _Prediction.of(self.encoded[h], placed, self.delay_s, tempo, clock, step)
+        return predictions
 
     def squares(self, blocks: Sequence[Sequence[int]]) -> Vector:
         """The mean squared errors (H,) [m²] of the held-out demonstrations, at some samples."""
-        step = 1 + max(len(one.labels) for one in self.encoded) // SAMPLES_TRIED
-        found: dict[int, _Prediction] = {}
+        step = 1 + max(len(demo.labels) for demo in self.encoded) // SAMPLES_TRIED
+        predictions: dict[int, _Prediction] = {}
         for block in blocks:
-            found |= self.without(block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step)
-        return np.array([rms(found[h].errors) ** 2 for h in range(self.samples.new)])
+            predictions |= self.without(block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step)
+        return np.array([rms(predictions[h].errors) ** 2 for h in range(self.samples.new)])
 
 
 def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence[int]:
@@ -401,7 +401,7 @@ def with_delay(
     """
     delays_s = DELAYS_S if given_s is None else (given_s,)
     candidates = [Candidate.of(task, shown, late_s) for late_s in delays_s]
-    squares = np.array([one.squares(blocks) for one in candidates])
+    squares = np.array([candidate.squares(blocks) for candidate in candidates])
     best, each_s = int(squares.sum(axis=1).argmin()), np.array(delays_s)[squares.argmin(axis=0)]
     if usual_s is not None:
         usual = delays_s.index(usual_s)
@@ -439,12 +439,12 @@ class Segmented:
         progress(f"learning between the via-points {', '.join(self.task.names)}")
         blocks = blocks_of(persons_of(takes))
         best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
-        task, encoded, off = best.task, best.encoded, best.off
+        task, encoded, off_m = best.task, best.encoded, best.off
         if best.samples.clock is not None:
             remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each segment")
-        tempos, shown = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
+        tempos, demos = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
         untimed = segment_clock_of(
-            tempos, [one.segments for one in shown], [one.labels for one in shown], waits=False
+            tempos, [demo.segments for demo in demos], [demo.labels for demo in demos], waits=False
         )._replace(weight=0.0)
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
@@ -453,13 +453,13 @@ class Segmented:
             predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
-        known = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
+        known_places = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
         progress(f"learning from all {len(takes)}")
         model = SegmentedKMP(
             best.samples.fitted(best.parameters),
             task,
             self._nominal(takes),
-            off,
+            off_m,
             np.concatenate(errors),
             delay.mean_s,
             clock=best.samples.clock or untimed,
@@ -468,14 +468,14 @@ class Segmented:
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
-            others = np.concatenate([one for h, one in enumerate(errors) if h not in block] or errors)
+            others = np.concatenate([take_errors for h, take_errors in enumerate(errors) if h not in block] or errors)
             for h in block:
-                placed = Placed.of(task, encoded[h].at, off, model.primitive, others, best.samples.clock, known)
+                placed = Placed.of(task, encoded[h].at, off_m, model.primitive, others, best.samples.clock, known_places)
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
                 wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
         in_order = [held_out[h] for h in range(len(takes))]
         kinds = [np.concatenate(kind) for kind in zip(*(wrong[h] for h in range(len(takes))), strict=True)]
-        reached = np.concatenate([one.gate_m for one in in_order])
+        reached = np.concatenate([result.gate_m for result in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
         return Fitted(
@@ -512,8 +512,8 @@ class Segmented:
             error_m = math.sqrt(tried(self.task).squares(all_blocks).mean())
         taken, tried_m = POSITIONS.name, {POSITIONS.name: error_m}
         for is_simpler in (True, False):
-            shown = tried(best.task).encoded if earlier else best.encoded
-            tasks = leading_tasks(best.task, shown) if is_simpler else turning_tasks(best.task, demonstrations)
+            demos = tried(best.task).encoded if earlier else best.encoded
+            tasks = leading_tasks(best.task, demos) if is_simpler else turning_tasks(best.task, demonstrations)
             errors_m = {taken: tried_m[taken]}
             for name, task in tasks.items():
                 progress(f"trying {name}")
@@ -526,11 +526,11 @@ class Segmented:
                 errors_m[taken] = errors_m[taken] if earlier else least_m
             tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
-        errors_m = {taken + name: math.sqrt(one.squares(blocks).mean()) for name, one in clocked.items()}
+        errors_m = {taken + name: math.sqrt(candidate.squares(blocks).mean()) for name, candidate in clocked.items()}
         without_m = math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
         if errors_m and min(errors_m.values()) < clock_limit_m(without_m):
             best = clocked[preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))]
-            taken = next(name for name, one in zip(errors_m, clocked.values(), strict=True) if one is best)
+            taken = next(name for name, candidate in zip(errors_m, clocked.values(), strict=True) if candidate is best)
         if not earlier or taken in errors_m:  # else these are errors of the new takes alone
             tried_m |= errors_m
         if len(tried_m) == 1:
@@ -547,21 +547,21 @@ class Segmented:
         }
         if (clock := best.samples.clock) is not None:
             tempos = [Tempo.of(take.demonstration) for take in taught.all]
-            weighted = {weight: one.clocked(tempos[: len(one.encoded)], clock) for weight, one in weighted.items()}
-        weight, weights = chosen({one: math.sqrt(it.squares(blocks).mean()) for one, it in weighted.items()})
+            weighted = {weight: candidate.clocked(tempos[: len(candidate.encoded)], clock) for weight, candidate in weighted.items()}
+        weight, weights = chosen({weight: math.sqrt(candidate.squares(blocks).mean()) for weight, candidate in weighted.items()})
         return weighted[weight], delay, tried_m, taken, weights
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
         places = (list(ordered(take.demonstration.places, self.task.names)) for take in takes)
-        return NamedViaPoints(self.task.names, np.mean([NamedViaPoints.of(one).at for one in places], axis=0))
+        return NamedViaPoints(self.task.names, np.mean([NamedViaPoints.of(points).at for points in places], axis=0))
 
     def _without_places(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
         """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
         progress("learning without the via-points, for comparison")
         inputs = [take.hands for take in takes]
         fit = refit(POSITIONS, takes, inputs, self.options.points, None)
-        return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
+        return [result.errors for result in held_out_takes(takes, inputs, fit, progress)]
 
 
 def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
@@ -580,12 +580,12 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
 
     tempos = [Tempo.of(take.demonstration) for take in taught.new]
     limit_m, out = clock_limit_m(error_m(best.samples)), dict[str, Candidate]()
-    segments, labels = [one.segments for one in best.encoded], [one.labels for one in best.encoded]
+    segments, labels = [demo.segments for demo in best.encoded], [demo.labels for demo in best.encoded]
     for waits, name in CLOCKS.items():
         progress(f"trying {POSITIONS.name}{name}")
         clock = segment_clock_of(tempos, segments, labels, waits=waits)
         tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
-        errors_m = [error_m(best.samples.clocked(tempos, one)) for one in tried]
+        errors_m = [error_m(best.samples.clocked(tempos, tried_clock)) for tried_clock in tried]
         if min(errors_m) < limit_m:
             out[name] = best.clocked(tempos, preferred(tried, errors_m, AS_GOOD * min(errors_m)))
     return out
@@ -596,21 +596,21 @@ def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
     it follows a hand, they are those of its offset from that hand; where it also turns with the
     hand, zeros.
     """
-    at = np.array([one.at.at[[one.at.names.index(name) for name in task.names]] for one in encoded])
+    points_m = np.array([demo.at.at[[demo.at.names.index(name) for name in task.names]] for demo in encoded])
     for n, side in enumerate(task.follow.tolist()):
         if side != NONE:
-            at[:, n, 6:] -= at[:, n, 6:] if task.levers is not None else at[:, n, 3 * side : 3 * side + 3]
-    off = at[:, :, 6:] - at[:, :, 6:].mean(axis=0)
-    return np.asarray(np.einsum("dni,dnj->nij", off, off) / max(len(encoded) - 1, 1))
+            points_m[:, n, 6:] -= points_m[:, n, 6:] if task.levers is not None else points_m[:, n, 3 * side : 3 * side + 3]
+    offsets_m = points_m[:, :, 6:] - points_m[:, :, 6:].mean(axis=0)
+    return np.asarray(np.einsum("dni,dnj->nij", offsets_m, offsets_m) / max(len(encoded) - 1, 1))
 
 
 def _off_m(encoded: Sequence[Encoded]) -> Vector:
     """The distances (K, 2) [m] of the hands from their paths in each segment, root mean square. A
     segment that no demonstration has gets those of all segments.
     """
-    labels, off = np.concatenate([one.labels for one in encoded]), np.concatenate([one.off for one in encoded])
-    by_segment = [off[labels == k] if (labels == k).any() else off for k in range(len(encoded[0].segments))]
-    return np.array([np.maximum(np.sqrt((one**2).mean(axis=0)), LEAST_OFF_M) for one in by_segment])
+    labels, distances_m = np.concatenate([demo.labels for demo in encoded]), np.concatenate([demo.off for demo in encoded])
+    by_segment = [distances_m[labels == k] if (labels == k).any() else distances_m for k in range(len(encoded[0].segments))]
+    return np.array([np.maximum(np.sqrt((part_m**2).mean(axis=0)), LEAST_OFF_M) for part_m in by_segment])
 
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:

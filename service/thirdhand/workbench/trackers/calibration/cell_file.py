@@ -79,23 +79,23 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
         raise CalibrationError(f"{path} cannot be changed: {error}. {by_hand}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
-    wanted = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    fields = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     table: Any = before.trackers[tracker] if tracker else before.hands
-    replaced = msgspec.structs.replace(table, **wanted)
+    replaced = msgspec.structs.replace(table, **fields)
     changes = {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
     if after != msgspec.structs.replace(before, **changes):
         raise CalibrationError(f"{path} cannot be changed without other settings. {by_hand}")
-    kept = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
+    backup = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
     try:
-        shutil.copy2(path, kept)
-        if kept.read_bytes() != text.encode():
-            kept.unlink()
+        shutil.copy2(path, backup)
+        if backup.read_bytes() != text.encode():
+            backup.unlink()
             raise CalibrationError(f"{path} was changed by another program meanwhile. {by_hand}")
         _replace(path, changed.encode())
         _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n")
     except OSError as error:
         raise CalibrationError(f"{in_words(error)}. {by_hand}") from None
-    return kept
+    return backup
 
 
 def real_path(path: Path) -> Path:
@@ -103,13 +103,13 @@ def real_path(path: Path) -> Path:
     for a file that cannot be written.
     """
     try:
-        found = path.resolve(strict=True)
+        target = path.resolve(strict=True)
     except (OSError, RuntimeError) as error:  # a RuntimeError for links in a circle
         raise CalibrationError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
-    is_writable = found.is_file() and found.stat().st_mode & 0o222 and os.access(found.parent, os.W_OK)
-    if not (is_writable and os.access(found, os.W_OK)):
+    is_writable = target.is_file() and target.stat().st_mode & 0o222 and os.access(target.parent, os.W_OK)
+    if not (is_writable and os.access(target, os.W_OK)):
         raise CalibrationError(f"{path} cannot be written: a file that this user may change, in such a folder, needed")
-    return found
+    return target
 
 
 def _replace(path: Path, data: bytes) -> None:
@@ -124,17 +124,17 @@ def recorded(path: Path, settings: Settings, tracker: str = "") -> CalibrationRe
     """The record of a tracker's calibration, with the pose in the settings. Raises
     CalibrationError.
     """
-    beside = record_path(path.resolve(), tracker)
+    record_file = record_path(path.resolve(), tracker)
     try:
-        given = msgspec.json.decode(content(beside, LARGEST_CONFIGURATION))
-        record = validated(given, CalibrationRecord)
+        raw = msgspec.json.decode(content(record_file, LARGEST_CONFIGURATION))
+        record = validated(raw, CalibrationRecord)
     except FileNotFoundError:
         raise CalibrationError(
-            f"{beside} does not exist, so that the hand's place in the tool is unknown: `thirdhand calibrate --held` "
+            f"{record_file} does not exist, so that the hand's place in the tool is unknown: `thirdhand calibrate --held` "
             "writes it"
         ) from None
     except (OSError, UnusableError, msgspec.DecodeError, UnicodeDecodeError, InvalidError) as error:
-        raise CalibrationError(f"{beside} cannot be read: {in_words(error, named=False)}") from None
+        raise CalibrationError(f"{record_file} cannot be read: {in_words(error, named=False)}") from None
     pose = settings.hands_in(tracker).base_from_tracker
     return msgspec.structs.replace(
         record, calibration=msgspec.structs.replace(record.calibration, base_from_tracker=pose)

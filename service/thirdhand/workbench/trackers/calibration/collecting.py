@@ -101,8 +101,8 @@ class LiveLed(Capture):
 
     def unheard(self, side: str | None, *, needs_joints: bool = True) -> list[str]:
         """The required streams from which nothing arrived; without a side, one hand is enough."""
-        wanted = [TAKE_KEYS[one] for one in SIDES if side in (None, one)]
-        hands = [] if any(self.samples[key] for key in wanted) else [" or ".join(wanted)]
+        keys = [TAKE_KEYS[hand] for hand in SIDES if side in (None, hand)]
+        hands = [] if any(self.samples[key] for key in keys) else [" or ".join(keys)]
         return hands + ([JOINT_STATES] if needs_joints and not self.samples[JOINT_STATES] else [])
 
     @property
@@ -128,16 +128,16 @@ class LiveLed(Capture):
             samples = _lately(self.samples[TAKE_KEYS[side]], since_s)
             poses = [channels.POSE.decode(sample.payload) for sample in samples]
             frame = poses[-1].frame_id if poses else ""
-            kept = [i for i, pose in enumerate(poses) if pose.frame_id == frame]
-            if len(kept) < len(poses):
+            indices = [i for i, pose in enumerate(poses) if pose.frame_id == frame]
+            if len(indices) < len(poses):
                 remarks.append(
                     f"{TAKE_KEYS[side]} changed its frame to {frame!r}: "
-                    f"the {len(poses) - len(kept)} samples before are not used"
+                    f"the {len(poses) - len(indices)} samples before are not used"
                 )
-            if kept:
-                stamps = np.array([poses[i].stamp_ns for i in kept], np.int64)
-                logged = np.array([samples[i].arrived_ns for i in kept], np.int64)
-                rows = np.array([(*poses[i].position, *poses[i].orientation) for i in kept])
+            if indices:
+                stamps = np.array([poses[i].stamp_ns for i in indices], np.int64)
+                logged = np.array([samples[i].arrived_ns for i in indices], np.int64)
+                rows = np.array([(*poses[i].position, *poses[i].orientation) for i in indices])
                 hands[side] = Track(TAKE_KEYS[side], "", stamps, logged, rows, frame)
         return LedTracks(hands, self._tool(most_states, since_s), remarks)
 
@@ -156,11 +156,11 @@ class LiveLed(Capture):
         if len(samples) < LEAST_TOUCH_SAMPLES:
             raise CalibrationError(f"{len(samples)} samples of {TAKE_KEYS[side]} in {TOUCH_S:g} s: is the hand seen?")
         poses = [channels.POSE.decode(sample.payload) for sample in samples]
-        at = in_metres(np.array([pose.position for pose in poses]), self.settings.hands_in(poses[-1].frame_id))
-        moved_m = float(np.ptp(np.sort(at, axis=0)[len(at) // 10 : len(at) - len(at) // 10], axis=0).max())
+        positions_m = in_metres(np.array([pose.position for pose in poses]), self.settings.hands_in(poses[-1].frame_id))
+        moved_m = float(np.ptp(np.sort(positions_m, axis=0)[len(positions_m) // 10 : len(positions_m) - len(positions_m) // 10], axis=0).max())
         if moved_m > MAX_TOUCH_M:
             raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
-        return np.asarray(np.median(at, axis=0))
+        return np.asarray(np.median(positions_m, axis=0))
 
 
 def _lately(samples: Sequence[Sample], since_s: float | None) -> Sequence[Sample]:
@@ -231,8 +231,8 @@ def _plausible(positions: Vector) -> NDArray[np.bool_]:
     """
     sound = np.asarray((np.abs(positions) < LARGEST_POSITION).all(axis=1))
     if sound.any():
-        off = np.linalg.norm(np.where(sound[:, None], positions, 0.0) - np.median(positions[sound], axis=0), axis=1)
-        sound &= off <= FAR_RATIO * max(float(np.median(off[sound])), MIN_MEDIAN_OFF)
+        distances = np.linalg.norm(np.where(sound[:, None], positions, 0.0) - np.median(positions[sound], axis=0), axis=1)
+        sound &= distances <= FAR_RATIO * max(float(np.median(distances[sound])), MIN_MEDIAN_OFF)
     return sound
 
 
@@ -268,12 +268,12 @@ def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None
     except CalibrationError as error:
         for other in led.hands.keys() - {side}:
             try:
-                found = _solved(led, settings, corners, other, **more)
+                solution = _solved(led, settings, corners, other, **more)
             except CalibrationError:
                 continue
             raise CalibrationError(
                 f"{error}. {TAKE_KEYS[other]} moves with the tool, with a residual of "
-                f"{1e3 * found.calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else the "
+                f"{1e3 * solution.calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else the "
                 "tracker exchanges left and right"
             ) from None
         raise
@@ -297,8 +297,8 @@ class LedProgress(NamedTuple):
         """The progress in one line."""
         moved = " x ".join(f"{100 * size:.0f}" for size in self.coverage.extent_m)
         turned = ", ".join(f"{math.degrees(angle):.0f}°" for angle in self.coverage.turned_rad[:2])
-        known = "unknown" if self.std_m is None else f"{1e3 * self.std_m:.1f} mm"
-        return f"led over {moved} cm, turned {turned}; accuracy {known}: {self.advice}"
+        accuracy = "unknown" if self.std_m is None else f"{1e3 * self.std_m:.1f} mm"
+        return f"led over {moved} cm, turned {turned}; accuracy {accuracy}: {self.advice}"
 
 
 def progress(led: LedTracks, settings: Settings, corners: Vector, side: str | None) -> LedProgress | None:
@@ -307,8 +307,8 @@ def progress(led: LedTracks, settings: Settings, corners: Vector, side: str | No
         return None
     cover, std_m, advice = coverage(led.tool.poses[:, :3], led.tool.poses[:, 3:]), None, ""
     try:
-        found = solved(led, settings, corners, side, max_samples=SHOWN_SAMPLES).calibration
-        std_m, advice = found.std_m, found.remedy
+        calibration = solved(led, settings, corners, side, max_samples=SHOWN_SAMPLES).calibration
+        std_m, advice = calibration.std_m, calibration.remedy
     except CalibrationError as error:
         advice = str(error) if len(led.tool.poses) > SHOWN_SAMPLES else ""
     if cover.extent_m[2] < LEAST_LED_M:
@@ -349,16 +349,16 @@ def lead(
             warn(f"{' and '.join(ended)} no longer arrives" if ended else "all streams arrive again")
         if now_s - shown_s < SHOW_EVERY_S:
             continue
-        found = progress(live.led(most_states=4 * SHOWN_SAMPLES), settings, corners, side)
+        status = progress(live.led(most_states=4 * SHOWN_SAMPLES), settings, corners, side)
         shown_s = time.monotonic()
-        if found is None:
+        if status is None:
             continue
         lasts_s = now_s - begun_s
-        show(f"{lasts_s:4.0f} s  {found.text()}")
-        wide = found.coverage.extent_m[2] >= LEAST_LED_M and found.coverage.turned_rad[1] >= LEAST_TURNED_RAD
+        show(f"{lasts_s:4.0f} s  {status.text()}")
+        wide = status.coverage.extent_m[2] >= LEAST_LED_M and status.coverage.turned_rad[1] >= LEAST_TURNED_RAD
         goal_m = accept_m if lasts_s > LED_S else 0.5 * accept_m
-        if found.std_m is not None and wide and lasts_s > LEAST_LED_S and found.std_m < goal_m:
-            return f"ended: the expected accuracy is {1e3 * found.std_m:.1f} mm"
+        if status.std_m is not None and wide and lasts_s > LEAST_LED_S and status.std_m < goal_m:
+            return f"ended: the expected accuracy is {1e3 * status.std_m:.1f} mm"
     return f"ended after {longest_s:g} s"
 
 

@@ -190,9 +190,9 @@ def solve_held(
 
     first = _robust(problem(rows))
     is_near = _inliers(first.off, first.deviation_m)
-    found = problem(rows[is_near])
+    inlier_problem = problem(rows[is_near])
     hint = f" The tool turned by {_degrees(cover)}" if cover.turned_rad[1] < math.radians(20) else ""
-    return _refined(found, first, corners, hint)
+    return _refined(inlier_problem, first, corners, hint)
 
 
 def solve_points(hand: Vector, base: Vector, corners: Vector, *, section: str = "[hands]") -> Calibration:
@@ -345,11 +345,11 @@ def _affine(problem: _Problem) -> tuple[float, Vector, Vector]:
         weights = np.ones((count, 1))
         for _ in range(5):  # reweighted, so that it minimises the distances rather than their squares
             weighted = (weights[:, :, None] * rows).reshape(3 * count, -1)
-            found = np.linalg.lstsq(weighted, (weights * tool).ravel(), rcond=1e-9)[0]
-            off = np.linalg.norm(rows @ found - tool, axis=1)
-            weights = 1.0 / np.sqrt(FIRST_SCALE_M + off)[:, None]
-        if best is None or off.mean() < best[0]:
-            best = float(off.mean()), delay_s, np.asarray(found[:9].reshape(3, 3) / size)
+            solution = np.linalg.lstsq(weighted, (weights * tool).ravel(), rcond=1e-9)[0]
+            distances_m = np.linalg.norm(rows @ solution - tool, axis=1)
+            weights = 1.0 / np.sqrt(FIRST_SCALE_M + distances_m)[:, None]
+        if best is None or distances_m.mean() < best[0]:
+            best = float(distances_m.mean()), delay_s, np.asarray(solution[:9].reshape(3, 3) / size)
     assert best is not None
     return best[1], best[2], centre
 
@@ -377,11 +377,11 @@ def _check_scale(matrix: Vector, section: str) -> None:
     if not 1 / MAX_SCALE_ERROR < TRACKER_UNITS_M[unit] / scale < MAX_SCALE_ERROR:
         unit = ""
     times = f"{float(f'{1 / scale:.2g}'):g}"
-    found = f"the hand moves {times} times as far as the tool"
+    finding = f"the hand moves {times} times as far as the tool"
     if unit in ("mm", "cm"):
-        raise CalibrationError(f'{found}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"')
+        raise CalibrationError(f'{finding}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"')
     looks = f": the tracker looks to publish {unit}" if unit else ""
-    raise CalibrationError(f"{found}{looks}. Let it publish metres, or correct {section} unit")
+    raise CalibrationError(f"{finding}{looks}. Let it publish metres, or correct {section} unit")
 
 
 def _rigid(problem: _Problem, matrix: Vector, centre: Vector, delay_s: float) -> _Fit:
@@ -398,13 +398,13 @@ def _rigid(problem: _Problem, matrix: Vector, centre: Vector, delay_s: float) ->
         def off(x: Vector, turn: Rotation = turn) -> Vector:
             return _residual(problem, turn, centre, x).ravel()
 
-        found = least_squares(off, x, loss="soft_l1", f_scale=scale_m, bounds=(-bounds, bounds), x_scale=0.1)
-        turn, x = Rotation.from_rotvec(found.x[:3]) * turn, found.x
+        fit = least_squares(off, x, loss="soft_l1", f_scale=scale_m, bounds=(-bounds, bounds), x_scale=0.1)
+        turn, x = Rotation.from_rotvec(fit.x[:3]) * turn, fit.x
         x[:3] = 0.0
-        deviation_m = max(1.4826 * float(np.median(np.abs(found.fun))), 1e-5)
+        deviation_m = max(1.4826 * float(np.median(np.abs(fit.fun))), 1e-5)
         scale_m = float(np.clip(2.0 * deviation_m, *SCALES_M))
     x = np.pad(x, (0, 10 - count))
-    distances = np.linalg.norm(found.fun.reshape(-1, 3), axis=1)
+    distances = np.linalg.norm(fit.fun.reshape(-1, 3), axis=1)
     return _Fit(turn, centre, x[3:6], x[6:9], float(x[9]), distances, deviation_m)
 
 
@@ -423,8 +423,8 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
         return _residual(problem, first.turn, first.centre, x)
 
     def slopes(x: Vector) -> Vector:
-        here = off(x)
-        return np.stack([(off(x + EPSILON * axis) - here) / EPSILON for axis in np.eye(count)], axis=2)
+        reference = off(x)
+        return np.stack([(off(x + EPSILON * axis) - reference) / EPSILON for axis in np.eye(count)], axis=2)
 
     def fitted(x: Vector, noise: WanderingNoise | None) -> Vector:
         def white(x: Vector) -> Vector:
@@ -453,8 +453,8 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
     remedy = LEAD_APART
     if problem.is_held:
         firm = np.array([*range(6), 9])
-        known = variance * np.linalg.inv(information[np.ix_(firm, firm)])
-        remedy = TURN_WRIST if _stds(known, levers).max() < 0.7 * stds.max() else LEAD_APART
+        firm_covariance = variance * np.linalg.inv(information[np.ix_(firm, firm)])
+        remedy = TURN_WRIST if _stds(firm_covariance, levers).max() < 0.7 * stds.max() else LEAD_APART
     turn, residual = Rotation.from_rotvec(x[:3]) * first.turn, np.linalg.norm(off(x), axis=1)
     x = np.pad(x, (0, 10 - count))
     return Calibration(
