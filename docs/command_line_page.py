@@ -43,7 +43,9 @@ def page() -> str:
     commands = _subparsers(top) | {"sim": thirdhand_sim.__main__.parser()}
     parts = [HEAD]
     for title, names in main.GROUPS.items():
-        parts.append(f"| {title} | {', '.join(f'[`{name}`](#thirdhand-{name})' for name in names)} |\n")
+        parts.append(
+            f"| {title} | {', '.join(f'[`{name}`](#thirdhand-{name})' for name in names)} |\n"
+        )
     parts.append(SHARED + _table(_group(commands["status"], REACH)))
     for names in main.GROUPS.values():
         for name in names:
@@ -53,7 +55,9 @@ def page() -> str:
 
 def _subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser, by their names."""
-    actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]  # noqa: SLF001
+    actions = [
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    ]  # noqa: SLF001
     return {name: found for action in actions for name, found in action.choices.items()}
 
 
@@ -93,7 +97,9 @@ def _table(actions: list[argparse.Action]) -> str:
 
 def _called(action: argparse.Action) -> str:
     """An option with its value as one writes it, or an argument."""
-    value = action.metavar or (f"{{{','.join(map(str, action.choices))}}}" if action.choices else action.dest.upper())
+    value = action.metavar or (
+        f"{{{','.join(map(str, action.choices))}}}" if action.choices else action.dest.upper()
+    )
     value = " ".join(value) if isinstance(value, tuple) else value
     if not action.option_strings:
         return f"`{value}{' ...' * (action.nargs in ('+', '*'))}`"
@@ -103,7 +109,9 @@ def _called(action: argparse.Action) -> str:
 
 def _meaning(action: argparse.Action) -> str:
     """The help text of an option, with its default."""
-    text = " ".join((action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%").split())
+    text = " ".join(
+        (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%").split()
+    )
     if action.required and action.option_strings:
         text += " (required)"
     return re.sub(r"(<\w+>[/\w]*)", r"`\1`", text).replace("|", "\\|")

@@ -56,13 +56,17 @@ def motion(skill: Skill, path: Skill, settings: Settings) -> tuple[Vector, Vecto
     frames: list[Frame] = []
     controller = Controller(settings, skill, urdf=robot_description(settings))
     run(controller, ticks(), [lambda _, frame: frames.append(frame)])
-    return np.array([frame["hands"][0] for frame in frames]), np.array([frame["tool"] for frame in frames])
+    return np.array([frame["hands"][0] for frame in frames]), np.array(
+        [frame["tool"] for frame in frames]
+    )
 
 
 def main() -> None:
     """Draw the picture beside this file."""
     settings = Settings()
-    settings = msgspec.structs.replace(settings, arm=msgspec.structs.replace(settings.arm, source="assumed"))
+    settings = msgspec.structs.replace(
+        settings, arm=msgspec.structs.replace(settings.arm, source="assumed")
+    )
     before = adapted(shipped_skill(), Scene().via_points(), tolerance=0.05)
     begin, end = before.model.hands[SEGMENT : SEGMENT + 2]
     held = begin + SHARE * (end - begin)
@@ -74,7 +78,9 @@ def main() -> None:
     hand, old = (one[begun // 2 :] for one in motion(before, before, settings))
     _, new = (one[begun // 2 :] for one in motion(after, before, settings))
     green, blue = (np.array(colour) / 255 for colour in (TOOL, LEFT))
-    figure, (side, change) = plt.subplots(1, 2, figsize=(11, 4), width_ratios=(1.3, 1.0), layout="constrained")
+    figure, (side, change) = plt.subplots(
+        1, 2, figsize=(11, 4), width_ratios=(1.3, 1.0), layout="constrained"
+    )
     side.plot(hand[:, 0], hand[:, 2], "--", color=blue, label="left hand")
     side.plot(old[:, 0], old[:, 2], color="0.6", lw=2, label="tool before")
     side.plot(new[:, 0], new[:, 2], color=green, lw=2, label="tool after")
@@ -92,8 +98,16 @@ def main() -> None:
     change.axhline(50 * effect.moved_m, color="0.5", ls=":")
     for sign in (-1.0, 1.0):
         change.axvline(100 * sign * effect.reach_m, color="0.5", ls=":")
-    change.text(0.0, 50 * effect.moved_m - 0.3, f"reach {100 * effect.reach_m:.0f} cm", ha="center", va="top")
-    change.set(xlabel="left hand before and after the hold's place [cm]", ylabel="change of the tool [cm]")
+    change.text(
+        0.0,
+        50 * effect.moved_m - 0.3,
+        f"reach {100 * effect.reach_m:.0f} cm",
+        ha="center",
+        va="top",
+    )
+    change.set(
+        xlabel="left hand before and after the hold's place [cm]", ylabel="change of the tool [cm]"
+    )
     change.set_title("How far the correction reaches")
     change.grid(alpha=0.3)
     figure.savefig(PICTURE, dpi=DPI)

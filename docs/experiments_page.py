@@ -26,7 +26,23 @@ from thirdhand_sim.lab.people.moving_hands import MOST_LATE_S, PRECISE_M, UNSEEN
 HERE = Path(__file__).parent
 WIDTH = 100
 WORDS = dict(
-    enumerate(["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"], 1)
+    enumerate(
+        [
+            "one",
+            "two",
+            "three",
+            "four",
+            "five",
+            "six",
+            "seven",
+            "eight",
+            "nine",
+            "ten",
+            "eleven",
+            "twelve",
+        ],
+        1,
+    )
 )
 BLOCK = re.compile(r"(?<=<!-- evidence -->\n).*(?=<!-- /evidence -->)", re.DOTALL)
 BLOCKS = {  # templates of a paragraph in a page
@@ -83,14 +99,18 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     `motion_of_others` is motion-of-others.json.
     """
     found = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(HERE), undefined=jinja2.StrictUndefined, line_statement_prefix="%%"
+        loader=jinja2.FileSystemLoader(HERE),
+        undefined=jinja2.StrictUndefined,
+        line_statement_prefix="%%",
     )
     stale = {name for name, result in results.items() if staleness(name, result, here)}
 
     def table_miss(who: str) -> float:
         """The largest miss of a point [cm] by a method of Table I."""
         rows = [results["table"][letters][who] for letters in ("modelled", "recorded")]
-        return max(row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end"))
+        return max(
+            row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end")
+        )
 
     def share(value: float) -> str:
         """A share of the scenes, in words."""
@@ -101,7 +121,9 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
 
     def version(*names: str) -> str:
         """The commit of some results, by which each is marked if it is stale."""
-        cells = [f"**stale**: {commit(name)}" if name in stale else f"`{commit(name)}`" for name in names]
+        cells = [
+            f"**stale**: {commit(name)}" if name in stale else f"`{commit(name)}`" for name in names
+        ]
         return "; ".join(dict.fromkeys(cells))
 
     def stale_line(*names: str) -> str:
@@ -125,7 +147,9 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     found.filters |= {
         "fixed": lambda value, digits=0: f"{value:.{digits}f}",
         "percent": lambda value, digits=0: f"{100 * value:.{digits}f}",
-        "up": lambda value, digits: f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.{digits}f}",
+        "up": lambda value, digits: (
+            f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.{digits}f}"
+        ),
         "significant": significant,
         "short": lambda value: significant(value, 2) if value >= 0.01 else f"{value:.4f}",
         "word": lambda value: WORDS.get(value, str(value)),
@@ -137,8 +161,16 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
 
 def refusals(tasks: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
     """The numbers of refused skills and of all in recorded tasks of `partners`."""
-    rows = [(task, verdict(task, name)) for task in tasks.values() for name in task["methods"] if "service" in name]
-    return {"refused": sum(one.folds_refused for _, one in rows), "folds": sum(task["folds"] for task, _ in rows)}
+    rows = [
+        (task, verdict(task, name))
+        for task in tasks.values()
+        for name in task["methods"]
+        if "service" in name
+    ]
+    return {
+        "refused": sum(one.folds_refused for _, one in rows),
+        "folds": sum(task["folds"] for task, _ in rows),
+    }
 
 
 def significant(value: float, digits: int) -> str:
@@ -162,7 +194,9 @@ def wrapped(text: str) -> str:
 
 
 def _filled(text: str, indent: str) -> str:
-    return textwrap.fill(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)
+    return textwrap.fill(
+        text, WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
+    )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,10 @@ from thirdhand.settings.config import Settings, robot_description
 PICTURE = Path(__file__).with_name("frames.png")
 TRACKER = (1.2, 0.0, 0.9, 0.683, 0.683, -0.183, -0.183)  # `base_from_tracker` of first-tracker.md
 PLATE_FROM_TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0, 1.0)
-HANDS = {"left hand": (0.78, -0.22, 0.10), "right hand": (0.78, 0.22, 0.10)}  # [m] the person faces the arm
+HANDS = {
+    "left hand": (0.78, -0.22, 0.10),
+    "right hand": (0.78, 0.22, 0.10),
+}  # [m] the person faces the arm
 AXIS_M, ELBOW_M = 0.13, 0.18
 COLOURS = ("tab:red", "tab:green", "tab:blue")  # x, y, z
 DPI = 90
@@ -45,9 +48,13 @@ class CoordinateFrame(NamedTuple):
     label_m: tuple[float, float, float] = (0.0, 0.0, 0.03)  # offset of the label
 
 
-def frame_of(name: str, pose: tuple[float, ...], label_m: tuple[float, float, float]) -> CoordinateFrame:
+def frame_of(
+    name: str, pose: tuple[float, ...], label_m: tuple[float, float, float]
+) -> CoordinateFrame:
     """The frame of a pose in frame `base`."""
-    return CoordinateFrame(name, np.array(pose[:3]), rotation((pose[3], pose[4], pose[5], pose[6])), label_m)
+    return CoordinateFrame(
+        name, np.array(pose[:3]), rotation((pose[3], pose[4], pose[5], pose[6])), label_m
+    )
 
 
 def with_tool(settings: Settings, plate_from_tool: tuple[float, ...]) -> Settings:
@@ -57,17 +64,29 @@ def with_tool(settings: Settings, plate_from_tool: tuple[float, ...]) -> Setting
     )
 
 
-def tool_frame(name: str, settings: Settings, label_m: tuple[float, float, float]) -> CoordinateFrame:
+def tool_frame(
+    name: str, settings: Settings, label_m: tuple[float, float, float]
+) -> CoordinateFrame:
     """The frame of the tool in the posture of the settings."""
     here = Arm(settings, robot_description(settings)).at(np.array(settings.arm.posture))
-    return CoordinateFrame(name, np.array(here.position), np.array(here.record["rotation"][0]), label_m)
+    return CoordinateFrame(
+        name, np.array(here.position), np.array(here.record["rotation"][0]), label_m
+    )
 
 
 def draw_frame(axes: Axes3D, frame: CoordinateFrame) -> None:
     """Three arrows, and the name."""
     for i, colour in enumerate(COLOURS):
-        axes.quiver(*frame.origin, *(AXIS_M * frame.axes[:, i]), color=colour, linewidth=2.2, arrow_length_ratio=0.25)
-        axes.text(*(frame.origin + 1.2 * AXIS_M * frame.axes[:, i]), "xyz"[i], color=colour, fontsize=9)
+        axes.quiver(
+            *frame.origin,
+            *(AXIS_M * frame.axes[:, i]),
+            color=colour,
+            linewidth=2.2,
+            arrow_length_ratio=0.25,
+        )
+        axes.text(
+            *(frame.origin + 1.2 * AXIS_M * frame.axes[:, i]), "xyz"[i], color=colour, fontsize=9
+        )
     axes.text(*(frame.origin + frame.label_m), frame.name, fontsize=11, weight="bold", zorder=20)
 
 
@@ -76,9 +95,22 @@ def draw_arm(axes: Axes3D, settings: Settings) -> None:
     body = body_of(settings, robot_description(settings))
     placed = np.empty((len(body.capsules), 2, 3))
     place(np.array(settings.arm.posture), body.frames, body.axes, body.capsules, placed)
-    axes.plot(*np.vstack([np.zeros((1, 3)), placed.reshape(-1, 3)]).T, color="0.62", linewidth=4, alpha=0.5, zorder=1)
+    axes.plot(
+        *np.vstack([np.zeros((1, 3)), placed.reshape(-1, 3)]).T,
+        color="0.62",
+        linewidth=4,
+        alpha=0.5,
+        zorder=1,
+    )
     for ends, radius in zip(placed, body.capsules["radius"], strict=True):
-        axes.plot(*ends.T, color="0.62", linewidth=300 * radius, solid_capstyle="round", alpha=0.45, zorder=1)
+        axes.plot(
+            *ends.T,
+            color="0.62",
+            linewidth=300 * radius,
+            solid_capstyle="round",
+            alpha=0.45,
+            zorder=1,
+        )
 
 
 def draw_hand(axes: Axes3D, name: str, at: tuple[float, ...], colour: palette.Colour) -> None:
@@ -90,10 +122,19 @@ def draw_hand(axes: Axes3D, name: str, at: tuple[float, ...], colour: palette.Co
     axes.text(at[0] + 0.05, at[1], at[2] - 0.07, name, fontsize=11, weight="bold")
 
 
-def draw_transform(axes: Axes3D, begin: Vector, end: Vector, name: str, share: float, offset: Vector) -> None:
+def draw_transform(
+    axes: Axes3D, begin: Vector, end: Vector, name: str, share: float, offset: Vector
+) -> None:
     """A dashed line between the origins of two frames, with the setting that relates them."""
     axes.plot(*np.array([begin, end]).T, color="0.25", linestyle="--", linewidth=1.1)
-    axes.text(*(begin + share * (end - begin) + offset), name, fontsize=9, family="monospace", zorder=30, bbox=LABEL)
+    axes.text(
+        *(begin + share * (end - begin) + offset),
+        name,
+        fontsize=9,
+        family="monospace",
+        zorder=30,
+        bbox=LABEL,
+    )
 
 
 def main() -> None:
@@ -107,7 +148,9 @@ def main() -> None:
     axes = figure.add_axes((-0.1, -0.22, 1.2, 1.52), projection="3d")
     assert isinstance(axes, Axes3D)
     corners = [(0.15, -0.6, 0.0), (1.25, -0.6, 0.0), (1.25, 0.6, 0.0), (0.15, 0.6, 0.0)]
-    axes.add_collection3d(Poly3DCollection([corners], facecolor="burlywood", alpha=0.25, edgecolor="sienna"))
+    axes.add_collection3d(
+        Poly3DCollection([corners], facecolor="burlywood", alpha=0.25, edgecolor="sienna")
+    )
     axes.text(1.1, 0.48, 0.0, "table", fontsize=9, color="sienna")
     draw_arm(axes, settings)
     for (name, at), colour in zip(HANDS.items(), (palette.LEFT, palette.RIGHT), strict=True):
@@ -115,11 +158,32 @@ def main() -> None:
     for frame in (base, plate, tool, tracker):
         draw_frame(axes, frame)
     above = np.array([0.0, 0.0, 0.02])
-    draw_transform(axes, base.origin, tracker.origin, "[hands] base_from_tracker", 0.62, np.array([-0.2, 0.0, 0.23]))
-    draw_transform(axes, plate.origin, tool.origin, "[tool] plate_from_tool", 0.5, np.array([0.03, 0.05, 0.015]))
+    draw_transform(
+        axes,
+        base.origin,
+        tracker.origin,
+        "[hands] base_from_tracker",
+        0.62,
+        np.array([-0.2, 0.0, 0.23]),
+    )
+    draw_transform(
+        axes,
+        plate.origin,
+        tool.origin,
+        "[tool] plate_from_tool",
+        0.5,
+        np.array([0.03, 0.05, 0.015]),
+    )
     for at in HANDS.values():
         draw_transform(axes, tracker.origin, np.array(at), "", 0.5, above)
-    axes.text(1.06, 0.06, 0.46, "hands/left, hands/right:\nposes in the tracker's frame", fontsize=9, color="0.15")
+    axes.text(
+        1.06,
+        0.06,
+        0.46,
+        "hands/left, hands/right:\nposes in the tracker's frame",
+        fontsize=9,
+        color="0.15",
+    )
     axes.set(xlim=(0.0, 1.2), ylim=(-0.6, 0.6), zlim=(0.0, 0.9), box_aspect=(1.2, 1.2, 0.9))
     axes.set_axis_off()
     axes.view_init(elev=22, azim=-52)

@@ -18,7 +18,9 @@ PAGE = Path(__file__).with_name("incidents.md")
 
 def page() -> str:
     """The text of the page."""
-    template = jinja2.Template(PAGE.with_suffix(".md.jinja").read_text(encoding="utf-8"), trim_blocks=True)
+    template = jinja2.Template(
+        PAGE.with_suffix(".md.jinja").read_text(encoding="utf-8"), trim_blocks=True
+    )
     return template.render(incidents=INCIDENTS, table=table) + "\n"
 
 
@@ -31,7 +33,12 @@ def table(rows: Sequence[Incident]) -> str:
     lines = [[*heads, "what happened", "what to do"], ["---"] * (len(heads) + 2)]
     for row in rows:
         mode = "" if row.mode is None else f"`{word(row.mode)}`"
-        cells = [_name(row), *([mode] if len(heads) > 1 else []), filled(row.what_happened, Settings()), row.what_to_do]
+        cells = [
+            _name(row),
+            *([mode] if len(heads) > 1 else []),
+            filled(row.what_happened, Settings()),
+            row.what_to_do,
+        ]
         lines.append(cells)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 

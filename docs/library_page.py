@@ -60,8 +60,22 @@ Python 3.11 or later on Linux, macOS and Windows, with `eclipse-zenoh` and `msgs
 
 ![The frames of a cell: base, plate, tool, tracker and both hands](frames.png)"""
 KMP_GROUPS = {
-    "Learn": ("learn", "Learned", "Score", "GaussianMixture", "gaussian_process_reference", "Gaussians"),
-    "Primitives": ("KMP", "MotionPrediction", "Uncertainty", "OrientationKMP", "LocalKMP", "CoordinateFrame"),
+    "Learn": (
+        "learn",
+        "Learned",
+        "Score",
+        "GaussianMixture",
+        "gaussian_process_reference",
+        "Gaussians",
+    ),
+    "Primitives": (
+        "KMP",
+        "MotionPrediction",
+        "Uncertainty",
+        "OrientationKMP",
+        "LocalKMP",
+        "CoordinateFrame",
+    ),
     "Kernels and means": ("GaussianKernel", "PeriodicKernel", "VelocityKernel", "AffineMean"),
     "Beyond": ("LinearConstraints", "superposed", "Correlation", "improve", "Improvement"),
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
@@ -72,7 +86,13 @@ CLIENT_GROUPS = {
     "Hands and joints": ("Tracker", "Follower", "Command", "Publisher"),
     "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
-    "Errors": ("UnreachableError", "StartingError", "UncertainError", "RefusedError", "SettingsError"),
+    "Errors": (
+        "UnreachableError",
+        "StartingError",
+        "UncertainError",
+        "RefusedError",
+        "SettingsError",
+    ),
 }
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of thirdhand.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
@@ -95,7 +115,10 @@ def _library() -> str:
     for name, value in inspect.getmembers(orientation, inspect.isfunction):
         if value.__module__ == orientation.__name__ and not name.startswith("_"):
             parts += _described(name, value)
-    parts += ["## With scikit-learn, `kmp.estimator`", *_described("KMPRegressor", estimator.KMPRegressor)]
+    parts += [
+        "## With scikit-learn, `kmp.estimator`",
+        *_described("KMPRegressor", estimator.KMPRegressor),
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -124,9 +147,19 @@ def _described(name: str, value: Any) -> Iterator[str]:
     if not inspect.isclass(value) or raised or name in WITHOUT_METHODS:
         return
     for part, member in inspect.getmembers(value):
-        module = getattr(inspect.unwrap(getattr(member, "fget", getattr(member, "func", member))), "__module__", "")
+        module = getattr(
+            inspect.unwrap(getattr(member, "fget", getattr(member, "func", member))),
+            "__module__",
+            "",
+        )
         ours = (module or "").startswith(("kmp.", "thirdhand."))
-        if part.startswith("_") or not ours or part in INSIDE or not member.__doc__ or _is_inherited(value, part):
+        if (
+            part.startswith("_")
+            or not ours
+            or part in INSIDE
+            or not member.__doc__
+            or _is_inherited(value, part)
+        ):
             continue
         yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
         yield inspect.cleandoc(member.__doc__)
@@ -134,13 +167,19 @@ def _described(name: str, value: Any) -> Iterator[str]:
 
 def _is_inherited(value: type, part: str) -> bool:
     """True if a class of the client has a member from another one, which is listed there."""
-    return any(part in vars(base) for base in value.__mro__[1:] if base.__module__.startswith("thirdhand."))
+    return any(
+        part in vars(base) for base in value.__mro__[1:] if base.__module__.startswith("thirdhand.")
+    )
 
 
 def _signature(name: str, value: Any) -> str:
     """A call with the names of its arguments; their types are in the docstring."""
     signature = inspect.signature(value)
-    parameters = [one.replace(annotation=one.empty) for one in signature.parameters.values() if one.name != "self"]
+    parameters = [
+        one.replace(annotation=one.empty)
+        for one in signature.parameters.values()
+        if one.name != "self"
+    ]
     arguments = str(signature.replace(parameters=parameters, return_annotation=signature.empty))
     arguments = arguments.replace("'", '"')  # as the formatter writes it
     text = name + arguments

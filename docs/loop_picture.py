@@ -73,7 +73,13 @@ ARROWS = (
     Arrow("separation", "limiter", "", 0.0, 0.0),
     Arrow("setpoint", "arm", "setpoint: p, v, a\n[m, m/s, m/s²]"),
     Arrow("arm", "limiter", "q', q''\n[rad/s, rad/s²]"),
-    Arrow("limiter", "driver", f"command q, q'\n[rad, rad/s]\n{BY_KEY['joints/command'].rate}", 0.0, -0.5),
+    Arrow(
+        "limiter",
+        "driver",
+        f"command q, q'\n[rad, rad/s]\n{BY_KEY['joints/command'].rate}",
+        0.0,
+        -0.5,
+    ),
     Arrow(CORE, "scribe", "frame\nevery tick"),
     Arrow(CORE, "viewers", f"status [JSON]\n{BY_KEY['status'].rate.split(',')[0]}", 0.1),
 )
@@ -83,7 +89,9 @@ def draw_box(axes: Axes, name: str, box: Box) -> None:
     """A box with its name and what it does."""
     corner = (box.x - WIDTH / 2, box.y - HEIGHT / 2)
     axes.add_patch(
-        FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle="round,pad=0.08", facecolor=box.colour, edgecolor="0.3")
+        FancyBboxPatch(
+            corner, WIDTH, HEIGHT, boxstyle="round,pad=0.08", facecolor=box.colour, edgecolor="0.3"
+        )
     )
     axes.text(box.x, box.y + 0.14, name, ha="center", va="center", fontsize=11, weight="bold")
     axes.text(box.x, box.y - 0.2, box.about, ha="center", va="center", fontsize=8.5)
@@ -93,7 +101,8 @@ def edge(begin: Box, end: Box) -> tuple[float, float]:
     """The point where the line to another box leaves this one."""
     dx, dy = end.x - begin.x, end.y - begin.y
     share = min(
-        (WIDTH / 2 + 0.12) / abs(dx) if dx else float("inf"), (HEIGHT / 2 + 0.12) / abs(dy) if dy else float("inf")
+        (WIDTH / 2 + 0.12) / abs(dx) if dx else float("inf"),
+        (HEIGHT / 2 + 0.12) / abs(dy) if dy else float("inf"),
     )
     return begin.x + share * dx, begin.y + share * dy
 
@@ -103,7 +112,9 @@ def draw_arrow(axes: Axes, arrow: Arrow) -> None:
     end = BOXES[arrow.end]
     begin = BOXES.get(arrow.begin, Box(CORE_RIGHT - WIDTH / 2, end.y, "", STAGE))
     start, stop = edge(begin, end), edge(end, begin)
-    axes.annotate("", stop, start, arrowprops={"arrowstyle": "-|>", "color": "0.2", "linewidth": 1.2})
+    axes.annotate(
+        "", stop, start, arrowprops={"arrowstyle": "-|>", "color": "0.2", "linewidth": 1.2}
+    )
     middle = ((start[0] + stop[0]) / 2 + arrow.dx, (start[1] + stop[1]) / 2 + arrow.dy)
     axes.text(*middle, arrow.text, ha="center", va="center", fontsize=8.5, bbox=LABEL)
 
@@ -123,7 +134,14 @@ def main() -> None:
     )
     axes.add_patch(core)
     rate_hz = Settings().rate_hz
-    axes.text(8.1, 5.95, f"the core: one tick every {1000 / rate_hz:g} ms", ha="center", fontsize=11, color="#3a6ea5")
+    axes.text(
+        8.1,
+        5.95,
+        f"the core: one tick every {1000 / rate_hz:g} ms",
+        ha="center",
+        fontsize=11,
+        color="#3a6ea5",
+    )
     for name, box in BOXES.items():
         draw_box(axes, name, box)
     for arrow in ARROWS:

@@ -37,7 +37,9 @@ def main(path: Path = PICTURE) -> None:
             "--output",
             str(folder / "out"),
         ]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT) as demo:
+        with subprocess.Popen(
+            command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT
+        ) as demo:
             watchdog = threading.Timer(TIMEOUT_S, demo.kill)
             watchdog.start()
             try:

@@ -47,12 +47,19 @@ def pauses(take: LeftOut) -> list[tuple[float, float]]:
 
 def main() -> None:
     """Draw the picture beside this file."""
-    of_others = learn([one.demonstration for one in takes(TASK, people=OTHERS, each=2)], name="others")
+    of_others = learn(
+        [one.demonstration for one in takes(TASK, people=OTHERS, each=2)], name="others"
+    )
     mine = [one.demonstration for one in takes(TASK, people=[PERSON], each=2 * OWN)]
     refined = learn(mine[:OWN], name="mine", refined=of_others)
     rest = [left_out(f"take {OWN + 1 + i}", "", one) for i, one in enumerate(mine[OWN:])]
-    skills = (("skill of others", of_others, "0.6"), ("refined by three own takes", refined, np.array(TOOL) / 255))
-    figure, (along, over) = plt.subplots(1, 2, figsize=(11, 3.6), width_ratios=(2.2, 1.0), layout="constrained")
+    skills = (
+        ("skill of others", of_others, "0.6"),
+        ("refined by three own takes", refined, np.array(TOOL) / 255),
+    )
+    figure, (along, over) = plt.subplots(
+        1, 2, figsize=(11, 3.6), width_ratios=(2.2, 1.0), layout="constrained"
+    )
     for k, (label, skill, colour) in enumerate(skills):
         errors = [missed_m(skill, take) for take in rest]
         worst = int(np.argmax([np.square(missed_m(of_others, take)).mean() for take in rest]))
@@ -62,7 +69,9 @@ def main() -> None:
     for begin, end in pauses(rest[worst]):
         along.axvspan(begin, end, color="0.93", zorder=0)
     along.set(
-        xlabel="time [s]", ylabel="tool from the teacher's [cm]", title=f"{rest[worst].name}; grey: both hands rest"
+        xlabel="time [s]",
+        ylabel="tool from the teacher's [cm]",
+        title=f"{rest[worst].name}; grey: both hands rest",
     )
     along.legend(frameon=False)
     along.grid(alpha=0.3)

@@ -34,7 +34,12 @@ def draw_path(axes: Axes) -> None:
     """A hand beside its path, with λ and d."""
     share, off_m = on_way(HAND, segment_of(LONG_M), 0)
     foot = share * LONG_M
-    axes.annotate("", (LONG_M, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 2})
+    axes.annotate(
+        "",
+        (LONG_M, 0.0),
+        (0.0, 0.0),
+        arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 2},
+    )
     axes.plot([0.0, LONG_M], [0.0, 0.0], "o", color="tab:blue")
     axes.plot([foot, foot], [0.0, HAND[1]], ":", color="0.4")
     axes.plot(*HAND[:2], "o", color="tab:orange", ms=9)
@@ -57,7 +62,9 @@ def draw_shares(axes: Axes) -> None:
     for length_m, style in ((LONG_M, "-"), (SHORT_M, "--")):
         segment = segment_of(length_m)
         shares = [along_way(np.array([x * length_m, 0.0, 0.0]), 1.0, segment, 0) for x in covered]
-        axes.plot(covered, shares, style, color="tab:orange", label=f"it rests, path of {length_m:g} m")
+        axes.plot(
+            covered, shares, style, color="tab:orange", label=f"it rests, path of {length_m:g} m"
+        )
     axes.set(xlabel="λ", ylabel="share of the path", title="Resting hands are drawn to the ends")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
@@ -65,7 +72,9 @@ def draw_shares(axes: Axes) -> None:
 
 def main() -> None:
     """Draw the picture beside this file."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), width_ratios=(1.3, 1.0), layout="constrained")
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(11, 3.6), width_ratios=(1.3, 1.0), layout="constrained"
+    )
     draw_path(left)
     draw_shares(right)
     figure.savefig(PICTURE, dpi=DPI)

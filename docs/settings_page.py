@@ -84,12 +84,19 @@ def _section(kind: Any, name: str) -> Iterator[str]:
     yield "\n| setting | default | accepted | meaning |\n|---|---|---|---|\n"
     for field in types.type_info(kind).fields:  # type: ignore[attr-defined]
         if not isinstance(field.type, types.StructType | types.DictType):
-            cells = (f"`{field.name}`", _value(_default(field)), _accepted(field.type), comments.get(field.name, ""))
+            cells = (
+                f"`{field.name}`",
+                _value(_default(field)),
+                _accepted(field.type),
+                comments.get(field.name, ""),
+            )
             yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
 
 
 def _paragraphs(kind: Any) -> str:
-    return "\n\n".join(textwrap.fill(" ".join(part.split()), 100) for part in inspect.getdoc(kind).split("\n\n"))
+    return "\n\n".join(
+        textwrap.fill(" ".join(part.split()), 100) for part in inspect.getdoc(kind).split("\n\n")
+    )
 
 
 def _comments(kind: Any) -> dict[str, str]:
@@ -102,14 +109,18 @@ def _comments(kind: Any) -> dict[str, str]:
     fields = [node for node in ast.parse(source).body[0].body if isinstance(node, ast.AnnAssign)]  # type: ignore[attr-defined]
     return {
         ast.unparse(node.target): " ".join(
-            comments[line] for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in comments
+            comments[line]
+            for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+            if line in comments
         )
         for node in fields
     }
 
 
 def _default(field: types.Field) -> Any:
-    return field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
+    return (
+        field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
+    )
 
 
 def _value(value: Any) -> str:
@@ -143,14 +154,22 @@ def _accepted(kind: Any) -> str:
     if isinstance(kind, types.TupleType):
         return f"{len(kind.item_types)} numbers{_each(kind.item_types[0])}"
     if isinstance(kind, types.VarTupleType):
-        inner = kind.item_type.type if isinstance(kind.item_type, types.Metadata) else kind.item_type
+        inner = (
+            kind.item_type.type if isinstance(kind.item_type, types.Metadata) else kind.item_type
+        )
         if isinstance(inner, types.StructType):
             fields = "; ".join(f"`{field.name}`: {_accepted(field.type)}" for field in inner.fields)
             return f"tables with {fields}"
         if isinstance(inner, types.LiteralType):
             return f"a list of {_accepted(inner)}"
-        return f"a list of {'texts' if isinstance(inner, types.StrType) else f'numbers{_each(inner)}'}"
-    return ", ".join(filter(None, ("whole number" if isinstance(kind, types.IntType) else "number", _range(kind))))
+        return (
+            f"a list of {'texts' if isinstance(inner, types.StrType) else f'numbers{_each(inner)}'}"
+        )
+    return ", ".join(
+        filter(
+            None, ("whole number" if isinstance(kind, types.IntType) else "number", _range(kind))
+        )
+    )
 
 
 def _each(kind: Any) -> str:

@@ -16,7 +16,14 @@ from thirdhand_sim.lab.evidence import RESULTS, result_of, staleness, tree
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"
-STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision")  # the limiter has no tuned number
+STAGES = (
+    "intake",
+    "skill",
+    "setpoint",
+    "arm",
+    "separation",
+    "decision",
+)  # the limiter has no tuned number
 RECORD = re.compile(r"\s*# (\S+) to (\S+)\. More: (.+)\. Less: (.+)\.")
 HEAD = """# Tuned numbers
 
@@ -57,9 +64,15 @@ class Number(NamedTuple):
 def numbers_of(stage: str) -> Iterator[Number]:
     """The tuned numbers of a stage, which are those with a range in the line above."""
     values = vars(skill_tuning) if stage == "skill" else getattr(TUNING, stage)._asdict()
-    lines = (ROOT / "service" / "thirdhand" / "core" / stage / "tuning.py").read_text(encoding="utf-8").splitlines()
+    lines = (
+        (ROOT / "service" / "thirdhand" / "core" / stage / "tuning.py")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
     for node in ast.walk(ast.parse("\n".join(lines))):
-        if isinstance(node, (ast.Assign, ast.AnnAssign)) and (record := RECORD.fullmatch(lines[node.lineno - 2])):
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and (
+            record := RECORD.fullmatch(lines[node.lineno - 2])
+        ):
             name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
             low, high, more, less = record.groups()
             meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2]
@@ -74,7 +87,9 @@ def page() -> str:
     tables = {stage: list(numbers_of(stage)) for stage in STAGES}
     head = HEAD.format(count=sum(map(len, tables.values())), state=state)
     return head + "".join(
-        line for stage, numbers in tables.items() for line in _section(stage, numbers, result["numbers"])
+        line
+        for stage, numbers in tables.items()
+        for line in _section(stage, numbers, result["numbers"])
     )
 
 
@@ -92,16 +107,24 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
             number.meaning,
             number.more,
             number.less,
-            _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["moving_percent"])),
-            _both(effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["stops_mm"])),
+            _both(
+                effects,
+                lambda effect: ", ".join(f"{change:+.1f}" for change in effect["moving_percent"]),
+            ),
+            _both(
+                effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["stops_mm"])
+            ),
             _both(effects, _largest),
         )
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells[: len(titles)])} |\n"
+        escaped = [cell.replace("|", chr(92) + "|") for cell in cells[: len(titles)]]
+        yield f"| {' | '.join(escaped)} |\n"
 
 
 def _both(effects: Mapping[str, Any], text: Any) -> str:
     """The texts of the effects of half and twice a number."""
-    return "; ".join(f"×{factor}: {effect.get('fails') or text(effect)}" for factor, effect in effects.items())
+    return "; ".join(
+        f"×{factor}: {effect.get('fails') or text(effect)}" for factor, effect in effects.items()
+    )
 
 
 def _largest(effect: Mapping[str, Any]) -> str:
@@ -112,7 +135,11 @@ def _largest(effect: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    return f"{value:.6g}" if not hasattr(value, "__len__") else ", ".join(f"{one:.6g}" for one in value)
+    return (
+        f"{value:.6g}"
+        if not hasattr(value, "__len__")
+        else ", ".join(f"{one:.6g}" for one in value)
+    )
 
 
 if __name__ == "__main__":

@@ -21,8 +21,15 @@ def main(arguments: list[str] | None = None) -> list[float]:
     parser.add_argument("--connect", action="append", help="of the daemon or a router")
     parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
-    client, names, joints = client_settings(connect=args.connect), Settings().joints.names, list(Settings().arm.posture)
-    with client.session(timeout_s=None) as session, Follower(session, names, client.cell) as follower:
+    client, names, joints = (
+        client_settings(connect=args.connect),
+        Settings().joints.names,
+        list(Settings().arm.posture),
+    )
+    with (
+        client.session(timeout_s=None) as session,
+        Follower(session, names, client.cell) as follower,
+    ):
         begin, braking = time.monotonic(), True
         while time.monotonic() - begin < args.seconds:
             command = follower.command()  # waits for one, 20 ms at most
@@ -33,7 +40,9 @@ def main(arguments: list[str] | None = None) -> list[float]:
             if braking != (command is None):
                 braking = not braking
                 print(
-                    "no command for 20 ms: it brakes" if command is None else f"commands arrive, at tick {command.tick}"
+                    "no command for 20 ms: it brakes"
+                    if command is None
+                    else f"commands arrive, at tick {command.tick}"
                 )
             follower.tell(joints, velocity)
             time.sleep(PERIOD_S)

@@ -42,13 +42,20 @@ def poses(packet: bytes, stamp_ns: int) -> Iterator[tuple[str, PoseStamped]]:
 
 def main() -> None:
     """Publishes until Ctrl-C."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     p.add_argument("--port", type=int, default=PORT, help="UDP port to which the app sends")
-    p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    p.add_argument(
+        "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
+    )
     p.add_argument("--cell")
     args = p.parse_args()
     settings = client_settings(connect=args.connect, cell=args.cell)
-    with settings.session(timeout_s=None) as session, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream:
+    with (
+        settings.session(timeout_s=None) as session,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream,
+    ):
         publishers = {key: Publisher(session, settings.cell, key) for key in KEYS.values()}
         stream.bind(("", args.port))
         said = ""

@@ -17,7 +17,11 @@ def demonstrations(count: int) -> Array:
     """Positions (D, T, 2) [m] of a curve that is never drawn quite the same."""
     random = np.random.default_rng(0)
     path = 0.3 * np.hstack([np.sin(2 * TIMES), np.cos(3 * TIMES)])
-    return path + 0.01 * random.normal(size=(count, 1, 2)) + 0.001 * random.normal(size=(count, *path.shape))
+    return (
+        path
+        + 0.01 * random.normal(size=(count, 1, 2))
+        + 0.001 * random.normal(size=(count, *path.shape))
+    )
 
 
 def reference(shown: Array) -> Gaussians:
@@ -29,14 +33,19 @@ def reference(shown: Array) -> Gaussians:
 
 def main() -> KMP:
     """The adapted primitive; prints what it predicts."""
-    skill = KMP.fit(TIMES, reference(demonstrations(5)), kernel=GaussianKernel(ell=8.0), lambda_mean=1.0)
+    skill = KMP.fit(
+        TIMES, reference(demonstrations(5)), kernel=GaussianKernel(ell=8.0), lambda_mean=1.0
+    )
     there = Gaussians(np.array([[0.20, 0.10]]), np.array([1e-10 * np.eye(2)]))  # [m], to 10 µm
     adapted = skill.adapt(np.array([[1.0]]), there, tolerance=0.05)
     for name, primitive in (("as learned", skill), ("adapted", adapted)):
         found = primitive.predict(np.array([[0.5], [1.0], [1.5]]))
         for t, mean, covariance in zip((0.5, 1.0, 1.5), found.mean, found.covariance, strict=True):
             std = np.sqrt(np.trace(covariance) / 2)
-            print(f"{name:<11} at {t:.1f} s: ({mean[0]:+.3f}, {mean[1]:+.3f}) m, give or take {1000 * std:.1f} mm")
+            print(
+                f"{name:<11} at {t:.1f} s: ({mean[0]:+.3f}, {mean[1]:+.3f}) m, give or take "
+                f"{1000 * std:.1f} mm"
+            )
     return adapted
 
 

@@ -21,7 +21,9 @@ from thirdhand.contract.messages import PoseStamped
 FRAME = "optitrack"
 
 
-def poses(bodies: Iterable[Any], keys: Mapping[int, str], stamp_ns: int) -> Iterator[tuple[str, PoseStamped]]:
+def poses(
+    bodies: Iterable[Any], keys: Mapping[int, str], stamp_ns: int
+) -> Iterator[tuple[str, PoseStamped]]:
     """Key and pose of each of a frame's rigid bodies that is wanted, and is tracked in it.
 
     `keys` are what bodies are, by their numbers in Motive.
@@ -40,8 +42,12 @@ def main() -> None:
     p.add_argument("--server", default="127.0.0.1", help="address of the machine with Motive")
     p.add_argument("--local", default="127.0.0.1", help="address of this machine on that network")
     for name in ("left", "right", "tool"):
-        p.add_argument(f"--{name}", type=int, required=name != "tool", help="number of its rigid body")
-    p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+        p.add_argument(
+            f"--{name}", type=int, required=name != "tool", help="number of its rigid body"
+        )
+    p.add_argument(
+        "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
+    )
     p.add_argument("--cell")
     args = p.parse_args()
     settings = client_settings(connect=args.connect, cell=args.cell)
@@ -60,7 +66,10 @@ def main() -> None:
                 client.connect()
             except (TimeoutError, OSError, NatNetError) as error:
                 reason = str(error) or "no answer"
-                print(f"waiting for Motive at {args.server}, which must stream as unicast: {reason}", file=sys.stderr)
+                print(
+                    f"waiting for Motive at {args.server}, which must stream as unicast: {reason}",
+                    file=sys.stderr,
+                )
                 time.sleep(1)
         with client:
             client.run_async()

@@ -23,18 +23,29 @@ class FakeArm:
 
     period_s: float = 0.002  # at which the drive takes what is written
     takes_velocity: bool = False  # it is led by positions, and keeps to them by itself
-    lag_s: float = 0.0  # of its servo, which `thirdhand doctor` measures: what is written leads by it
-    speed_limits: SpeedLimits | None = None  # less than in `limits` at some positions, where the drive has such
+    lag_s: float = (
+        0.0  # of its servo, which `thirdhand doctor` measures: what is written leads by it
+    )
+    speed_limits: SpeedLimits | None = (
+        None  # less than in `limits` at some positions, where the drive has such
+    )
 
     def __init__(self, settings: Settings) -> None:
-        self.limits = settings.joints  # names, and what the drive can do: no less than what is commanded
-        self.position, self.velocity = np.array(settings.arm.posture), np.zeros(len(settings.joints.names))
+        self.limits = (
+            settings.joints
+        )  # names, and what the drive can do: no less than what is commanded
+        self.position, self.velocity = (
+            np.array(settings.arm.posture),
+            np.zeros(len(settings.joints.names)),
+        )
 
     def __enter__(self) -> "FakeArm":  # switch the drives on: the arm stands
         self._read_s = time.monotonic()
         return self
 
-    def __exit__(self, *_: object) -> None: ...  # the arm is at rest, or something failed: switch them off
+    def __exit__(
+        self, *_: object
+    ) -> None: ...  # the arm is at rest, or something failed: switch them off
 
     def stands_at(self) -> np.ndarray:  # before they are on [rad]
         return self.position
@@ -45,17 +56,32 @@ class FakeArm:
         self._read_s = max(due, time.monotonic() - 0.05)
         return Measured(self.position, self.velocity, self._read_s - before)
 
-    def write(self, position: np.ndarray, velocity: np.ndarray) -> None:  # where to be when the next one does
-        self.move(np.clip(position + self.lag_s * velocity, self.limits.lower, self.limits.upper), velocity)
+    def write(
+        self, position: np.ndarray, velocity: np.ndarray
+    ) -> None:  # where to be when the next one does
+        self.move(
+            np.clip(position + self.lag_s * velocity, self.limits.lower, self.limits.upper),
+            velocity,
+        )
 
-    def move(self, position: np.ndarray, velocity: np.ndarray) -> None:  # a servo is late; this one is not
+    def move(
+        self, position: np.ndarray, velocity: np.ndarray
+    ) -> None:  # a servo is late; this one is not
         self.position, self.velocity = position, velocity
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", type=Path, help="settings of the cell: joints, and where they begin, [arm] posture")
-    parser.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--config",
+        type=Path,
+        help="settings of the cell: joints, and where they begin, [arm] posture",
+    )
+    parser.add_argument(
+        "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
+    )
     args, stop = parser.parse_args(), threading.Event()
     settings = load(args.config) if args.config else Settings()
     where = args.connect or (settings.network.reached_at if args.config else None)

@@ -12,18 +12,25 @@ import time
 from thirdhand import Tracker, client_settings
 
 RATE_HZ = 100
-LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # frame base [m]: x forward from the arm, y to its left, z up
+LEFT, RIGHT = (
+    (0.98, -0.32, 0.06),
+    (0.98, 0.32, 0.06),
+)  # frame base [m]: x forward from the arm, y to its left, z up
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Publishes for so many seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    parser.add_argument(
+        "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
+    )
     parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
     client = client_settings(connect=args.connect)
     with (
-        client.session(timeout_s=None) as session,  # None: it waits for who listens, whoever is started first
+        client.session(
+            timeout_s=None
+        ) as session,  # None: it waits for who listens, whoever is started first
         Tracker(session, client.cell, timeout_s=None) as tracker,
     ):
         begin = time.monotonic()

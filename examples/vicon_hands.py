@@ -23,7 +23,10 @@ from thirdhand.contract.messages import PoseStamped, Quaternion
 
 FRAME = "vicon"
 PORT = 51001
-HEAD, ITEM = struct.Struct("<IB"), struct.Struct("<BH")  # frame and number of items; kind and size of an item
+HEAD, ITEM = (
+    struct.Struct("<IB"),
+    struct.Struct("<BH"),
+)  # frame and number of items; kind and size of an item
 OBJECT = struct.Struct("<24s6d")  # name, x y z [mm], rotations about the moving x, y and z [rad]
 
 
@@ -38,7 +41,9 @@ def quaternion(x: float, y: float, z: float) -> Quaternion:
     )
 
 
-def poses(packet: bytes, keys: Mapping[str, str], stamp_ns: int) -> Iterator[tuple[str, PoseStamped]]:
+def poses(
+    packet: bytes, keys: Mapping[str, str], stamp_ns: int
+) -> Iterator[tuple[str, PoseStamped]]:
     """Key and pose of each wanted object in a packet; `keys` are by the objects' names. An object
     that Tracker does not see has zeros, and is left out. Raises ValueError for another packet.
     """
@@ -53,21 +58,32 @@ def poses(packet: bytes, keys: Mapping[str, str], stamp_ns: int) -> Iterator[tup
                 x, y, z = (value / 1000 for value in numbers[:3])
                 yield key, PoseStamped(stamp_ns, FRAME, (x, y, z), quaternion(*numbers[3:]))
     except struct.error as error:
-        raise ValueError(f"{len(packet)} bytes are no packet of Vicon Tracker's UDP object stream: {error}") from None
+        raise ValueError(
+            f"{len(packet)} bytes are no packet of Vicon Tracker's UDP object stream: {error}"
+        ) from None
 
 
 def main() -> None:
     """Publishes until Ctrl-C."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name in ("left", "right", "tool"):
         p.add_argument(f"--{name}", required=name != "tool", help="name of its object in Tracker")
     p.add_argument("--port", type=int, default=PORT, help="UDP port of the stream")
-    p.add_argument("--connect", action="append", help="of the daemon, of `thirdhand record` or of a router")
+    p.add_argument(
+        "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
+    )
     p.add_argument("--cell")
     args = p.parse_args()
     settings = client_settings(connect=args.connect, cell=args.cell)
-    keys = {args.left: "hands/left", args.right: "hands/right"} | ({args.tool: "tool/pose"} if args.tool else {})
-    with settings.session(timeout_s=None) as session, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream:
+    keys = {args.left: "hands/left", args.right: "hands/right"} | (
+        {args.tool: "tool/pose"} if args.tool else {}
+    )
+    with (
+        settings.session(timeout_s=None) as session,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stream,
+    ):
         publishers = {key: Publisher(session, settings.cell, key) for key in keys.values()}
         stream.bind(("", args.port))
         said = ""

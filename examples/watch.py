@@ -23,7 +23,9 @@ def main(arguments: list[str] | None = None) -> None:
         end = time.monotonic() + args.seconds
         while time.monotonic() < end:
             now = {
-                cell.name: f"{cell.status.mode} {cell.status.reason}".strip() if cell.status else "does not answer"
+                cell.name: f"{cell.status.mode} {cell.status.reason}".strip()
+                if cell.status
+                else "does not answer"
                 for cell in cells(session)
             }
             for name in sorted(said.keys() | now.keys()):

@@ -49,7 +49,8 @@ if njit is not None:
             if function.__module__.startswith("kmp.") and not self.made:
                 self.made = True
                 logging.getLogger("kmp").warning(
-                    "kmp compiles its loops for this machine: some seconds, once; later runs load them from its cache."
+                    "kmp compiles its loops for this machine: some seconds, once; later runs load "
+                    "them from its cache."
                 )
 
         def on_end(self, event: Any) -> None:

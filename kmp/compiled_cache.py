@@ -44,7 +44,9 @@ _number_anew()
 os.register_at_fork(after_in_child=_number_anew)
 
 UNUSED_S = 90 * 86400.0  # a file that was not read for this time is removed
-IMPORTS = re.compile(rb"^ *(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +([\w.]+))", re.MULTILINE)
+IMPORTS = re.compile(
+    rb"^ *(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +([\w.]+))", re.MULTILINE
+)
 WORDS = re.compile(r"\w+")
 _DIGEST_BYTES = 32
 
@@ -80,7 +82,8 @@ class CompiledCache:
         target.refresh()
         with contextlib.suppress(OSError):
             content = self._path(signature, target.codegen()).read_bytes()
-            digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+            digest = content[:_DIGEST_BYTES]
+            payload = content[_DIGEST_BYTES:]
             if hashlib.sha256(payload).digest() == digest:
                 return CompileResult._rebuild(target, *pickle.loads(payload))  # noqa: SLF001
         return None
@@ -115,7 +118,9 @@ def cache_folder() -> Path | None:
     """The first folder that can be written: `NUMBA_CACHE_DIR`, or the user's cache, or the one of
     this package's bytecode; None if there is none.
     """
-    user_cache = config.CACHE_DIR or os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "numba")
+    user_cache = config.CACHE_DIR or os.path.join(
+        os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "numba"
+    )
     for folder in (Path(user_cache, "kmp"), Path(__file__).parent / "__pycache__"):
         with contextlib.suppress(OSError):
             if folder.is_absolute():
@@ -151,7 +156,11 @@ def _sources_digest(file: Path, package: str) -> str:
 def _read(file: Path, package: str) -> tuple[str, tuple[Path, ...]]:
     """Digest of a file, and the files of the modules that it imports."""
     content = file.read_bytes()
-    imported = {found for name in _imported_names(content) if (found := _module_file(name, package)) is not None}
+    imported = {
+        found
+        for name in _imported_names(content)
+        if (found := _module_file(name, package)) is not None
+    }
     return hashlib.sha256(content).hexdigest(), tuple(imported)
 
 

@@ -64,12 +64,19 @@ class LinearConstraints(Immutable):
     def joined(self, other: LinearConstraints) -> LinearConstraints:
         """These constraints, then the others. Raises ValueError if I or O differs."""
         check_kind("other", other, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
-        shapes = [(constraints.inputs.shape[1], constraints.normals.shape[1]) for constraints in (self, other)]
+        shapes = [
+            (constraints.inputs.shape[1], constraints.normals.shape[1])
+            for constraints in (self, other)
+        ]
         if shapes[0] != shapes[1]:
-            raise ValueError(f"other: constraints of {shapes[1]} inputs and outputs given, {shapes[0]} needed.")
+            raise ValueError(
+                f"other: constraints of {shapes[1]} inputs and outputs given, {shapes[0]} needed."
+            )
         points = Functionals.concatenated([self.functionals, other.functionals])
         normals = np.concatenate([self.normals, other.normals])
-        return LinearConstraints(points.inputs, normals, np.concatenate([self.bounds, other.bounds]), points.directions)
+        return LinearConstraints(
+            points.inputs, normals, np.concatenate([self.bounds, other.bounds]), points.directions
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,8 +112,10 @@ class Constrained(Expansion):
     @cached_property
     def weights(self) -> Array:
         """(N + J, O) the weights of their kernels."""
-        constraints, outputs = self.constraints, self.hyperparameters.outputs
-        kernel, c = self.hyperparameters.kernel, self.hyperparameters.kernel.channels
+        constraints = self.constraints
+        outputs = self.hyperparameters.outputs
+        kernel = self.hyperparameters.kernel
+        c = self.hyperparameters.kernel.channels
         normals = constraints.normals.reshape(len(constraints), c, -1)
         points = constraints.functionals
         across = between(kernel, self.solution.functionals, points).reshape(-1, c, len(points), c)
@@ -129,8 +138,9 @@ class Constrained(Expansion):
         missed = -slack(kkt_multipliers) / size
         for worst in np.flatnonzero(missed > _VIOLATION)[:1]:
             raise ValueError(
-                f"The constraints cannot be met together: {worst} is missed by {missed[worst]:.3g}. They contradict "
-                "each other, or the reference's variance there is too small: give it more, or fewer constraints."
+                f"The constraints cannot be met together: {worst} is missed by "
+                f"{missed[worst]:.3g}. They contradict each other, or the reference's variance "
+                "there is too small: give it more, or fewer constraints."
             )
         return frozen(weights(kkt_multipliers))
 
@@ -170,13 +180,21 @@ def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:
     root = np.sqrt(np.maximum(values, _RIDGE * values[-1]))
     from scipy.optimize import nnls  # its import takes a quarter of a second
 
-    multipliers = nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[0] / size
+    multipliers = (
+        nnls(root[:, None] * vectors.T, vectors.T @ (-slack(np.zeros(len(scaled))) / size) / root)[
+            0
+        ]
+        / size
+    )
     for _ in range(_ROUNDS):
         left = slack(multipliers)
         acts = (multipliers > 0) | (left < 0)
         if not acts.any() or np.abs(left[acts]).max() <= _CONVERGED:
             break
-        step = np.linalg.lstsq(scaled[np.ix_(acts, acts)], -left[acts] / size[acts], rcond=1e-13)[0] / size[acts]
+        step = (
+            np.linalg.lstsq(scaled[np.ix_(acts, acts)], -left[acts] / size[acts], rcond=1e-13)[0]
+            / size[acts]
+        )
         multipliers = multipliers.copy()
         multipliers[acts] = np.maximum(multipliers[acts] + step, 0.0)
     return multipliers

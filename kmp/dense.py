@@ -29,7 +29,9 @@ from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, Expansion, check_resolved
 
-_LEAST_SHARED = 0.75  # a border is faster than a fit if at least this share of points precedes the first change
+_LEAST_SHARED = (
+    0.75  # a border is faster than a fit if at least this share of points precedes the first change
+)
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
 _COLUMNS = 64  # columns of a factor that are copied at once
 
@@ -52,7 +54,9 @@ class _Removed(NamedTuple):
         unit = np.zeros((len(base), len(rows)), order="F")
         unit[rows, np.arange(len(rows))] = 1.0
         span, root = np.linalg.qr(lapack.dtrtrs(base, unit, lower=1)[0])
-        return cls(frozen(rows), frozen(np.delete(np.arange(len(base)), rows)), frozen(span), frozen(root))
+        return cls(
+            frozen(rows), frozen(np.delete(np.arange(len(base)), rows)), frozen(span), frozen(root)
+        )
 
     def projected(self, base: Array, right: Array, removed: Array | None = None) -> Array:
         """(I - Q Q^T) L^-1 x (p, J), for the remaining rows of x (p - q, J).
@@ -94,11 +98,15 @@ class _Bordered(NamedTuple):
 
     def whole(self) -> Array:
         """The factor as one array (p + m, p + m)."""
-        p, n = len(self.base), sum(self.border.shape)
+        p = len(self.base)
+        n = sum(self.border.shape)
         factor = np.zeros((n, n), order="F")  # LAPACK's order: each use would copy another
-        for a in range(0, p, _COLUMNS):  # pages above the diagonal are not written, and take no memory
+        for a in range(
+            0, p, _COLUMNS
+        ):  # pages above the diagonal are not written, and take no memory
             factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
-        factor[p:, :p], factor[p:, p:] = self.border.T, self.corner
+        factor[p:, :p] = self.border.T
+        factor[p:, p:] = self.corner
         return frozen(factor)
 
 
@@ -110,7 +118,9 @@ class Dense(Expansion):
     """
 
     # A copy in another process predicts without the factors; only `adapted` computes them again.
-    _not_pickled = frozenset({"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver"})
+    _not_pickled = frozenset(
+        {"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver"}
+    )
 
     hyperparameters: Hyperparameters
     database: Database
@@ -136,12 +146,14 @@ class Dense(Expansion):
 
     def times_inverse(self, right: Array) -> Array:
         """(K + lambda Sigma)^-1 times (N, O), or (N, O, J)."""
-        columns, solver = (
-            right.reshape(len(self.database) * self.hyperparameters.kernel.channels * self.distinct, -1),
-            self._mean_solver,
+        columns = right.reshape(
+            len(self.database) * self.hyperparameters.kernel.channels * self.distinct, -1
         )
+        solver = self._mean_solver
         solution = (
-            lapack.dpotrs(solver, columns, lower=1)[0] if isinstance(solver, np.ndarray) else solver.solve(columns)
+            lapack.dpotrs(solver, columns, lower=1)[0]
+            if isinstance(solver, np.ndarray)
+            else solver.solve(columns)
         )
         return np.ascontiguousarray(solution).reshape(right.shape)
 
@@ -152,28 +164,41 @@ class Dense(Expansion):
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         root = self.inverse_factor.times_one(row.T)
-        prior_covariance = self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
-        return self._for_all_outputs(np.asarray(prior_covariance - blas.dgemm(1.0, root, root, trans_b=1)))
+        prior_covariance = (
+            self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
+        )
+        return self._for_all_outputs(
+            np.asarray(prior_covariance - blas.dgemm(1.0, root, root, trans_b=1))
+        )
 
     def posterior_covariance(self, rows: Array) -> Array:
         roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
-        return self._for_all_outputs(np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots))
+        return self._for_all_outputs(
+            np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots)
+        )
 
     def adapted(self, changes: Changes) -> Dense:
         """The base's solution with these changes; it shares the base's factor if that is faster."""
         base = self.base or self
-        count, replaced = len(base.database), changes.replaced
-        database, first = base.database.changed(changes), int(replaced[0]) if len(replaced) else count
+        count = len(base.database)
+        replaced = changes.replaced
+        database = base.database.changed(changes)
+        first = int(replaced[0]) if len(replaced) else count
         if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
             solution = Dense(self.hyperparameters, database, base, count - len(replaced), replaced)
             if solution.distinct >= base.distinct:
                 return solution
-        return Dense(self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0)
+        return Dense(
+            self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0
+        )
 
     def extended(self, database: Database) -> Dense:
         """The solution of a database that begins with this one: the factors get a border."""
         bordered = Dense(self.hyperparameters, database, self, len(self.database))
-        factors = {"_mean_solver": bordered.mean_factor, "_covariance_solver": bordered.covariance_factor}
+        factors = {
+            "_mean_solver": bordered.mean_factor,
+            "_covariance_solver": bordered.covariance_factor,
+        }
         return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
@@ -185,7 +210,8 @@ class Dense(Expansion):
     @cached_property
     def distinct(self) -> int:
         """The number of outputs of a channel in the factors: D, or 1 if one factor serves all."""
-        c, d = self.hyperparameters.kernel.channels, self.hyperparameters.channel_outputs
+        c = self.hyperparameters.kernel.channels
+        d = self.hyperparameters.channel_outputs
         covariance = self.database.reference.covariance
         first = covariance.reshape(-1, c, d, c, d)[:, :, 0, :, 0]
         return 1 if np.array_equal(covariance, kron_identity(first, d)) else d
@@ -226,7 +252,9 @@ class Dense(Expansion):
 
     @cached_property
     def _mean_solver(self) -> Array | _Bordered:
-        return self._factorised(self.hyperparameters.lambda_mean, self.base.mean_factor if self.base else None)
+        return self._factorised(
+            self.hyperparameters.lambda_mean, self.base.mean_factor if self.base else None
+        )
 
     @cached_property
     def _covariance_solver(self) -> Array | _Bordered:
@@ -234,14 +262,22 @@ class Dense(Expansion):
         check_resolved(parameters, self.database.since(self.same), first=self.same)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self._mean_solver
-        return self._factorised(parameters.lambda_covariance, self.base.covariance_factor if self.base else None)
+        return self._factorised(
+            parameters.lambda_covariance, self.base.covariance_factor if self.base else None
+        )
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array | _Bordered:
         """The Cholesky factor with this lambda, bordering the base's if that is shared."""
         rows = self._rows(penalty)
-        if base_factor is not None and self.base is not None and self.base.distinct != self.distinct:
+        if (
+            base_factor is not None
+            and self.base is not None
+            and self.base.distinct != self.distinct
+        ):
             d = self.hyperparameters.channel_outputs
-            base_factor = kron_identity(base_factor, d) if self.distinct == d else base_factor[::d, ::d]
+            base_factor = (
+                kron_identity(base_factor, d) if self.distinct == d else base_factor[::d, ::d]
+            )
         if base_factor is None or self.same == 0:
             # In place: the matrix is symmetric, and its transpose has LAPACK's order.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
@@ -251,39 +287,52 @@ class Dense(Expansion):
         if info:
             point = self.same + (info - 1) // (self.hyperparameters.kernel.channels * self.distinct)
             raise ValueError(
-                f"K + lambda Sigma is not positive definite to working precision at point {point}, with lambda "
-                f"{penalty:g}. A point this near to others needs more variance, or a larger lambda or ell."
+                f"K + lambda Sigma is not positive definite to working precision at point {point}, "
+                f"with lambda {penalty:g}. A point this near to others needs more variance, or a "
+                "larger lambda or ell."
             )
         return solver
 
     def _bordered(self, rows: Array, base_factor: Array) -> tuple[_Bordered, int]:
         """The base's factor bordered by these rows, without removed points; LAPACK's info."""
-        p, removed = rows.shape[1] - len(rows), None
+        p = rows.shape[1] - len(rows)
+        removed = None
         columns = rows[:, :p].T
         if self.gone is None or self.base is None:
             shared = np.asfortranarray(base_factor[:p, :p])
             border, _ = lapack.dtrtrs(shared, columns, lower=1)
         else:
-            shared, kernel = np.asfortranarray(base_factor), self.hyperparameters.kernel
-            o, removed_points = kernel.channels * self.distinct, self.base.database.functionals.take(self.gone)
+            shared = np.asfortranarray(base_factor)
+            kernel = self.hyperparameters.kernel
+            o = kernel.channels * self.distinct
+            removed_points = self.base.database.functionals.take(self.gone)
             removed = _Removed.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
-            across = between(kernel, removed_points, self.database.functionals.take(slice(self.same, None)))
+            across = between(
+                kernel, removed_points, self.database.functionals.take(slice(self.same, None))
+            )
             border = removed.projected(shared, columns, kron_identity(across, self.distinct))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), removed), info
 
     def _rows(self, penalty: float) -> Array:
         """The rows of K (x) I + lambda Sigma that the base does not share, with all columns."""
-        kernel, first = self.hyperparameters.kernel, self.same
-        c, d, outputs = kernel.channels, self.distinct, self.hyperparameters.channel_outputs
+        kernel = self.hyperparameters.kernel
+        first = self.same
+        c = kernel.channels
+        d = self.distinct
+        outputs = self.hyperparameters.channel_outputs
         o = c * d
-        points, count, changed = self.database.functionals, len(self.database), len(self.database) - first
+        points = self.database.functionals
+        count = len(self.database)
+        changed = len(self.database) - first
         rows = np.zeros((changed, c, d, count, c, d))
         k = between(kernel, points.take(slice(first, None)), points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
         diagonal = np.arange(changed)
         blocks = rows.reshape(changed, o, count, o)
-        covariance = self.database.reference.covariance[first:].reshape(changed, c, outputs, c, outputs)[:, :, :d, :, :d]
+        covariance = self.database.reference.covariance[first:].reshape(
+            changed, c, outputs, c, outputs
+        )[:, :, :d, :, :d]
         blocks[diagonal, :, diagonal + first, :] += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)

@@ -16,8 +16,10 @@ from kmp.compiled import compiled
 
 # log(2) and pi / 2 as sums of two numbers, the first with so few bits that its products with
 # integers below 2^20 are exact.
-LOG_2_HIGH, LOG_2_LOW = float.fromhex("0x1.62e42fee00000p-1"), float.fromhex("0x1.a39ef35793c76p-33")
-HALF_PI_HIGH, HALF_PI_LOW = float.fromhex("0x1.921fb54400000p+0"), float.fromhex("0x1.0b4611a626331p-34")
+LOG_2_HIGH = float.fromhex("0x1.62e42fee00000p-1")
+LOG_2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
+HALF_PI_HIGH = float.fromhex("0x1.921fb54400000p+0")
+HALF_PI_LOW = float.fromhex("0x1.0b4611a626331p-34")
 LARGEST_EXPONENT = 708.0  # exp of more is infinite, exp of less than its negative is 0
 
 # Coefficients of Taylor series without their first terms, from the last one on.
@@ -58,7 +60,9 @@ def log(x: float) -> float:
         m *= 2.0
         k -= 1
     s = (m - 1.0) / (m + 1.0)
-    return k * LOG_2_HIGH + (k * LOG_2_LOW + (2.0 * s + s * (s * s) * polynomial(LOG_SERIES, s * s)))
+    return k * LOG_2_HIGH + (
+        k * LOG_2_LOW + (2.0 * s + s * (s * s) * polynomial(LOG_SERIES, s * s))
+    )
 
 
 @compiled

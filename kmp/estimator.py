@@ -59,7 +59,9 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
         Raises ValueError as `KMP.fit` and scikit-learn's checks do.
         """
-        inputs, outputs = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        inputs, outputs = validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64
+        )
         self._one_output = outputs.ndim == 1
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
         spread = outputs.var(axis=0)
@@ -105,5 +107,7 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         if not isinstance(self.ell, str):
             return self.ell
         if self.ell != "scale":
-            raise ValueError(f'ell: {brief(self.ell)} given, a number, one for each input, or "scale" needed.')
+            raise ValueError(
+                f'ell: {brief(self.ell)} given, a number, one for each input, or "scale" needed.'
+            )
         return 1.0 / (inputs.shape[1] * (float(inputs.var()) or 1.0))

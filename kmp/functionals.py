@@ -76,4 +76,8 @@ class Functionals(Immutable):
         if self.directions is None:
             return None
         rows = np.flatnonzero(~self.values)
-        return Derivatives(frozen(rows), frozen(self.directions[rows] * stretch)) if len(rows) else None
+        return (
+            Derivatives(frozen(rows), frozen(self.directions[rows] * stretch))
+            if len(rows)
+            else None
+        )

@@ -32,7 +32,9 @@ class Gaussians(Immutable):
 
     def __post_init__(self) -> None:
         mean = numbers("mean", self.mean, "N", "O")
-        self.__dict__.update(mean=mean, covariance=covariances("covariance", self.covariance, *mean.shape))
+        self.__dict__.update(
+            mean=mean, covariance=covariances("covariance", self.covariance, *mean.shape)
+        )
 
     @classmethod
     def of(cls, mean: ArrayLike, *, deviation: ArrayLike) -> Gaussians:
@@ -49,10 +51,15 @@ class Gaussians(Immutable):
         deviations = real("deviation", deviation)
         if deviations.shape not in {(), means.shape[1:], means.shape}:
             shape_text = f"(), {means.shape[1:]} or {means.shape}"
-            raise ValueError(f"deviation: shape {deviations.shape} given, {shape_text} needed for a mean of {means.shape}.")
+            raise ValueError(
+                f"deviation: shape {deviations.shape} given, {shape_text} needed for a mean of "
+                f"{means.shape}."
+            )
         check_finite("deviation", deviations)
         if (deviations < 0).any():
-            raise ValueError(f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact.")
+            raise ValueError(
+                f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact."
+            )
         variances = np.maximum(np.broadcast_to(deviations, means.shape) ** 2, _EXACT)
         check_finite("deviation", variances, "too large for its square:")
         return unchecked(means.copy(), variances[:, :, None] * np.eye(means.shape[1]))
@@ -92,7 +99,9 @@ class Gaussians(Immutable):
         """
         a = numbers("matrix", matrix, "P", self.outputs)
         b = numbers("offset", offset, len(a))
-        covariance = covariances("matrix: covariance", symmetric(a @ self.covariance @ a.T), len(self), len(a))
+        covariance = covariances(
+            "matrix: covariance", symmetric(a @ self.covariance @ a.T), len(self), len(a)
+        )
         return Gaussians(self.mean @ a.T + b, covariance)
 
     def product(self, *others: Gaussians) -> Gaussians:
@@ -105,7 +114,9 @@ class Gaussians(Immutable):
         for other in others:
             check_gaussians("product", other)
             if other.mean.shape != self.mean.shape:
-                raise ValueError(f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed.")
+                raise ValueError(
+                    f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed."
+                )
         precisions = [np.linalg.inv(factor.covariance) for factor in factors]
         covariance = symmetric(np.linalg.inv(np.sum(precisions, axis=0)))
         return Gaussians(fused_mean(covariance, precisions, factors), covariance)
@@ -118,7 +129,8 @@ class Gaussians(Immutable):
         if len(nonempty := [part for part in parts if len(part)]) == 1:
             return nonempty[0]
         return unchecked(
-            np.concatenate([part.mean for part in parts]), np.concatenate([part.covariance for part in parts])
+            np.concatenate([part.mean for part in parts]),
+            np.concatenate([part.covariance for part in parts]),
         )
 
 
@@ -129,9 +141,14 @@ def unchecked(mean: Array, covariance: Array) -> Gaussians:
     return self
 
 
-def fused_mean(covariance: Array, precisions: Sequence[NDArray[Any]], factors: Sequence[Gaussians]) -> Array:
+def fused_mean(
+    covariance: Array, precisions: Sequence[NDArray[Any]], factors: Sequence[Gaussians]
+) -> Array:
     """Sigma sum_l P_l mu_l (N, O), of precisions P_l and a covariance Sigma (N, O, O)."""
-    pulls = [precision @ factor.mean[:, :, None] for precision, factor in zip(precisions, factors, strict=True)]
+    pulls = [
+        precision @ factor.mean[:, :, None]
+        for precision, factor in zip(precisions, factors, strict=True)
+    ]
     return np.asarray((covariance @ np.sum(pulls, axis=0))[:, :, 0])
 
 
@@ -146,7 +163,8 @@ def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> No
     """Raise ValueError unless each input (N, I) has one normal, over this number of outputs."""
     check_gaussians(name, points)
     if points.mean.shape != (len(inputs), outputs):
-        n, points_text = len(inputs), f"{len(points)} normals over {points.outputs} outputs"
+        n = len(inputs)
+        points_text = f"{len(points)} normals over {points.outputs} outputs"
         raise ValueError(f"{name}: {points_text} given for {n} inputs; {n} over {outputs} needed.")
 
 
@@ -162,15 +180,20 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     alone = np.count_nonzero(covariance, axis=2) == 1
-    exact = alone & (variances > 0) & (variances < _EXACT_BELOW)  # exact outputs of `Gaussians.of`, beside others that are not
+    exact = (
+        alone & (variances > 0) & (variances < _EXACT_BELOW)
+    )  # exact outputs of `Gaussians.of`, beside others that are not
     filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
     try:
         smallest = np.linalg.eigvalsh(filled)[:, 0]
     except np.linalg.LinAlgError:
-        raise ValueError(f"{name}: {brief(value)} given, and its eigenvalues cannot be found.") from None
+        raise ValueError(
+            f"{name}: {brief(value)} given, and its eigenvalues cannot be found."
+        ) from None
     for n in np.flatnonzero(smallest <= covariance.shape[1] * _MACHINE * size)[:1]:
         raise ValueError(
             f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest[n]:.3g}, "
-            "and must be above 0. Add a small variance to the diagonal: (deviation that may be ignored)^2."
+            "and must be above 0. Add a small variance to the diagonal: (deviation that may be "
+            "ignored)^2."
         )
     return frozen(symmetric(covariance))

@@ -55,7 +55,9 @@ class Kernel(Protocol):
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         """The scale, and the stretch (I,) of the inputs."""
 
-    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
+    def __call__(
+        self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
+    ) -> Array:
         """k(a, b) of every pair: (A, I), (B, I) -> (A C, B C).
 
         Where a direction in `along_a` (A, I) or `along_b` (B, I) is not zero, the derivative of k
@@ -70,12 +72,18 @@ class Kernel(Protocol):
         """k (R,) of the offsets, as if all centres were values."""
 
     @staticmethod
-    def row(offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None) -> Array:
+    def row(
+        offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None
+    ) -> Array:
         """k(s, s_r): (R,) if C is 1, else (C, R C)."""
 
     @staticmethod
     def jacobian(
-        offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weight_rows: Array,
+        derivatives: Derivatives | None = None,
     ) -> Array:
         """d/dx sum_r k(s, s_r) w_r (O, I), of weights w as rows (D, R C)."""
 
@@ -99,7 +107,9 @@ def between(kernel: Kernel, a: Functionals, b: Functionals) -> Array:
 def variances(kernel: Kernel, functionals: Functionals) -> Array:
     """k (N, C) of each functional with itself."""
     if functionals.directions is None:
-        return np.broadcast_to(np.diagonal(kernel.prior_variance), (len(functionals), kernel.channels))
+        return np.broadcast_to(
+            np.diagonal(kernel.prior_variance), (len(functionals), kernel.channels)
+        )
     return kernel.variances(functionals.directions)
 
 
@@ -142,7 +152,8 @@ class GaussianKernel(Immutable):
         """Raise ValueError unless there is one ell for each input, or one for all."""
         if np.ndim(self.ell) and np.size(self.ell) != inputs:
             raise ValueError(
-                f"kernel's ell: {np.size(self.ell)} values given, 1 or {inputs} needed for {inputs} inputs."
+                f"kernel's ell: {np.size(self.ell)} values given, 1 or {inputs} needed for "
+                f"{inputs} inputs."
             )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
@@ -150,16 +161,22 @@ class GaussianKernel(Immutable):
             return self.ell, unstretched(inputs)
         return 1.0, frozen(np.sqrt(self.ell))
 
-    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
+    def __call__(
+        self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
+    ) -> Array:
         scale, stretch = self.coordinates(a.shape[1])
-        x, y = a * stretch, b * stretch
+        x = a * stretch
+        y = b * stretch
         k = np.exp(-scale * cdist(x, y, "sqeuclidean"))
         if along_a is None and along_b is None:
             return k
         i, u = directed(along_a, stretch)
         j, v = directed(along_b, stretch)
-        origin = y[:1].sum(axis=0)  # a shift to the first point, as differences of small numbers round less
-        x, y = x - origin, y - origin
+        origin = y[:1].sum(
+            axis=0
+        )  # a shift to the first point, as differences of small numbers round less
+        x = x - origin
+        y = y - origin
         left = 2 * scale * (u @ y.T - np.vecdot(x[i], u)[:, None])  # (I', B)
         right = 2 * scale * (x @ v.T - np.vecdot(y[j], v))  # (A, J')
         mixed = k[np.ix_(i, j)] * (left[:, j] * right[i] + 2 * scale * (u @ v.T))
@@ -180,20 +197,28 @@ class GaussianKernel(Immutable):
         return np.asarray(np.exp(value, value))
 
     @staticmethod
-    def row(offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None) -> Array:
+    def row(
+        offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None
+    ) -> Array:
         if derivatives is None:
             return values
-        row, (rows, along) = values.copy(), derivatives
+        row = values.copy()
+        rows, along = derivatives
         row[rows] *= 2 * scale * np.vecdot(offsets[rows], along)
         return row
 
     @staticmethod
     def jacobian(
-        offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weight_rows: Array,
+        derivatives: Derivatives | None = None,
     ) -> Array:
         if derivatives is None:
             return np.asarray((weight_rows * (values * (-2 * scale))) @ offsets)
-        row, (rows, along) = GaussianKernel.row(offsets, values, scale, derivatives), derivatives
+        row = GaussianKernel.row(offsets, values, scale, derivatives)
+        rows, along = derivatives
         through = (weight_rows[:, rows] * (values[rows] * (2 * scale))) @ along
         return np.asarray((weight_rows * (row * (-2 * scale))) @ offsets + through)
 

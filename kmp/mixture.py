@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from kmp.arrays.checks import Array, brief, check_finite, check_some, numbers, positive, seeded, whole
+from kmp.arrays.checks import (
+    Array,
+    brief,
+    check_finite,
+    check_some,
+    numbers,
+    positive,
+    seeded,
+    whole,
+)
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
@@ -34,18 +43,24 @@ class GaussianMixture(Immutable):
     covariances: Array
 
     def __repr__(self) -> str:
-        return f"GaussianMixture({len(self.weights)} components over {self.means.shape[1]} dimensions)"
+        return (
+            f"GaussianMixture({len(self.weights)} components over {self.means.shape[1]} dimensions)"
+        )
 
     def __post_init__(self) -> None:
         weights = numbers("weights", self.weights, "K")
         if not ((weights >= 0).all() and abs(weights.sum() - 1) < 1e-6):
-            raise ValueError(f"weights: {brief(weights)} given; needed are numbers of sum 1, none below 0.")
+            raise ValueError(
+                f"weights: {brief(weights)} given; needed are numbers of sum 1, none below 0."
+            )
         means = numbers("means", self.means, len(weights), "I+O")
         checked = covariances("covariances", self.covariances, *means.shape)
         self.__dict__.update(weights=weights, means=means, covariances=checked)
 
     @classmethod
-    def fit(cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6) -> GaussianMixture:
+    def fit(
+        cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6
+    ) -> GaussianMixture:
         """The mixture that EM finds from a k-means start: samples (M, I+O), the inputs first.
 
         `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2
@@ -96,7 +111,9 @@ class GaussianMixture(Immutable):
         whole("count", count)
         i = self._checked_dimensions(whole("dimensions", dimensions, least=0))
         random = np.random.default_rng(seeded(seed))
-        component = random.choice(len(self.weights), size=count, p=self.weights / self.weights.sum())
+        component = random.choice(
+            len(self.weights), size=count, p=self.weights / self.weights.sum()
+        )
         root = np.linalg.cholesky(self.covariances[:, :i, :i])[component]  # (count, I, I)
         drawn = self.means[component, :i] + (root @ random.standard_normal((count, i, 1)))[:, :, 0]
         return frozen(np.asarray(drawn))
@@ -146,11 +163,14 @@ def mixture_of(
         **initial,
     )
     try:
-        with threadpool_limits(1):  # k-means sums its threads' results in the order in which they finish
+        with threadpool_limits(
+            1
+        ):  # k-means sums its threads' results in the order in which they finish
             fitted = estimator.fit(data)
         return GaussianMixture(fitted.weights_, fitted.means_, symmetric(fitted.covariances_))
     except ValueError:  # a covariance is not positive definite
         raise ValueError(
-            f"samples: with regularization {added:g} no mixture of {components} components was found, as one of their "
-            "covariances is singular. Give a larger regularization, or fewer components."
+            f"samples: with regularization {added:g} no mixture of {components} components was "
+            "found, as one of their covariances is singular. Give a larger regularization, or "
+            "fewer components."
         ) from None

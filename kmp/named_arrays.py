@@ -73,7 +73,9 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
 
 
 def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
-    base, changes, solution = primitive.base.inner.solution, primitive.inner.changes, primitive.inner.solution
+    base = primitive.base.inner.solution
+    changes = primitive.inner.changes
+    solution = primitive.inner.solution
     parameters = base.hyperparameters
     arrays = {
         "base_inputs": base.database.inputs,
@@ -88,7 +90,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
         "ell": np.array(parameters.kernel.ell),
         "lambda_mean": np.array(parameters.lambda_mean),
         "lambda_covariance": np.array(parameters.lambda_covariance),
-        "prior_mean": parameters.prior_offset if parameters.prior_matrix is None else parameters.prior_columns,
+        "prior_mean": parameters.prior_offset
+        if parameters.prior_matrix is None
+        else parameters.prior_columns,
     }
     if parameters.kernel.period is not None:
         arrays["period"] = np.array(parameters.kernel.period)
@@ -99,7 +103,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
             arrays[f"{name}_directions"] = functionals.directions
     if isinstance(solution, Constrained):
         constraints = solution.constraints
-        arrays |= {name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS}
+        arrays |= {
+            name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS
+        }
         if constraints.directions is not None:
             arrays["constraint_directions"] = constraints.directions
     return arrays | base.to_arrays()
@@ -109,8 +115,8 @@ def _primitive(arrays: Mapping[str, NDArray[Any]]) -> KMP:
     names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
         raise ValueError(
-            f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}: give all that "
-            "`named_arrays.to_arrays` returned."
+            f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}: "
+            "give all that `named_arrays.to_arrays` returned."
         )
     base = _base(arrays)
     changes = _changes(arrays, base.database)
@@ -120,17 +126,21 @@ def _primitive(arrays: Mapping[str, NDArray[Any]]) -> KMP:
     unadapted = KMP(Inner.of_base(base))
     if solution is base:
         return unadapted
-    return KMP(Inner(_weighted(solution, "weights", arrays), changes, unadapted.inner.count), unadapted)
+    return KMP(
+        Inner(_weighted(solution, "weights", arrays), changes, unadapted.inner.count), unadapted
+    )
 
 
 def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
     if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
         raise ValueError(
-            f"The primitive's arrays lack {', '.join(missing)}: give all of {', '.join(_OF_CONSTRAINTS)}, or none."
+            f"The primitive's arrays lack {', '.join(missing)}: give all of "
+            f"{', '.join(_OF_CONSTRAINTS)}, or none."
         )
     if not isinstance(solution, Dense):
         raise ValueError(
-            "constraints: given for a low rank solution, a dense one needed. Leave out the arrays of either."
+            "constraints: given for a low rank solution, a dense one needed. Leave out the arrays "
+            "of either."
         )
     inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
     constraints = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
@@ -154,7 +164,9 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
     )
     database = Database(Functionals.checked(inputs, arrays.get("base_directions")), reference)
     low_rank = "pivots" in arrays
-    solution = LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
+    solution = (
+        LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
+    )
     return _weighted(solution, "base_weights", arrays)
 
 
@@ -162,12 +174,22 @@ def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
     via = numbers("via_inputs", arrays["via_inputs"], "V", database.inputs.shape[1])
     points = _normals("via", arrays)
     check_pairs("via_mean", via, points, database.reference.outputs)
-    replaced, n = real("replaced", arrays["replaced"]), len(database)
-    if not (replaced.ndim == 1 and np.isin(replaced, np.arange(n)).all() and (np.diff(replaced) > 0).all()):
+    replaced = real("replaced", arrays["replaced"])
+    n = len(database)
+    if not (
+        replaced.ndim == 1
+        and np.isin(replaced, np.arange(n)).all()
+        and (np.diff(replaced) > 0).all()
+    ):
         raise ValueError(
-            f"replaced: {brief(arrays['replaced'])} given, ascending indices of the {n} base points needed."
+            f"replaced: {brief(arrays['replaced'])} given, ascending indices of the {n} base "
+            "points needed."
         )
-    return Changes(frozen(replaced.astype(np.intp)), Functionals.checked(via, arrays.get("via_directions")), points)
+    return Changes(
+        frozen(replaced.astype(np.intp)),
+        Functionals.checked(via, arrays.get("via_directions")),
+        points,
+    )
 
 
 def _normals(of: str, arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
@@ -177,12 +199,16 @@ def _normals(of: str, arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
 
 def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
     parameters = solution.hyperparameters
-    return solution.with_weights(numbers(name, arrays[name], len(solution.centres), parameters.outputs))
+    return solution.with_weights(
+        numbers(name, arrays[name], len(solution.centres), parameters.outputs)
+    )
 
 
 def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
     if "period" in arrays:
-        return PeriodicKernel(float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"])))
+        return PeriodicKernel(
+            float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"]))
+        )
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
     if (channels := float(numbers("channels", arrays["channels"]))) != 2:
@@ -205,9 +231,14 @@ def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
 def _value(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
     kind = _KINDS.get(str(arrays[prefix + KIND]))
     if kind is None:
-        raise ValueError(f"{prefix}{KIND}: {arrays[prefix + KIND]!s:.60} given, one of {', '.join(_KINDS)} needed.")
+        raise ValueError(
+            f"{prefix}{KIND}: {arrays[prefix + KIND]!s:.60} given, one of {', '.join(_KINDS)} "
+            "needed."
+        )
     if kind is KMP:
-        return _primitive({name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)})
+        return _primitive(
+            {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}
+        )
     return kind(**{name: _field(arrays, prefix + name) for name in _fields(kind)})
 
 
@@ -220,7 +251,9 @@ def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:
         return {}
     if isinstance(value, tuple) and not hasattr(value, "_fields"):
         parts = [_of_field(part, f"{name}.{i}") for i, part in enumerate(value)]
-        return {f"{name}.count": np.array(len(value))} | {key: array for part in parts for key, array in part.items()}
+        return {f"{name}.count": np.array(len(value))} | {
+            key: array for part in parts for key, array in part.items()
+        }
     if isinstance(value, (np.ndarray, float, int, str)):
         return {name: np.array(value)}
     return _of_value(value, f"{name}.")

@@ -39,14 +39,21 @@ def continuous(quaternions: ArrayLike) -> Array:
 
 def multiplied(a: Array, b: Array) -> Array:
     """The products a b (..., 4): rotation b, then a. Raises ValueError if shapes differ."""
-    a, b = real("a", a), real("b", b)
+    a = real("a", a)
+    b = real("b", b)
     for name, factor, other in (("a", a, b), ("b", b, a)):
-        if factor.shape[-1:] != (4,) or (factor.ndim > 1 and other.ndim > 1 and factor.shape != other.shape):
+        if factor.shape[-1:] != (4,) or (
+            factor.ndim > 1 and other.ndim > 1 and factor.shape != other.shape
+        ):
             raise ValueError(
-                f"{name}: shape {factor.shape} given, for a of {a.shape} and b of {b.shape}; (..., 4) needed."
+                f"{name}: shape {factor.shape} given, for a of {a.shape} and b of {b.shape}; (..., "
+                "4) needed."
             )
         check_finite(name, factor)
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    av = a[..., :3]
+    aw = a[..., 3:]
+    bv = b[..., :3]
+    bw = b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
 
@@ -63,9 +70,14 @@ def log(quaternions: ArrayLike, auxiliary: ArrayLike) -> Array:
     length = np.linalg.norm(q[:, :3], axis=1, keepdims=True)
     angle = np.arctan2(length, q[:, 3:])
     for n in np.flatnonzero(angle > np.pi - 1e-6)[:1]:
-        raise ValueError(f"quaternions[{n}] is the auxiliary one with the sign changed: give -q, the same orientation.")
+        raise ValueError(
+            f"quaternions[{n}] is the auxiliary one with the sign changed: give -q, the same "
+            "orientation."
+        )
     series = 1 + length**2 / 6
-    return np.asarray(np.where(length > _TINY, angle / np.maximum(length, _TINY), series) * q[:, :3])
+    return np.asarray(
+        np.where(length > _TINY, angle / np.maximum(length, _TINY), series) * q[:, :3]
+    )
 
 
 def exp(zeta: Array, auxiliary: Array) -> Array:
@@ -74,10 +86,13 @@ def exp(zeta: Array, auxiliary: Array) -> Array:
     exp(zeta) = (zeta sin|zeta| / |zeta|, cos|zeta|). T-RO, section II. Raises ValueError if a shape
     differs.
     """
-    zeta, auxiliary = numbers("zeta", zeta, "T", 3), numbers("auxiliary", auxiliary, 4)
+    zeta = numbers("zeta", zeta, "T", 3)
+    auxiliary = numbers("auxiliary", auxiliary, 4)
     angle = np.linalg.norm(zeta, axis=1, keepdims=True)
     check_finite("zeta", angle)
-    return multiplied(np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary)
+    return multiplied(
+        np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary
+    )
 
 
 def rotation_per_zeta(zeta: ArrayLike) -> Array:
@@ -93,7 +108,8 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle < _TINY:
         return np.asarray(2 * (np.eye(3) + cross / 2 + cross @ cross / 6))
-    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    first = (1 - np.cos(angle)) / angle**2
+    second = (angle - np.sin(angle)) / angle**3
     return np.asarray(2 * (np.eye(3) + first * cross + second * (cross @ cross)))
 
 
@@ -114,7 +130,9 @@ class OrientationKMP(Immutable):
     def __post_init__(self) -> None:
         needed_outputs = 3 * checked_primitive(self.primitive).kernel.channels
         if (outputs := self.primitive.outputs) != needed_outputs:
-            raise ValueError(f"primitive: {outputs} outputs given, {needed_outputs} needed for an orientation.")
+            raise ValueError(
+                f"primitive: {outputs} outputs given, {needed_outputs} needed for an orientation."
+            )
         auxiliary = _unit("auxiliary", self.auxiliary, 4)
         object.__setattr__(self, "auxiliary", frozen(auxiliary.copy()))
 
@@ -131,7 +149,9 @@ class OrientationKMP(Immutable):
         prediction = self.primitive.predict(queries)
         zeta = prediction.mean[:, :3]
         turn = np.array([rotation_per_zeta(tangent) for tangent in zeta]).reshape(-1, 3, 3)
-        return exp(zeta, self.auxiliary), turn @ prediction.covariance[:, :3, :3] @ turn.transpose(0, 2, 1)
+        return exp(zeta, self.auxiliary), turn @ prediction.covariance[:, :3, :3] @ turn.transpose(
+            0, 2, 1
+        )
 
     def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
         """omega (3,) [rad/s] at one query (I,) that moves with (I,) [unit of the inputs / s].
@@ -168,11 +188,15 @@ class OrientationKMP(Immutable):
             not_negative("tolerance", tolerance)
         q = _unit("quaternions", numbers("quaternions", quaternions, len(where), 4))
         zeta = self._nearest(where, q)
-        back = np.array([np.linalg.inv(rotation_per_zeta(tangent)) for tangent in zeta]).reshape(-1, 3, 3)
+        back = np.array([np.linalg.inv(rotation_per_zeta(tangent)) for tangent in zeta]).reshape(
+            -1, 3, 3
+        )
         turned = self._turned("covariance", covariance, back, self.primitive.least_variance)
         if self.primitive.kernel.channels == 1:
             if angular_velocities is not None or velocity_covariance is not None:
-                raise ValueError("angular_velocities: the skill has no rates; fit it with a VelocityKernel.")
+                raise ValueError(
+                    "angular_velocities: the skill has no rates; fit it with a VelocityKernel."
+                )
             return self._adapted(where, unchecked(zeta, turned), tolerance)
         if (angular_velocities is None) != (velocity_covariance is None):
             raise ValueError("angular_velocities and velocity_covariance: give both, or none.")
@@ -183,11 +207,16 @@ class OrientationKMP(Immutable):
         else:
             omega = numbers("angular_velocities", angular_velocities, len(where), 3)
             rates = (back @ omega[:, :, None])[:, :, 0]
-            least = self.primitive.least_variance * float(self.primitive.kernel.prior_variance[1, 1])
+            least = self.primitive.least_variance * float(
+                self.primitive.kernel.prior_variance[1, 1]
+            )
             rate_covariance = self._turned("velocity_covariance", velocity_covariance, back, least)
         whole = np.zeros((len(where), 6, 6))
-        whole[:, :3, :3], whole[:, 3:, 3:] = turned, rate_covariance
-        return self._adapted(where, unchecked(np.hstack([zeta, rates]), symmetric(whole)), tolerance)
+        whole[:, :3, :3] = turned
+        whole[:, 3:, 3:] = rate_covariance
+        return self._adapted(
+            where, unchecked(np.hstack([zeta, rates]), symmetric(whole)), tolerance
+        )
 
     @staticmethod
     def _turned(name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
@@ -197,8 +226,15 @@ class OrientationKMP(Immutable):
         a rotation's is at most 4 times that of zeta. Raises ValueError if a covariance is not
         positive definite, or too small.
         """
-        count, array = len(back), real(name, covariance)
-        array = numbers(name, np.broadcast_to(array, (count, 3, 3)) if array.shape == (3, 3) else array, count, 3, 3)
+        count = len(back)
+        array = real(name, covariance)
+        array = numbers(
+            name,
+            np.broadcast_to(array, (count, 3, 3)) if array.shape == (3, 3) else array,
+            count,
+            3,
+            3,
+        )
         exact = ~array.any(axis=(1, 2), keepdims=True)
         checked = covariances(name, np.where(exact, np.eye(3), array), count, 3)
         turned = symmetric(back @ checked @ back.transpose(0, 2, 1))
@@ -206,17 +242,24 @@ class OrientationKMP(Immutable):
         for n in np.flatnonzero(np.linalg.eigvalsh(turned)[:, 0] < least)[:1]:
             smallest = np.linalg.eigvalsh(array[n])[0]
             raise ValueError(
-                f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is {smallest:.3g}, and "
-                f"{4.1 * least:.2g} is enough. Give 0 for the least, or the primitive a larger lambda_covariance."
+                f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is "
+                f"{smallest:.3g}, and {4.1 * least:.2g} is enough. Give 0 for the least, or the "
+                "primitive a larger lambda_covariance."
             )
         return np.where(exact, Gaussians.of(np.zeros(3), deviation=0).covariance, turned)
 
-    def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float | None) -> OrientationKMP:
-        return OrientationKMP(self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary)
+    def _adapted(
+        self, inputs: Array, desired: Gaussians, tolerance: float | None
+    ) -> OrientationKMP:
+        return OrientationKMP(
+            self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary
+        )
 
     def _nearest(self, inputs: Array, quaternions: Array) -> Array:
         """zeta (V, 3) of q or -q, whichever is nearer to the skill's present mean."""
-        signs = np.where((self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        signs = np.where(
+            (self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0
+        )
         return log(signs * quaternions, self.auxiliary)
 
 
@@ -226,5 +269,8 @@ def _unit(name: str, quaternions: ArrayLike, *shape: int) -> Array:
     for n in np.flatnonzero(np.abs(length - 1) > _UNIT)[:1]:
         index_text = "" if shape else f"[{n}]"
         norm = f"{length.flat[n]:.4g}"
-        raise ValueError(f"{name}{index_text} has norm {norm}, and must have 1. Divide by it, if that is what is meant.")
+        raise ValueError(
+            f"{name}{index_text} has norm {norm}, and must have 1. Divide by it, if that is what "
+            "is meant."
+        )
     return np.asarray(q / length)

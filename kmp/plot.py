@@ -18,8 +18,20 @@ if TYPE_CHECKING:
 
 _QUERIES = 200  # number of queries along the input, if none are given
 _REGIONS = ((2, 0.18, "2 deviations"), (1, 0.35, "1 deviation"))  # multiple, opacity; back to front
-_REFERENCE: dict[str, Any] = {"color": "0.55", "markersize": 3, "linestyle": "", "marker": ".", "zorder": 3}
-_VIA_POINT: dict[str, Any] = {"color": "0.1", "markersize": 5, "linestyle": "", "marker": "o", "zorder": 5}
+_REFERENCE: dict[str, Any] = {
+    "color": "0.55",
+    "markersize": 3,
+    "linestyle": "",
+    "marker": ".",
+    "zorder": 3,
+}
+_VIA_POINT: dict[str, Any] = {
+    "color": "0.1",
+    "markersize": 5,
+    "linestyle": "",
+    "marker": "o",
+    "zorder": 5,
+}
 _CIRCLE = np.linspace(0, 2 * np.pi, 49)  # [rad] the points of an ellipse
 
 
@@ -82,16 +94,30 @@ class Plotted:
         except ModuleNotFoundError as error:
             message = "plot draws with Matplotlib, which is not installed: pip install 'kmp[plot]'"
             raise ModuleNotFoundError(message, name=error.name) from None
-        for name, text in (("label", label), ("input_unit", input_unit), ("output_unit", output_unit)):
+        for name, text in (
+            ("label", label),
+            ("input_unit", input_unit),
+            ("output_unit", output_unit),
+        ):
             check_kind(name, text, str, "a text")
         plot_data = self.to_plot()
-        s = _along(plot_data) if queries is None else numbers("queries", queries, "M", plot_data.references.inputs.shape[1])
+        s = (
+            _along(plot_data)
+            if queries is None
+            else numbers("queries", queries, "M", plot_data.references.inputs.shape[1])
+        )
         titles = _titles(outputs, plot_data, input_unit, output_unit)
-        chosen = None if plane is None else [whole("plane", i, least=0, most=len(titles) - 1) for i in _two(plane)]
+        chosen = (
+            None
+            if plane is None
+            else [whole("plane", i, least=0, most=len(titles) - 1) for i in _two(plane)]
+        )
         axes_count = len(titles) if chosen is None else 1
         if axes is None:
             size = (6.4, 1.0 + 1.9 * axes_count) if chosen is None else (6.4, 5.0)
-            axes = plt.subplots(axes_count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained")[1]
+            axes = plt.subplots(
+                axes_count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained"
+            )[1]
         into: list[Any] = [axes]
         if isinstance(axes, (list, tuple, np.ndarray)):
             into = list(np.ravel(np.asarray(axes, dtype=object)))
@@ -145,19 +171,40 @@ def _titles(outputs: Sequence[str] | None, shown: Shown, input_unit: str, unit: 
     return [_named(name, unit if i < values else rate) for i, name in enumerate(names)]
 
 
-def _draw_over_input(axes: Axes, s: Array, found: Gaussians, shown: Shown, i: int, label: str) -> None:
+def _draw_over_input(
+    axes: Axes, s: Array, found: Gaussians, shown: Shown, i: int, label: str
+) -> None:
     alone = s.shape[1] == 1
-    x, mean, deviation = s[:, 0] if alone else np.arange(len(s)), found.mean[:, i], np.sqrt(found.covariance[:, i, i])
+    x = s[:, 0] if alone else np.arange(len(s))
+    mean = found.mean[:, i]
+    deviation = np.sqrt(found.covariance[:, i, i])
     [line] = axes.plot(x, mean, label=label, zorder=4)
     for times, opacity, region_label in _REGIONS:
-        style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
-        axes.fill_between(x, mean - times * deviation, mean + times * deviation, label=region_label, **style)
+        style: dict[str, Any] = {
+            "color": line.get_color(),
+            "alpha": opacity,
+            "linewidth": 0,
+            "zorder": 2,
+        }
+        axes.fill_between(
+            x, mean - times * deviation, mean + times * deviation, label=region_label, **style
+        )
     if alone:  # with more inputs, no axis shows their position
-        references, via = shown.references, shown.via_points
-        axes.plot(references.inputs[:, 0], references.normals.mean[:, i], label="reference", **_REFERENCE)
+        references = shown.references
+        via = shown.via_points
+        axes.plot(
+            references.inputs[:, 0], references.normals.mean[:, i], label="reference", **_REFERENCE
+        )
         if len(via.normals):
             error_bar = 2 * np.sqrt(via.normals.covariance[:, i, i])
-            axes.errorbar(via.inputs[:, 0], via.normals.mean[:, i], error_bar, label="via-point", capsize=3, **_VIA_POINT)
+            axes.errorbar(
+                via.inputs[:, 0],
+                via.normals.mean[:, i],
+                error_bar,
+                label="via-point",
+                capsize=3,
+                **_VIA_POINT,
+            )
 
 
 def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], label: str) -> None:
@@ -165,13 +212,20 @@ def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], la
 
     [line] = axes.plot(*found.mean[:, plane].T, label=label, zorder=4)
     for times, opacity, region_label in _REGIONS:
-        style: dict[str, Any] = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
+        style: dict[str, Any] = {
+            "color": line.get_color(),
+            "alpha": opacity,
+            "linewidth": 0,
+            "zorder": 2,
+        }
         axes.add_patch(PathPatch(_ellipses(found, plane, times), label=region_label, **style))
     via = shown.via_points.normals
     axes.plot(*shown.references.normals.mean[:, plane].T, label="reference", **_REFERENCE)
     if len(via):
         axes.plot(*via.mean[:, plane].T, label="via-point", **_VIA_POINT)
-        axes.add_patch(PathPatch(_ellipses(via, plane, 2), fill=False, edgecolor=_VIA_POINT["color"], zorder=5))
+        axes.add_patch(
+            PathPatch(_ellipses(via, plane, 2), fill=False, edgecolor=_VIA_POINT["color"], zorder=5)
+        )
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
 
@@ -184,7 +238,9 @@ def _ellipses(normals: Gaussians, plane: list[int], times: int) -> Path:
     # All ellipses have the same sense of rotation.
     vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None] ** np.array([1, 0])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    around = normals.mean[:, None, plane] + times * (np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)], 1) @ root.mT)
+    around = normals.mean[:, None, plane] + times * (
+        np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)], 1) @ root.mT
+    )
     return Path.make_compound_path(*(Path(ellipse, closed=True) for ellipse in around))
 
 
@@ -192,6 +248,18 @@ def _add_legend(axes: Axes) -> None:
     """Add the legend above the axes; a label that occurs twice is shown once."""
     handles, labels = axes.get_legend_handles_labels()
     named = dict(zip(reversed(labels), reversed(handles), strict=True))
-    look: dict[str, Any] = {"frameon": False, "fontsize": "small", "columnspacing": 1.2, "handlelength": 1.4}
+    look: dict[str, Any] = {
+        "frameon": False,
+        "fontsize": "small",
+        "columnspacing": 1.2,
+        "handlelength": 1.4,
+    }
     order = sorted(named, key=labels.index)
-    axes.legend([named[label] for label in order], order, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, **look)
+    axes.legend(
+        [named[label] for label in order],
+        order,
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=4,
+        **look,
+    )

@@ -86,7 +86,9 @@ class Predictor(Immutable):
             return mean_and_row[0]
         s = self._checked_many(s)
         return (
-            self.inner.query.mean(self.inner.query.row(s[0]))[None] if len(s) == 1 else mean_at(self.inner.solution, s)
+            self.inner.query.mean(self.inner.query.row(s[0]))[None]
+            if len(s) == 1
+            else mean_at(self.inner.solution, s)
         )
 
     def predict(self, queries: ArrayLike) -> Gaussians:
@@ -104,11 +106,19 @@ class Predictor(Immutable):
         s = self._checked_many(s)
         if len(s) == 1:
             row = self.inner.query.row(s[0])
-            return unchecked(self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None])
+            return unchecked(
+                self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None]
+            )
         batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
-        posterior = [self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches]
-        stacked = np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
-        return unchecked(self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale)
+        posterior = [
+            self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches
+        ]
+        stacked = (
+            np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
+        )
+        return unchecked(
+            self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale
+        )
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -120,7 +130,9 @@ class Predictor(Immutable):
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
         posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        covariance = nearest_positive_semidefinite(posterior[None]) * self.inner.query.covariance_scale
+        covariance = (
+            nearest_positive_semidefinite(posterior[None]) * self.inner.query.covariance_scale
+        )
         return unchecked(self.mean(s).reshape(1, -1), covariance)
 
     def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
@@ -152,7 +164,9 @@ class Predictor(Immutable):
 
         Raises ValueError if a shape differs or a number is not finite.
         """
-        s, v, a = real("query", query), real("velocity", velocity), real("acceleration", acceleration)
+        s = real("query", query)
+        v = real("velocity", velocity)
+        a = real("acceleration", acceleration)
         compiled = self.inner.compiled_query
         if compiled is not None and s.shape == v.shape == a.shape == (self._dimensions,):
             motion = compiled.motion(s, v, a, covariance=covariance)
@@ -167,8 +181,13 @@ class Predictor(Immutable):
         The derivative of equation (8). Raises ValueError if the shape differs or a number is not
         finite.
         """
-        s, compiled = real("query", query), self.inner.compiled_query
-        if compiled is not None and s.shape == (self._dimensions,) and (jacobian := compiled.jacobian(s)) is not None:
+        s = real("query", query)
+        compiled = self.inner.compiled_query
+        if (
+            compiled is not None
+            and s.shape == (self._dimensions,)
+            and (jacobian := compiled.jacobian(s)) is not None
+        ):
             return jacobian
         return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
 
@@ -188,7 +207,8 @@ class Predictor(Immutable):
         inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
         Raises ValueError if a shape differs or a number is not finite.
         """
-        s, v = self._one_query(query), self._checked("direction", direction)
+        s = self._one_query(query)
+        v = self._checked("direction", direction)
         return self.inner.query.curvature(self.inner.query.row(s), v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
@@ -201,9 +221,13 @@ class Predictor(Immutable):
         total = self.predict(s).covariance
         c = self.kernel.channels
         z = self._spanned(Functionals(s)).T.reshape(len(s), c, len(self._spanned.pivots))
-        residual = kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c)
+        residual = kron_identity(
+            self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c
+        )
         distance = nearest_positive_semidefinite(residual) * self.inner.query.covariance_scale
-        return Uncertainty(frozen(nearest_positive_semidefinite(total - distance)), frozen(distance))
+        return Uncertainty(
+            frozen(nearest_positive_semidefinite(total - distance)), frozen(distance)
+        )
 
     @property
     def kernel(self) -> Kernel:
@@ -227,7 +251,8 @@ class Predictor(Immutable):
         With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
         smaller variances.
         """
-        parameters, anywhere = self.inner.solution.hyperparameters, Functionals(np.zeros((1, self._dimensions)))
+        parameters = self.inner.solution.hyperparameters
+        anywhere = Functionals(np.zeros((1, self._dimensions)))
         penalty = parameters.lambda_covariance
         if self.representation == "low_rank":
             penalty = min(penalty, parameters.lambda_mean)
@@ -291,12 +316,19 @@ class Predictor(Immutable):
 
     def _rows(self, queries: Array, directions: Array | None = None) -> Array:
         """k (M C, R C) between M queries, or derivatives there, and the solution's functionals."""
-        return between(self.kernel, Functionals(queries, directions), self.inner.solution.functionals)
+        return between(
+            self.kernel, Functionals(queries, directions), self.inner.solution.functionals
+        )
 
     def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
         """The mean (M, O) by compiled loops, and the last kernel row; None if these cannot."""
         compiled = self.inner.compiled_query
-        if compiled is None or queries.ndim != 2 or queries.shape[1] != self._dimensions or len(queries) == 0:
+        if (
+            compiled is None
+            or queries.ndim != 2
+            or queries.shape[1] != self._dimensions
+            or len(queries) == 0
+        ):
             return None
         return compiled.mean(queries)
 

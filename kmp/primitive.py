@@ -61,8 +61,13 @@ class KMP(Predictor, Plotted):
 
     def __repr__(self) -> str:
         count, inputs = self.inputs.shape
-        of = f"{count} points" + (f", {len(self.via_inputs)} of them taught" if len(self.via_inputs) else "")
-        return f"KMP({of}: {inputs} inputs, {self.outputs} outputs, {self.kernel}, {self.representation})"
+        of = f"{count} points" + (
+            f", {len(self.via_inputs)} of them taught" if len(self.via_inputs) else ""
+        )
+        return (
+            f"KMP({of}: {inputs} inputs, {self.outputs} outputs, {self.kernel}, "
+            f"{self.representation})"
+        )
 
     @classmethod
     def fit(
@@ -113,10 +118,14 @@ class KMP(Predictor, Plotted):
         one_of("representation", representation, ("auto", "dense", "low_rank"))
         whole("rank", rank)
         if positive("rank_tolerance", rank_tolerance) >= 1:
-            raise ValueError(f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share.")
+            raise ValueError(
+                f"rank_tolerance is {rank_tolerance:g}, and must be below 1, as it is a share."
+            )
         points = Functionals.checked(s, directions)
         database = Database(points, resolved(parameters, points, reference))
-        return cls(Inner.of_base(solved(parameters, database, representation, rank, rank_tolerance)))
+        return cls(
+            Inner.of_base(solved(parameters, database, representation, rank, rank_tolerance))
+        )
 
     def adapt(
         self,
@@ -189,7 +198,12 @@ class KMP(Predictor, Plotted):
 
         Raises ValueError if shapes do not agree, or the constraints cannot be met together.
         """
-        check_kind("constraints", constraints, LinearConstraints, "LinearConstraints(inputs, normals, bounds)")
+        check_kind(
+            "constraints",
+            constraints,
+            LinearConstraints,
+            "LinearConstraints(inputs, normals, bounds)",
+        )
         for name, count, needed in (
             ("inputs", constraints.inputs.shape[1], self._dimensions),
             ("outputs", constraints.normals.shape[1], self.outputs),
@@ -204,7 +218,8 @@ class KMP(Predictor, Plotted):
             base = self.base.inner.solution.database
             if (size := base.reference.mean.size) > LARGE:
                 raise ValueError(
-                    f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} or the dense "
+                    f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} "
+                    "or the dense "
                     'representation needed. Fit fewer points, or with representation="dense".'
                 )
             dense = KMP(Inner.of_base(Dense(solution.hyperparameters, base)))
@@ -216,13 +231,18 @@ class KMP(Predictor, Plotted):
 
         Raises ValueError as `fit` and `adapt` do.
         """
-        points, parameters = self.base.inner.solution.database.functionals, self.inner.solution.hyperparameters
+        points = self.base.inner.solution.database.functionals
+        parameters = self.inner.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
         database = Database(points, resolved(parameters, points, reference))
-        fitted = KMP(Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE)))
+        fitted = KMP(
+            Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE))
+        )
         return self._on(fitted)
 
-    def extended(self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None) -> KMP:
+    def extended(
+        self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None
+    ) -> KMP:
         """A new primitive with M more reference points: inputs (M, I), M normals, as in `fit`.
 
         It equals a `fit` of all points, to rounding. The dense factors grow at the cost N^2 M,
@@ -276,10 +296,14 @@ class KMP(Predictor, Plotted):
 
     def to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""
-        database, count = self.inner.solution.database, len(self.inputs) - len(self.via_inputs)
+        database = self.inner.solution.database
+        count = len(self.inputs) - len(self.via_inputs)
         values = database.functionals.values
-        before, taught = np.flatnonzero(values[:count]), count + np.flatnonzero(values[count:])
-        references, via = (Points(self.inputs[part], database.reference.take(part)) for part in (before, taught))
+        before = np.flatnonzero(values[:count])
+        taught = count + np.flatnonzero(values[count:])
+        references, via = (
+            Points(self.inputs[part], database.reference.take(part)) for part in (before, taught)
+        )
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
     def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
@@ -315,7 +339,11 @@ class KMP(Predictor, Plotted):
         other = positive("lambda_covariance", lambda_covariance)
         parameters = replace(self.inner.solution.hyperparameters, lambda_covariance=other)
         before = self.base.inner.solution
-        base = KMP(Inner.of_base(before.with_hyperparameters(parameters).with_weights(before.weights).solved()))
+        base = KMP(
+            Inner.of_base(
+                before.with_hyperparameters(parameters).with_weights(before.weights).solved()
+            )
+        )
         if self is self.base:
             return base
         weighted = self._solution_on(base).with_weights(self.inner.solution.weights)
@@ -332,7 +360,10 @@ class KMP(Predictor, Plotted):
         pairs = parts_of("points", points)
         for i, pair in enumerate(pairs):
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
-                raise ValueError(f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals needed.")
+                raise ValueError(
+                    f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals "
+                    "needed."
+                )
         return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
@@ -350,20 +381,27 @@ class KMP(Predictor, Plotted):
         if not 0 < positive("share", share) < 1:
             raise ValueError(f"share is {share:g}, and must be between 0 and 1.")
         values = self.outputs // self.kernel.channels
-        desired = Gaussians.of(self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs])
+        desired = Gaussians.of(
+            self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs]
+        )
         point = Functionals(s[None])
-        adapted = self._through(point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0)
+        adapted = self._through(
+            point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0
+        )
         reach = np.empty(len(s))
         for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
             path = np.tile(s, (2, len(r), 1))
             path[:, :, i] += [r, -r]
             moved = np.linalg.norm(
-                (adapted.mean(flat := path.reshape(-1, len(s))) - self.mean(flat))[:, :values], axis=1
+                (adapted.mean(flat := path.reshape(-1, len(s))) - self.mean(flat))[:, :values],
+                axis=1,
             )
             matters = moved.reshape(2, -1) >= share * moved[0]
             if self.kernel.period is None:  # outside the data the mean extrapolates
-                matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (path[:, :, i] <= self.inputs[:, i].max())
+                matters &= (path[:, :, i] >= self.inputs[:, i].min()) & (
+                    path[:, :, i] <= self.inputs[:, i].max()
+                )
             reach[i] = r[matters.any(axis=0)].max(initial=0.0)
         return reach
 

@@ -70,7 +70,8 @@ class Query(Immutable):
 
         Raises ValueError if the solution cannot be computed.
         """
-        parameters, centres = solution.hyperparameters, solution.centres
+        parameters = solution.hyperparameters
+        centres = solution.centres
         scale, stretch = parameters.kernel.coordinates(centres.shape[1])
         weights = solution.weights.reshape(-1, parameters.channel_outputs)
         return cls(
@@ -100,13 +101,17 @@ class Query(Immutable):
         """The kernel row of a query (I,)."""
         offsets = (query if self.unstretched else query * self.stretch) - self.centres
         values = self.kernel.values(offsets, self.scale)
-        return KernelRow(query, offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives))
+        return KernelRow(
+            query, offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives)
+        )
 
     def mean(self, row: KernelRow) -> Array:
         """xi(s) (O,). Equation (8)."""
         mean = row.kernel @ self.weights
         mean = (mean if mean.ndim == 1 else mean.ravel()) + self.prior_offset
-        return np.asarray(mean if self.prior_mean.shape[1] == 1 else mean + self.prior_mean[:, 1:] @ row.query)
+        return np.asarray(
+            mean if self.prior_mean.shape[1] == 1 else mean + self.prior_mean[:, 1:] @ row.query
+        )
 
     def covariance(self, kernel: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
@@ -115,22 +120,31 @@ class Query(Immutable):
 
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""
-        jacobian = self.kernel.jacobian(row.offsets, row.values, self.scale, self.weight_rows, self.derivatives)
+        jacobian = self.kernel.jacobian(
+            row.offsets, row.values, self.scale, self.weight_rows, self.derivatives
+        )
         jacobian = jacobian if self.unstretched else jacobian * self.stretch
         return jacobian if self.prior_mean.shape[1] == 1 else jacobian + self.prior_mean[:, 1:]
 
     def jacobians(self, queries: Array) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
-        functionals, kernel, i = self.solution.functionals, self.kernel, len(self.stretch)
+        functionals = self.solution.functionals
+        kernel = self.kernel
+        i = len(self.stretch)
         if isinstance(kernel, GaussianKernel) and self.derivatives is None:
             # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
             # at the mean of the centres, the differences lose few digits.
             products = between(kernel, Functionals(queries), functionals) @ self._moments
             x = queries * self.stretch - self._origin
-            pulls, moments = products[:, : self.weights.shape[1], None], products[:, self.weights.shape[1] :]
-            slopes = (pulls * x[:, None, :] - moments.reshape(len(x), -1, i)) * (-2 * self.scale * self.stretch)
+            pulls = products[:, : self.weights.shape[1], None]
+            moments = products[:, self.weights.shape[1] :]
+            slopes = (pulls * x[:, None, :] - moments.reshape(len(x), -1, i)) * (
+                -2 * self.scale * self.stretch
+            )
         else:
-            along = Functionals(np.repeat(queries, i, axis=0), np.tile(np.eye(i), (len(queries), 1)))
+            along = Functionals(
+                np.repeat(queries, i, axis=0), np.tile(np.eye(i), (len(queries), 1))
+            )
             products = between(kernel, along, functionals) @ self.weights
             slopes = products.reshape(len(queries), i, -1).transpose(0, 2, 1)
         return slopes if self.prior_mean.shape[1] == 1 else slopes + self.prior_mean[:, 1:]
@@ -149,12 +163,17 @@ class Query(Immutable):
     def curvature(self, row: KernelRow, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""
         direction = velocity * self.stretch
-        return self.kernel.curvature(row.offsets, row.values, self.scale, self.weights, direction, self.derivatives)
+        return self.kernel.curvature(
+            row.offsets, row.values, self.scale, self.weights, direction, self.derivatives
+        )
 
-    def motion(self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool) -> MotionPrediction:
+    def motion(
+        self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
+    ) -> MotionPrediction:
         """All of these for a query (I,), its velocity (I,) and acceleration (I,)."""
         row = self.row(query)
-        jacobian, curvature = self.jacobian(row), self.curvature(row, velocity)
+        jacobian = self.jacobian(row)
+        curvature = self.curvature(row, velocity)
         return MotionPrediction(
             self.mean(row),
             jacobian @ velocity,

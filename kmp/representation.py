@@ -20,8 +20,12 @@ from kmp.solution import Solution, is_resolved
 _TINY = 450  # N O up to which the dense solution takes at most a millisecond
 _SMALL = 1500  # N O up to which finding the rank of several inputs costs more than it can save
 LARGE = 6000  # N O above which the dense solution takes seconds and 300 MB
-_LOW_EXPECTED, _LOW = 0.2, 0.45  # the low rank is faster below these r / (N C), estimated and found
-_RANK_AT_0, _RANK_PER_LENGTH = 8.0, 3.5  # measured: r = 8 + 3.5 range sqrt(ell) over one input
+# the low rank is faster below these r / (N C), estimated and found
+_LOW_EXPECTED = 0.2
+_LOW = 0.45
+# measured: r = 8 + 3.5 range sqrt(ell) over one input
+_RANK_AT_0 = 8.0
+_RANK_PER_LENGTH = 3.5
 _ROUNDING = 1e-12  # a residual of this share of k(s, s) is rounding, and always allowed
 
 
@@ -34,12 +38,17 @@ def solved(
 ) -> Solution:
     """The solution of the database. Warns `RankReached` if the rank does not suffice."""
     size = database.reference.mean.size
-    if representation == "dense" or (representation == "auto" and not _may_be_low(parameters, database)):
+    if representation == "dense" or (
+        representation == "auto" and not _may_be_low(parameters, database)
+    ):
         return Dense(parameters, database).solved()
     optional = representation == "auto" and size <= LARGE
     most = min(rank, int(_LOW * len(database) * parameters.kernel.channels)) if optional else rank
-    points, kernel = database.functionals, parameters.kernel
-    features, residual, values = Features.with_values(kernel, points, rank=most, tolerance=tolerance)
+    points = database.functionals
+    kernel = parameters.kernel
+    features, residual, values = Features.with_values(
+        kernel, points, rank=most, tolerance=tolerance
+    )
     reached = len(features.pivots) >= most
     enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
     if optional and not (enough and is_resolved(parameters, database)):
@@ -48,9 +57,10 @@ def solved(
     if not enough:
         error_bound = solution.error_bounds.at_points
         warnings.warn(
-            f"rank: {rank} features leave up to {residual:.2g} of the kernel at the {len(database)} inputs, and "
-            f"{tolerance:.2g} is required: the mean at them may be off by up to {error_bound:.2g} "
-            "[unit of the outputs]. Raise the rank, or take a smaller ell or fewer points with the dense solution.",
+            f"rank: {rank} features leave up to {residual:.2g} of the kernel at the "
+            f"{len(database)} inputs, and {tolerance:.2g} is required: the mean at them may be "
+            f"off by up to {error_bound:.2g} [unit of the outputs]. Raise the rank, or take a "
+            "smaller ell or fewer points with the dense solution.",
             RankReached,
             stacklevel=3,
         )
@@ -59,7 +69,8 @@ def solved(
 
 def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
     """True if the low rank may be the faster solution, estimated before features exist."""
-    size, kernel = database.reference.mean.size, parameters.kernel
+    size = database.reference.mean.size
+    kernel = parameters.kernel
     if size <= _TINY or size > _SMALL:
         return size > _SMALL
     if database.inputs.shape[1] > 1:  # the rank grows with the number of inputs

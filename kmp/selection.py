@@ -34,7 +34,9 @@ _STEP = 4.0  # of the search around the best
 _SWEEPS = 2
 _AS_GOOD = 1.03  # times the least RMSE: among these the shortest lengths are taken
 _AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with each of these
-_SHORTER = 2.0 ** np.arange(1, 9)  # times the best ell, that are tried for it, up to the last of _ELLS
+_SHORTER = 2.0 ** np.arange(
+    1, 9
+)  # times the best ell, that are tried for it, up to the last of _ELLS
 _ROUNDED = 1 + 1e-9
 _PLACES = 9  # reference points at which the reach of a via-point is measured
 _COARSEST = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
@@ -79,7 +81,9 @@ class Learned(Immutable):
         """
         base = self.primitive.base
         places = base.inputs[np.linspace(0, len(base.inputs) - 1, _PLACES).round().astype(int)]
-        return frozen(np.median([base.via_point_reach(place) for place in np.unique(places, axis=0)], axis=0))
+        return frozen(
+            np.median([base.via_point_reach(place) for place in np.unique(places, axis=0)], axis=0)
+        )
 
     def report(self, count: int = 10) -> str:
         """The best `count` of the scores as a table, then what was chosen and its reach."""
@@ -87,12 +91,24 @@ class Learned(Immutable):
         for score in self.scores[: whole("count", count)]:
             ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell))
             other = "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}"
-            likelihood = "" if score.negative_log_likelihood is None else f"{score.negative_log_likelihood:.3f}"
-            lines.append(f"{ell:>40} {score.lambda_mean:>10.3g} {other:>10} {score.rmse:>10.4g} {likelihood:>10}")
-        lines.append(f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}")
-        kernel, penalty = self.primitive.kernel, self.primitive.lambda_mean
+            likelihood = (
+                ""
+                if score.negative_log_likelihood is None
+                else f"{score.negative_log_likelihood:.3f}"
+            )
+            lines.append(
+                f"{ell:>40} {score.lambda_mean:>10.3g} {other:>10} {score.rmse:>10.4g} "
+                f"{likelihood:>10}"
+            )
+        lines.append(
+            f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}"
+        )
+        kernel = self.primitive.kernel
+        penalty = self.primitive.lambda_mean
         reach = " ".join(f"{distance:.3g}" for distance in self.reach)
-        lines.append(f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it")
+        lines.append(
+            f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it"
+        )
         return "\n".join(lines)
 
 
@@ -106,7 +122,9 @@ class _Recipe:
     regularization: float
     channels: int
 
-    def mixture(self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None) -> GaussianMixture:
+    def mixture(
+        self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None
+    ) -> GaussianMixture:
         """The mixture of all samples, from that of a few more if it is known."""
         try:
             return mixture_of(
@@ -121,11 +139,15 @@ class _Recipe:
                 _check_scale(data, self.regularization, is_singular=True)
             raise
 
-    def reference(self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool) -> Fold:
+    def reference(
+        self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool
+    ) -> Fold:
         """The reference of all demonstrations, nothing held out."""
         samples = np.concatenate([s for s, _ in data])
         if shown:
-            inputs = samples[np.linspace(0, len(samples) - 1, min(self.count, len(samples))).astype(int)]
+            inputs = samples[
+                np.linspace(0, len(samples) - 1, min(self.count, len(samples))).astype(int)
+            ]
         elif samples.shape[1] == 1:
             inputs = np.linspace(samples.min(), samples.max(), self.count)[:, None]
         else:
@@ -136,16 +158,27 @@ class _Recipe:
         nothing = np.empty((0, 0))
         return Fold(frozen(inputs), reference, frozen(prior), nothing, nothing, np.nan)
 
-    def folds(self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool) -> _Folds:
+    def folds(
+        self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool
+    ) -> _Folds:
         """Those that hold out one demonstration each, with the mixtures of the others."""
-        return _Folds(tuple(self._fold(data, h, mixture, shown) for h, mixture in enumerate(mixtures)), shown, self.channels)
+        return _Folds(
+            tuple(self._fold(data, h, mixture, shown) for h, mixture in enumerate(mixtures)),
+            shown,
+            self.channels,
+        )
 
-    def _fold(self, data: Sequence[tuple[Array, Array]], h: int, mixture: GaussianMixture, shown: bool) -> Fold:
+    def _fold(
+        self, data: Sequence[tuple[Array, Array]], h: int, mixture: GaussianMixture, shown: bool
+    ) -> Fold:
         training = self.reference([*data[:h], *data[h + 1 :]], mixture, shown)
         indices = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
-        inputs, outputs = data[h][0][indices], data[h][1][indices]
+        inputs = data[h][0][indices]
+        outputs = data[h][1][indices]
         miss = (mixture.regress(inputs).mean - outputs)[:, : outputs.shape[1] // self.channels]
-        return Fold(training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss))
+        return Fold(
+            training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss)
+        )
 
 
 class _Folds(NamedTuple):
@@ -167,7 +200,10 @@ class _Folds(NamedTuple):
 
     def likelihoods(self, kernel: Kernel, penalty: float, others: Sequence[float]) -> list[float]:
         """The mean negative log likelihoods, for each lambda of the covariance."""
-        fold_likelihoods = [fold.negative_log_likelihoods(kernel, penalty, others, self.outputs) for fold in self.each]
+        fold_likelihoods = [
+            fold.negative_log_likelihoods(kernel, penalty, others, self.outputs)
+            for fold in self.each
+        ]
         return [float(likelihood) for likelihood in np.mean(fold_likelihoods, axis=0)]
 
 
@@ -236,8 +272,10 @@ def learn(
     if is_incomplete and criterion == "left-out":
         if len(data) < 2:
             raise ValueError(
-                f"{len(data)} demonstration given: at least 2 needed to choose parameters by leaving one out. "
-                'Give kernel, lambda_mean and lambda_covariance, or criterion "likelihood", or another demonstration.'
+                f"{len(data)} demonstration given: at least 2 needed to choose parameters by "
+                "leaving one out. "
+                'Give kernel, lambda_mean and lambda_covariance, or criterion "likelihood", or '
+                "another demonstration."
             )
         mixtures = [recipe.mixture([*data[:h], *data[h + 1 :]], mixture) for h in range(len(data))]
         asked = [is_shown, False] if points == "auto" and is_shown else [is_shown]
@@ -258,15 +296,20 @@ def learn(
             lambda_mean,
             free="none" if kernel else scales,
         )
-        kernel, lambda_mean = likeliest.kernel, likeliest.lambda_mean
+        kernel = likeliest.kernel
+        lambda_mean = likeliest.lambda_mean
         lambda_covariance = lambda_covariance or len(full.inputs) / likeliest.signal_variance
     assert kernel is not None, "given or chosen"
     assert lambda_mean is not None, "given or chosen"
     order = sorted(scores, key=_best_first)
-    return Learned(full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), plain)
+    return Learned(
+        full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), plain
+    )
 
 
-def _check_scale(data: Sequence[tuple[Array, Array]], regularization: float, *, is_singular: bool = False) -> None:
+def _check_scale(
+    data: Sequence[tuple[Array, Array]], regularization: float, *, is_singular: bool = False
+) -> None:
     """Raise ValueError for inputs that vary too little for the regularization [unit^2], or for the
     precision of numbers of their size; and if a mixture is singular, for those that vary too much.
     """
@@ -278,24 +321,33 @@ def _check_scale(data: Sequence[tuple[Array, Array]], regularization: float, *, 
     least = float(np.sqrt(regularization))
     varies = f"demonstrations: the inputs deviate by {deviation:.3g} from their mean"
     if deviation < coarse and coarse > least:
-        raise ValueError(f"{varies}, which is too little at {largest:.3g}: subtract the begin of each demonstration.")
+        raise ValueError(
+            f"{varies}, which is too little at {largest:.3g}: subtract the begin of each "
+            "demonstration."
+        )
     if 0.0 < deviation < least:
         needed = f"at least {least:.3g}, the root of the regularization, needed"
         raise ValueError(f"{varies}, {needed}: give them in a smaller unit.")
     if is_singular and np.finfo(float).eps * deviation**2 > regularization:
         raise ValueError(
-            f"{varies}, too much for a regularization of {regularization:g}: give seconds, not nanoseconds."
+            f"{varies}, too much for a regularization of {regularization:g}: give seconds, not "
+            "nanoseconds."
         )
 
 
 def _variances(inputs: Array) -> Array:
     """The variances (I,) of inputs (N, I), above 0."""
     variances = np.var(inputs, axis=0)
-    return np.where(variances > 0, variances, variances.max() or 1.0)  # one that never changed has no length
+    return np.where(
+        variances > 0, variances, variances.max() or 1.0
+    )  # one that never changed has no length
 
 
 def _best_first(score: Score) -> tuple[float, float]:
-    return score.rmse, np.inf if score.negative_log_likelihood is None else score.negative_log_likelihood
+    return (
+        score.rmse,
+        np.inf if score.negative_log_likelihood is None else score.negative_log_likelihood,
+    )
 
 
 def _likeliest(folds: _Folds, kernel: Kernel, lambda_mean: float, scores: list[Score]) -> float:
@@ -304,7 +356,9 @@ def _likeliest(folds: _Folds, kernel: Kernel, lambda_mean: float, scores: list[S
     [rmse] = folds.rmses(kernel, [lambda_mean])
     likelihoods = folds.likelihoods(kernel, lambda_mean, others)
     scores += [
-        Score(kernel.ell, lambda_mean, other, rmse if np.isfinite(likelihood) else np.inf, likelihood)
+        Score(
+            kernel.ell, lambda_mean, other, rmse if np.isfinite(likelihood) else np.inf, likelihood
+        )
         for other, likelihood in zip(others, likelihoods, strict=True)
     ]
     return min(zip(likelihoods, others, strict=True))[1]
@@ -332,19 +386,30 @@ class _Search:
         changes no more of the skill than the demonstrations ask for.
         """
         grids: list[list[Score]] = [[] for _ in choices]
-        candidates = [self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)]
+        candidates = [
+            self._grid(folds, scores) for folds, scores in zip(choices, grids, strict=True)
+        ]
         i = min(range(len(choices)), key=lambda i: candidates[i])
-        folds, scores, best = choices[i], grids[i], candidates[i]
+        folds = choices[i]
+        scores = grids[i]
+        best = candidates[i]
         dimensions = folds.each[0].inputs.shape[1]
         lengths = [range(dimensions)] if self.one_length else [[i] for i in range(dimensions)]
         free = ([] if self.kernel else lengths) + ([] if self.lambda_mean else [[dimensions]])
         for _ in range(_SWEEPS):
             for indices in free:
                 for step in (np.log(_STEP), -np.log(_STEP)):
-                    other = tuple(value + step * (n in indices) for n, value in enumerate(best.parameters))
+                    other = tuple(
+                        value + step * (n in indices) for n, value in enumerate(best.parameters)
+                    )
                     best = min(best, *self._tried(folds, other[:-1], [other[-1]], scores))
         chosen = self._shortest(folds, best, scores)
-        return folds, self._kernel(folds, chosen.parameters[:-1]), self._penalty(chosen.parameters[-1]), scores
+        return (
+            folds,
+            self._kernel(folds, chosen.parameters[:-1]),
+            self._penalty(chosen.parameters[-1]),
+            scores,
+        )
 
     def _shortest(self, folds: _Folds, best: _Tried, scores: list[Score]) -> _Tried:
         """The parameters of the shortest lengths whose RMSE is within 3 % of the best."""
@@ -352,21 +417,42 @@ class _Search:
             return best
         *lengths, penalty = best.parameters
         last = max(_ELLS) * 0.5 / self._spread(folds)  # beyond it, a via-point is a spike
-        penalties = [0.0] if self.lambda_mean else [penalty + np.log(multiple) for multiple in _AROUND]
+        penalties = (
+            [0.0] if self.lambda_mean else [penalty + np.log(multiple) for multiple in _AROUND]
+        )
         candidates = [best]
-        for factor in _SHORTER[(_SHORTER * np.exp(lengths)[:, None] <= _ROUNDED * last[:, None]).all(axis=0)]:
-            candidates.append(min(self._tried(folds, tuple(length + np.log(factor) for length in lengths), penalties, scores)))
+        for factor in _SHORTER[
+            (_SHORTER * np.exp(lengths)[:, None] <= _ROUNDED * last[:, None]).all(axis=0)
+        ]:
+            candidates.append(
+                min(
+                    self._tried(
+                        folds,
+                        tuple(length + np.log(factor) for length in lengths),
+                        penalties,
+                        scores,
+                    )
+                )
+            )
         shortest_first = candidates[::-1]
-        return preferred(shortest_first, [candidate.rmse for candidate in shortest_first], _AS_GOOD * best.rmse)
+        return preferred(
+            shortest_first, [candidate.rmse for candidate in shortest_first], _AS_GOOD * best.rmse
+        )
 
     def _grid(self, folds: _Folds, scores: list[Score]) -> _Tried:
         variances = self._spread(folds)
-        traces = [np.trace(fold.reference.covariance, axis1=1, axis2=2).mean() for fold in folds.each]
+        traces = [
+            np.trace(fold.reference.covariance, axis1=1, axis2=2).mean() for fold in folds.each
+        ]
         variance = float(np.mean(traces)) / folds.each[0].reference.outputs
         lengths = [0.0] if self.kernel else np.log(_ELLS)
         penalties = [0.0] if self.lambda_mean else np.log(_LAMBDAS) - np.log(variance)
         start = np.log(0.5 / variances)
-        return min(candidate for n in lengths for candidate in self._tried(folds, tuple(start + n), penalties, scores))
+        return min(
+            candidate
+            for n in lengths
+            for candidate in self._tried(folds, tuple(start + n), penalties, scores)
+        )
 
     @staticmethod
     def _spread(folds: _Folds) -> Array:
@@ -374,16 +460,29 @@ class _Search:
         return _variances(np.concatenate([fold.held_inputs for fold in folds.each]))
 
     def _tried(
-        self, folds: _Folds, lengths: tuple[float, ...], penalties: Sequence[float], scores: list[Score]
+        self,
+        folds: _Folds,
+        lengths: tuple[float, ...],
+        penalties: Sequence[float],
+        scores: list[Score],
     ) -> list[_Tried]:
-        kernel, values = self._kernel(folds, lengths), [self._penalty(penalty) for penalty in penalties]
+        kernel = self._kernel(folds, lengths)
+        values = [self._penalty(penalty) for penalty in penalties]
         rmses = folds.rmses(kernel, values)
-        scores += [Score(kernel.ell, value, None, rmse, None) for value, rmse in zip(values, rmses, strict=True)]
-        return [_Tried(rmse, (*lengths, penalty)) for rmse, penalty in zip(rmses, penalties, strict=True)]
+        scores += [
+            Score(kernel.ell, value, None, rmse, None)
+            for value, rmse in zip(values, rmses, strict=True)
+        ]
+        return [
+            _Tried(rmse, (*lengths, penalty))
+            for rmse, penalty in zip(rmses, penalties, strict=True)
+        ]
 
     def _kernel(self, folds: _Folds, lengths: Sequence[float]) -> Kernel:
         ell = np.exp(np.array(lengths))
-        return self.kernel or (VelocityKernel(float(ell[0])) if folds.channels == 2 else GaussianKernel(ell))
+        return self.kernel or (
+            VelocityKernel(float(ell[0])) if folds.channels == 2 else GaussianKernel(ell)
+        )
 
     def _penalty(self, log: float) -> float:
         return self.lambda_mean or float(np.exp(log))

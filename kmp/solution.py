@@ -151,11 +151,14 @@ def check_resolved(
         smaller = min(parameters.lambda_mean, parameters.lambda_covariance) if both else penalty
         accepted = least_variances(parameters, points.functionals.take(slice(n, n + 1)), smaller)[0]
         of = ("",) if len(accepted) == 1 else (" of the values", " of their rates")
-        named = " and ".join(f"{variance:.2g}{suffix}" for variance, suffix in zip(accepted, of, strict=True))
+        named = " and ".join(
+            f"{variance:.2g}{suffix}" for variance, suffix in zip(accepted, of, strict=True)
+        )
         raise ValueError(
-            f"The covariance at point {first + n} would be lost in rounding: lambda Sigma is {least[n]:.3g} of "
-            f"k(s, s) there, at least {_RESOLVED:g} needed. Give the point a variance of at least {named} "
-            f"(Gaussians.of(mean, deviation=0) takes the least), or the primitive a {name} of at least {enough:.3g}."
+            f"The covariance at point {first + n} would be lost in rounding: lambda Sigma is "
+            f"{least[n]:.3g} of k(s, s) there, at least {_RESOLVED:g} needed. Give the point a "
+            f"variance of at least {named} (Gaussians.of(mean, deviation=0) takes the least), or "
+            f"the primitive a {name} of at least {enough:.3g}."
         )
 
 

@@ -19,7 +19,9 @@ from kmp.named_arrays import from_arrays, to_arrays
 from kmp.primitive import KMP
 
 _FORMAT = 1  # number of the file format
-_LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # begin of a file that Git LFS has not fetched
+_LFS_POINTER = (
+    b"version https://git-lfs.github.com/spec/"  # begin of a file that Git LFS has not fetched
+)
 
 
 class Stored(NamedTuple):
@@ -88,13 +90,22 @@ def load(path: str | Path) -> Stored:
         with Path(path).open("rb") as file:
             is_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
         if is_pointer:
-            raise ValueError(f"{path}: a pointer of Git LFS and not the file itself; `git lfs pull` fetches that.")
-        raise ValueError(f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again.")
+            raise ValueError(
+                f"{path}: a pointer of Git LFS and not the file itself; `git lfs pull` fetches "
+                "that."
+            )
+        raise ValueError(
+            f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again."
+        )
     if (version := arrays["kmp_format"].tolist()) != _FORMAT:
-        raise ValueError(f"{path}: format {brief(version)} given, {_FORMAT} needed. Load it with the kmp that wrote it.")
+        raise ValueError(
+            f"{path}: format {brief(version)} given, {_FORMAT} needed. Load it with the kmp that "
+            "wrote it."
+        )
     if str(arrays.get("checksum")) != checksum(arrays):
         raise ValueError(
-            f"{path}: the numbers are not those that were saved: their checksum is another. Copy or save it again."
+            f"{path}: the numbers are not those that were saved: their checksum is another. Copy "
+            "or save it again."
         )
     try:
         return Stored(from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))

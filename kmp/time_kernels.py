@@ -40,7 +40,9 @@ class _OneInput(Immutable):
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         """The scale, and the stretch (1,)."""
 
-    def __call__(self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None) -> Array:
+    def __call__(
+        self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
+    ) -> Array:
         scale, stretch = self.coordinates(1)
         r = a * stretch - (b * stretch).T
         values = self.values(r.reshape(-1, 1), scale).reshape(r.shape)
@@ -59,12 +61,19 @@ class _OneInput(Immutable):
         scale, stretch = self.coordinates(1)
         home = np.zeros(len(along))
         at_home = self.values(home[:, None], scale)
-        values, bends = (np.diagonal(self.blocks(home, at_home, scale, n), axis1=1, axis2=2) for n in (0, 2))
+        values, bends = (
+            np.diagonal(self.blocks(home, at_home, scale, n), axis1=1, axis2=2) for n in (0, 2)
+        )
         return np.where(along != 0, -bends * (along * stretch) ** 2, values)
 
     @classmethod
     def row(
-        cls, offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None, order: int = 0
+        cls,
+        offsets: Array,
+        values: Array,
+        scale: float,
+        derivatives: Derivatives | None = None,
+        order: int = 0,
     ) -> Array:
         """The derivative of this order of the row by x: (R,) if C is 1, else (C, R C)."""
         r = offsets[:, 0]
@@ -78,9 +87,16 @@ class _OneInput(Immutable):
 
     @classmethod
     def jacobian(
-        cls, offsets: Array, values: Array, scale: float, weight_rows: Array, derivatives: Derivatives | None = None
+        cls,
+        offsets: Array,
+        values: Array,
+        scale: float,
+        weight_rows: Array,
+        derivatives: Derivatives | None = None,
     ) -> Array:
-        return np.asarray((cls.row(offsets, values, scale, derivatives, 1) @ weight_rows.T).reshape(-1, 1))
+        return np.asarray(
+            (cls.row(offsets, values, scale, derivatives, 1) @ weight_rows.T).reshape(-1, 1)
+        )
 
     @classmethod
     def curvature(
@@ -121,8 +137,8 @@ class VelocityKernel(_OneInput):
         """Raise ValueError unless there are one input and as many rates as values."""
         if inputs != 1 or outputs % 2:
             raise ValueError(
-                f"kernel: {inputs} inputs and {outputs} outputs given; value and rate over time need "
-                "1 input and an even number of outputs: the values, then their rates."
+                f"kernel: {inputs} inputs and {outputs} outputs given; value and rate over time "
+                "need 1 input and an even number of outputs: the values, then their rates."
             )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
@@ -166,11 +182,15 @@ class PeriodicKernel(_OneInput):
     def check(self, inputs: int, outputs: int) -> None:
         """Raise ValueError unless there is one input."""
         if inputs != 1:
-            raise ValueError(f"kernel: {inputs} inputs given; a periodic kernel needs 1, the time or a phase.")
+            raise ValueError(
+                f"kernel: {inputs} inputs given; a periodic kernel needs 1, the time or a phase."
+            )
 
     def coordinates(self, inputs: int) -> tuple[float, Array]:
         """The scale ell (T / pi)^2, and the stretch 2 pi / T to radians."""
-        return self.ell * (self.period / np.pi) ** 2, frozen(np.full(inputs, 2 * np.pi / self.period))
+        return self.ell * (self.period / np.pi) ** 2, frozen(
+            np.full(inputs, 2 * np.pi / self.period)
+        )
 
     @staticmethod
     def values(offsets: Array, scale: float) -> Array:
@@ -179,7 +199,8 @@ class PeriodicKernel(_OneInput):
     @staticmethod
     def blocks(r: Array, values: Array, scale: float, order: int) -> Array:
         c = scale / 2
-        sine, cosine = np.sin(r), np.cos(r)
+        sine = np.sin(r)
+        cosine = np.cos(r)
         if order == 0:
             factor = np.ones_like(r)
         elif order == 1:

@@ -24,9 +24,13 @@ from thirdhand.viewer import vulkan
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of a thousand processes would compile what it imports
+os.environ.pop(
+    "PYTHONDONTWRITEBYTECODE", None
+)  # each of a thousand processes would compile what it imports
 sys.dont_write_bytecode = False
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's `&` has it ignored, and children inherit that
+signal.signal(
+    signal.SIGINT, signal.default_int_handler
+)  # a script's `&` has it ignored, and children inherit that
 
 pytest_plugins = ["support.busy"]
 PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()
@@ -145,4 +149,7 @@ def golden(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
 def drawing() -> None:
     """Skip the test where the viewer cannot draw without a screen."""
     if not vulkan.is_there():
-        pytest.skip("drawing without a screen needs a Vulkan driver: on Debian, apt install mesa-vulkan-drivers")
+        pytest.skip(
+            "drawing without a screen needs a Vulkan driver: on Debian, apt install "
+            "mesa-vulkan-drivers"
+        )

@@ -57,7 +57,9 @@ class Walk:
         caller = frame.f_back
         while caller is not None and not self._is_ours(caller):
             caller = caller.f_back
-        start = LOOP if caller is None or caller.f_code.co_filename == __file__ else _file_of(caller)
+        start = (
+            LOOP if caller is None or caller.f_code.co_filename == __file__ else _file_of(caller)
+        )
         function = "" if caller is None else caller.f_code.co_name
         end = _file_of(frame)
         call = (start, function, end, frame.f_code.co_name)
@@ -67,7 +69,9 @@ class Walk:
     @staticmethod
     def _is_ours(frame: FrameType) -> bool:
         file = frame.f_code.co_filename
-        return file not in ARITHMETIC and (file.startswith((f"{ROOT}/service", f"{ROOT}/kmp")) or file == __file__)
+        return file not in ARITHMETIC and (
+            file.startswith((f"{ROOT}/service", f"{ROOT}/kmp")) or file == __file__
+        )
 
     @property
     def files(self) -> list[str]:
@@ -88,9 +92,12 @@ def _file_of(frame: FrameType) -> str:
 
 def walk() -> Walk:
     """A sample's way, while the arm follows."""
-    settings, skill, trace = Settings(), shipped_skill().for_loop(), Walk()
+    settings = Settings()
+    skill = shipped_skill().for_loop()
+    trace = Walk()
     controller = Controller(settings, skill, urdf=robot_description(settings))
-    hands, names = skill.hands[0].reshape(2, 3), settings.joints.names
+    hands = skill.hands[0].reshape(2, 3)
+    names = settings.joints.names
     listening = open_session(listen=["tcp/127.0.0.1:0"])
     arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES}
     streams = CellStreams(listening, settings, arrivals=arrivals, failed=print)
@@ -100,16 +107,22 @@ def walk() -> Walk:
         def sample(hand: Vector, index: int) -> bytes:
             x, y, z = hand.tolist()
             return cdr.encode_pose(
-                PoseStamped(1 + 2_000_000 * index, BASE, (x, y, z + 1e-4 * index), (0.0, 0.0, 0.0, 1.0))
+                PoseStamped(
+                    1 + 2_000_000 * index, BASE, (x, y, z + 1e-4 * index), (0.0, 0.0, 0.0, 1.0)
+                )
             )
 
         def publish(tick: Tick, frame: Frame) -> None:
-            attachment = cdr.encode_attachment(Attachment(tick.index, 0, int(frame["hand_stamp_ns"])))
+            attachment = cdr.encode_attachment(
+                Attachment(tick.index, 0, int(frame["hand_stamp_ns"]))
+            )
             for key, payload in outgoing(frame, tick.index, names):
                 streams.publish(key, payload, attachment)
 
         def arm(index: int) -> Event:
-            state = JointState(1 + 2_000_000 * index, names, settings.arm.posture, (0.0,) * len(names))
+            state = JointState(
+                1 + 2_000_000 * index, names, settings.arm.posture, (0.0,) * len(names)
+            )
             return Event("joints/state", b"", state)
 
         frames: list[Frame] = []
@@ -120,9 +133,15 @@ def walk() -> Walk:
             inbox: list[Event] = []
             while len(inbox) < 2 and time.monotonic() < until:
                 inbox += streams.receive()
-            run(controller, [Tick(index, (*inbox, arm(index)))], [lambda tick, frame: frames.append(frame)])
+            run(
+                controller,
+                [Tick(index, (*inbox, arm(index)))],
+                [lambda tick, frame: frames.append(frame)],
+            )
         if frames[-1]["mode"] != Mode.FOLLOW:
-            raise SystemExit(f"the arm does not follow, but has mode {Mode(int(frames[-1]['mode'])).name}")
+            raise SystemExit(
+                f"the arm does not follow, but has mode {Mode(int(frames[-1]['mode'])).name}"
+            )
         trackers[0].put(sample(hands[0], PERIODS))
         newest: list[Event] = []
         until = time.monotonic() + 10.0
@@ -142,10 +161,16 @@ def main() -> None:
     """Prints the way, and counts it."""
     trace = walk()
     print("\n".join(f"{number:2} {file}" for number, file in enumerate(trace.files, 1)))
-    print(f"{len(trace.files)} files, {len(trace.calls)} calls between them, {trace.re_entries} re-entries")
+    print(
+        f"{len(trace.files)} files, {len(trace.calls)} calls between them, {trace.re_entries} "
+        "re-entries"
+    )
     if "--calls" in sys.argv:
         for start, caller, end, called in trace.calls:
-            print(f"{Path(start).relative_to(ROOT)} {caller} -> {Path(end).relative_to(ROOT)} {called}")
+            print(
+                f"{Path(start).relative_to(ROOT)} {caller} -> {Path(end).relative_to(ROOT)} "
+                f"{called}"
+            )
 
 
 if __name__ == "__main__":

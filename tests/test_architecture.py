@@ -19,25 +19,89 @@ from support.paths import ROOT
 
 PACKAGES = {"kmp": "", "thirdhand": "service", "thirdhand_sim": "sim"}  # and the folder of each
 OUTSIDE = {
-    *("time", "threading", "os", "socket", "subprocess", "datetime", "random", "asyncio", "multiprocessing"),
+    *(
+        "time",
+        "threading",
+        "os",
+        "socket",
+        "subprocess",
+        "datetime",
+        "random",
+        "asyncio",
+        "multiprocessing",
+    ),
     *("signal", "logging", "sched", "queue", "zenoh", "mcap", "rerun", "pybullet", "mujoco"),
 }
-VAGUE = {"utils", "util", "common", "base", "manager", "helper", "helpers", "node", "interface", "misc"}
-PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
-MODULES = sorted(path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py"))
-PURE = sorted(path for room in ("core", "contract") for path in (ROOT / "service" / "thirdhand" / room).rglob("*.py"))
+VAGUE = {
+    "utils",
+    "util",
+    "common",
+    "base",
+    "manager",
+    "helper",
+    "helpers",
+    "node",
+    "interface",
+    "misc",
+}
+PRIVATE = (
+    r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
+)
+MODULES = sorted(
+    path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py")
+)
+PURE = sorted(
+    path
+    for room in ("core", "contract")
+    for path in (ROOT / "service" / "thirdhand" / room).rglob("*.py")
+)
 ENTRY_POINTS = [
     path
     for path in MODULES
-    if not path.is_relative_to(ROOT / "tests") and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
+    if not path.is_relative_to(ROOT / "tests")
+    and 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
 ]
 STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
-    *("MODES", "STATES", "NO_TREMOR", "KEPT", "WAY", "HULL_SPANS", "ORDER", "TURNS", "TURN_INPUTS", "MOST_SEGMENTS"),
-    *("OUTPUTS", "NEIGHBOURS", "SPEED", "NEAR", "SEPARATED", "BOUNDED", "CHASED", "UNSAFE", "UNUSABLE", "NO_SEGMENT"),
-    *("NO_GRIPPER", "MAX_SKILL_DISTANCE_M", "FARTHEST_REPORTED_M", "TABLE_DEPTH_M"),  # of files, of reports, of a shape
-    *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),  # of what is recorded
+    *(
+        "MODES",
+        "STATES",
+        "NO_TREMOR",
+        "KEPT",
+        "WAY",
+        "HULL_SPANS",
+        "ORDER",
+        "TURNS",
+        "TURN_INPUTS",
+        "MOST_SEGMENTS",
+    ),
+    *(
+        "OUTPUTS",
+        "NEIGHBOURS",
+        "SPEED",
+        "NEAR",
+        "SEPARATED",
+        "BOUNDED",
+        "CHASED",
+        "UNSAFE",
+        "UNUSABLE",
+        "NO_SEGMENT",
+    ),
+    *(
+        "NO_GRIPPER",
+        "MAX_SKILL_DISTANCE_M",
+        "FARTHEST_REPORTED_M",
+        "TABLE_DEPTH_M",
+    ),  # of files, of reports, of a shape
+    *(
+        "MOTION_ROUND_TO",
+        "COVARIANCE_ROUND_TO",
+        "TURN_ROUND_TO",
+        "CLOSURE_ROUND_TO",
+    ),  # of what is recorded
 }
-CONVENIENCES = {("kmp.primitive", "kmp.storage")}  # `KMP.save` and `KMP.load` import what stores primitives
+CONVENIENCES = {
+    ("kmp.primitive", "kmp.storage")
+}  # `KMP.save` and `KMP.load` import what stores primitives
 IN_EVERY_STAGE = {"FRAME", "STATE"}  # the fields that a stage owns in the frame and in the state
 # Names of constants and classes that are still defined twice. This list only becomes shorter.
 NAMED_TWICE = """
@@ -55,7 +119,8 @@ NAMED_TWICE = """
     WORK WayOut _ATTACHMENT _FREE _HELD_OUT _LENGTH _MACHINE _NAMES _NOISES _RESIDUAL _ROUNDS
     _SHOWN _System _TICK _TINY
 """
-PLANTED = {  # lines that break a contract, by what they break, and the contracts that are then broken
+# lines that break a contract, by what they break, and the contracts that are then broken
+PLANTED = {
     "what comes from outside": (
         {
             "service/thirdhand/core/intake/stage.py": "import time",
@@ -76,7 +141,8 @@ PLANTED = {  # lines that break a contract, by what they break, and the contract
             "service/thirdhand/contract/channels.py": "from thirdhand.core.frame import Tick",
             "service/thirdhand/scribe/scribe.py": "from thirdhand.daemon.clock import Deadlines",
             "service/thirdhand/daemon/clock.py": "from thirdhand.cli.usage import UsageError",
-            "service/thirdhand/core/skill/skill.py": "from thirdhand.workbench.learning.learn import learn",
+            "service/thirdhand/core/skill/skill.py": "from thirdhand.workbench.learning.learn "
+            "import learn",
             "kmp/mixture.py": "from thirdhand.settings.config import Settings",
             "service/thirdhand/settings/config.py": "from thirdhand_sim.scene import Scene",
         },
@@ -123,7 +189,11 @@ def modules_imported(folder: Path) -> dict[str, set[str]]:
                 imports |= {name.name for name in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 parts = {f"{node.module}.{name.name}" for name in node.names}
-                imports |= parts & names.keys() if parts <= names.keys() else parts & names.keys() | {node.module}
+                imports |= (
+                    parts & names.keys()
+                    if parts <= names.keys()
+                    else parts & names.keys() | {node.module}
+                )
         graph[module] = (imports & names.keys()) - {module}
     return graph
 
@@ -139,7 +209,10 @@ def circle(imports: dict[str, set[str]]) -> list[str]:
 
 def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
     """The import contracts of a tree, checked."""
-    code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
+    code = (
+        "import sys; from importlinter.cli import lint_imports_command; "
+        "sys.exit(lint_imports_command())"
+    )
     return subprocess.run(
         [sys.executable, "-c", code, "--no-cache"],
         capture_output=True,
@@ -147,7 +220,8 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
         timeout=120,
         check=False,
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": f"{folder}:{folder / 'service'}:{folder / 'sim'}", "COLUMNS": "200"},
+        env=os.environ
+        | {"PYTHONPATH": f"{folder}:{folder / 'service'}:{folder / 'sim'}", "COLUMNS": "200"},
     )
 
 
@@ -170,7 +244,11 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 def test_a_circle_is_found_also_in_functions_and_for_types_alone(late: str, tmp_path: Path) -> None:
     folder = tmp_path / "service" / "thirdhand"
     folder.mkdir(parents=True)
-    for name, text in (("a", "from thirdhand import b"), ("b", "from thirdhand.c import C"), ("c", late)):
+    for name, text in (
+        ("a", "from thirdhand import b"),
+        ("b", "from thirdhand.c import C"),
+        ("c", late),
+    ):
         (folder / f"{name}.py").write_text(text, encoding="utf-8")
     assert set(circle(modules_imported(tmp_path))) == {"thirdhand.a", "thirdhand.b", "thirdhand.c"}
 
@@ -181,13 +259,17 @@ def test_lines_that_break_a_contract_are_found_and_named(
 ) -> None:
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for folder in ("kmp", "service", "sim"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for path, line in lines.items():
         with (tmp_path / path).open("a", encoding="utf-8") as file:
             file.write(f"\n{line}\n")
     done = contracts(tmp_path)
     assert done.returncode == 1, done.stdout
-    assert broken <= set(re.findall(r"^(.*) BROKEN(?: \(.*\))?$", done.stdout, re.MULTILINE)), done.stdout
+    assert broken <= set(re.findall(r"^(.*) BROKEN(?: \(.*\))?$", done.stdout, re.MULTILINE)), (
+        done.stdout
+    )
     for path, line in lines.items():
         module = path.removesuffix(".py").removeprefix("service/").replace("/", ".")
         brought = f" -> {line.split()[1]} (l." if "import" in line else "\n"
@@ -197,29 +279,49 @@ def test_lines_that_break_a_contract_are_found_and_named(
 @pytest.mark.parametrize(
     ("process", "most", "without"),
     [
-        ("thirdhand.daemon.daemon", 195, ("thirdhand.workbench", "thirdhand_sim", "rerun", "mcap", "sklearn", "rich")),
+        (
+            "thirdhand.daemon.daemon",
+            195,
+            ("thirdhand.workbench", "thirdhand_sim", "rerun", "mcap", "sklearn", "rich"),
+        ),
         (
             "thirdhand.scribe.process, thirdhand.viewer.stream",
             80,
-            ("thirdhand.workbench", "thirdhand.daemon", "pinocchio", "ruckig", "zenoh", "sklearn", "kmp.primitive"),
+            (
+                "thirdhand.workbench",
+                "thirdhand.daemon",
+                "pinocchio",
+                "ruckig",
+                "zenoh",
+                "sklearn",
+                "kmp.primitive",
+            ),
         ),
     ],
     ids=["control process", "scribe"],
 )
-def test_a_process_of_a_cell_imports_what_it_needs(process: str, most: int, without: tuple[str, ...]) -> None:
+def test_a_process_of_a_cell_imports_what_it_needs(
+    process: str, most: int, without: tuple[str, ...]
+) -> None:
     code = f"import sys, {process}; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     modules = done.stdout.split()
     assert [name for name in modules if name.startswith(without)] == []
     assert len([name for name in modules if name.split(".")[0] in PACKAGES]) <= most
 
 
 def test_core_and_contract_import_neither_a_clock_nor_the_outside() -> None:
-    assert {named(path): imported(path) & OUTSIDE for path in PURE if imported(path) & OUTSIDE} == {}
+    assert {
+        named(path): imported(path) & OUTSIDE for path in PURE if imported(path) & OUTSIDE
+    } == {}
 
 
 @pytest.mark.parametrize("path", ENTRY_POINTS, ids=named)
-def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_library(path: Path) -> None:
+def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_library(
+    path: Path,
+) -> None:
     imports = (
         node
         for node in ast.parse(path.read_text(encoding="utf-8")).body
@@ -228,13 +330,26 @@ def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_lib
     names = ((node, getattr(node, "module", None) or node.names[0].name) for node in imports)
     first = next(node for node, name in names if name.split(".")[0] not in sys.stdlib_module_names)
     assert isinstance(first, ast.ImportFrom)
-    assert (first.module, [name.name for name in first.names]) == ("thirdhand.process", ["one_blas_thread"])
+    assert (first.module, [name.name for name in first.names]) == (
+        "thirdhand.process",
+        ["one_blas_thread"],
+    )
 
 
 def test_the_mathematics_imports_nothing_but_mathematics() -> None:
-    allowed = {"numpy", "scipy", "numba", "sklearn", "threadpoolctl", "kmp", *sys.stdlib_module_names}
+    allowed = {
+        "numpy",
+        "scipy",
+        "numba",
+        "sklearn",
+        "threadpoolctl",
+        "kmp",
+        *sys.stdlib_module_names,
+    }
     for path in (ROOT / "kmp").rglob("*.py"):
-        assert imported(path) <= allowed | ({"matplotlib"} if path.name == "plot.py" else set()), named(path)
+        assert imported(path) <= allowed | ({"matplotlib"} if path.name == "plot.py" else set()), (
+            named(path)
+        )
 
 
 def test_a_module_begins_with_what_it_is() -> None:
@@ -244,7 +359,9 @@ def test_a_module_begins_with_what_it_is() -> None:
 
 
 def test_no_module_has_a_name_that_says_nothing() -> None:
-    assert [named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE] == []
+    assert [
+        named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE
+    ] == []
 
 
 def defined(path: Path) -> set[str]:
@@ -255,8 +372,17 @@ def defined(path: Path) -> set[str]:
             identifiers.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = (name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))
-            identifiers |= {name.id for name in names if isinstance(name.ctx, ast.Store) and name.id.strip("_").isupper()}
+            names = (
+                name
+                for target in targets
+                for name in ast.walk(target)
+                if isinstance(name, ast.Name)
+            )
+            identifiers |= {
+                name.id
+                for name in names
+                if isinstance(name.ctx, ast.Store) and name.id.strip("_").isupper()
+            }
     return identifiers
 
 
@@ -272,7 +398,9 @@ def test_a_class_or_constant_has_a_name_of_its_own() -> None:
 
 def test_tests_share_what_stands_in_support_and_never_import_each_other() -> None:
     tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
-    theirs = {path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")} | {"tests"}
+    theirs = {
+        path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")
+    } | {"tests"}
     assert [named(path) for path in tests if imported(path) & theirs] == []
 
 
@@ -281,8 +409,16 @@ def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
     findings = []
     for path in (path for path in MODULES if path.is_relative_to(ROOT / "tests")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
-                findings += [f"{named(path)}: {name.name}" for name in node.names if re.match("_[a-z]", name.name)]
+            if (
+                isinstance(node, ast.ImportFrom)
+                and node.module
+                and node.module.split(".")[0] in PACKAGES
+            ):
+                findings += [
+                    f"{named(path)}: {name.name}"
+                    for name in node.names
+                    if re.match("_[a-z]", name.name)
+                ]
             elif isinstance(node, ast.Constant) and re.search(PRIVATE, str(node.value)):
                 findings.append(f"{named(path)}: {node.value}")
     assert findings == []
@@ -303,7 +439,9 @@ def test_constraints_name_versions_and_no_places() -> None:
     lines = (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = [line for line in lines if line.strip() and not line.startswith("#")]
     assert pins
-    assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", pin)] == []
+    assert [
+        pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", pin)
+    ] == []
     assert [line for line in lines if re.search(r"://|--(extra-)?index|--find-links|@", line)] == []
 
 
@@ -318,7 +456,13 @@ def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
         assert {"step.py", "stage.py"} <= {path.name for path in stage.glob("*.py")}
         for path in stage.glob("*.py"):
             text = path.read_text(encoding="utf-8")
-            others = [s.name for s in stages if s != stage and f"thirdhand.core.{s.name}.step import" in text]
+            others = [
+                s.name
+                for s in stages
+                if s != stage and f"thirdhand.core.{s.name}.step import" in text
+            ]
             assert not others, f"{named(path)} imports the step of {others}"
             loose = re.findall(r"^([A-Z][A-Z0-9_]+) = [-\d.e]+ *(?:#|$)", text, re.MULTILINE)
-            assert path.name == "tuning.py" or not [n for n in loose if n not in STRUCTURAL], f"{named(path)}: {loose}"
+            assert path.name == "tuning.py" or not [n for n in loose if n not in STRUCTURAL], (
+                f"{named(path)}: {loose}"
+            )

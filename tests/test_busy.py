@@ -52,11 +52,27 @@ def busy_processor() -> Iterator[int]:
 def test_a_failure_on_a_busy_processor_counts_only_if_it_comes_again(tmp_path: Path) -> None:
     (tmp_path / "test_both.py").write_text(TESTS)
     with busy_processor() as processor:
-        options = ["-p", "support.busy", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), str(tmp_path)]
-        code = f"import os, pytest, sys; os.sched_setaffinity(0, {{{processor}}}); sys.exit(pytest.main({options!r}))"
+        options = [
+            "-p",
+            "support.busy",
+            "-p",
+            "no:cacheprovider",
+            "--rootdir",
+            str(tmp_path),
+            str(tmp_path),
+        ]
+        code = (
+            f"import os, pytest, sys; os.sched_setaffinity(0, {{{processor}}}); "
+            f"sys.exit(pytest.main({options!r}))"
+        )
         environment = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
         done = subprocess.run(
-            [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
     assert done.returncode == 1
     assert "1 failed, 1 busy in" in done.stdout

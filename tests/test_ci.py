@@ -22,11 +22,19 @@ def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
     """
     (folder / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
-    (folder / "README.md").write_text(f"# A\n\n<!-- test -->\n```sh\n{readme}\n```\n", encoding="utf-8")
+    (folder / "README.md").write_text(
+        f"# A\n\n<!-- test -->\n```sh\n{readme}\n```\n", encoding="utf-8"
+    )
     newer = "pythons/versions/3.13.1/bin"
-    for path in (".venv/bin/python", f"{newer}/python", *(f".venv-newer/bin/{name}" for name in ("pip", "thirdhand"))):
+    for path in (
+        ".venv/bin/python",
+        f"{newer}/python",
+        *(f".venv-newer/bin/{name}" for name in ("pip", "thirdhand")),
+    ):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(f'#!/bin/sh\necho "$0 $*" >> "{folder}/calls"\n{python}\n', encoding="utf-8")
+        (folder / path).write_text(
+            f'#!/bin/sh\necho "$0 $*" >> "{folder}/calls"\n{python}\n', encoding="utf-8"
+        )
         (folder / path).chmod(0o755)
     shutil.copy(folder / ".venv/bin/python", folder / ".venv-newer/bin/python")
     (folder / newer / "python3.13").symlink_to("python")
@@ -49,22 +57,40 @@ def test_every_part_runs_and_the_end_names_those_that_failed(
 ) -> None:
     environment = checkout(tmp_path, readme=readme, python=python)
     done = subprocess.run(
-        ["bash", ".ci/run"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+        ["bash", ".ci/run"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == (1 if failed else 0), done.stderr
     for part in PARTS:
         assert f"== {part}\n" in done.stdout
         assert f"\n{part}: " in done.stdout
-    assert [line.removeprefix("failed: ") for line in done.stderr.splitlines() if "failed: " in line] == list(failed)
+    assert [
+        line.removeprefix("failed: ") for line in done.stderr.splitlines() if "failed: " in line
+    ] == list(failed)
     calls = (tmp_path / "calls").read_text(encoding="utf-8")
-    assert ("replay --exact recordings/golden.mcap" in calls) == ("a newer Python" not in failed or "demo" in python)
+    assert ("replay --exact recordings/golden.mcap" in calls) == (
+        "a newer Python" not in failed or "demo" in python
+    )
 
 
 def test_a_part_that_cannot_run_has_failed(tmp_path: Path) -> None:
-    environment = checkout(tmp_path, readme="true", python='[ "$1" != -c ]')  # a Python that cannot make environments
+    environment = checkout(
+        tmp_path, readme="true", python='[ "$1" != -c ]'
+    )  # a Python that cannot make environments
     (tmp_path / "README.md").write_text("# A\n", encoding="utf-8")
     done = subprocess.run(
-        ["bash", ".ci/run"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+        ["bash", ".ci/run"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == 1
     assert "README.md has no test command" in done.stderr

@@ -31,7 +31,9 @@ def instruction(name: str) -> list[str]:
     return list(json.loads(re.findall(rf"^{name} .*?(\[.*\])$", IMAGE, re.MULTILINE)[-1]))
 
 
-def test_the_image_installs_this_distribution_as_tested_and_runs_its_commands_without_rights() -> None:
+def test_the_image_installs_this_distribution_as_tested_and_runs_its_commands_without_rights() -> (
+    None
+):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = re.findall(r'"/source\[(.*?)\]"', IMAGE)[0].split(",")
     assert set(extras) <= set(project["optional-dependencies"])
@@ -49,7 +51,9 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
     for sources, target in re.findall(r"^COPY ((?!--).*) /source/?(.*)$", IMAGE, re.MULTILINE):
         for source in sources.split():
             if (ROOT / source).is_dir():
-                shutil.copytree(ROOT / source, tmp_path / target, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(
+                    ROOT / source, tmp_path / target, ignore=shutil.ignore_patterns("__pycache__")
+                )
             else:
                 (tmp_path / target).mkdir(exist_ok=True)
                 shutil.copy(ROOT / source, tmp_path / target)
@@ -61,7 +65,8 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
 
 
 def test_the_services_are_commands_of_this_version_and_reach_each_other() -> None:
-    services, configs = COMPOSE["services"], COMPOSE["configs"]
+    services = COMPOSE["services"]
+    configs = COMPOSE["configs"]
     cell, metrics = (parser().parse_args(services[name]["command"]) for name in ("cell", "metrics"))
     assert (cell.run, cell.hold) == ("thirdhand.cli.serve.serve", True)
     assert metrics.run == "thirdhand.workbench.cli.metrics.metrics"
@@ -69,8 +74,12 @@ def test_the_services_are_commands_of_this_version_and_reach_each_other() -> Non
     assert isinstance(settings, Settings)
     assert [str(cell.config)] == [config["target"] for config in services["cell"]["configs"]]
     router = services["router"]["command"]
-    assert list(settings.network.connect) == metrics.connect == [router[router.index("--listen") + 1]]
-    assert services["router"]["image"].split(":")[1] in (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8")
+    assert (
+        list(settings.network.connect) == metrics.connect == [router[router.index("--listen") + 1]]
+    )
+    assert services["router"]["image"].split(":")[1] in (
+        ROOT / ".ci" / "constraints.txt"
+    ).read_text(encoding="utf-8")
     scraped = yaml.safe_load(configs["prometheus"]["content"])
     assert scraped["scrape_configs"][0]["static_configs"][0]["targets"] == [metrics.listen]
     rules, inside, _ = services["prometheus"]["volumes"][0].split(":")
@@ -84,6 +93,10 @@ def test_the_services_are_commands_of_this_version_and_reach_each_other() -> Non
 @pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint is not installed")
 def test_a_linter_accepts_the_image() -> None:
     done = subprocess.run(
-        ["hadolint", str(EXAMPLES / "Containerfile")], capture_output=True, text=True, timeout=60, check=False
+        ["hadolint", str(EXAMPLES / "Containerfile")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == 0, done.stdout

@@ -28,7 +28,9 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.viewer.blueprint import plot_views
 
 FAULTS = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
-MEASURED = json.loads((ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8"))["faults"]
+MEASURED = json.loads(
+    (ROOT / "recordings" / "experiments" / "faults.json").read_text(encoding="utf-8")
+)["faults"]
 STATUS = (ROOT / "docs" / "status.md").read_text(encoding="utf-8")
 
 
@@ -43,7 +45,9 @@ def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
         return sorted(word for cell in cells for word in re.findall(r"`(\w+)`", cell))
 
     assert named(row[0] for row in table("field")) == sorted(requests.Status.__struct_fields__)
-    assert named(row[0] for row in table("of a source")) == sorted(requests.Source.__struct_fields__)
+    assert named(row[0] for row in table("of a source")) == sorted(
+        requests.Source.__struct_fields__
+    )
     scribe = next(row[1] for row in table("field") if row[0] == "`scribe`")
     assert named([scribe]) == sorted(Scribe(Settings()).status())
 
@@ -51,9 +55,13 @@ def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
 def test_what_to_do_names_fields_settings_and_causes_that_exist() -> None:
     settings = msgspec.to_builtins(Settings())
     terms = {*requests.Status.__struct_fields__, *incidents.BY_WORD, *settings, BASE}
-    terms |= {name for section in settings.values() if isinstance(section, dict) for name in section}
+    terms |= {
+        name for section in settings.values() if isinstance(section, dict) for name in section
+    }
     named = {
-        name for row in incidents.BY_WORD.values() for name in re.findall(r"`([a-z]+(?:_[a-z]+)*)`", row.what_to_do)
+        name
+        for row in incidents.BY_WORD.values()
+        for name in re.findall(r"`([a-z]+(?:_[a-z]+)*)`", row.what_to_do)
     }
     assert {"hand_age_ms", "rejected", "older", "keep_mb"} <= named <= terms
 
@@ -62,14 +70,18 @@ def test_each_view_that_a_page_names_by_its_title_exists() -> None:
     titles = {view.title for view in plot_views(Settings()).values()}
     for name in ("incidents.md", "viewing.md"):
         text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-        named = {" ".join(title.split()) for title in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)}
+        named = {
+            " ".join(title.split())
+            for title in re.findall(r"""["`]([A-Z][^"`]*\[[^]]+\])["`]""", text)
+        }
         assert named <= titles
         assert named or name != "incidents.md"
 
 
 def test_the_table_of_signs_is_that_of_the_shipped_arm() -> None:
     text = (ROOT / "docs" / "hardware.md").read_text(encoding="utf-8")
-    arm, names = Arm(Settings(), robot_description(Settings())), Settings().joints.names
+    arm = Arm(Settings(), robot_description(Settings()))
+    names = Settings().joints.names
     begin = np.array([0.0, 0.5, 0.0, 1.5, 0.0, -1.0, 0.0])
     rows = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)
     assert [row[0] for row in rows] == list(names)
@@ -83,14 +95,23 @@ def test_the_table_of_signs_is_that_of_the_shipped_arm() -> None:
 def cells_below(text: str, head: str) -> list[list[str]]:
     """The cells of each row of all tables in a text whose first column has this head."""
     tables = re.findall(rf"^\| {head} \|.*\n\|---.*\n((?:\|.*\n?)+)", text, flags=re.MULTILINE)
-    return [[cell.strip() for cell in row.strip("|").split("|")] for rows in tables for row in rows.splitlines()]
+    return [
+        [cell.strip() for cell in row.strip("|").split("|")]
+        for rows in tables
+        for row in rows.splitlines()
+    ]
 
 
 @pytest.mark.parametrize(
-    ("page", "head", "least"), [("faults.md", "fault", len(MEASURED) + 10), ("bounds.md", "bound", 10)]
+    ("page", "head", "least"),
+    [("faults.md", "fault", len(MEASURED) + 10), ("bounds.md", "bound", 10)],
 )
-def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(page: str, head: str, least: int) -> None:
-    promises = [row[0] for row in cells_below((ROOT / "docs" / page).read_text(encoding="utf-8"), head)]
+def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(
+    page: str, head: str, least: int
+) -> None:
+    promises = [
+        row[0] for row in cells_below((ROOT / "docs" / page).read_text(encoding="utf-8"), head)
+    ]
     rows = cells_below((ROOT / "docs" / "evidence.md").read_text(encoding="utf-8"), head)
     assert [row[0] for row in rows] == promises
     assert len(rows) >= least
@@ -99,9 +120,9 @@ def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(page: str, he
         assert named, promise
         for file, test in named:
             text = (ROOT / file).read_text(encoding="utf-8")
-            assert re.search(rf"^(def|class) {test}\b" if test else r"^def test_|^class Test", text, re.MULTILINE), (
-                tests
-            )
+            assert re.search(
+                rf"^(def|class) {test}\b" if test else r"^def test_|^class Test", text, re.MULTILINE
+            ), tests
 
 
 def test_each_fault_that_was_measured_has_a_row_with_its_figures() -> None:
@@ -120,13 +141,16 @@ def publisher(channel: Channel) -> str:
         return "the service" + ", which answers too" * channel.queryable
     if channel.direction == "request":
         return "the service answers"
-    return next((name for name, role in ROLES.items() if channel.key in role.publishes), "who demonstrates")
+    return next(
+        (name for name, role in ROLES.items() if channel.key in role.publishes), "who demonstrates"
+    )
 
 
 def test_the_table_of_the_wire_is_the_table_of_channels() -> None:
     assert rows_of("wire.md", "| `<cell>/") == [
-        f"| `<cell>/{channel.key}` | `{channel.codec.type}` | `application/{channel.codec.encoding}` | "
-        f"{publisher(channel)} | {channel.rate} | {channel.about} |"
+        f"| `<cell>/{channel.key}` | `{channel.codec.type}` | "
+        f"`application/{channel.codec.encoding}` | {publisher(channel)} | {channel.rate} | "
+        f"{channel.about} |"
         for channel in CHANNELS
         if channel.direction != "recording"
     ]
@@ -135,7 +159,8 @@ def test_the_table_of_the_wire_is_the_table_of_channels() -> None:
 def test_the_table_of_topics_is_that_of_the_ros2_node() -> None:
     does = {True: "subscribes | best effort, volatile", False: "publishes | reliable, volatile"}
     assert rows_of("ros2.md", "| `/<cell>/") == [
-        f"| `/<cell>/{channel.key}` | `{ros2.type_of(channel)}`{', JSON' * (channel.codec.encoding == 'json')} | "
+        f"| `/<cell>/{channel.key}` | "
+        f"`{ros2.type_of(channel)}`{', JSON' * (channel.codec.encoding == 'json')} | "
         f"{does[channel in ros2.HEARD]} |"
         for channel in (*ros2.HEARD, *ros2.SAID)
     ]
@@ -150,14 +175,23 @@ def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() 
     text = json.dumps(layout)
     topics = {topic("thirdhand", channel.key) for channel in CHANNELS if channel.recorded}
     scene_topics = set(layout["configById"]["3D!scene"]["topics"])
-    assert {"/robot_description", "/thirdhand/objects", "/thirdhand/hands/left", "/thirdhand/tool/target"} <= scene_topics
+    assert {
+        "/robot_description",
+        "/thirdhand/objects",
+        "/thirdhand/hands/left",
+        "/thirdhand/tool/target",
+    } <= scene_topics
     assert scene_topics <= topics
     named = re.findall(r'"(/thirdhand/\w+)\.(\w+)', text)
     assert len(named) >= 8
     assert all(field in fields.get(name, {"data"}) and name in topics for name, field in named)
 
     def panels(part: object) -> set[str]:
-        return panels(part["first"]) | panels(part["second"]) if isinstance(part, dict) else {str(part)}
+        return (
+            panels(part["first"]) | panels(part["second"])
+            if isinstance(part, dict)
+            else {str(part)}
+        )
 
     assert panels(layout["layout"]) == set(layout["configById"])
 
@@ -173,7 +207,9 @@ PAGES = sorted(
 
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser."""
-    actions = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))  # noqa: SLF001
+    actions = (
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    )  # noqa: SLF001
     return {name: command for action in actions for name, command in action.choices.items()}
 
 
@@ -183,18 +219,29 @@ def options(parser: argparse.ArgumentParser) -> set[str]:
 
 
 OPTIONS = {
-    name: options(command) for name, command in (commands(main.parser()) | {"sim": thirdhand_sim.__main__.parser()}).items()
+    name: options(command)
+    for name, command in (
+        commands(main.parser()) | {"sim": thirdhand_sim.__main__.parser()}
+    ).items()
 }
-TABLES = {name: set(section) for name, section in msgspec.to_builtins(Settings()).items() if isinstance(section, dict)}
+TABLES = {
+    name: set(section)
+    for name, section in msgspec.to_builtins(Settings()).items()
+    if isinstance(section, dict)
+}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_options_settings_and_files_that_a_page_names_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     code = re.findall(r"```(?:sh|console)\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL)
-    for name, arguments in re.findall(r"(?:^|\s)thirdhand ([a-z][a-z-]*)([^|&#\n]*)", "\n".join(map("".join, code))):
+    for name, arguments in re.findall(
+        r"(?:^|\s)thirdhand ([a-z][a-z-]*)([^|&#\n]*)", "\n".join(map("".join, code))
+    ):
         assert name in OPTIONS, f"thirdhand {name}"
-        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", arguments)) <= OPTIONS[name] | {"--help"}, name + arguments
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", arguments)) <= OPTIONS[name] | {
+            "--help"
+        }, name + arguments
     for table, name in re.findall(r"\[(\w+)\] (\w+)", text):
         assert table not in TABLES or name in TABLES[table], f"[{table}] {name}"
     for file in re.findall(r"`((?:service|sim|kmp|tests|docs|examples)/[\w./-]+\.\w+)`", text):
@@ -202,11 +249,19 @@ def test_commands_options_settings_and_files_that_a_page_names_exist(page: Path)
 
 
 def test_the_data_flow_is_drawn_once() -> None:
-    drawn = [page.name for page in PAGES if "Tick(index, inbox)" in page.read_text(encoding="utf-8")]
+    drawn = [
+        page.name for page in PAGES if "Tick(index, inbox)" in page.read_text(encoding="utf-8")
+    ]
     assert drawn == ["how-it-works.md"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_has_lines_of_100_characters_at_most(page: Path) -> None:
-    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    assert [line for line in text.splitlines() if len(line) > 100 and not line.startswith(("|", "!", "<!--"))] == []
+    text = re.sub(
+        r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
+    assert [
+        line
+        for line in text.splitlines()
+        if len(line) > 100 and not line.startswith(("|", "!", "<!--"))
+    ] == []

@@ -30,9 +30,12 @@ def example(name: str) -> ModuleType:
 
 
 @pytest.mark.thorough
-def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tracker_follower_teacher_and_watcher_work_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Once more with twice the time where a busy machine did not let them."""
-    output, ended = "", dict[str, Any]()
+    output = ""
+    ended = dict[str, Any]()
     with serving(tmp_path) as daemon:
         options = ["--connect", daemon.endpoint]
         example("teach").main(options)
@@ -43,7 +46,10 @@ def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, caps
             def run(name: str, *arguments: str) -> None:
                 ended[name] = modules[name].main([*options, *arguments])
 
-            running = [threading.Thread(target=run, args=(name, "--seconds", f"{seconds}")) for name in modules]
+            running = [
+                threading.Thread(target=run, args=(name, "--seconds", f"{seconds}"))
+                for name in modules
+            ]
             for thread in running:
                 thread.start()
             for thread in running:
@@ -53,7 +59,13 @@ def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, caps
                 break
         received = daemon.client.status().received
     assert ended.keys() == modules.keys()
-    assert received.keys() == {"hands/left", "hands/right", "joints/state", "joints/guided", "objects"}
+    assert received.keys() == {
+        "hands/left",
+        "hands/right",
+        "joints/state",
+        "joints/guided",
+        "objects",
+    }
     assert "thirdhand: follow" in output
     assert "commands arrive, at tick " in output
     assert "were none of this arm's" not in output
@@ -62,7 +74,9 @@ def test_tracker_follower_teacher_and_watcher_work_together(tmp_path: Path, caps
     assert np.abs(ended["follower"]).max() > 0.1
 
 
-def test_the_mathematics_alone_goes_through_the_point_it_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_mathematics_alone_goes_through_the_point_it_was_given(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     adapted = example("kmp_alone").main()
     assert np.allclose(adapted.mean(np.array([[1.0]])), [[0.20, 0.10]], atol=2e-3)
     assert len(capsys.readouterr().out.splitlines()) == 6

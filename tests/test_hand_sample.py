@@ -15,7 +15,12 @@ from support.paths import ROOT
 def printed() -> list[str]:
     """What the program prints that follows one sample."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.hand_sample"], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
+        [sys.executable, "-m", "tests.hand_sample"],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
@@ -30,4 +35,6 @@ def test_a_hand_sample_enters_few_files_and_few_of_them_again(printed: list[str]
 def test_the_page_for_contributors_follows_it_file_by_file(printed: list[str]) -> None:
     page = (ROOT / "docs" / "CONTRIBUTING.md").read_text(encoding="utf-8")
     walk = page[page.index("<!-- walk -->") : page.index("<!-- /walk -->")]
-    assert re.findall(r"`((?:service|kmp)/[\w/]+\.py)`", walk) == [line.split()[1] for line in printed[:-1]]
+    assert re.findall(r"`((?:service|kmp)/[\w/]+\.py)`", walk) == [
+        line.split()[1] for line in printed[:-1]
+    ]

@@ -22,10 +22,16 @@ from thirdhand.recordings.replay import replay
 from thirdhand.workbench.timing import benchmark
 
 pytestmark = pytest.mark.timed
-SECONDS, RATE_HZ = 5.0, 500
+SECONDS = 5.0
+RATE_HZ = 500
 # What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 0 and 0.
-MOST_WORK, MOST_LATENCY, MOST_MISSED = 14.0, 1.4, 0.03
-MOST_LATE = {"p50": 0.02, "p99": 0.5}  # shares of a period; a busy thread exceeds one of them, seldom both
+MOST_WORK = 14.0
+MOST_LATENCY = 1.4
+MOST_MISSED = 0.03
+MOST_LATE = {
+    "p50": 0.02,
+    "p99": 0.5,
+}  # shares of a period; a busy thread exceeds one of them, seldom both
 PLANTED = """
 from thirdhand.process import one_blas_thread
 import sys, threading, time
@@ -66,7 +72,9 @@ def two_cores() -> Iterator[None]:
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the command keeps of a run."""
     folder = tmp_path_factory.mktemp("kept")
-    done = thirdhand("bench", "--seconds", str(SECONDS), "--json", "--output", str(folder), timeout=150)
+    done = thirdhand(
+        "bench", "--seconds", str(SECONDS), "--json", "--output", str(folder), timeout=150
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout == (folder / "bench.json").read_text()
     return folder
@@ -75,9 +83,12 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The empty loop and the core, which no plant changes, are not measured again."""
-    report, measure = json.loads((kept / "bench.json").read_text()), benchmark.probe
+    report = json.loads((kept / "bench.json").read_text())
+    measure = benchmark.probe
     reports = {kind: report[kind] for kind in ("empty", "core")}
-    monkeypatch.setattr(benchmark, "probe", lambda kind, *more: reports.get(kind) or measure(kind, *more))
+    monkeypatch.setattr(
+        benchmark, "probe", lambda kind, *more: reports.get(kind) or measure(kind, *more)
+    )
 
 
 def complaints(report: dict[str, Any]) -> list[str]:
@@ -91,7 +102,11 @@ def complaints(report: dict[str, Any]) -> list[str]:
     for percentile, most in MOST_LATE.items():
         empty, whole = (report[kind]["lateness_us"][percentile] for kind in ("empty", "whole"))
         checks[f"lateness, {percentile}"] = 1e-6 * RATE_HZ * (whole - empty), most
-    return [f"{name} {value:g}, at most {most:g}" for name, (value, most) in checks.items() if value > most]
+    return [
+        f"{name} {value:g}, at most {most:g}"
+        for name, (value, most) in checks.items()
+        if value > most
+    ]
 
 
 def test_the_loop_keeps_its_time(kept: Path) -> None:
@@ -105,7 +120,8 @@ def test_the_loop_keeps_its_time(kept: Path) -> None:
 
 
 def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
-    whole, ticks = json.loads((kept / "bench.json").read_text())["whole"], SECONDS / 3 * RATE_HZ
+    whole = json.loads((kept / "bench.json").read_text())["whole"]
+    ticks = SECONDS / 3 * RATE_HZ
     assert whole["ticks"] == pytest.approx(ticks, abs=0.1 * ticks)
     assert sum(whole["work_counts"]) == pytest.approx(ticks, abs=0.1 * ticks)
     segments = sum(stage["p50"] for stage in whole["stages_us"].values())
@@ -129,9 +145,15 @@ def test_busy_processes_take_no_message_from_a_subscriber(tmp_path: Path) -> Non
     def note(sample: zenoh.Sample) -> None:
         numbers.setdefault(str(sample.key_expr), []).append(sample.source_info.source_sn)
 
-    with serving(tmp_path, "--joints", "assumed", "--rate", str(RATE_HZ)) as daemon, Tracker(daemon.session):
+    with (
+        serving(tmp_path, "--joints", "assumed", "--rate", str(RATE_HZ)) as daemon,
+        Tracker(daemon.session),
+    ):
         daemon.until(lambda status: status["mode"] == "follow")
-        heard = [daemon.session.declare_subscriber(f"thirdhand/{key}/*", note) for key in ("joints", "tool")]
+        heard = [
+            daemon.session.declare_subscriber(f"thirdhand/{key}/*", note)
+            for key in ("joints", "tool")
+        ]
         busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
         try:
             time.sleep(2 * SECONDS)

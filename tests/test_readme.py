@@ -23,19 +23,26 @@ def program() -> str:
     return str(programs[0])
 
 
-def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(tmp_path: Path) -> None:
+def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(
+    tmp_path: Path,
+) -> None:
     assert len([line for line in program().splitlines() if line]) <= 10
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
     with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = {"THIRDHAND_CONNECT": daemon.endpoint, "HOME": str(tmp_path)}
-        for _ in range(3):  # a busy machine may leave the hands stale, or the skill worker without time
+        for _ in range(
+            3
+        ):  # a busy machine may leave the hands stale, or the skill worker without time
             done = isolated(site, program(), "zenoh", "msgspec", env=environment)
             held = daemon.client.status().reason
             daemon.client.resume()
             if done.stdout.startswith("mode follow"):
                 break
     assert (done.returncode, done.stderr, held) == (0, "", "operator")
-    assert done.stdout == "mode follow: the tool is at (0.5, -0.2, 0.4), its target at (0.5, -0.2, 0.4)\n"
+    assert (
+        done.stdout
+        == "mode follow: the tool is at (0.5, -0.2, 0.4), its target at (0.5, -0.2, 0.4)\n"
+    )
 
 
 def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
@@ -47,7 +54,13 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
         before = daemon.client.status().tool_m
         command = [sys.executable, "-c", code.replace("range(3000)", "range(315)")]
         done = subprocess.run(
-            command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+            command,
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         after = daemon.client.status().tool_m
@@ -57,7 +70,11 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
 
 
 def test_the_environment_is_activated_before_the_first_bare_command() -> None:
-    lines = [line for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
+    lines = [
+        line
+        for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+        for line in block.splitlines()
+    ]
     first = next(i for i, line in enumerate(lines) if line.startswith("thirdhand "))
     assert ". .venv/bin/activate" in lines[:first]
 

@@ -26,9 +26,38 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.people.moving_hands import SMALL_KINDS
 
 DOCS = ROOT / "docs"
-PAGES = sorted(path for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings") for path in folder.glob("*.md"))
-UNITS = ("_M", "_M2", "_M3", "_S", "_S2", "_RAD", "_RADPS", "_MPS", "_MPS2", "_M2PS5", "_PER_S", "_PER_S2", "_PER_M")
-UNITS += ("_PER_M2", "_SHARE", "_SHARES", "_SAMPLES", "_STDS", "_WEIGHT", "_POWER", "_ODDS", "_PROBABILITY", "_SPEEDS")
+PAGES = sorted(
+    path
+    for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings")
+    for path in folder.glob("*.md")
+)
+UNITS = (
+    "_M",
+    "_M2",
+    "_M3",
+    "_S",
+    "_S2",
+    "_RAD",
+    "_RADPS",
+    "_MPS",
+    "_MPS2",
+    "_M2PS5",
+    "_PER_S",
+    "_PER_S2",
+    "_PER_M",
+)
+UNITS += (
+    "_PER_M2",
+    "_SHARE",
+    "_SHARES",
+    "_SAMPLES",
+    "_STDS",
+    "_WEIGHT",
+    "_POWER",
+    "_ODDS",
+    "_PROBABILITY",
+    "_SPEEDS",
+)
 DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a primitive's inputs
     *(
         "MODE_PRIOR",
@@ -38,11 +67,21 @@ DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a p
         "SEGMENT_DISTANCE_BESIDE",
         "REST_SHARPNESS",
     ),
-    *("ERROR_WIDTH", "GRIPPER_OPEN_BELOW", "STOP_SECANTS", "PLANNED_BRAKE_LIMITS", "MAX_SQUARED_DEVIATION"),
+    *(
+        "ERROR_WIDTH",
+        "GRIPPER_OPEN_BELOW",
+        "STOP_SECANTS",
+        "PLANNED_BRAKE_LIMITS",
+        "MAX_SQUARED_DEVIATION",
+    ),
     *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-INSIDE = {"decoded", "no_room_to_brake", "publisher"}  # of `thirdhand.client`, for the service's own programs
+INSIDE = {
+    "decoded",
+    "no_room_to_brake",
+    "publisher",
+}  # of `thirdhand.client`, for the service's own programs
 
 
 def program(name: str) -> ModuleType:
@@ -63,7 +102,9 @@ def written_by(name: str) -> str:
 @pytest.mark.parametrize("name", ["settings", "command-line", "incidents", "tuning"])
 def test_a_generated_page_is_up_to_date(name: str) -> None:
     writer = f"{name.replace('-', '_')}_page"
-    assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), f"run `python docs/{writer}.py`"
+    assert (DOCS / f"{name}.md").read_text(encoding="utf-8") == written_by(writer), (
+        f"run `python docs/{writer}.py`"
+    )
 
 
 def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
@@ -72,14 +113,18 @@ def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -
     assert len(numbers) > 70
     for number in numbers:
         assert number.meaning, number.name
-        assert number.low <= np.min(number.value) <= np.max(number.value) <= number.high, number.name
+        assert number.low <= np.min(number.value) <= np.max(number.value) <= number.high, (
+            number.name
+        )
         name = number.name.upper()
         assert name.endswith(UNITS) or name in DIMENSIONLESS, name
 
 
 def test_the_page_lists_each_tuned_number_that_is_data() -> None:
     page = program("tuning_page")
-    listed = {f"{segment}.{number.name}" for segment in page.STAGES for number in page.numbers_of(segment)}
+    listed = {
+        f"{segment}.{number.name}" for segment in page.STAGES for number in page.numbers_of(segment)
+    }
     assert set(sensitivity.numbers()) <= listed
 
 
@@ -87,7 +132,12 @@ def test_the_page_on_the_command_line_has_every_command_and_option() -> None:
     written = written_by("command_line_page")
     commands = {name for names in GROUPS.values() for name in names}
     assert set(re.findall(r"^## thirdhand ([\w-]+)$", written, re.MULTILINE)) == commands
-    for text in ("### thirdhand via-points add", "| `--web [[HOST:]PORT]` |", "| `--at X Y Z` |", "`DEMO ...`"):
+    for text in (
+        "### thirdhand via-points add",
+        "| `--web [[HOST:]PORT]` |",
+        "| `--at X Y Z` |",
+        "`DEMO ...`",
+    ):
         assert text in written
 
 
@@ -96,26 +146,45 @@ def test_the_pages_on_python_are_those_of_the_docstrings_and_have_every_name() -
         assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
         module = {"library": kmp, "client": client}[page.stem]
         headings = set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
-        assert {name for name in module.__all__ if callable(getattr(module, name)) and name not in INSIDE} <= headings
+        assert {
+            name
+            for name in module.__all__
+            if callable(getattr(module, name)) and name not in INSIDE
+        } <= headings
         called = {
-            "library": ("KMP.predict(queries)", "KMP.plot(", "LocalKMP.placed(frames)", "Gaussians.product(*others)"),
-            "client": ("Client.load_skill(name)", "Tracker.publish(", "Follower.command(timeout_s=0.02)"),
+            "library": (
+                "KMP.predict(queries)",
+                "KMP.plot(",
+                "LocalKMP.placed(frames)",
+                "Gaussians.product(*others)",
+            ),
+            "client": (
+                "Client.load_skill(name)",
+                "Tracker.publish(",
+                "Follower.command(timeout_s=0.02)",
+            ),
         }
         assert [text for text in called[page.stem] if text not in written] == []
 
 
 def test_the_index_and_the_navigation_have_every_page() -> None:
     stems = {path.stem for path in DOCS.glob("*.md")} - {"index"}
-    linked = {link.removesuffix(".md") for link in LINK.findall((DOCS / "index.md").read_text(encoding="utf-8"))}
+    linked = {
+        link.removesuffix(".md")
+        for link in LINK.findall((DOCS / "index.md").read_text(encoding="utf-8"))
+    }
     assert stems <= linked
     assert stems <= {name for names in program("conf").GROUPS.values() for name in names}
 
 
 @pytest.mark.parametrize("name", ["frames", "loop", "path"])
-def test_a_picture_is_drawn_by_its_program(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_is_drawn_by_its_program(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawing = program(f"{name}_picture")
     monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")
-    matplotlib.rcdefaults()  # experiments, which this process may have run before, have a style of their own
+    # experiments, which this process may have run before, have a style of their own
+    matplotlib.rcdefaults()
     drawing.main()
     assert (tmp_path / "drawn.png").stat().st_size > 20_000
 
@@ -129,29 +198,51 @@ def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() ->
     page = program("experiments_page")
     options = {"share": 1.0, "arm": "wam", "set": "test"}
     results: dict[str, dict[str, Any]] = {
-        name: {"depends_on": dict.fromkeys(experiment.depends_on, "a"), "options": options, "commit": "1234+"}
+        name: {
+            "depends_on": dict.fromkeys(experiment.depends_on, "a"),
+            "options": options,
+            "commit": "1234+",
+        }
         for name, experiment in EXPERIMENTS.items()
     }
     results["motion"]["depends_on"] |= {"kmp": "b"}
 
     def written(text: str) -> str:
-        return str(page.templates(results, dict.fromkeys(("core", "learning", "kmp"), "a")).from_string(text).render())
+        return str(
+            page.templates(results, dict.fromkeys(("core", "learning", "kmp"), "a"))
+            .from_string(text)
+            .render()
+        )
 
     assert (
         written("{{ stale('separation', 'motion', 'faults') }}")
         == "*Measured with an earlier version: `motion` at 1234+.*"
     )
-    assert written("{{ version('motion') }} {{ version('separation') }}") == "**stale**: 1234+ `1234+`"
+    assert (
+        written("{{ version('motion') }} {{ version('separation') }}") == "**stale**: 1234+ `1234+`"
+    )
     assert written("{{ stale('separation') }}") == ""
-    assert written("{{ separation.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}") == "1234+, 0.06, 0.360"
+    assert (
+        written("{{ separation.commit }}, {{ 0.0512 | up(2) }}, {{ 0.36 | significant(3) }}")
+        == "1234+, 0.06, 0.360"
+    )
     with pytest.raises(jinja2.UndefinedError, match="tremor"):
         written("{{ separation.tremor }}")
 
 
 def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them() -> None:
     page = program("experiments_page")
-    results: dict[str, dict[str, Any]] = {name: page.result_of(page.RESULTS, name) for name in EXPERIMENTS}
-    errors = {"ours": 3.0, "chase": 4.0, "ours_median": 1.5, "chase_median": 2.5, "ratio": 0.75, "lag_ms": 30.0}
+    results: dict[str, dict[str, Any]] = {
+        name: page.result_of(page.RESULTS, name) for name in EXPERIMENTS
+    }
+    errors = {
+        "ours": 3.0,
+        "chase": 4.0,
+        "ours_median": 1.5,
+        "chase_median": 2.5,
+        "ratio": 0.75,
+        "lag_ms": 30.0,
+    }
     groups = ("clean", "recorded", "recorded, jumps in the truth")
     results["motion-of-others"] |= {
         "takes": {"somebody": 2},
@@ -160,9 +251,13 @@ def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them()
         "by_tracker": {group: {"camera": errors} for group in groups},
         "all": dict.fromkeys(groups, errors),
     }
-    gains = {method: {"setpoint": [1.0, 1.25], "tool": [1.0, 1.125]} for method in ("ours", "chase")}
+    gains = {
+        method: {"setpoint": [1.0, 1.25], "tool": [1.0, 1.125]} for method in ("ours", "chase")
+    }
     results["motion"]["gain_by_frequency"] = {"hz": [1, 2], **dict.fromkeys(SMALL_KINDS, gains)}
-    text = page.wrapped(page.templates(results, page.tree()).get_template("experiments.md.jinja").render())
+    text = page.wrapped(
+        page.templates(results, page.tree()).get_template("experiments.md.jinja").render()
+    )
     row = "| 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 | 3.0, 1.5 | 4.0, 2.5 |"
     assert f"\n| `somebody` | camera {row}\n| all by camera | {row}\n| all | {row}\n" in text
     assert "the gain is at most 1.25, and 1.12 at the tool" in " ".join(text.split())
@@ -203,19 +298,39 @@ def test_every_link_within_the_project_has_a_target(page: Path) -> None:
         assert target.exists(), link
         assert target.is_relative_to(ROOT), link
         if part:
-            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            headings = re.findall(
+                r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE
+            )
             assert part in map(anchor, headings), link
 
 
 def test_a_site_is_built_of_all_pages_without_a_warning(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", str(tmp_path / "read")]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-n",
+        "-q",
+        "-d",
+        str(tmp_path / "read"),
+    ]
     done = subprocess.run(
-        [*command, str(DOCS), str(tmp_path / "site")], capture_output=True, text=True, timeout=110, check=False
+        [*command, str(DOCS), str(tmp_path / "site")],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     front = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     for page in DOCS.glob("*.md"):
         assert (tmp_path / "site" / f"{page.stem}.html").exists()
         html = (tmp_path / "site" / f"{page.stem}.html").read_text(encoding="utf-8")
-        assert not re.search("[\u2013\u2014](json|mouse|web|output|each|live|[a-z]+-[a-z]+)\\b", html), page  # options
-        assert f'href="{page.stem}.html"' in front or page.stem == "index", f"{page.stem} is not in the navigation"
+        assert not re.search(
+            "[\u2013\u2014](json|mouse|web|output|each|live|[a-z]+-[a-z]+)\\b", html
+        ), page  # options
+        assert f'href="{page.stem}.html"' in front or page.stem == "index", (
+            f"{page.stem} is not in the navigation"
+        )

@@ -24,6 +24,11 @@ MYPY_CACHE = Path.home() / ".cache" / "thirdhand" / "mypy"  # by content, for ev
 )
 def test_static_checks_find_nothing(command: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", *command], capture_output=True, text=True, timeout=300, check=False, cwd=ROOT
+        [sys.executable, "-m", *command],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stdout + done.stderr

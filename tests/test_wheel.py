@@ -27,9 +27,17 @@ def test_it_holds_service_bench_and_recordings_and_nothing_else(wheel: Path) -> 
     folders = (ROOT / "service", ROOT / "sim")
     sources = {str(path.relative_to(folder)) for folder in folders for path in folder.rglob("*.py")}
     sources = {name for name in sources if not name.startswith("thirdhand_sim/lab/")}
-    arms = {f"thirdhand/arms/{name}" for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")}
-    people = {f"thirdhand/shipped/people/{path.name}" for path in (ROOT / "recordings" / "people").iterdir()}
-    assert sources | arms | people | {"thirdhand/shipped/soldering.npz", "thirdhand/py.typed"} <= held
+    arms = {
+        f"thirdhand/arms/{name}"
+        for name in ("wam.urdf", "franka.toml", "fr3.urdf", "ur5.toml", "ur5.urdf")
+    }
+    people = {
+        f"thirdhand/shipped/people/{path.name}"
+        for path in (ROOT / "recordings" / "people").iterdir()
+    }
+    assert (
+        sources | arms | people | {"thirdhand/shipped/soldering.npz", "thirdhand/py.typed"} <= held
+    )
     assert {name for name in held if name.endswith(".py")} == sources
     assert wheel.stat().st_size < 1.8e6
     assert {name.split("/")[0] for name in held} == {"thirdhand", "thirdhand_sim"}
@@ -40,21 +48,39 @@ def test_how_to_cite_it_is_told_with_its_version_and_the_papers_it_follows(wheel
     citation = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text(encoding="utf-8"))
     assert f"-{citation['version']}-" in wheel.name
     paper, article = citation["preferred-citation"], *citation["references"]
-    assert (paper["year"], paper["start"], paper["end"], article["volume"]) == (2019, 5266, 5272, 38)
-    assert [author["family-names"] for author in paper["authors"]] == ["Huang", "Rozo", "Silvério", "Caldwell"]
-    assert paper["title"] in (ROOT / "kmp" / "README.md").read_text(encoding="utf-8").replace("\n", " ")
+    assert (paper["year"], paper["start"], paper["end"], article["volume"]) == (
+        2019,
+        5266,
+        5272,
+        38,
+    )
+    assert [author["family-names"] for author in paper["authors"]] == [
+        "Huang",
+        "Rozo",
+        "Silvério",
+        "Caldwell",
+    ]
+    assert paper["title"] in (ROOT / "kmp" / "README.md").read_text(encoding="utf-8").replace(
+        "\n", " "
+    )
 
 
 def test_nothing_in_it_needs_the_lab(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        texts = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+        texts = {
+            name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")
+        }
     lab = re.compile(r"(from|import) thirdhand_sim(\.| import )lab")
     assert [name for name, text in texts.items() if lab.search(text)] == []
 
 
-def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(wheel: Path) -> None:
+def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(
+    wheel: Path,
+) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
+        page = archive.read(
+            next(name for name in archive.namelist() if name.endswith("/METADATA"))
+        ).decode()
     assert "Description-Content-Type: text/markdown" in page
     assert "# thirdhand\n" in page
     targets = re.findall(r"\]\(([^)\s]+)\)", page)
@@ -63,8 +89,15 @@ def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_reposit
 
 def test_the_bench_wants_a_library_only_where_that_has_wheels(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        page = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
-    requirements = [line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")]
+        page = archive.read(
+            next(name for name in archive.namelist() if name.endswith("/METADATA"))
+        ).decode()
+    requirements = [
+        line for line in page.splitlines() if line.startswith("Requires-Dist: pybullet")
+    ]
     assert requirements
     assert all("python_version < '3.12'" in line and "extra ==" in line for line in requirements)
-    assert any(line.startswith("Requires-Dist: mujoco-core") and "python" not in line for line in page.splitlines())
+    assert any(
+        line.startswith("Requires-Dist: mujoco-core") and "python" not in line
+        for line in page.splitlines()
+    )

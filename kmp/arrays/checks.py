@@ -27,7 +27,9 @@ def real(name: str, value: ArrayLike) -> Array:
     try:
         array = np.asarray(value)
     except ValueError:
-        raise ValueError(f"{name}: rows of different lengths given, an array of real numbers needed.") from None
+        raise ValueError(
+            f"{name}: rows of different lengths given, an array of real numbers needed."
+        ) from None
     if array.dtype.char == "d":
         return array
     if array.dtype.kind not in "biuf":
@@ -68,15 +70,23 @@ def check_finite(name: str, array: Array, what: str = "") -> None:
             return
         of = f"{name}: {what} " if what else name
         for place in np.argwhere(~(np.abs(array) <= _LARGEST))[:1].tolist():
-            needed = "finite" if not np.isfinite(array[tuple(place)]) else f"at most {_LARGEST:g} in size"
-            raise ValueError(f"{of}{place or ''} is {array[tuple(place)]:g}, and every number must be {needed}.")
+            needed = (
+                "finite"
+                if not np.isfinite(array[tuple(place)])
+                else f"at most {_LARGEST:g} in size"
+            )
+            raise ValueError(
+                f"{of}{place or ''} is {array[tuple(place)]:g}, and every number must be {needed}."
+            )
 
 
 def check_shape(name: str, array: Array, *shape: int | str) -> None:
     """Raise ValueError unless the array has this shape; a word stands for any length."""
     if array.shape == shape:
         return
-    if array.ndim == len(shape) and all(n == m or isinstance(n, str) for n, m in zip(shape, array.shape, strict=True)):
+    if array.ndim == len(shape) and all(
+        n == m or isinstance(n, str) for n, m in zip(shape, array.shape, strict=True)
+    ):
         return
     shape_text = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
     raise ValueError(f"{name}: shape {array.shape} given, ({shape_text}) needed.")
@@ -122,7 +132,10 @@ def check_some(name: str, values: Sized) -> None:
 
 def parts_of(name: str, value: Any, kind: type | None = None, how: str = "") -> list[Any]:
     """The parts as a list. Raises ValueError if there is none, or one is not of this kind."""
-    if not isinstance(value, (list, tuple)) and np.ndim(value if isinstance(value, np.ndarray) else 0) == 0:
+    if (
+        not isinstance(value, (list, tuple))
+        and np.ndim(value if isinstance(value, np.ndarray) else 0) == 0
+    ):
         raise ValueError(f"{name}: {type(value).__name__} given, a list needed.")
     check_some(name, value)
     for i, part in enumerate(value):
@@ -164,7 +177,9 @@ def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
     raise ValueError(f"{name}: {type(demonstration).__name__}{of} given, {needed}.")
 
 
-def checked_demonstrations(demonstrations: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:
+def checked_demonstrations(
+    demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
+) -> list[tuple[Array, Array]]:
     """Inputs (T, I) and outputs (T, O) of each demonstration. Raises ValueError if one is empty."""
     data: list[tuple[Array, Array]] = []
     for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):

@@ -26,7 +26,11 @@ class Immutable:
 
     def __repr__(self) -> str:
         """The fields in one line, arrays as their shapes."""
-        fields = (f"{name}={_short(value)}" for name, value in self.__dict__.items() if name in self._fields())
+        fields = (
+            f"{name}={_short(value)}"
+            for name, value in self.__dict__.items()
+            if name in self._fields()
+        )
         return f"{type(self).__name__}({', '.join(fields)})"
 
     @classmethod
@@ -34,7 +38,9 @@ class Immutable:
         return tuple(getattr(cls, "__dataclass_fields__", ()))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in self._not_pickled}
+        return {
+            name: value for name, value in self.__dict__.items() if name not in self._not_pickled
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         _freeze(tuple(state.values()))

@@ -32,7 +32,8 @@ class InverseCholeskyFactor(Immutable):
     @classmethod
     def of(cls, factor: Array, copies: int) -> InverseCholeskyFactor:
         """The inverse of a factor L (n D, n D), with D = `copies`."""
-        size, d = len(factor), copies
+        size = len(factor)
+        d = copies
         n = size // d
         inverse, _ = lapack.dtrtri(factor, lower=1)
         rows = inverse.reshape(size, n, d)
@@ -50,7 +51,11 @@ class InverseCholeskyFactor(Immutable):
         if x.ndim == 1:
             return product.reshape(-1, self.copies).T
         channels = x.shape[1]
-        return product.reshape(-1, self.copies, channels).transpose(2, 1, 0).reshape(channels * self.copies, -1)
+        return (
+            product.reshape(-1, self.copies, channels)
+            .transpose(2, 1, 0)
+            .reshape(channels * self.copies, -1)
+        )
 
     def times_many(self, x: Array, channels: int) -> Array:
         """L^-1 (x_m (x) I) for M of them side by side, x (n, M C): (M, n D, C D)."""

@@ -28,7 +28,9 @@ def squared_distances(points: Array) -> Array:
     return np.asarray(np.maximum(0.5 * (squares + squares.T), 0.0))
 
 
-def held_out_residuals(kernel: Array, ratios: Array, group: NDArray[np.intp], targets: Callable[[int], Array]) -> Array:
+def held_out_residuals(
+    kernel: Array, ratios: Array, group: NDArray[np.intp], targets: Callable[[int], Array]
+) -> Array:
     """The residuals (J, N, D) of kernel ridge regression without each point's group.
 
     `ratios` (J,) are the variances of the noise over the kernel's, `group` (N,) the numbers of the
@@ -45,7 +47,9 @@ def held_out_residuals(kernel: Array, ratios: Array, group: NDArray[np.intp], ta
     return out
 
 
-def held_out_covariances(kernel: Array, scatter: Array, ratios: Array, group: NDArray[np.intp]) -> Array:
+def held_out_covariances(
+    kernel: Array, scatter: Array, ratios: Array, group: NDArray[np.intp]
+) -> Array:
     """The covariances (J, N, O, O) of each point without its group, in units of the kernel.
 
     The noise of a point is a ratio (J,) times its scatter S_n (N, O, O). With S_n = L_n L_n^T, the
@@ -53,16 +57,26 @@ def held_out_covariances(kernel: Array, scatter: Array, ratios: Array, group: ND
     covariance without its noise is L_n (C_n - r I) L_n^T.
     """
     roots = np.linalg.cholesky(scatter)
-    white, (count, width, _) = np.linalg.inv(roots), roots.shape
-    total = np.einsum("nm,nik,mjk->nimj", kernel, white, white, optimize=True).reshape(2 * [count * width])
+    white = np.linalg.inv(roots)
+    count, width, _ = roots.shape
+    total = np.einsum("nm,nik,mjk->nimj", kernel, white, white, optimize=True).reshape(
+        2 * [count * width]
+    )
     values, vectors = np.linalg.eigh(total)
     out = np.empty((len(ratios), count, width, width))
     for number in np.unique(group):
         mine = np.flatnonzero(group == number)
-        rows, diagonal = vectors[(width * mine[:, None] + np.arange(width)).ravel()], np.arange(len(mine))
+        rows = vectors[(width * mine[:, None] + np.arange(width)).ravel()]
+        diagonal = np.arange(len(mine))
         blocks = np.linalg.inv(rows / (values + ratios[:, None])[:, None] @ rows.T)
-        diagonal_blocks = blocks.reshape(-1, len(mine), width, len(mine), width)[:, diagonal, :, diagonal].swapaxes(0, 1)
-        out[:, mine] = roots[mine] @ (diagonal_blocks - ratios[:, None, None, None] * np.eye(width)) @ roots[mine].mT
+        diagonal_blocks = blocks.reshape(-1, len(mine), width, len(mine), width)[
+            :, diagonal, :, diagonal
+        ].swapaxes(0, 1)
+        out[:, mine] = (
+            roots[mine]
+            @ (diagonal_blocks - ratios[:, None, None, None] * np.eye(width))
+            @ roots[mine].mT
+        )
     return np.asarray(0.5 * (out + out.mT))
 
 
@@ -85,4 +99,7 @@ def preferred(candidates: Sequence[T], scores: Sequence[float], limit: float) ->
     for candidate, score in zip(candidates, scores, strict=True):
         if score <= limit:
             return candidate
-    raise ValueError(f"limit: {limit:g} given, at least the least score, {min(scores, default=np.nan):g}, needed.")
+    raise ValueError(
+        f"limit: {limit:g} given, at least the least score, {min(scores, default=np.nan):g}, "
+        "needed."
+    )

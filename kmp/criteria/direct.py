@@ -57,7 +57,9 @@ class Scales(NamedTuple):
 
     ells: Sequence[float]  # candidates for the kernel's ell
     ridges: Sequence[float]  # candidates: inputs that vary by less do not move the affine mean
-    linear_share: float  # an affine mean is chosen if its error is below this share of a constant one's
+    linear_share: (
+        float  # an affine mean is chosen if its error is below this share of a constant one's
+    )
     max_gain: float  # limit of the affine mean's singular values
     local: float  # l [unit of the inputs]
     noise: float  # sigma, the noise of the outputs, which made demonstrations lack
@@ -85,10 +87,14 @@ class DirectSelection:
     outputs: Array
     group: NDArray[np.intp]
     scales: Scales
-    isotropic: bool = False  # True if S is a multiple of I at each point, which costs a ninth of the time
+    isotropic: bool = (
+        False  # True if S is a multiple of I at each point, which costs a ninth of the time
+    )
     joint: bool = False  # True if the prior mean is chosen with the kernel, not after it
     factors: Array | None = None  # (N,) f_n; None if all are 1
-    judged: NDArray[np.bool_] | None = None  # (N,) True for points whose residuals count; None if all do
+    judged: NDArray[np.bool_] | None = (
+        None  # (N,) True for points whose residuals count; None if all do
+    )
 
     @cached_property
     def _constant(self) -> Array:
@@ -111,7 +117,9 @@ class DirectSelection:
     def _counted(self) -> NDArray[np.bool_]:
         return np.ones(len(self.group), bool) if self.judged is None else self.judged
 
-    def best_mean(self, ell: float | None = None, *, may_be_linear: bool = False) -> tuple[float, Parameters]:
+    def best_mean(
+        self, ell: float | None = None, *, may_be_linear: bool = False
+    ) -> tuple[float, Parameters]:
         """The root mean square residual and the parameters of the best mean.
 
         ell is this one, or chosen from `Scales.ells`; `spread` and `deviation` are 1.
@@ -121,20 +129,32 @@ class DirectSelection:
         count = len(np.unique(self.group))
         if count < 2:
             raise ValueError(f"group: {count} number given, at least 2 needed to hold one out.")
-        ridges, ells = self.scales.ridges, np.array(self.scales.ells if ell is None else [ell])
-        tried = list(self._tried(ells, (None, *ridges) if may_be_linear and self.joint else (None,)))
-        constant = min((candidate for candidate in tried if candidate[1].ridge is None), key=lambda one: one[0])
+        ridges = self.scales.ridges
+        ells = np.array(self.scales.ells if ell is None else [ell])
+        tried = list(
+            self._tried(ells, (None, *ridges) if may_be_linear and self.joint else (None,))
+        )
+        constant = min(
+            (candidate for candidate in tried if candidate[1].ridge is None), key=lambda one: one[0]
+        )
         if not may_be_linear:
             return constant
         # Chosen one after the other, both means have the same kernel, and the covariance grows
         # equally fast off the data.
         tried = tried if self.joint else list(self._tried(np.array([constant[1].ell]), ridges))
-        linear = min((candidate for candidate in tried if candidate[1].ridge is not None), key=lambda one: one[0])
+        linear = min(
+            (candidate for candidate in tried if candidate[1].ridge is not None),
+            key=lambda one: one[0],
+        )
         return linear if linear[0] < self.scales.linear_share * constant[0] else constant
 
-    def _tried(self, ells: Array, ridges: Sequence[float | None]) -> Iterator[tuple[float, Parameters]]:
+    def _tried(
+        self, ells: Array, ridges: Sequence[float | None]
+    ) -> Iterator[tuple[float, Parameters]]:
         for ell in ells.tolist():
-            for noise, by_ridge in zip(_NOISES.tolist(), self._residuals(ell, _NOISES, ridges), strict=True):
+            for noise, by_ridge in zip(
+                _NOISES.tolist(), self._residuals(ell, _NOISES, ridges), strict=True
+            ):
                 for ridge, residuals in zip(ridges, by_ridge, strict=True):
                     yield rms(residuals[self._counted]), Parameters(ell, noise, 1.0, 1.0, ridge)
 
@@ -144,17 +164,25 @@ class DirectSelection:
         Raises ValueError if all points are of one group.
         """
         _, unscaled = self.best_mean(ell, may_be_linear=may_be_linear)
-        basis = unscaled if self.joint or unscaled.ridge is None else self.best_mean(unscaled.ell)[1]
+        basis = (
+            unscaled if self.joint or unscaled.ridge is None else self.best_mean(unscaled.ell)[1]
+        )
         spread = self._spread(unscaled.ell, self.residuals(basis.ell, basis.noise, basis.ridge))
         unscaled = unscaled._replace(spread=spread)
         residuals = self.residuals(unscaled.ell, unscaled.noise, unscaled.ridge)
-        squares, floors = [], []
+        squares = []
+        floors = []
         groups = np.unique(self.group[self._counted])
         for number in groups.tolist():
             mine = self.group == number
-            prediction = self.primitive(unscaled, residuals, without=number).predict(self.inputs[mine])
+            prediction = self.primitive(unscaled, residuals, without=number).predict(
+                self.inputs[mine]
+            )
             squares.append(mahalanobis(self.outputs[mine] - prediction.mean, prediction.covariance))
-            floors.append(self.scales.noise**2 * np.trace(np.linalg.inv(prediction.covariance), axis1=1, axis2=2))
+            floors.append(
+                self.scales.noise**2
+                * np.trace(np.linalg.inv(prediction.covariance), axis1=1, axis2=2)
+            )
         few = (len(groups) + 1) / (len(groups) - 1)
         scale = max(few * np.concatenate(squares).mean(), np.concatenate(floors).mean()) / 3
         return unscaled._replace(deviation=float(np.sqrt(scale)))
@@ -165,7 +193,8 @@ class DirectSelection:
 
     def _residuals(self, ell: float, noises: Array, ridges: Sequence[float | None]) -> Array:
         """The residuals (J, R, N, 3) for noises (J,) and prior means of these ridges (R,)."""
-        kernel, shape = np.exp(-ell * self._squares), (len(noises), len(self.group), len(ridges), 3)
+        kernel = np.exp(-ell * self._squares)
+        shape = (len(noises), len(self.group), len(ridges), 3)
 
         def targets(number: int) -> Array:
             return np.hstack([self._target(ridge, number) for ridge in ridges])
@@ -175,7 +204,9 @@ class DirectSelection:
         else:  # K + r F = F^1/2 (F^-1/2 K F^-1/2 + r I) F^1/2
             roots = np.sqrt(self.factors)[:, None]
             white = kernel / (roots * roots.T)
-            residuals = roots * held_out_residuals(white, noises, self.group, lambda number: targets(number) / roots)
+            residuals = roots * held_out_residuals(
+                white, noises, self.group, lambda number: targets(number) / roots
+            )
         return np.asarray(residuals.reshape(shape).swapaxes(1, 2))
 
     def _target(self, ridge: float | None, without: int) -> Array:
@@ -188,7 +219,9 @@ class DirectSelection:
             self._targets[ridge, without] = self.outputs - self.inputs @ mean.matrix.T - mean.offset
         return self._targets[ridge, without]
 
-    def primitive(self, parameters: Parameters, residuals: Array, *, without: int | None = None) -> KMP:
+    def primitive(
+        self, parameters: Parameters, residuals: Array, *, without: int | None = None
+    ) -> KMP:
         """The primitive of all groups but one.
 
         With the covariance of IJRR 2019, N / lambda_c = d^2 and lambda_c Sigma_n = q S_n; for the
@@ -203,7 +236,9 @@ class DirectSelection:
             kernel=GaussianKernel(parameters.ell),
             lambda_mean=parameters.noise / size,
             lambda_covariance=lambda_covariance,
-            prior_mean=self._constant if parameters.ridge is None else self._affine(parameters.ridge, training_mask),
+            prior_mean=self._constant
+            if parameters.ridge is None
+            else self._affine(parameters.ridge, training_mask),
         )
 
     def _scatter(self, residuals: Array, kept: NDArray[np.bool_]) -> Array:
@@ -216,7 +251,9 @@ class DirectSelection:
             local = np.trace(local, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         local = (1 - _SHARED) * local + _SHARED * max((errors**2).mean(), 1e-12) * np.eye(3)
         scatter = local / (np.trace(local, axis1=1, axis2=2).mean() / 3)
-        return np.asarray(scatter if self.factors is None else scatter * self.factors[kept, None, None])
+        return np.asarray(
+            scatter if self.factors is None else scatter * self.factors[kept, None, None]
+        )
 
     def _spread(self, ell: float, residuals: Array) -> float:
         """The least q under which the residuals are about as likely as under any, at any scale.
@@ -226,8 +263,11 @@ class DirectSelection:
         scatter = self._scatter(residuals, np.ones(len(self.group), bool))
         if self.isotropic:
             scatter = scatter[:, :1, :1]
-        counted, costs = self._counted, []
-        for covariance in held_out_covariances(np.exp(-ell * self._squares), scatter, _SPREADS, self.group):
+        counted = self._counted
+        costs = []
+        for covariance in held_out_covariances(
+            np.exp(-ell * self._squares), scatter, _SPREADS, self.group
+        ):
             covariances = (covariance * np.eye(3) if self.isotropic else covariance)[counted]
             scale = mahalanobis(residuals[counted], covariances).mean() / 3
             costs.append(0.5 * (3 * np.log(scale) + np.linalg.slogdet(covariances)[1].mean()))
@@ -235,7 +275,13 @@ class DirectSelection:
 
     def _affine(self, ridge: float, kept: NDArray[np.bool_]) -> AffineMean:
         weights = None if self._weights is None else self._weights[kept]
-        return ridge_mean(self.inputs[kept], self.outputs[kept], ridge, max_gain=self.scales.max_gain, weights=weights)
+        return ridge_mean(
+            self.inputs[kept],
+            self.outputs[kept],
+            ridge,
+            max_gain=self.scales.max_gain,
+            weights=weights,
+        )
 
 
 def ridge_mean(
@@ -248,9 +294,12 @@ def ridge_mean(
     limited to `max_gain`.
     """
     centre, middle = (np.average(part, axis=0, weights=weights) for part in (inputs, outputs))
-    centred, total = inputs - centre, len(inputs) if weights is None else float(weights.sum())
+    centred = inputs - centre
+    total = len(inputs) if weights is None else float(weights.sum())
     weighed = centred if weights is None else weights[:, None] * centred
     square = weighed.T @ centred + total * ridge**2 * np.eye(inputs.shape[1])
-    u, gains, v = np.linalg.svd(np.linalg.solve(square, weighed.T @ (outputs - middle)).T, full_matrices=False)
+    u, gains, v = np.linalg.svd(
+        np.linalg.solve(square, weighed.T @ (outputs - middle)).T, full_matrices=False
+    )
     matrix = (u * np.minimum(gains, max_gain)) @ v
     return AffineMean(matrix, middle - matrix @ centre)

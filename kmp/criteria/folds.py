@@ -103,10 +103,11 @@ class _System:
         if self._features is not None:
             values, vectors = self._modes
             pulls = self._whitened(target.reshape(-1, 1))[:, 0] @ self._rows @ vectors
-            return np.asarray((self._held_modes @ (pulls / (values + penalty))).reshape(self._shape)) + (
-                self.fold.prior_mean
-            )
-        total, count = self._gram.copy(), len(target)
+            return np.asarray(
+                (self._held_modes @ (pulls / (values + penalty))).reshape(self._shape)
+            ) + (self.fold.prior_mean)
+        total = self._gram.copy()
+        count = len(target)
         points = np.arange(count)
         total.reshape(count, -1, count, target.shape[1])[points, :, points, :] += (
             penalty * self.fold.reference.covariance
@@ -116,7 +117,10 @@ class _System:
             raise ValueError(f"not positive definite to working precision with lambda {penalty:g}")
         weights, _ = lapack.dpotrs(factor, target.reshape(-1, 1), lower=1)
         d = target.shape[1] // self.kernel.channels
-        return np.asarray((self._across @ weights.reshape(-1, d)).reshape(self._shape)) + self.fold.prior_mean
+        return (
+            np.asarray((self._across @ weights.reshape(-1, d)).reshape(self._shape))
+            + self.fold.prior_mean
+        )
 
     def covariance(self, penalty: float) -> Array:
         """N / lambda_c (k - k (K + lambda_c Sigma)^-1 k^T) (M, O, O). Raises as `mean` does."""
@@ -125,9 +129,11 @@ class _System:
         modes = self._held_modes.reshape(*self._shape, -1)
         shrunk = 1 / (np.maximum(values, 0.0) + penalty)
         if self._features is None:
-            left, sign = self._own, -1.0
+            left = self._own
+            sign = -1.0
         else:
-            left, sign = self._residual, penalty
+            left = self._residual
+            sign = penalty
         posterior = left + sign * (modes * shrunk) @ modes.transpose(0, 2, 1)
         return nearest_positive_semidefinite(posterior) * (len(self.fold.inputs) / penalty)
 
@@ -141,7 +147,9 @@ class _System:
 
     @property
     def _own(self) -> Array:
-        return kron_identity(self.kernel.prior_variance, self.fold.reference.outputs // self.kernel.channels)
+        return kron_identity(
+            self.kernel.prior_variance, self.fold.reference.outputs // self.kernel.channels
+        )
 
     def _whitened(self, rows: Array) -> Array:
         """Sigma^-1/2 times rows (N O, J), with the inverse Cholesky factors of the covariances."""
@@ -154,7 +162,8 @@ class _System:
 
     @cached_property
     def _features(self) -> Features | None:
-        rank, points = int(_MOST_FEATURES * len(self.fold.inputs)), Functionals(self.fold.inputs)
+        rank = int(_MOST_FEATURES * len(self.fold.inputs))
+        points = Functionals(self.fold.inputs)
         if rank == 0 or self.fold.inputs.shape[1] > 1:  # with more inputs the rank is too high
             return None
         features, left = Features.of(self.kernel, points, rank=rank, tolerance=_RESIDUAL)
@@ -175,7 +184,9 @@ class _System:
     @cached_property
     def _across(self) -> Array:
         """k between the held-out inputs and the points: (M C, N C)."""
-        return between(self.kernel, Functionals(self.fold.held_inputs), Functionals(self.fold.inputs))
+        return between(
+            self.kernel, Functionals(self.fold.held_inputs), Functionals(self.fold.inputs)
+        )
 
     @cached_property
     def _modes(self) -> tuple[Array, Array]:
@@ -191,7 +202,9 @@ class _System:
     def _held_modes(self) -> Array:
         """k Sigma^-1/2 V of the held-out inputs (M O, N O), or z V of their features (M O, r D)."""
         if self._features is not None:
-            return np.asarray(self._wide(self._features(Functionals(self.fold.held_inputs)).T) @ self._modes[1])
+            return np.asarray(
+                self._wide(self._features(Functionals(self.fold.held_inputs)).T) @ self._modes[1]
+            )
         across = self._whitened(np.ascontiguousarray(self._wide(self._across).T))
         return np.asarray(across.T @ self._modes[1])
 
@@ -199,7 +212,9 @@ class _System:
     def _residual(self) -> Array:
         """The residual of the features at the held-out inputs: (M, O, O)."""
         assert self._features is not None
-        z = self._features(Functionals(self.fold.held_inputs)).T.reshape(len(self.fold.held_inputs), -1, self._rank)
+        z = self._features(Functionals(self.fold.held_inputs)).T.reshape(
+            len(self.fold.held_inputs), -1, self._rank
+        )
         d = self.fold.reference.outputs // self.kernel.channels
         return kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), d)
 
@@ -218,4 +233,6 @@ def _negative_log_likelihood(residual: Array, covariance: Array) -> float:
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, residual[:, :, None])[:, :, 0]
     log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return float(0.5 * (log_det + (white**2).sum(axis=1) + residual.shape[1] * np.log(2 * np.pi)).mean())
+    return float(
+        0.5 * (log_det + (white**2).sum(axis=1) + residual.shape[1] * np.log(2 * np.pi)).mean()
+    )

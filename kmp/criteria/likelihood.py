@@ -21,7 +21,10 @@ from kmp.time_kernels import VelocityKernel
 
 _STARTS = (0.1, 1.0, 10.0)  # factors on the initial ell, as the likelihood has several maxima
 _LAMBDA = 1e-2  # initial lambda times the mean variance of the reference
-_ELL_BOUNDS = np.log(1e-6), np.log(1e4)  # log ell / initial ell: the input has no effect, or every effect
+_ELL_BOUNDS = (
+    np.log(1e-6),
+    np.log(1e4),
+)  # log ell / initial ell: the input has no effect, or every effect
 _LAMBDA_BOUNDS = np.log(1e-7), np.log(1e3)  # log lambda / initial lambda: rounding limits it
 _UNLIKELY = 1e12  # [nat] value without a Cholesky factor, from which the search turns back
 
@@ -51,13 +54,17 @@ def most_likely(
     from scipy.optimize import minimize  # its import takes a quarter of a second
 
     first = np.log(np.atleast_1d(np.asarray(kernel.ell, dtype=np.float64)))
-    variance = np.trace(points.reference.covariance, axis1=1, axis2=2).mean() / points.reference.outputs
+    variance = (
+        np.trace(points.reference.covariance, axis1=1, axis2=2).mean() / points.reference.outputs
+    )
     penalty = np.log(lambda_mean or _LAMBDA / variance)
     lengths = {"each": len(first), "one": 1, "none": 0}[free]
 
     def parameters(x: Array) -> tuple[Kernel, float]:
         ell = np.exp(first + x[:lengths]) if lengths else np.exp(first)
-        return with_ell(kernel, ell) if lengths else kernel, lambda_mean or float(np.exp(penalty + x[lengths]))
+        return with_ell(kernel, ell) if lengths else kernel, lambda_mean or float(
+            np.exp(penalty + x[lengths])
+        )
 
     def target(x: Array) -> tuple[float, Array]:
         likelihood = negative_log_likelihood(points, prior_mean, *parameters(x))
@@ -65,10 +72,13 @@ def most_likely(
             return _UNLIKELY, np.zeros(len(x))
         value, gradient, _ = likelihood
         of_lengths = gradient[:-1] if free == "each" else gradient[:-1].sum(keepdims=True)
-        return value, np.concatenate([of_lengths[:lengths], gradient[-1:] if lambda_mean is None else []])
+        return value, np.concatenate(
+            [of_lengths[:lengths], gradient[-1:] if lambda_mean is None else []]
+        )
 
     bounds = [_ELL_BOUNDS] * lengths + ([_LAMBDA_BOUNDS] if lambda_mean is None else [])
-    best, least = np.zeros(len(bounds)), np.inf
+    best = np.zeros(len(bounds))
+    least = np.inf
     for start in _STARTS if lengths else _STARTS[1:2]:
         x = np.zeros(len(bounds))
         x[:lengths] = np.log(start)
@@ -80,7 +90,8 @@ def most_likely(
     likelihood = negative_log_likelihood(points, prior_mean, likeliest, other)
     if likelihood is None:
         raise ValueError(
-            "criterion: no likelihood to working precision. Give kernel and lambda_mean, or more regularization."
+            "criterion: no likelihood to working precision. Give kernel and lambda_mean, or more "
+            "regularization."
         )
     return MostLikely(likeliest, other, likelihood[2])
 
@@ -93,12 +104,16 @@ def negative_log_likelihood(
     The gradient (I + 1,) is by the log of each ell and by log lambda; (2,) with one ell for all
     inputs. None if K + lambda Sigma is not positive definite.
     """
-    reference, c = points.reference, kernel.channels
+    reference = points.reference
+    c = kernel.channels
     count, outputs = reference.mean.shape
-    d, every = outputs // c, np.arange(count)
+    d = outputs // c
+    every = np.arange(count)
     k = between(kernel, points.functionals, points.functionals)
     total = kron_identity(k, d)
-    total.reshape(count, outputs, count, outputs)[every, :, every, :] += lambda_mean * reference.covariance
+    total.reshape(count, outputs, count, outputs)[every, :, every, :] += (
+        lambda_mean * reference.covariance
+    )
     factor, info = lapack.dpotrf(total.T, lower=1, clean=1, overwrite_a=1)
     residual = (reference.mean - prior_mean).ravel()
     weights = lapack.dpotrs(factor, residual, lower=1)[0]
@@ -111,7 +126,10 @@ def negative_log_likelihood(
     inverse = np.tril(lower) + np.tril(lower, -1).T
     pull = (inverse - np.outer(weights, weights) / signal).reshape(count * c, d, count * c, d)
     shared = np.einsum("idjd->ij", pull)  # twice the derivative of -log p by each entry of K
-    by_lengths = [0.5 * float((shared * derivative).sum()) for derivative in _by_log_ell(kernel, points.inputs, k)]
+    by_lengths = [
+        0.5 * float((shared * derivative).sum())
+        for derivative in _by_log_ell(kernel, points.inputs, k)
+    ]
     diagonal_blocks = pull.reshape(count, outputs, count, outputs)[every, :, every, :]
     by_lambda = 0.5 * lambda_mean * float((diagonal_blocks * reference.covariance).sum())
     return float(value), np.array([*by_lengths, by_lambda]), signal
@@ -119,7 +137,9 @@ def negative_log_likelihood(
 
 def with_ell(kernel: Kernel, ell: Array) -> Kernel:
     """A kernel of the same class with other ell (I,), or (1,)."""
-    return VelocityKernel(float(ell[0])) if isinstance(kernel, VelocityKernel) else GaussianKernel(ell)
+    return (
+        VelocityKernel(float(ell[0])) if isinstance(kernel, VelocityKernel) else GaussianKernel(ell)
+    )
 
 
 def _by_log_ell(kernel: Kernel, inputs: Array, k: Array) -> Iterator[Array]:

@@ -23,16 +23,19 @@ LANES = 4  # partial sums of each sum: a vector unit of 256 bits adds four numbe
 _LOG2_E = 1.4426950408889634
 _LN2_HIGH = 6.93147180369123816490e-01  # its last bits are 0, so that k times it is exact
 _LN2_LOW = 1.90821492927058770002e-10
-_ROUND = 6755399441055744.0  # 1.5 * 2^52: x + _ROUND holds x, rounded to a whole number, in its last bits
+# 1.5 * 2^52: x + _ROUND holds x, rounded to a whole number, in its last bits
+_ROUND = 6755399441055744.0
 _LEAST = -708.0  # exp of less is below 1e-307, and set to 0
 _EXPONENT = 52  # position of the exponent in the bits of a number
 
 
 def table_of(centres: Array, weights: Array) -> Array:
     """The table (I + O, P) of centres (R, I) and weights (R, O)."""
-    (count, inputs), outputs = centres.shape, weights.shape[1]
+    count, inputs = centres.shape
+    outputs = weights.shape[1]
     table = np.zeros((inputs + outputs, -(-count // LANES) * LANES))
-    table[:inputs, :count], table[inputs:, :count] = centres.T, weights.T
+    table[:inputs, :count] = centres.T
+    table[inputs:, :count] = weights.T
     return table
 
 
@@ -56,7 +59,8 @@ def exponentials(values: Array, scale: float, steps: Array) -> None:
         p = 1.0 + (f + g * (p + h * q))
         values[r] = p if x > _LEAST else 0.0
         steps[r] = step if x > _LEAST else _ROUND
-    bits, whole = values.view(np.int64), steps.view(np.int64)
+    bits = values.view(np.int64)
+    whole = steps.view(np.int64)
     for r in range(len(bits)):
         bits[r] += whole[r] << _EXPONENT
 
@@ -67,12 +71,17 @@ def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Ar
     inputs = len(x)
     values[:] = 0.0
     for i in range(0, inputs - 1, 2):
-        coordinate, other_coordinate, centres, others = x[i], x[i + 1], table[i], table[i + 1]
+        coordinate = x[i]
+        other_coordinate = x[i + 1]
+        centres = table[i]
+        others = table[i + 1]
         for r in range(len(values)):
-            offset, other = coordinate - centres[r], other_coordinate - others[r]
+            offset = coordinate - centres[r]
+            other = other_coordinate - others[r]
             values[r] += offset * offset + other * other
     if inputs % 2:
-        coordinate, centres = x[inputs - 1], table[inputs - 1]
+        coordinate = x[inputs - 1]
+        centres = table[inputs - 1]
         for r in range(len(values)):
             offset = coordinate - centres[r]
             values[r] += offset * offset
@@ -80,10 +89,13 @@ def _kernel_values(x: Array, table: Array, scale: float, values: Array, room: Ar
 
 
 @compiled
-def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scale: float, values: Array) -> None:
+def _derive(
+    x: Array, table: Array, places: NDArray[np.intp], along: Array, scale: float, values: Array
+) -> None:
     """Replace the values at indices `places` (R',) by derivatives along `along` (R', I)."""
     for n in range(len(places)):
-        r, away = places[n], 0.0
+        r = places[n]
+        away = 0.0
         for i in range(len(x)):
             away += (x[i] - table[i, r]) * along[n, i]
         values[r] *= 2.0 * scale * away
@@ -93,7 +105,9 @@ def _derive(x: Array, table: Array, places: NDArray[np.intp], along: Array, scal
 def _sum(a: Array, b: Array) -> float:
     """sum_r a_r b_r (P,)."""
     # Signed indices may count from the end, which costs a check each.
-    unit, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
+    unit = np.uint64(1)
+    two = np.uint64(2)
+    three = np.uint64(3)
     first = second = third = fourth = 0.0
     for k in range(len(a) // LANES):
         r = np.uint64(LANES * k)
@@ -132,9 +146,13 @@ def means(
     derivatives along `along` (R', I); `coordinates` (1 + I,) the kernel's scale and the stretch of
     each input; `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I).
     """
-    scale, stretch, outputs = coordinates[0], coordinates[1:], len(prior)
+    scale = coordinates[0]
+    stretch = coordinates[1:]
+    outputs = len(prior)
     inputs = len(stretch)
-    x, room, total = np.empty(inputs), np.empty(len(values)), 0.0
+    x = np.empty(inputs)
+    room = np.empty(len(values))
+    total = 0.0
     for m in range(len(queries)):
         for i in range(inputs):
             x[i] = queries[m, i] * stretch[i]
@@ -161,9 +179,16 @@ def slopes(
     out: Array,
 ) -> bool:
     """Write dxi/ds at a query (I,) to `out` (O, I); true if all is finite. See `means`."""
-    scale, stretch, outputs, total = coordinates[0], coordinates[1:], len(prior), 0.0
-    inputs, padded = len(stretch), table.shape[1]
-    x, values, pull, offsets = query * stretch, np.empty(padded), np.empty(padded), np.empty((inputs, padded))
+    scale = coordinates[0]
+    stretch = coordinates[1:]
+    outputs = len(prior)
+    total = 0.0
+    inputs = len(stretch)
+    padded = table.shape[1]
+    x = query * stretch
+    values = np.empty(padded)
+    pull = np.empty(padded)
+    offsets = np.empty((inputs, padded))
     _kernel_values(x, table, scale, values, pull)
     out[:] = 0.0
     for n in range(len(places)):
@@ -173,7 +198,9 @@ def slopes(
                 out[o, i] -= share * along[n, i]
     _derive(x, table, places, along, scale, values)
     for i in range(inputs):
-        coordinate, centres, offset = x[i], table[i], offsets[i]
+        coordinate = x[i]
+        centres = table[i]
+        offset = offsets[i]
         for r in range(len(values)):
             offset[r] = coordinate - centres[r]
     for o in range(outputs):

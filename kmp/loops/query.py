@@ -25,7 +25,9 @@ from kmp.loops.kernel_row import kernel_value
 from kmp.loops.mean import means, slopes, table_of
 from kmp.query import MotionPrediction, Query
 
-_MOST_EXACT = 1500  # rows and columns of a factor that is computed in a fixed order, in less than 2 s
+_MOST_EXACT = (
+    1500  # rows and columns of a factor that is computed in a fixed order, in less than 2 s
+)
 MEANS = 4  # rows of a motion's output before the Jacobian: mean, velocity, acceleration, curvature
 
 
@@ -52,9 +54,20 @@ class CompiledQuery(Immutable):
         inputs = len(query.stretch)
         nothing = frozen(np.empty((0, inputs)))
         none: NDArray[np.intp] = frozen(np.empty(0, dtype=np.intp))
-        along = frozen(query.solution.functionals.along * query.stretch) if query.derivatives else nothing
-        rows, table = np.hstack([query.centres, query.weights]), table_of(query.centres, query.weights)
-        return cls(query, frozen(rows), along, frozen(table), query.derivatives or Derivatives(none, nothing))
+        along = (
+            frozen(query.solution.functionals.along * query.stretch)
+            if query.derivatives
+            else nothing
+        )
+        rows = np.hstack([query.centres, query.weights])
+        table = table_of(query.centres, query.weights)
+        return cls(
+            query,
+            frozen(rows),
+            along,
+            frozen(table),
+            query.derivatives or Derivatives(none, nothing),
+        )
 
     @cached_property
     def columns(self) -> Array | None:
@@ -78,8 +91,11 @@ class CompiledQuery(Immutable):
         Equal to `Query.mean` but for rounding; None if a query or a result is not finite.
         """
         table, places, along, coordinates, prior = self._reads
-        query_array = np.array(queries, np.float64, order="C")  # one type of array, and so compiled once
-        values, out = np.empty(table.shape[1]), np.empty((len(query_array), len(prior)))
+        query_array = np.array(
+            queries, np.float64, order="C"
+        )  # one type of array, and so compiled once
+        values = np.empty(table.shape[1])
+        out = np.empty((len(query_array), len(prior)))
         finite = means(query_array, table, places, along, coordinates, prior, values, out)
         return (out, values[: len(self.rows)]) if finite else None
 
@@ -95,13 +111,20 @@ class CompiledQuery(Immutable):
     ) -> MotionPrediction | None:
         """As `Query.motion`, to rounding; None as in `mean`."""
         q = self.query
-        moving, values = np.empty((3, len(query))), np.empty(len(self.rows))
-        moving[0], moving[1], moving[2] = query, velocity, acceleration
+        moving = np.empty((3, len(query)))
+        values = np.empty(len(self.rows))
+        moving[0] = query
+        moving[1] = velocity
+        moving[2] = acceleration
         out = np.empty((MEANS + len(query), len(q.prior_mean)))
-        if not _motion(moving, self.rows, self.along, q.stretch, q.scale, q.prior_mean, values, out):
+        if not _motion(
+            moving, self.rows, self.along, q.stretch, q.scale, q.prior_mean, values, out
+        ):
             return None
         posterior = self.covariance(values) if covariance else None
-        return MotionPrediction(out[0], out[1], out[2], posterior, out[MEANS:].reshape(-1, len(query)), out[3])
+        return MotionPrediction(
+            out[0], out[1], out[2], posterior, out[MEANS:].reshape(-1, len(query)), out[3]
+        )
 
     def covariance(self, values: Array) -> Array:
         """As `Query.covariance`, to rounding."""
@@ -110,18 +133,27 @@ class CompiledQuery(Immutable):
             return q.covariance(values)
         distinct = q.solution.distinct
         posterior = np.empty((distinct, distinct))
-        if not _posterior(values, self.columns, np.zeros((distinct, len(values) * distinct)), posterior):
+        if not _posterior(
+            values, self.columns, np.zeros((distinct, len(values) * distinct)), posterior
+        ):
             posterior = nearest_positive_semidefinite(posterior[None])[0]
         posterior *= q.covariance_scale
         return posterior if distinct > 1 else posterior[0, 0] * np.eye(len(q.prior_mean))
 
 
 def _packed(query: Query, solution: Dense) -> Array:
-    a, size = solution.distinct, len(query.centres) * solution.distinct
+    a = solution.distinct
+    size = len(query.centres) * solution.distinct
     inverse = np.empty((size, size))
-    noise = solution.hyperparameters.lambda_covariance * solution.database.reference.covariance[:, :a, :a]
+    noise = (
+        solution.hyperparameters.lambda_covariance
+        * solution.database.reference.covariance[:, :a, :a]
+    )
     is_exact = size <= _MOST_EXACT and not query.derivatives
-    if not (is_exact and _inverse_factor(np.ascontiguousarray(query.centres), query.scale, noise, inverse)):
+    if not (
+        is_exact
+        and _inverse_factor(np.ascontiguousarray(query.centres), query.scale, noise, inverse)
+    ):
         inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
     return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
 
@@ -136,7 +168,9 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
     """
     count, outputs = noise.shape[:2]
     size = count * outputs
-    factor, offset, column = np.zeros((size, size)), np.empty(centres.shape[1]), np.empty(size)
+    factor = np.zeros((size, size))
+    offset = np.empty(centres.shape[1])
+    column = np.empty(size)
     for n in range(count):
         for m in range(n + 1):
             value = kernel_value(centres[n], centres[m], scale, offset)
@@ -153,7 +187,8 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
             column[i] = factor[i, k] / root
         factor[k:, k] = column[k:]
         for i in range(k + 1, size):
-            row, share = factor[i], column[i]
+            row = factor[i]
+            share = column[i]
             for j in range(k + 1, i + 1):
                 row[j] -= share * column[j]
     out[:] = 0.0
@@ -161,7 +196,8 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
         row = out[i]
         row[i] = 1.0
         for k in range(i):
-            share, other = factor[i, k], out[k]
+            share = factor[i, k]
+            other = out[k]
             for j in range(k + 1):
                 row[j] -= share * other[j]
         for j in range(i + 1):
@@ -171,7 +207,14 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
 
 @compiled
 def _motion(
-    moving: Array, rows: Array, along: Array, stretch: Array, scale: float, prior: Array, values: Array, out: Array
+    moving: Array,
+    rows: Array,
+    along: Array,
+    stretch: Array,
+    scale: float,
+    prior: Array,
+    values: Array,
+    out: Array,
 ) -> bool:
     """Equation (8) and its derivatives along a motion, in one pass over the centres.
 
@@ -179,9 +222,17 @@ def _motion(
     `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I). Writes the kernel row
     to `values` (R,), and mean, velocity, acceleration, curvature, Jacobian to `out` (4 + I, O).
     """
-    inputs, outputs, derivatives, affine = len(stretch), len(prior), len(along) > 0, prior.shape[1] > 1
-    query, offset, direction = np.empty(inputs), np.empty(inputs), np.empty(inputs)
-    mean, moved, pushed, curvature = out[0], out[1], out[2], out[3]
+    inputs = len(stretch)
+    outputs = len(prior)
+    derivatives = len(along) > 0
+    affine = prior.shape[1] > 1
+    query = np.empty(inputs)
+    offset = np.empty(inputs)
+    direction = np.empty(inputs)
+    mean = out[0]
+    moved = out[1]
+    pushed = out[2]
+    curvature = out[3]
     jacobian = out[MEANS:].reshape(outputs, inputs)
     square = 0.0
     for i in range(inputs):
@@ -222,7 +273,8 @@ def _motion(
                 jacobian[o, i] += pull * offset[i]
     total = 0.0
     for o in range(outputs):
-        moved[o], pushed[o] = 0.0, curvature[o]
+        moved[o] = 0.0
+        pushed[o] = curvature[o]
         for i in range(inputs):
             jacobian[o, i] *= stretch[i]
             if affine:
@@ -243,10 +295,12 @@ def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
     outputs, size = roots.shape
     start = 0
     for r in range(len(values)):
-        value, first = values[r], r * outputs
+        value = values[r]
+        first = r * outputs
         length = size - first
         for o in range(outputs):
-            root, column = roots[o, first:], columns[start : start + length]
+            root = roots[o, first:]
+            column = columns[start : start + length]
             for i in range(length):
                 root[i] += value * column[i]
             start += length

@@ -29,9 +29,14 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     |alpha_m|, and that of g. It is the lower one if the rank suffices. The second bound: the cost
     (4) is quadratic and least at the dense solution, so |Sigma^-1/2 df|^2 is at most the cost (4).
     """
-    kernel, lambda_mean = features.kernel, solution.hyperparameters.lambda_mean
-    points, reference, functionals = solution.database.functionals, solution.database.reference, solution.functionals
-    c, count, rank = kernel.channels, len(points), len(features.pivots)
+    kernel = features.kernel
+    lambda_mean = solution.hyperparameters.lambda_mean
+    points = solution.database.functionals
+    reference = solution.database.reference
+    functionals = solution.functionals
+    c = kernel.channels
+    count = len(points)
+    rank = len(features.pivots)
     blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
     error = reference.mean - np.concatenate([mean_of(solution, block) for block in blocks])
     pull = np.linalg.solve(reference.covariance, error[:, :, None])[:, :, 0]
@@ -57,7 +62,10 @@ def error_bounds(solution: Solution, features: Features, *, added: int = 0) -> E
     between_via = np.sqrt(np.maximum((via_alpha * (via_residual @ via_alpha)).sum(axis=0), 0.0))
     distance = np.sqrt((unsolved**2).sum() + ((outside + between_via) ** 2).sum())  # |h|
     squared = (unsolved**2).sum() + (between_via**2).sum()
-    by_means = np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum()) + np.sqrt(lambda_mean * squared) / 2
+    by_means = (
+        np.sqrt(((moved**2).sum(axis=(1, 2)) / spread[:, 0]).sum())
+        + np.sqrt(lambda_mean * squared) / 2
+    )
 
     flat = weights.reshape(len(functionals) * c, -1)
     penalty = (flat * (between(kernel, functionals, functionals) @ flat)).sum()

@@ -41,14 +41,18 @@ class Features(Immutable):
     @classmethod
     def at(cls, kernel: Kernel, pivots: Functionals, channels: NDArray[np.intp]) -> Features:
         """The features of these r pivots, without those from which on rounding hides them."""
-        k = _columns(_columns(between(kernel, pivots, pivots), channels, kernel).T, channels, kernel)
+        k = _columns(
+            _columns(between(kernel, pivots, pivots), channels, kernel).T, channels, kernel
+        )
         root, info = lapack.dpotrf(k, lower=1, clean=1)
         if info:
             return cls.at(kernel, pivots.take(slice(info - 1)), channels[: info - 1])
         return cls(kernel, pivots, frozen(channels.copy()), frozen(np.asfortranarray(root)))
 
     @classmethod
-    def of(cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float) -> tuple[Features, float]:
+    def of(
+        cls, kernel: Kernel, points: Functionals, *, rank: int, tolerance: float
+    ) -> tuple[Features, float]:
         """The features and the largest residual, as `with_values` returns them."""
         features, residual, _ = cls.with_values(kernel, points, rank=rank, tolerance=tolerance)
         return features, residual
@@ -67,15 +71,20 @@ class Features(Immutable):
         The residual, a share of k(s, s) of a channel, is at most `tolerance` unless the rank is too
         low. z is a list of blocks (r, n C), empty if they are too large to keep.
         """
-        count, c = len(points), kernel.channels
+        count = len(points)
+        c = kernel.channels
         index = np.linspace(0, count - 1, min(count, _CANDIDATES // c)).astype(np.intp)
         chosen = _pivots(kernel, points.take(index), rank, _MARGIN * tolerance)
         features = cls.at(kernel, points.take(index[chosen // c]), chosen % c)
         blocks = [points.take(slice(i, i + BLOCK)) for i in range(0, count, BLOCK)]
         z = [features(block) for block in blocks] if count * c * rank <= KEPT else []
         for n in range(_ROUNDS):
-            pairs = zip(blocks, z, strict=True) if z else ((block, features(block)) for block in blocks)
-            residual = np.concatenate([features.residual_of(block, z_block).max(axis=1) for block, z_block in pairs])
+            pairs = (
+                zip(blocks, z, strict=True) if z else ((block, features(block)) for block in blocks)
+            )
+            residual = np.concatenate(
+                [features.residual_of(block, z_block).max(axis=1) for block, z_block in pairs]
+            )
             worst = np.argsort(-residual, kind="stable")[: _CANDIDATES // (2 * c)]
             worst = np.sort(worst[residual[worst] > tolerance])
             if len(worst) == 0 or len(features.pivots) >= rank or n == _ROUNDS - 1:
@@ -141,7 +150,8 @@ def _pivots(
     Greedy: the next is where the residual is largest, as a share of k(s, s). `known` (r', N C) are
     the features of earlier pivots.
     """
-    c, deviation = kernel.channels, np.sqrt(variances(kernel, points)).ravel()
+    c = kernel.channels
+    deviation = np.sqrt(variances(kernel, points)).ravel()
     count = len(deviation)
     before = np.empty((0, count)) if known is None else known / deviation
     residual = 1 - (before**2).sum(axis=0)

@@ -76,7 +76,9 @@ class LowRank(Expansion):
         beside k(s, s), of which the features leave a residual.
         """
         check_resolved(hyperparameters, database, name="lambda_mean", both=True)
-        r, c, d = len(features.pivots), features.kernel.channels, hyperparameters.channel_outputs
+        r = len(features.pivots)
+        c = features.kernel.channels
+        d = hyperparameters.channel_outputs
         points = database.functionals
         precision = np.asarray(np.linalg.inv(database.reference.covariance), dtype=np.float64)
         target = database.reference.mean - hyperparameters.prior_at(points)
@@ -92,7 +94,8 @@ class LowRank(Expansion):
         for block in blocks:
             _add_information(total, z(block.start), precision[block])
         information = frozen(total.reshape(r * d, r * d))
-        factor, w = _factorised(information, hyperparameters.lambda_mean), np.zeros((r, d))
+        factor = _factorised(information, hyperparameters.lambda_mean)
+        w = np.zeros((r, d))
         for _ in range(1 + _REFINEMENTS):
             pull = -hyperparameters.lambda_mean * w
             for block in blocks:
@@ -112,19 +115,27 @@ class LowRank(Expansion):
     ) -> LowRank:
         """The solution of stored arrays. Raises ValueError if they do not belong together."""
         pivots = numbers("pivots", arrays["pivots"], "r", database.inputs.shape[1])
-        r, d = len(pivots), hyperparameters.channel_outputs
+        r = len(pivots)
+        d = hyperparameters.channel_outputs
         information = numbers("information", arrays["information"], r * d, r * d)
         w = numbers("features", arrays["features"], r, d)
         directions = arrays.get("pivot_directions")
         c = hyperparameters.kernel.channels
         channels = numbers("pivot_channels", arrays.get("pivot_channels", np.zeros(r)), r)
         if not np.isin(channels, np.arange(c)).all():
-            raise ValueError(f"pivot_channels: {brief(channels)} given, whole numbers below {c} needed.")
+            raise ValueError(
+                f"pivot_channels: {brief(channels)} given, whole numbers below {c} needed."
+            )
         features = Features.at(
-            hyperparameters.kernel, Functionals.checked(pivots, directions), channels.astype(np.intp)
+            hyperparameters.kernel,
+            Functionals.checked(pivots, directions),
+            channels.astype(np.intp),
         )
         if (usable := len(features.pivots)) < r:
-            raise ValueError(f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the primitive anew.")
+            raise ValueError(
+                f"pivots: {r} given, and rounding tells only {usable} apart here. Fit the "
+                "primitive anew."
+            )
         return cls(hyperparameters, database, features, information, w)
 
     @property
@@ -149,12 +160,18 @@ class LowRank(Expansion):
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.whitened_one(row)
         within = blas.dgemm(1.0, root, root, trans_b=1)
-        return self.residual_covariance(z.T @ z, prior) + self.hyperparameters.lambda_covariance * within
+        return (
+            self.residual_covariance(z.T @ z, prior)
+            + self.hyperparameters.lambda_covariance * within
+        )
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.whitened(rows)
         within = roots.transpose(0, 2, 1) @ roots
-        return self.residual_covariance(z.transpose(0, 2, 1) @ z) + self.hyperparameters.lambda_covariance * within
+        return (
+            self.residual_covariance(z.transpose(0, 2, 1) @ z)
+            + self.hyperparameters.lambda_covariance * within
+        )
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         """The base's solution conditioned on these changes, or a new fit if they are many."""
@@ -165,7 +182,9 @@ class LowRank(Expansion):
         # Conditioning on more changes than features costs more, and loses more digits, than a fit.
         database = base.database.changed(changes)
         rank = max(RANK, len(base.centres) + len(changes.inputs) * base.features.kernel.channels)
-        features, _ = Features.of(base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
+        features, _ = Features.of(
+            base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE
+        )
         return LowRank.fit(self.hyperparameters, database, features, base)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> LowRank:
@@ -221,8 +240,8 @@ def _factorised(information: Array, penalty: float) -> Array:
     factor, info = lapack.dpotrf(information + penalty * np.eye(len(information)), lower=1, clean=1)
     if info:
         raise ValueError(
-            f"The normal equations are not positive definite to working precision with lambda {penalty:g}. "
-            "Raise lambda, the smallest variances, or the tolerance of the rank."
+            "The normal equations are not positive definite to working precision with lambda "
+            f"{penalty:g}. Raise lambda, the smallest variances, or the tolerance of the rank."
         )
     return frozen(np.asfortranarray(factor))
 
@@ -298,15 +317,25 @@ class Conditioned(Expansion):
     @cached_property
     def weights(self) -> Array:
         """(r + V, O) the weights of their kernels."""
-        base, penalty, d = self.base, self.hyperparameters.lambda_mean, self.base.w.shape[1]
+        base = self.base
+        penalty = self.hyperparameters.lambda_mean
+        d = self.base.w.shape[1]
         shared = penalty == self.hyperparameters.lambda_covariance
-        system = self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
+        system = (
+            self._covariance_system if shared else self._system("lambda_mean", base.mean_factor)
+        )
         mean = (self._z.T @ base.w).reshape(len(self._points), -1)
-        target = self._points.reference.mean - self.hyperparameters.prior_at(self._points.functionals)
+        target = self._points.reference.mean - self.hyperparameters.prior_at(
+            self._points.functionals
+        )
         pull = system.solve((target - mean).ravel())
         back, _ = lapack.dtrtrs(base.mean_factor, system.cross @ pull, lower=1, trans=1)
         columns = self._added_columns
-        w = base.w + penalty * back.reshape(-1, d) - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]
+        w = (
+            base.w
+            + penalty * back.reshape(-1, d)
+            - self._z[:, :columns] @ pull.reshape(-1, d)[:columns]
+        )
         added = pull.reshape(len(self._points), -1)[: self._added]
         return frozen(np.concatenate([base.features.kernel_weights(w), added]))
 
@@ -321,7 +350,9 @@ class Conditioned(Expansion):
 
     def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
         z, root = self.base.whitened_one(row)
-        return np.asarray(self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0])
+        return np.asarray(
+            self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0]
+        )
 
     def posterior_covariance(self, rows: Array) -> Array:
         z, roots = self.base.whitened(rows)
@@ -347,8 +378,11 @@ class Conditioned(Expansion):
     @cached_property
     def _points(self) -> Database:
         """The U changed points, those added first."""
-        database, replaced = self.base.database, self.changes.replaced
-        functionals = Functionals.concatenated([self.changes.functionals, database.functionals.take(replaced)])
+        database = self.base.database
+        replaced = self.changes.replaced
+        functionals = Functionals.concatenated(
+            [self.changes.functionals, database.functionals.take(replaced)]
+        )
         normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
         return Database(functionals, normals)
 
@@ -368,15 +402,23 @@ class Conditioned(Expansion):
     @cached_property
     def _neglected(self) -> Array:
         """The kernel's residual between the V added points: k - z^T z (V C, V C)."""
-        points, z = self.changes.functionals, self._z[:, : self._added_columns]
+        points = self.changes.functionals
+        z = self._z[:, : self._added_columns]
         return frozen(between(self.hyperparameters.kernel, points, points) - z.T @ z)
 
-    def _posterior_covariance(self, rows: Array, z: Array, roots: Array, prior: Array | None = None) -> Array:
+    def _posterior_covariance(
+        self, rows: Array, z: Array, roots: Array, prior: Array | None = None
+    ) -> Array:
         """(M, O, O), of rows (M, C, (r + V) C), features z (M, r, C) and L^-1 z (M, r D, O)."""
-        m, c, d, penalty = len(z), z.shape[2], self.base.w.shape[1], self.hyperparameters.lambda_covariance
-        columns, system = self._added_columns, self._covariance_system
+        m = len(z)
+        c = z.shape[2]
+        d = self.base.w.shape[1]
+        penalty = self.hyperparameters.lambda_covariance
+        columns = self._added_columns
+        system = self._covariance_system
         residual = (
-            rows[:, :, z.shape[1] * self.base.features.kernel.channels :] - z.transpose(0, 2, 1) @ self._z[:, :columns]
+            rows[:, :, z.shape[1] * self.base.features.kernel.channels :]
+            - z.transpose(0, 2, 1) @ self._z[:, :columns]
         )  # (M, C, V C)
         cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
         split = cross.reshape(m, c, d, -1, d)
@@ -388,8 +430,11 @@ class Conditioned(Expansion):
         before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
         return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
-    def _system(self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array) -> _System:
-        parameters, count = self.hyperparameters, len(self._points)
+    def _system(
+        self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array
+    ) -> _System:
+        parameters = self.hyperparameters
+        count = len(self._points)
         first = len(self.base.database) - len(self.changes.replaced)
         check_resolved(parameters, self._added_points, first=first, name=name, both=True)
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
@@ -405,7 +450,7 @@ class Conditioned(Expansion):
         lu, pivots, info = lapack.dgetrf(matrix)
         if info or not np.isfinite(lu).all():
             raise ValueError(
-                f"The via-points contradict each other to working precision, with lambda {penalty:g}. "
-                "Give those that are near to others more variance."
+                "The via-points contradict each other to working precision, with lambda "
+                f"{penalty:g}. Give those that are near to others more variance."
             )
         return _System(frozen(cross), frozen(lu), frozen(pivots))

@@ -89,10 +89,12 @@ class Database(Immutable):
 
     def changed(self, changes: Changes) -> Database:
         """The database after the changes: the points not replaced, then the via-points."""
-        functionals, reference = self.functionals, self.reference
+        functionals = self.functionals
+        reference = self.reference
         if len(changes.replaced):
             remaining = np.delete(np.arange(len(self)), changes.replaced)
-            functionals, reference = functionals.take(remaining), reference.take(remaining)
+            functionals = functionals.take(remaining)
+            reference = reference.take(remaining)
         return Database(
             Functionals.concatenated([functionals, changes.functionals]),
             Gaussians.concatenated([reference, changes.points]),
@@ -118,7 +120,8 @@ class Database(Immutable):
         """
         if tolerance == 0:
             return np.empty(0, dtype=np.intp)
-        values, near = via.inputs[via.values], np.zeros(len(self), dtype=bool)
+        values = via.inputs[via.values]
+        near = np.zeros(len(self), dtype=bool)
         step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):
             distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
@@ -143,7 +146,8 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
 
     The error r of a channel is a miss if |r| > 0.001 and sqrt(r^T Sigma^-1 r) > 3.
     """
-    count, d = len(mean), desired.outputs // channels
+    count = len(mean)
+    d = desired.outputs // channels
     residual = (desired.mean - mean).reshape(count, channels, d)
     distance = np.sqrt((residual * residual).sum(axis=2))  # (V, C)
     if not (distance > _MISSED_DISTANCE).any():
@@ -153,14 +157,17 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
         block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
         pull = np.linalg.solve(block, residual[:, c, :, None])[:, :, 0]
         deviations = np.sqrt(np.vecdot(residual[:, c], pull))
-        for n in np.flatnonzero((distance[:, c] > _MISSED_DISTANCE) & (deviations > _MISSED_DEVIATIONS)):
+        for n in np.flatnonzero(
+            (distance[:, c] > _MISSED_DISTANCE) & (deviations > _MISSED_DEVIATIONS)
+        ):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
         more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""
         warnings.warn(
-            f"Via-points missed [unit of the outputs]: {', '.join(missed[:_NAMED])}{more}. Another point near in the "
-            "inputs requires another value, or lambda is large: give the via-point less variance, "
-            "replace what is near by a larger tolerance, or take a larger ell.",
+            f"Via-points missed [unit of the outputs]: {', '.join(missed[:_NAMED])}{more}. Another "
+            "point near in the inputs requires another value, or lambda is large: give the "
+            "via-point less variance, replace what is near by a larger tolerance, or take a "
+            "larger ell.",
             ViaPointMissed,
             stacklevel=3,
         )

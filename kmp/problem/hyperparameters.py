@@ -34,8 +34,8 @@ class AffineMean(Immutable):
         offset = numbers("prior_mean.offset", self.offset, "O")
         if len(matrix) != len(offset):
             raise ValueError(
-                f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} given, "
-                f"(O, I) and (O,) needed."
+                f"prior_mean: matrix of shape {matrix.shape} and offset of shape {offset.shape} "
+                "given, (O, I) and (O,) needed."
             )
         self.__dict__.update(matrix=matrix, offset=offset)
 
@@ -64,41 +64,66 @@ class Hyperparameters(Immutable):
         """The parameters with defaults filled in. Raises ValueError if they do not fit I and O."""
         checked_kernel(kernel).check(inputs, outputs)
         penalty = positive("lambda_mean", lambda_mean)
-        other = penalty if lambda_covariance is None else positive("lambda_covariance", lambda_covariance)
+        other = (
+            penalty
+            if lambda_covariance is None
+            else positive("lambda_covariance", lambda_covariance)
+        )
         if isinstance(prior_mean, AffineMean):
             check_shape("prior_mean.matrix", prior_mean.matrix, outputs, inputs)
-            matrix, offset = prior_mean.matrix, prior_mean.offset
+            matrix = prior_mean.matrix
+            offset = prior_mean.offset
             if kernel.period is not None and matrix.any():
-                raise ValueError("prior_mean: a slope given, which no periodic motion has. Give an offset (O,) alone.")
+                raise ValueError(
+                    "prior_mean: a slope given, which no periodic motion has. Give an offset (O,) "
+                    "alone."
+                )
         else:
             matrix = None
-            offset = numbers("prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs)
+            offset = numbers(
+                "prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs
+            )
         if kernel.channels > 1:
             values = outputs // kernel.channels
-            slopes, of_rates = (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
+            slopes, of_rates = (
+                (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
+            )
             if not np.array_equal(rates := offset[values:], slopes) or np.any(of_rates):
                 raise ValueError(
-                    f"prior_mean: rates of {brief(rates)} given, {brief(slopes)} needed: those of the values' prior mean."
+                    f"prior_mean: rates of {brief(rates)} given, {brief(slopes)} needed: those of "
+                    "the values' prior mean."
                 )
         return cls(kernel, penalty, other, offset, matrix)
 
     @property
     def prior_mean(self) -> Array | AffineMean:
         """(O,) [unit of the outputs], or an `AffineMean` that depends on the input."""
-        return self.prior_offset if self.prior_matrix is None else AffineMean(self.prior_matrix, self.prior_offset)
+        return (
+            self.prior_offset
+            if self.prior_matrix is None
+            else AffineMean(self.prior_matrix, self.prior_offset)
+        )
 
     @cached_property
     def prior_columns(self) -> Array:
         """The offset (O, 1), or the offset and the matrix side by side (O, 1 + I)."""
         offset = self.prior_offset[:, None]
-        return frozen(np.array(offset) if self.prior_matrix is None else np.hstack([offset, self.prior_matrix]))
+        return frozen(
+            np.array(offset)
+            if self.prior_matrix is None
+            else np.hstack([offset, self.prior_matrix])
+        )
 
     def prior_at(self, points: Functionals) -> Array:
         """The prior mean of N functionals: (N, O), or (O,) if it is the same for all.
 
         A derivative along v has A v.
         """
-        offset = self.prior_offset if points.directions is None else points.values[:, None] * self.prior_offset
+        offset = (
+            self.prior_offset
+            if points.directions is None
+            else points.values[:, None] * self.prior_offset
+        )
         if self.prior_matrix is None:
             return offset
         moved = points.inputs
@@ -120,5 +145,7 @@ class Hyperparameters(Immutable):
 def checked_kernel(kernel: Kernel) -> Kernel:
     """The kernel. Raises ValueError unless it is a `Kernel`."""
     if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
-        raise ValueError(f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one.")
+        raise ValueError(
+            f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one."
+        )
     return kernel

@@ -21,7 +21,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from kmp.arrays.checks import Array, check_kind, check_shape, numbers, positive, real, seeded, squared, whole
+from kmp.arrays.checks import (
+    Array,
+    check_kind,
+    check_shape,
+    numbers,
+    positive,
+    real,
+    seeded,
+    squared,
+    whole,
+)
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.gaussians import Gaussians
 from kmp.primitive import KMP, checked_primitive
@@ -47,8 +57,11 @@ class Correlation(Immutable):
     theta: Array
 
     def __post_init__(self) -> None:
-        centres, width = numbers("centres", self.centres, "B", "I"), positive("width", self.width)
-        self.__dict__.update(centres=centres, width=width, theta=numbers("theta", self.theta, len(centres), "O"))
+        centres = numbers("centres", self.centres, "B", "I")
+        width = positive("width", self.width)
+        self.__dict__.update(
+            centres=centres, width=width, theta=numbers("theta", self.theta, len(centres), "O")
+        )
 
     @classmethod
     def neutral(cls, centres: ArrayLike, *, width: float, outputs: int) -> Correlation:
@@ -79,10 +92,13 @@ class Correlation(Immutable):
         base = checked_primitive(primitive).base
         if (outputs := self.theta.shape[1]) != base.outputs:
             raise ValueError(f"correlation: {outputs} outputs given, {base.outputs} needed.")
-        scale, sigma = self(base.inputs), base.reference.covariance
+        scale = self(base.inputs)
+        sigma = base.reference.covariance
         variances = np.diagonal(sigma, axis1=1, axis2=2)
         lacking = np.maximum(_LEAST_FACTOR**2 - scale**2, 0.0) * variances
-        covariance = scale[:, :, None] * sigma * scale[:, None, :] + lacking[:, :, None] * np.eye(base.outputs)
+        covariance = scale[:, :, None] * sigma * scale[:, None, :] + lacking[:, :, None] * np.eye(
+            base.outputs
+        )
         return primitive.refitted(Gaussians(base.reference.mean, covariance))
 
 
@@ -120,12 +136,21 @@ def improve(
     finite.
     """
     s = numbers("queries", queries, "M", checked_primitive(primitive).inputs.shape[1])
-    check_kind("correlation", correlation, Correlation, "Correlation.neutral(centres, width=..., outputs=...)")
+    check_kind(
+        "correlation",
+        correlation,
+        Correlation,
+        "Correlation.neutral(centres, width=..., outputs=...)",
+    )
     squared("exploration", exploration)
     if whole("rollouts", rollouts, least=0) < 2 or whole("updates", updates, least=0) < 1:
-        raise ValueError(f"{rollouts} rollouts and {updates} updates given; at least 2 and 1 are needed.")
+        raise ValueError(
+            f"{rollouts} rollouts and {updates} updates given; at least 2 and 1 are needed."
+        )
     if not callable(reward):
-        raise ValueError(f"reward: {type(reward).__name__} given, a function of a trajectory (M, O) needed.")
+        raise ValueError(
+            f"reward: {type(reward).__name__} given, a function of a trajectory (M, O) needed."
+        )
     random = np.random.default_rng(seeded(seed))
 
     def tried(theta: Array) -> tuple[float, Correlation]:
@@ -133,7 +158,9 @@ def improve(
         value = real("reward", reward(policy.applied(primitive).mean(s)))
         check_shape("reward", value)
         if not np.isfinite(value):
-            raise ValueError(f"The reward is {value}, and must be a finite number for any trajectory (M, O).")
+            raise ValueError(
+                f"The reward is {value}, and must be a finite number for any trajectory (M, O)."
+            )
         return float(value), policy
 
     theta = correlation.theta

@@ -111,7 +111,9 @@ class LocalKMP(Immutable, Plotted):
         _check_frames("frames", self.frames)
         needed = [primitive.outputs for primitive in self.primitives]
         if (outputs := [len(frame.offset) for frame in self.frames]) != needed:
-            raise ValueError(f"frames: over {brief(outputs)} outputs given, over {brief(needed)} needed.")
+            raise ValueError(
+                f"frames: over {brief(outputs)} outputs given, over {brief(needed)} needed."
+            )
 
     @classmethod
     def learn(
@@ -137,12 +139,21 @@ class LocalKMP(Immutable, Plotted):
         """
         kernel = checked_kernel(kernel)
         parts_of("demonstrations", demonstrations)
-        counts = [_check_frames(f"frames[{h}]", frame_set) for h, frame_set in enumerate(parts_of("frames", frames))]
+        counts = [
+            _check_frames(f"frames[{h}]", frame_set)
+            for h, frame_set in enumerate(parts_of("frames", frames))
+        ]
         if len(counts) != len(demonstrations) or len(set(counts)) != 1:
             count = len(demonstrations)
-            raise ValueError(f"frames: {brief(counts)} given for {count} demonstrations, as many for each needed.")
+            raise ValueError(
+                f"frames: {brief(counts)} given for {count} demonstrations, as many for each "
+                "needed."
+            )
         where = numbers("inputs", inputs, "N", "I")
-        data = [pair(f"demonstrations[{h}]", demonstration) for h, demonstration in enumerate(demonstrations)]
+        data = [
+            pair(f"demonstrations[{h}]", demonstration)
+            for h, demonstration in enumerate(demonstrations)
+        ]
         primitives = []
         for f in range(counts[0]):
             samples = [
@@ -174,7 +185,8 @@ class LocalKMP(Immutable, Plotted):
         if _check_frames("frames", frames) and [len(frame.offset) for frame in frames] != [
             len(frame.offset) for frame in self.frames
         ]:
-            count, outputs = len(self.frames), len(self.frames[0].offset)
+            count = len(self.frames)
+            outputs = len(self.frames[0].offset)
             raise ValueError(f"frames: {len(frames)} given, {count} over {outputs} outputs needed.")
         return LocalKMP(self.primitives, tuple(frames))
 
@@ -191,7 +203,9 @@ class LocalKMP(Immutable, Plotted):
         """The mean (M, O) [unit of the outputs] of `predict`. Raises ValueError as that does."""
         return self.predict(queries).mean
 
-    def adapt(self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float | None = None) -> LocalKMP:
+    def adapt(
+        self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float | None = None
+    ) -> LocalKMP:
         """A new skill through desired points (V, I), V normals in the world's coordinates.
 
         They are mapped into each frame, where `tolerance` [unit of the inputs] is that of
@@ -202,7 +216,10 @@ class LocalKMP(Immutable, Plotted):
             not_negative("tolerance", tolerance)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
         pairs = zip(self.frames, self.primitives, strict=True)
-        adapted = (primitive.adapt(via, frame.localised(desired), tolerance=tolerance) for frame, primitive in pairs)
+        adapted = (
+            primitive.adapt(via, frame.localised(desired), tolerance=tolerance)
+            for frame, primitive in pairs
+        )
         return LocalKMP(tuple(adapted), self.frames)
 
     def to_plot(self) -> Shown:
@@ -213,5 +230,8 @@ class LocalKMP(Immutable, Plotted):
             for frame, plot in zip(self.frames, plots, strict=True)
         ]
         inputs = np.concatenate([points.inputs for points in placed])
-        references, via = Points(inputs, Gaussians.concatenated([points.normals for points in placed])), plots[0].via_points
-        return plots[0]._replace(references=references, via_points=Points(via.inputs, self.frames[0].placed(via.normals)))
+        references = Points(inputs, Gaussians.concatenated([points.normals for points in placed]))
+        via = plots[0].via_points
+        return plots[0]._replace(
+            references=references, via_points=Points(via.inputs, self.frames[0].placed(via.normals))
+        )

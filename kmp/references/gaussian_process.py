@@ -14,14 +14,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.arrays.checks import Array, check_finite, check_some, checked_demonstrations, numbers, positive, whole
+from kmp.arrays.checks import (
+    Array,
+    check_finite,
+    check_some,
+    checked_demonstrations,
+    numbers,
+    positive,
+    whole,
+)
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
 
 _SIGNAL = 1e-3, 1e3  # bounds of the function's variance over the variance of the output
 _LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
 _NOISE = 1e-6, 1e1  # bounds of the noise's variance over the variance of the output
-_LONGER = 1.0, 1.5, 2.5, 4.0  # factors on the likeliest lengths, evaluated on held-out demonstrations
+_LONGER = (
+    1.0,
+    1.5,
+    2.5,
+    4.0,
+)  # factors on the likeliest lengths, evaluated on held-out demonstrations
 _NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # noises, evaluated on the same
 
 
@@ -55,9 +68,15 @@ def gaussian_process_reference(
     added = positive("regularization", regularization)
     chosen = [np.linspace(0, len(s) - 1, min(most, len(s))).astype(int) for s, _ in data]
     of = np.repeat(np.arange(len(data)), [len(rows) for rows in chosen])
-    s, y = (np.concatenate([part[i][rows] for part, rows in zip(data, chosen, strict=True)]) for i in (0, 1))
-    scale, size, centre = _deviations(s), _deviations(y), y.mean(axis=0)
-    s, queries = s / scale, where / scale
+    s, y = (
+        np.concatenate([part[i][rows] for part, rows in zip(data, chosen, strict=True)])
+        for i in (0, 1)
+    )
+    scale = _deviations(s)
+    size = _deviations(y)
+    centre = y.mean(axis=0)
+    s = s / scale
+    queries = where / scale
     check_finite("inputs", queries, "over the demonstrations' deviation:")
     processes = [_process(s, column, of, queries) for column in ((y - centre) / size).T]
     mean, deviation, errors = (np.stack(parts, axis=1) for parts in zip(*processes, strict=True))
@@ -65,7 +84,8 @@ def gaussian_process_reference(
     correlation = errors.T @ errors / len(errors) if len(data) > 1 else np.eye(len(centre))
     covariance = scaled[:, :, None] * correlation * scaled[:, None, :] + added * np.eye(len(centre))
     return Gaussians(
-        mean * size + centre, covariances("regularization: covariance", symmetric(covariance), *mean.shape)
+        mean * size + centre,
+        covariances("regularization: covariance", symmetric(covariance), *mean.shape),
     )
 
 
@@ -76,7 +96,9 @@ def _deviations(values: Array) -> Array:
     return np.where(deviations > 0, deviations, 1.0)
 
 
-def _process(s: Array, y: Array, of: NDArray[np.intp], queries: Array) -> tuple[Array, Array, Array]:
+def _process(
+    s: Array, y: Array, of: NDArray[np.intp], queries: Array
+) -> tuple[Array, Array, Array]:
     """Mean and deviation (N,) at inputs `queries` (N, I); left-out errors (M,) in their deviations.
 
     From samples s (M, I) and y (M,) of the demonstrations with the numbers `of` (M,).
@@ -87,15 +109,22 @@ def _process(s: Array, y: Array, of: NDArray[np.intp], queries: Array) -> tuple[
     from threadpoolctl import threadpool_limits
 
     count = s.shape[1]
-    kernel = ConstantKernel(1.0, _SIGNAL) * RBF(np.full(count, np.sqrt(count)), _LENGTH) + WhiteKernel(0.01, _NOISE)
+    kernel = ConstantKernel(1.0, _SIGNAL) * RBF(
+        np.full(count, np.sqrt(count)), _LENGTH
+    ) + WhiteKernel(0.01, _NOISE)
     with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore", ConvergenceWarning)  # an input without effect has no finite length
+        warnings.simplefilter(
+            "ignore", ConvergenceWarning
+        )  # an input without effect has no finite length
         likeliest = GaussianProcessRegressor(kernel).fit(s, y).kernel_
         tried = [likeliest]
         if of[-1] > 0:
             tried += [_with(likeliest, longer, noise) for longer in _LONGER for noise in _NOISES]
         left_out = [_left_out(candidate(s), y, of) for candidate in tried]
-        best = min(range(len(tried)), key=lambda i: np.sum(np.log(left_out[i][1]) + 0.5 * (left_out[i][0]) ** 2))
+        best = min(
+            range(len(tried)),
+            key=lambda i: np.sum(np.log(left_out[i][1]) + 0.5 * (left_out[i][0]) ** 2),
+        )
         fitted = GaussianProcessRegressor(tried[best], optimizer=None).fit(s, y)
         mean, deviation = fitted.predict(queries, return_std=True)
     return mean, deviation, left_out[best][0]
@@ -112,8 +141,12 @@ def _with(kernel: Any, longer: float, noise: float) -> Any:
 def _left_out(gram: Array, y: Array, of: NDArray[np.intp]) -> tuple[Array, Array]:
     """Errors (M,), in deviations, of each demonstration given the others; deviations (M,)."""
     precision = np.linalg.inv(gram)
-    pull, errors, deviations = precision @ y, np.empty_like(y), np.empty_like(y)
-    for h in np.unique(of):  # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
+    pull = precision @ y
+    errors = np.empty_like(y)
+    deviations = np.empty_like(y)
+    for h in np.unique(
+        of
+    ):  # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
         rows = of == h
         covariance = np.linalg.inv(precision[np.ix_(rows, rows)])
         deviations[rows] = np.sqrt(np.diag(covariance))

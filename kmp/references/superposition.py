@@ -27,10 +27,14 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
     n, outputs = references[0].mean.shape
     for i, other in enumerate(references):
         if other.mean.shape != (n, outputs):
-            raise ValueError(f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed.")
+            raise ValueError(
+                f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed."
+            )
     g = _priorities(priorities, len(references), n)
     inverses = [np.linalg.inv(normals.covariance) for normals in references]
-    precisions = [weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)]
+    precisions = [
+        weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)
+    ]
     covariance = np.linalg.inv(np.sum(precisions, axis=0))
     return Gaussians(fused_mean(covariance, precisions, references), symmetric(covariance))
 
@@ -40,8 +44,14 @@ def _priorities(priorities: ArrayLike, count: int, n: int) -> Array:
     array = real("priorities", priorities)
     g = numbers("priorities", array[:, None] if array.ndim == 1 else array, count, "N")
     if g.shape[1] not in {1, n}:
-        raise ValueError(f"priorities: shape {array.shape} given, ({count},) or {(count, n)} needed.")
-    least, total = g.min(), g.sum(axis=0)
+        raise ValueError(
+            f"priorities: shape {array.shape} given, ({count},) or {(count, n)} needed."
+        )
+    least = g.min()
+    total = g.sum(axis=0)
     if least < 0 or np.abs(total - 1).max() > 1e-6:
-        raise ValueError(f"priorities: from {least:g}, of sum {total[0]:g} given; needed are sums of 1, none below 0.")
+        raise ValueError(
+            f"priorities: from {least:g}, of sum {total[0]:g} given; needed are sums of 1, none "
+            "below 0."
+        )
     return g

@@ -27,7 +27,14 @@ GROUPS = {
     "check": ("doctor", "metrics", "bundle", "replay", "bench"),
     "set up": ("arm", "calibrate"),
 }
-CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")  # on Ctrl-C these first end their processes
+CLEAN_UP_FIRST = (
+    "demo",
+    "bench",
+    "view",
+    "record",
+    "hands",
+    "calibrate",
+)  # on Ctrl-C these first end their processes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -35,7 +42,10 @@ def parser() -> argparse.ArgumentParser:
     top = Parser(
         prog="thirdhand",
         description="A robot arm as a third hand at the soldering bench.",
-        epilog="thirdhand COMMAND --help explains a command, with an example. Begin with: thirdhand demo",
+        epilog=(
+            "thirdhand COMMAND --help explains a command, with an example. Begin with: thirdhand "
+            "demo"
+        ),
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     subparsers = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -45,7 +55,8 @@ def parser() -> argparse.ArgumentParser:
         for add_options in commands:
             add_options(add)
     top.groups = {
-        title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names} for title, names in GROUPS.items()
+        title: {name: abouts[name].split(". ")[0].rstrip(".") for name in names}
+        for title, names in GROUPS.items()
     }
     return top
 
@@ -69,7 +80,11 @@ def main(arguments: list[str] | None = None) -> int:
             args.cell = reaching(args).cell
         with foreign_modules.named():
             run = getattr(importlib.import_module(module), function)
-            with interrupt.clean_up_first() if args.command in CLEAN_UP_FIRST else contextlib.nullcontext():
+            with (
+                interrupt.clean_up_first()
+                if args.command in CLEAN_UP_FIRST
+                else contextlib.nullcontext()
+            ):
                 return int(run(args))
     except (UsageError, SettingsError) as error:
         say(f"thirdhand {args.command}: {in_file(str(error))}")

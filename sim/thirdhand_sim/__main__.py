@@ -37,49 +37,118 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="thirdhand sim",
-        description="The simulated bench publishes hands and joint states, follows joint commands, and plays the "
-        "soldering scene again and again, or once with --once. It prints progress on standard error, and writes "
-        "reports to --output.",
+        description="The simulated bench publishes hands and joint states, follows joint commands, "
+        "and plays the soldering scene again and again, or once with --once. It prints progress on "
+        "standard error, and writes reports to --output.",
         epilog=SIM_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    connect = f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})"
+    connect = (
+        f"Zenoh endpoint of the service; may be repeated ($THIRDHAND_CONNECT, else {ENDPOINT})"
+    )
     option(p, "--connect", "EP", connect, action="append", type=str)
-    option(p, "--listen", "EP", "Zenoh endpoint to listen on; may be repeated", action="append", type=str)
+    option(
+        p,
+        "--listen",
+        "EP",
+        "Zenoh endpoint to listen on; may be repeated",
+        action="append",
+        type=str,
+    )
     option(p, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
-    option(p, "--scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)")
-    via_points = "only print the request that teaches the scene's via-points, for `thirdhand via-points add --file -`"
+    option(
+        p,
+        "--scene",
+        "FILE",
+        "a TOML file with places [x, y, z] in metres (default: the nominal scene)",
+    )
+    via_points = (
+        "only print the request that teaches the scene's via-points, for `thirdhand via-points add "
+        "--file -`"
+    )
     p.add_argument("--via-points", action="store_true", help=via_points)
     option(p, "--arm", "ARM", f"{', '.join(ARMS)} or a cell's settings, FILE.toml", "wam")
-    p.add_argument("--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)")
-    hands_only = "publish hands and things only, and evaluate a real or other arm by its joint states"
+    p.add_argument(
+        "--engine", choices=list(ENGINES), help="the physics (default: the first that is installed)"
+    )
+    hands_only = (
+        "publish hands and things only, and evaluate a real or other arm by its joint states"
+    )
     p.add_argument("--hands-only", action="store_true", help=hands_only)
     tracked = (
-        "receive the hands that a tracker or `thirdhand hands` publishes, instead of playing a script; the scene shows "
-        "where they belong next. The run ends after S seconds (default: once all events are reached)"
+        "receive the hands that a tracker or `thirdhand hands` publishes, instead of playing a "
+        "script; the scene shows where they belong next. The run ends after S seconds (default: "
+        "once all events are reached)"
     )
-    p.add_argument("--tracked-hands", metavar="S", nargs="?", type=float, const=math.inf, help=tracked)
-    option(p, "--seed", None, "the seed for scatter, tremor and noise of the hands (default: the scene's)", type=int)
+    p.add_argument(
+        "--tracked-hands", metavar="S", nargs="?", type=float, const=math.inf, help=tracked
+    )
+    option(
+        p,
+        "--seed",
+        None,
+        "the seed for scatter, tremor and noise of the hands (default: the scene's)",
+        type=int,
+    )
     once = "end after one run; its report goes to standard output unless --output says otherwise"
     p.add_argument("--once", action="store_true", help=once)
     output = "write reports to this file, one JSON object per line; - is standard output"
     option(p, "--output", "FILE", output, type=str)
-    p.add_argument("--seconds", metavar="S", type=float, default=float("inf"), help="end after this time")
-    p.add_argument("--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    option(p, "--wait", "S", "wait this long for the first command, and again for tracked hands", 60.0)
+    p.add_argument(
+        "--seconds", metavar="S", type=float, default=float("inf"), help="end after this time"
+    )
+    p.add_argument(
+        "--duration", dest="seconds", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS
+    )
+    option(
+        p, "--wait", "S", "wait this long for the first command, and again for tracked hands", 60.0
+    )
     option(p, "--hands-rate", "HZ", "the rate of the hand poses, 30 to 500", 100, type=int)
     option(p, "--speed", "X", "the speed of the hands; 1 is as demonstrated", 1.0, type=float)
     for name, about in (
-        ("--pause", "stop the hands AT seconds after the beginning for LASTS seconds, at least 0.6; may be repeated"),
+        (
+            "--pause",
+            "stop the hands AT seconds after the beginning for LASTS seconds, at least 0.6; may be "
+            "repeated",
+        ),
         ("--turn", "like --pause, but the hands move back and return; may be repeated"),
     ):
-        p.add_argument(name, metavar=("AT", "LASTS"), type=float, nargs=2, action="append", default=[], help=about)
-    option(p, "--offset-mm", "MM", "the scatter of the places, standard deviation per axis", 8.0, type=float)
+        p.add_argument(
+            name,
+            metavar=("AT", "LASTS"),
+            type=float,
+            nargs=2,
+            action="append",
+            default=[],
+            help=about,
+        )
+    option(
+        p,
+        "--offset-mm",
+        "MM",
+        "the scatter of the places, standard deviation per axis",
+        8.0,
+        type=float,
+    )
     option(p, "--tremor-mm", "MM", "the tremor of the hands, rms per axis", 0.5, type=float)
-    option(p, "--noise-mm", "MM", "the noise of the tracker, standard deviation per axis", 0.5, type=float)
+    option(
+        p,
+        "--noise-mm",
+        "MM",
+        "the noise of the tracker, standard deviation per axis",
+        0.5,
+        type=float,
+    )
     dropout = "hide one hand from START of the script for DURATION seconds"
     p.add_argument("--dropout", metavar=("START", "DURATION"), type=float, nargs=2, help=dropout)
-    option(p, "--dropout-hand", None, "the hand that --dropout hides", "left", choices=("left", "right"))
+    option(
+        p,
+        "--dropout-hand",
+        None,
+        "the hand that --dropout hides",
+        "left",
+        choices=("left", "right"),
+    )
     add_end_with(p)
     return p
 
@@ -118,7 +187,8 @@ def main(arguments: list[str] | None = None) -> int:
     from thirdhand_sim.tracked_hands import TrackedHands
 
     world = ObservedWorld if args.hands_only else world_of(args.engine)
-    stop, came = threading.Event(), list[int]()
+    stop = threading.Event()
+    came = list[int]()
 
     def end(number: int, _: object) -> None:
         came.append(number)
@@ -129,7 +199,9 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         p.error(f"--pause, --turn: {error}")
     dropout = (
-        Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand) if args.dropout else None
+        Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand)
+        if args.dropout
+        else None
     )
     live = Live(
         cell=reach.cell,
@@ -139,7 +211,8 @@ def main(arguments: list[str] | None = None) -> int:
         wait_s=args.wait,
         dropout=dropout,
     )
-    target, runs = args.output or ("-" if args.once else None), 0
+    target = args.output or ("-" if args.once else None)
+    runs = 0
 
     def report(result: RunReport) -> None:
         nonlocal runs
@@ -168,9 +241,13 @@ def main(arguments: list[str] | None = None) -> int:
         if args.tracked_hands is not None:
             script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
         if target and target != "-":
-            Path(target).write_text("", encoding="utf-8")  # a file that cannot be written is reported before the run
+            Path(target).write_text(
+                "", encoding="utf-8"
+            )  # a file that cannot be written is reported before the run
         before_others()
-        listener = open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
+        listener = (
+            open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
+        )
         session = listener or reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
@@ -182,8 +259,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     if not args.once:
-        report_note = f"their reports are in {target}" if target else "without --output no report was written"
-        print(f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {report_note}", file=sys.stderr)
+        report_note = (
+            f"their reports are in {target}" if target else "without --output no report was written"
+        )
+        print(
+            f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {report_note}",
+            file=sys.stderr,
+        )
     return interrupt.EXIT_CODE if signal.SIGINT in came else 0
 
 

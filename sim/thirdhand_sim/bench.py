@@ -26,15 +26,33 @@ from thirdhand.settings.config import Settings
 from thirdhand_sim.engines import world_of
 from thirdhand_sim.scene import ARRIVED_M, GRASP_DISTANCE, HAND_ORIENTATION, TOOL_FROM_HAND, Scene
 from thirdhand_sim.script import GRIP_S, Array, HandMotions, TaskProgress
-from thirdhand_sim.world import BOARD_IN_TOOL, LEVEL, POSITION_GAIN, Floats, Pose, World, carried_by, seen_from
+from thirdhand_sim.world import (
+    BOARD_IN_TOOL,
+    LEVEL,
+    POSITION_GAIN,
+    Floats,
+    Pose,
+    World,
+    carried_by,
+    seen_from,
+)
 
-SETTLE_RANGE_S = (0.5, 2.5)  # shortest and longest time for the arm to settle before the script begins
+SETTLE_RANGE_S = (
+    0.5,
+    2.5,
+)  # shortest and longest time for the arm to settle before the script begins
 SETTLED_STILL_S = 0.25  # the arm has settled after resting for this time
-STAND_RAD, STAND_RADPS = 0.02, 0.05  # after a silence, a command must be within this of the standing arm
+# after a silence, a command must be within this of the standing arm
+STAND_RAD = 0.02
+STAND_RADPS = 0.05
 HOLDS = 0.5  # fingers that are closed this far hold a thing between them
 TAIL_S = 0.5  # the task is observed until this time after the script's end
-CATCH_UP_RADPS = 0.25  # the joint that is farthest behind exceeds its commanded speed by at most this
-STILL_WITHIN = 0.005  # [m] a resting tool moves by up to this, because the hand that leads it trembles
+CATCH_UP_RADPS = (
+    0.25  # the joint that is farthest behind exceeds its commanded speed by at most this
+)
+STILL_WITHIN = (
+    0.005  # [m] a resting tool moves by up to this, because the hand that leads it trembles
+)
 
 
 class TaskEvent(msgspec.Struct, frozen=True):
@@ -80,12 +98,15 @@ class _Watch:
     """The smallest distance within the window of one event."""
 
     def __init__(self) -> None:
-        self.nearest, self.nearest_s, self.reached_s = math.inf, 0.0, math.nan
+        self.nearest = math.inf
+        self.nearest_s = 0.0
+        self.reached_s = math.nan
 
     def see(self, distance: float, time_s: float, *, counts: bool = True) -> bool:
         """Note a distance [m]; True at the first one within GRASP_DISTANCE that `counts`."""
         if distance < self.nearest:
-            self.nearest, self.nearest_s = distance, time_s
+            self.nearest = distance
+            self.nearest_s = time_s
         first = counts and distance <= GRASP_DISTANCE and math.isnan(self.reached_s)
         if first:
             self.reached_s = time_s
@@ -94,7 +115,9 @@ class _Watch:
     def event(self) -> TaskEvent:
         reached = not math.isnan(self.reached_s)
         return TaskEvent(
-            reached, round(1000 * self.nearest, 3), round(self.reached_s if reached else self.nearest_s, 3)
+            reached,
+            round(1000 * self.nearest, 3),
+            round(self.reached_s if reached else self.nearest_s, 3),
         )
 
 
@@ -141,7 +164,8 @@ class Bench:
         self.scene = script.scene
         settings = settings or Settings()
         self.period_s = settings.period_s
-        self.joint_names, self._plate = settings.joints.names, settings.arm.plate
+        self.joint_names = settings.joints.names
+        self._plate = settings.arm.plate
         self.limits = settings.joints
         posture = posture or settings.arm.posture
         self.world = (world or world_of())(self.scene, settings, posture=posture)
@@ -151,7 +175,9 @@ class Bench:
         self._since_command = 0
         self.refused = 0  # commands that after a silence did not begin at the standing arm
         self._still = 0
-        self._gripper: float | None = None  # newest command; None without commands: near things are then grasped
+        self._gripper: float | None = (
+            None  # newest command; None without commands: near things are then grasped
+        )
         self._lay_out()
         self._observation = self._observe()
         self._still_at = self._observation.tool.position
@@ -161,21 +187,24 @@ class Bench:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
     def _lay_out(self) -> None:
         """Put everything at its place at the begin of a run."""
-        scene, world = self.scene, self.world
+        scene = self.scene
+        world = self.world
         self._watches = (_Watch(), _Watch(), _Watch())
         self.closed = 0  # number of events whose window is over
         world.put(world.glass, Pose(scene.glass, LEVEL))
         world.put(world.iron, Pose(scene.iron, LEVEL))
-        self._closure, self._closing = (
-            1.0,
-            0,
-        )  # closure of the fingers; 1 if they closed in this step, -1 if they opened
+        # closure of the fingers; 1 if they closed in this step, -1 if they opened
+        self._closure = 1.0
+        self._closing = 0
         # The held things, each with its holder and its pose in the holder's frame.
         self._held: dict[str, tuple[str, Pose]] = {world.board: (world.arm, BOARD_IN_TOOL)}
 
@@ -183,11 +212,14 @@ class Bench:
         """Begin the script: hands move from the next step on."""
         self._lay_out()
         self.script.begin()
-        self._ticks_since_begin, self._direction = 0, 1
+        self._ticks_since_begin = 0
+        self._direction = 1
 
     def turn_back(self) -> None:
         """Move the hands back on their path, where the skill is certain, before another `begin`."""
-        self._ticks_since_begin = min(self._ticks_since_begin, math.ceil(self.script.duration_s / self.period_s))
+        self._ticks_since_begin = min(
+            self._ticks_since_begin, math.ceil(self.script.duration_s / self.period_s)
+        )
         self._direction = -1
 
     @property
@@ -217,14 +249,20 @@ class Bench:
 
     def settled(self, waited_s: float) -> bool:
         """True if the arm has settled, or has had the longest time to settle, after a time [s]."""
-        return waited_s >= SETTLE_RANGE_S[1] or (waited_s >= SETTLE_RANGE_S[0] and self.still_s >= SETTLED_STILL_S)
+        return waited_s >= SETTLE_RANGE_S[1] or (
+            waited_s >= SETTLE_RANGE_S[0] and self.still_s >= SETTLED_STILL_S
+        )
 
     def observe(self) -> Observation:
         """The observation of the last step."""
         return self._observation
 
     def step(
-        self, position: Floats | None = None, velocity: Floats | None = None, *, gripper: float | None = None
+        self,
+        position: Floats | None = None,
+        velocity: Floats | None = None,
+        *,
+        gripper: float | None = None,
     ) -> Observation:
         """Advance by one period with a command of the joints [rad, rad/s] and of the gripper (0
         open, 1 closed), or none. Before the first command of the gripper, it grasps near things.
@@ -237,7 +275,8 @@ class Bench:
         observation = self._observe()
         self._still += 1
         if math.dist(observation.tool.position, self._still_at) > STILL_WITHIN:
-            self._still, self._still_at = 0, observation.tool.position
+            self._still = 0
+            self._still_at = observation.tool.position
         self._handle(observation)
         if self._direction == 1:
             self._watch(observation)
@@ -250,7 +289,9 @@ class Bench:
         After an interruption a network may deliver old commands at once, which would move the arm
         along a past path.
         """
-        offset_rad = max(abs(aim - is_at) for aim, is_at in zip(position, self._observation.joints, strict=True))
+        offset_rad = max(
+            abs(aim - is_at) for aim, is_at in zip(position, self._observation.joints, strict=True)
+        )
         return offset_rad <= STAND_RAD and max(map(abs, velocity or (0.0,))) <= STAND_RADPS
 
     def _follow(self, position: Floats | None, velocity: Floats | None) -> None:
@@ -284,14 +325,18 @@ class Bench:
         most = CATCH_UP_RADPS * self.period_s / POSITION_GAIN
         if behind <= most:
             return position
-        return tuple(is_at + most / behind * (aim - is_at) for aim, is_at in zip(position, joints_rad, strict=True))
+        return tuple(
+            is_at + most / behind * (aim - is_at)
+            for aim, is_at in zip(position, joints_rad, strict=True)
+        )
 
     def _grip(self, command: float | None) -> None:
         """Move the fingers toward the newest command."""
         self._gripper = self._gripper if command is None else command
         if self._gripper is None:
             return
-        before, most = self._closure, self.period_s / GRIP_S
+        before = self._closure
+        most = self.period_s / GRIP_S
         self._closure += min(max(self._gripper - before, -most), most)
         self._closing = (before < HOLDS <= self._closure) - (before >= HOLDS > self._closure)
 
@@ -299,7 +344,9 @@ class Bench:
         joints, velocities = self.world.joints()
         tool, speed = self.world.tool()
         hands = self.script.truth(self.time_s)
-        return Observation(self.tick, self.time_s, joints, velocities, tool, speed, hands, self._closure)
+        return Observation(
+            self.tick, self.time_s, joints, velocities, tool, speed, hands, self._closure
+        )
 
     def _handle(self, seen: Observation) -> None:
         """Move the hands and all held things."""
@@ -320,8 +367,11 @@ class Bench:
 
     def _watch(self, seen: Observation) -> None:
         """Detect the events, by the distances in the rests after the motions."""
-        world, scene = self.world, self.scene
-        reached = itertools.takewhile(bool, (event.reached for event in msgspec.structs.astuple(self.events())))
+        world = self.world
+        scene = self.scene
+        reached = itertools.takewhile(
+            bool, (event.reached for event in msgspec.structs.astuple(self.events()))
+        )
         observed, over = self.script.progress(seen.time_s, sum(reached))
         tool = np.array(seen.tool.position)
         handover, grasp, carry = self._watches
@@ -331,12 +381,19 @@ class Bench:
             self._take(world.board, world.left)
         if self._closing < 0:
             self._let_go(seen, offered)
-        if self._closing > 0 and not self._held_by_arm() and grasp.see(_distance(tool, scene.glass), seen.time_s):
+        if (
+            self._closing > 0
+            and not self._held_by_arm()
+            and grasp.see(_distance(tool, scene.glass), seen.time_s)
+        ):
             self._take(world.glass, world.arm)
         if observed == 1:
             if grasp.see(_distance(tool, scene.glass), seen.time_s, counts=by_itself):
                 self._take(world.glass, world.arm)
-            if world.iron not in self._held and _distance(seen.hands.right.position, scene.iron) <= ARRIVED_M:
+            if (
+                world.iron not in self._held
+                and _distance(seen.hands.right.position, scene.iron) <= ARRIVED_M
+            ):
                 self._take(world.iron, world.right)
             if self._held.get(world.board, ("",))[0] == world.left:
                 del self._held[world.board]
@@ -352,9 +409,11 @@ class Bench:
         for name, look in self.world.things.items():
             holder, grip = self._held.get(name, (None, None))
             held = grip is not None and holder == self.world.arm
-            frame, pose = BASE, self.world.pose(name)
+            frame = BASE
+            pose = self.world.pose(name)
             if held and grip:
-                frame, pose = self._plate, carried_by(self.world.plate_from_tool, grip)
+                frame = self._plate
+                pose = carried_by(self.world.plate_from_tool, grip)
             objects.append(SceneObject(name, look.shape, frame, *pose, look.size, look.colour))  # type: ignore[arg-type]
         return (*objects, *self.script.places())
 

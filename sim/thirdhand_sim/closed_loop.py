@@ -23,7 +23,9 @@ HANDS_HZ = 100  # rate of hands and joint states
 START_NS = 1_000_000_000_000  # first stamp; 0 would mean no stamp
 
 
-def hand_event(side: str, position: Vector3, stamp_ns: int, orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)) -> Event:
+def hand_event(
+    side: str, position: Vector3, stamp_ns: int, orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+) -> Event:
     """A sample of one hand as an event."""
     pose = PoseStamped(stamp_ns, BASE, position, orientation)
     return Event(f"hands/{side}", cdr.encode_pose(pose), pose)
@@ -56,7 +58,9 @@ class ClosedLoop:
         """`direct` is called before each step and starts and turns the script. `spoil` returns the
         events that replace a sample of a hand.
         """
-        self._bench, self._direct, self._spoil = bench, direct, spoil
+        self._bench = bench
+        self._direct = direct
+        self._spoil = spoil
         self._newest: Frame | None = None
 
     def follow(self, tick: Tick, frame: Frame) -> None:
@@ -73,9 +77,14 @@ class ClosedLoop:
                 return
             newest = self._newest
             if newest is not None and newest["commanded"]:
-                position, velocity = tuple(newest["joints"].tolist()), tuple(newest["joint_velocities"].tolist())
+                position = tuple(newest["joints"].tolist())
+                velocity = tuple(newest["joint_velocities"].tolist())
                 is_gripper_known = newest["gripper"] != UNKNOWN
-                observation = bench.step(position, velocity, gripper=float(newest["gripper"] == CLOSED) if is_gripper_known else None)
+                observation = bench.step(
+                    position,
+                    velocity,
+                    gripper=float(newest["gripper"] == CLOSED) if is_gripper_known else None,
+                )
             else:
                 observation = bench.step()
             inbox: list[Event] = []
@@ -84,5 +93,12 @@ class ClosedLoop:
                 for side, pose in zip(SIDES, bench.script.sample(bench.time_s), strict=True):
                     x, y, z, *orientation = pose.tolist()
                     inbox += self._spoil(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))
-                inbox.append(joints_event(bench.joint_names, observation.joints, observation.joint_velocities, stamp_ns))
+                inbox.append(
+                    joints_event(
+                        bench.joint_names,
+                        observation.joints,
+                        observation.joint_velocities,
+                        stamp_ns,
+                    )
+                )
             yield Tick(bench.tick, tuple(inbox))

@@ -11,7 +11,9 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-UNKNOWN_KG = "1"  # mass of moving links without one in the URDF, because engines move no link without a mass
+UNKNOWN_KG = (
+    "1"  # mass of moving links without one in the URDF, because engines move no link without a mass
+)
 UNKNOWN_INERTIA = {**NO_INERTIA, "ixx": "0.01", "iyy": "0.01", "izz": "0.01"}  # [kg m²]
 SHORTEST = 1e-3  # [m] a capsule with a shorter axis becomes a sphere
 
@@ -22,8 +24,10 @@ def simulated(settings: Settings, **compiler: str) -> str:
     Meshes, whose files the engines would not find, are replaced by the capsules that the service
     uses for distances. `compiler` has settings of MuJoCo.
     """
-    text, names = robot_description(settings), settings.joints.names
-    robot, urdf = ElementTree.fromstring(text), Urdf(text)
+    text = robot_description(settings)
+    names = settings.joints.names
+    robot = ElementTree.fromstring(text)
+    urdf = Urdf(text)
     for joint in robot.findall("joint"):
         if joint.get("name") not in names:
             joint.set("type", "fixed")
@@ -33,7 +37,9 @@ def simulated(settings: Settings, **compiler: str) -> str:
         if not _is_massive(link):
             for without in link.findall("inertial"):
                 link.remove(without)
-            inertial = SubElement(link, "inertial")  # without it, PyBullet gives 1 kg also to links without a body
+            inertial = SubElement(
+                link, "inertial"
+            )  # without it, PyBullet gives 1 kg also to links without a body
             SubElement(inertial, "mass", value=UNKNOWN_KG if name in driven else "0")
             SubElement(inertial, "inertia", UNKNOWN_INERTIA if name in driven else NO_INERTIA)
     if robot.find(".//mesh") is not None:
@@ -52,20 +58,24 @@ def simulated(settings: Settings, **compiler: str) -> str:
 
 def _is_massive(link: Element) -> bool:
     """True if a link has a mass above 0 and moments of inertia."""
-    mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
+    mass = link.find("inertial/mass")
+    inertia = link.find("inertial/inertia")
     return mass is not None and inertia is not None and float(mass.get("value", "0")) > 0.0
 
 
 def _cover(link: Element, ends: list[list[float]], radius: float) -> None:
     """Give a link a visible and colliding capsule between two ends [m]."""
     start, end = ends
-    (x, y, z), middle = (end[i] - start[i] for i in range(3)), [(start[i] + end[i]) / 2 for i in range(3)]
+    x, y, z = (end[i] - start[i] for i in range(3))
+    middle = [(start[i] + end[i]) / 2 for i in range(3)]
     for use in ("visual", "collision"):
         shape = SubElement(link, use)
         turn = f"0 {math.atan2(math.hypot(x, y), z)} {math.atan2(y, x)}"
         SubElement(shape, "origin", xyz=" ".join(map(str, middle)), rpy=turn)
         length = math.hypot(x, y, z)
         long = length > SHORTEST
-        geometry = SubElement(SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius))
+        geometry = SubElement(
+            SubElement(shape, "geometry"), "capsule" if long else "sphere", radius=str(radius)
+        )
         if long:
             geometry.set("length", str(length))

@@ -38,7 +38,9 @@ SWING_TIMEOUT_S = 5.0  # longer than a period of the hands' swing
 
 
 Network = Literal["relays", "router", "link"]
-Command = tuple[float, int, bytes]  # time of leaving the service (time.monotonic() [s]), tick, bytes
+Command = tuple[
+    float, int, bytes
+]  # time of leaving the service (time.monotonic() [s]), tick, bytes
 
 
 class FaultError(RuntimeError):
@@ -99,7 +101,13 @@ class _Arm:
                 deadlines.wait()
                 observation = bench.step(*bridge.commands.take())
                 bridge.publish_joints(observation)
-                self.steps.append((time.monotonic(), *observation.tool.position, math.hypot(*observation.tool_velocity)))
+                self.steps.append(
+                    (
+                        time.monotonic(),
+                        *observation.tool.position,
+                        math.hypot(*observation.tool_velocity),
+                    )
+                )
 
     @property
     def speed(self) -> float:
@@ -119,9 +127,13 @@ class FaultyCell:
     virtual cable to a network namespace. Raises FaultError, LaunchError and PartError.
     """
 
-    def __init__(self, folder: Path, *, network: Network = "relays", settings: Settings | None = None) -> None:
+    def __init__(
+        self, folder: Path, *, network: Network = "relays", settings: Settings | None = None
+    ) -> None:
         self.settings = settings or Settings()
-        self.folder, self.records, self.network = folder, folder / "records", network
+        self.folder = folder
+        self.records = folder / "records"
+        self.network = network
         self.commands: list[Command] = []  # commands of the service before its first restart
         self.unasked = 0  # number of faults that were not injected, caused by a busy machine
         self._parts = contextlib.ExitStack()
@@ -138,8 +150,11 @@ class FaultyCell:
             self.begin_service()
             endpoint = self.service.endpoint
             if self.network == "relays":
-                self.to_tracker, self.to_arm = (self._part(parts, "relay", endpoint, "0") for _ in range(2))
-                to_tracker, to_arm = self.to_tracker.endpoint, self.to_arm.endpoint
+                self.to_tracker, self.to_arm = (
+                    self._part(parts, "relay", endpoint, "0") for _ in range(2)
+                )
+                to_tracker = self.to_tracker.endpoint
+                to_arm = self.to_arm.endpoint
             else:
                 to_tracker = to_arm = self.router.endpoint if self.network == "router" else endpoint
             # The operator connects to the service directly, to observe commands during network
@@ -176,7 +191,9 @@ class FaultyCell:
         record = self.records if self._lives == 1 else self.folder / f"records-{self._lives}"
         self._life.close()
         self.service: Launched = self._life.enter_context(
-            launched(self.folder, settings=self.settings, record=record, network=network, program=program)
+            launched(
+                self.folder, settings=self.settings, record=record, network=network, program=program
+            )
         )
 
     def _listen(self) -> None:
@@ -197,12 +214,16 @@ class FaultyCell:
                     return int(pid)
         raise FaultError(f"no {what} was found among the children of the service")
 
-    def until(self, what: Callable[[], bool], said: str, within_s: float = RESUMES_WITHIN_S) -> float:
+    def until(
+        self, what: Callable[[], bool], said: str, within_s: float = RESUMES_WITHIN_S
+    ) -> float:
         """Wait for a condition and return the time at which it held [s]. Raises FaultError."""
         end = time.monotonic() + within_s
         while not what():
             if time.monotonic() > end:
-                raise FaultError(f"{said} within {within_s:g} s; the status: {self.client.status()}")
+                raise FaultError(
+                    f"{said} within {within_s:g} s; the status: {self.client.status()}"
+                )
             time.sleep(0.005)
         return time.monotonic()
 
@@ -213,12 +234,18 @@ class FaultyCell:
         end = time.monotonic() + RESUMES_WITHIN_S
         while time.monotonic() < end:
             with contextlib.suppress(FaultError, UnreachableError):
-                return self.until(lambda: self.arm.speed > speed, "the tool was not fast", within_s=SWING_TIMEOUT_S)
+                return self.until(
+                    lambda: self.arm.speed > speed,
+                    "the tool was not fast",
+                    within_s=SWING_TIMEOUT_S,
+                )
             with contextlib.suppress(UnreachableError):
                 if self.client.status().mode == "fault":
                     self.unasked += 1
                     self.client.reset()
-        raise FaultError(f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}")
+        raise FaultError(
+            f"the tool was not fast within {RESUMES_WITHIN_S:g} s: {self.client.status()}"
+        )
 
     def suffer(self, name: str, fault: Fault) -> FaultTimes:
         """Inject a fault while the tool is fast, repair it, and return the times."""

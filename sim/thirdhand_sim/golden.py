@@ -74,7 +74,8 @@ class GoldenSession:
         """The ticks of the session, with some missed deadlines."""
         jump = 0
         for tick in itertools.islice(self.loop.ticks(), self._tick(SESSION_S)):
-            events, k = [_as_measured(event) for event in tick.inbox], tick.index
+            events = [_as_measured(event) for event in tick.inbox]
+            k = tick.index
             if k in self._adopted:
                 events.append(Event("skill", self._adopted[k].file, self._adopted[k].for_loop()))
             if k in self._orders:
@@ -91,7 +92,8 @@ class GoldenSession:
 
     def _spoil(self, event: Event) -> tuple[Event, ...]:
         """Remove, spoil or displace samples of the left hand in parts of the session."""
-        pose, t = event.value, self._bench.tick * self._bench.period_s
+        pose = event.value
+        t = self._bench.tick * self._bench.period_s
         if event.kind != "hands/left":
             return (event,)
         if DROPOUT_S[0] <= t < DROPOUT_S[1]:
@@ -115,7 +117,8 @@ def _as_measured(event: Event) -> Event:
     """A sample, rounded to the resolution of its sensor."""
     was = event.value
     if event.kind == "joints/state":
-        position, velocity = _rounded(was.position, ENCODED), _rounded(was.velocity, ENCODED_SPEED)
+        position = _rounded(was.position, ENCODED)
+        velocity = _rounded(was.velocity, ENCODED_SPEED)
         return joints_event(was.names, position, velocity, was.stamp_ns)
     now = was._replace(position=_rounded(was.position, TRACKED))
     return Event(event.kind, cdr.encode_pose(now), now)
@@ -152,7 +155,12 @@ def record(
     table[[*checksums]] = [*checksums.values()]
     constants = controller.constants
     with Recorder(
-        path, settings=settings, skill=skill.file, state=start, constants=constants, checksums=table.tobytes()
+        path,
+        settings=settings,
+        skill=skill.file,
+        state=start,
+        constants=constants,
+        checksums=table.tobytes(),
     ) as recorder:
         for tick, frame in steps:
             whole_frame = frame if tick.index % WHOLE_EVERY == 0 else None
@@ -166,7 +174,8 @@ def _time_ns(tick: Tick, settings: Settings) -> int:
 
 def make(path: Path, skill: StoredSkill) -> None:
     """Write a new golden session."""
-    settings, scene = Settings(), Scene()
+    settings = Settings()
+    scene = Scene()
     with Bench(HandScript(scene, seed=scene.seed), settings=settings) as bench:
         session = GoldenSession(bench, skill)
         record(path, settings, skill, session.ticks(), follow=session.loop.follow)
@@ -204,14 +213,19 @@ def main(arguments: list[str] | None = None) -> int:
     )
     option(p, "--output", "FILE", "the recording", Path("recordings/golden.mcap"))
     option(p, "--skill", "FILE", "the skill", Path("recordings/soldering.npz"))
-    about = "keep the ticks, compute the frames again, print the number of changed ticks and the largest changes"
+    about = (
+        "keep the ticks, compute the frames again, print the number of changed ticks and the "
+        "largest changes"
+    )
     p.add_argument("--refresh", action="store_true", help=about)
     args = p.parse_args(arguments)
     try:
         if args.refresh:
             changes = refresh(args.output)
             print(
-                "\n".join(f"{name:<24} changed: {value:.4g}" for name, value in sorted(changes.items()))
+                "\n".join(
+                    f"{name:<24} changed: {value:.4g}" for name, value in sorted(changes.items())
+                )
                 or "nothing changed"
             )
         else:

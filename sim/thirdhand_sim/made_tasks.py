@@ -26,7 +26,19 @@ from thirdhand_sim.scene import TOOL_ORIENTATION
 from thirdhand_sim.script import Array
 from thirdhand_sim.sessions import SHAPE_STEPS, Leg, along, restless, shape
 
-TASK_KINDS = ("three", "six", "twelve", "cyclic", "thrice", "path", "heading", "one_hand", "loose", "ahead", "long")
+TASK_KINDS = (
+    "three",
+    "six",
+    "twelve",
+    "cyclic",
+    "thrice",
+    "path",
+    "heading",
+    "one_hand",
+    "loose",
+    "ahead",
+    "long",
+)
 TAUGHT = "visits"  # the task of the tutorial, which no experiment uses
 TAKE_HZ = 50
 START_REST_S = 1.2  # rest before the first motion
@@ -51,7 +63,9 @@ PAUSES = 0.12  # probability that a hand pauses in a leg
 STRAYS = 0.15  # probability that a hand strays before a leg
 TOOL_MARGIN_M = 0.05  # the tool's places are this far inside the arm's reach
 LEAST_WAY_M = 0.10  # successive places of a hand or tool are at least this far apart
-HANDS_BOX = np.array([[[0.55, -0.42, 0.07], [0.95, -0.02, 0.25]], [[0.55, 0.02, 0.07], [0.95, 0.42, 0.25]]])
+HANDS_BOX = np.array(
+    [[[0.55, -0.42, 0.07], [0.95, -0.02, 0.25]], [[0.55, 0.02, 0.07], [0.95, 0.42, 0.25]]]
+)
 CARRYING_BOX = np.array([[0.55, -0.30, 0.07], [0.70, 0.05, 0.18]])
 TOOL_BOX = np.array([[0.35, -0.36, 0.15], [0.60, 0.36, 0.40]])
 HAND_BOX = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # limits of a hand's places
@@ -86,18 +100,28 @@ def plan(kind: str) -> Plan:
     once = {"three": 3, "six": 6, "twelve": 12, "loose": 6, "ahead": 3, "heading": 3, "long": 24}
     if kind in once:
         count = once[kind]
-        names, segments = tuple(f"segment {i + 1}" for i in range(count)), [(i, i, i) for i in range(count)]
+        names = tuple(f"segment {i + 1}" for i in range(count))
+        segments = [(i, i, i) for i in range(count)]
     elif kind in ("cyclic", "thrice"):
-        names = ("start", "left out", "work", "left out again", "work again", "left out a third time")
+        names = (
+            "start",
+            "left out",
+            "work",
+            "left out again",
+            "work again",
+            "left out a third time",
+        )
         segments = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (2, 1, 4), (1, 0, 5)]
         names, segments = (names, segments) if kind == "thrice" else (names[:4], segments[:4])
     elif kind == TAUGHT:
         names = ("start", "tray", "work", "tray again", "done")
         segments = [(0, 0, 0), (1, 0, 1), (2, 1, 2), (1, 0, 3), (3, 0, 4)]
     elif kind == "path":
-        names, segments = ("start", "path begins", "path ends"), [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
+        names = ("start", "path begins", "path ends")
+        segments = [(0, 0, 0), (1, 1, 1), (2, 1, 2)]
     elif kind == "one_hand":
-        names, segments = ("start", "fetch", "bring"), [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
+        names = ("start", "fetch", "bring")
+        segments = [(0, 0, 0), (1, 0, 1), (2, 0, 2)]
     else:
         raise ValueError(f"{kind!r}: no kind of synthetic task; {', '.join(TASK_KINDS)} accepted")
     follow = {"path": [0.0, 1.0, 1.0], "heading": [1.0] * 3}.get(kind, [0.0] * len(names))
@@ -131,13 +155,24 @@ def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list
 
     Raises ValueError for a kind outside TASK_KINDS.
     """
-    return [Take(subject, run(kind, subject, number, seed=seed).demonstration()) for subject in people for number in range(each)]
+    return [
+        Take(subject, run(kind, subject, number, seed=seed).demonstration())
+        for subject in people
+        for number in range(each)
+    ]
 
 
 def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | None = None) -> Run:
     """A person's run of a task, in a scene of its own if none is given."""
     task = plan(kind)
-    key = (PROJECT_SEED, GROUP_SEEDS["made"], (*TASK_KINDS, TAUGHT).index(kind), seed, who, number + 1)
+    key = (
+        PROJECT_SEED,
+        GROUP_SEEDS["made"],
+        (*TASK_KINDS, TAUGHT).index(kind),
+        seed,
+        who,
+        number + 1,
+    )
     random = np.random.default_rng(key)
     habits = person("made", who)
     habits = habits._replace(tremor=0.4 * habits.tremor, lead_s=task.ahead_s or 0.2 * habits.lead_s)
@@ -145,9 +180,19 @@ def run(kind: str, who: int, number: int, *, seed: int = 0, scene: TaskScene | N
     right_rests = _within(RESTS, random)
     if kind == "one_hand":  # the place of the idle hand carries no information
         scene = scene._replace(right=np.tile(right_rests, (len(task.names), 1)))
-    order = _order(len(task.names), random) if kind == "loose" else [(i, False) for i in range(len(task.names))]
+    order = (
+        _order(len(task.names), random)
+        if kind == "loose"
+        else [(i, False) for i in range(len(task.names))]
+    )
     return Run(
-        task, scene, habits, who, tuple(segment for segment, _ in order), key, _legs(task, scene, habits, order, key)
+        task,
+        scene,
+        habits,
+        who,
+        tuple(segment for segment, _ in order),
+        key,
+        _legs(task, scene, habits, order, key),
     )
 
 
@@ -187,7 +232,9 @@ class Run:
         nodes = np.arange(len(order))
 
         def between(values: Array) -> Array:
-            return np.stack([np.interp(progress, nodes, column) for column in values[order].T], axis=1)
+            return np.stack(
+                [np.interp(progress, nodes, column) for column in values[order].T], axis=1
+            )
 
         turns = between(self.scene.turns)
         if self.task.carried:
@@ -204,12 +251,17 @@ class Run:
         random = np.random.default_rng([*self.key, 4])
         habit = np.random.default_rng([*self.key[:2], self.number])
         steps = np.arange(int(self.lasts_s * TAKE_HZ))
-        times, count = steps / TAKE_HZ, len(steps)
-        hands = self.hands(times) + habit.uniform(*TRACKER_NOISE_M) * random.standard_normal((count, 6))
+        times = steps / TAKE_HZ
+        count = len(steps)
+        hands = self.hands(times) + habit.uniform(*TRACKER_NOISE_M) * random.standard_normal(
+            (count, 6)
+        )
         tool, late = self.tool(times)
         (_, by_left), _ = (along(legs, times) for legs in self.legs)
         nodes = np.arange(len(self.order))
-        turns = np.stack([np.interp(by_left, nodes, c) for c in self.scene.turns[list(self.order)].T], axis=1)
+        turns = np.stack(
+            [np.interp(by_left, nodes, c) for c in self.scene.turns[list(self.order)].T], axis=1
+        )
         grips = GRIP_RAD * habit.standard_normal((2, 3))
         noise = TURN_NOISE_RAD * random.standard_normal((2, count, 3))
         left = Rotation.from_euler("ZYX", turns) * Rotation.from_euler("ZYX", grips[0] + noise[0])
@@ -220,7 +272,12 @@ class Run:
             steps * (1_000_000_000 // TAKE_HZ) + (1 + 300 * self.key[-1]) * 1_000_000_000,
             np.hstack([hands[:, :3], _quaternions(left, count)]),
             np.hstack([hands[:, 3:], _quaternions(right, count)]),
-            np.hstack([tool + TOOL_NOISE_M * random.standard_normal(tool.shape), _quaternions(turned, count)]),
+            np.hstack(
+                [
+                    tool + TOOL_NOISE_M * random.standard_normal(tool.shape),
+                    _quaternions(turned, count),
+                ]
+            ),
             places=self._perceived(random),
         )
 
@@ -233,7 +290,10 @@ class Run:
         rows = [
             {
                 "name": name,
-                **{side: position.tolist() for side, position in zip(("left", "right", "tool"), ends, strict=True)},
+                **{
+                    side: position.tolist()
+                    for side, position in zip(("left", "right", "tool"), ends, strict=True)
+                },
                 "std": 0.003,
                 "radius": 0.03,
                 "follow": "left" if follow else "none",
@@ -256,19 +316,25 @@ def _usual(kind: str, seed: int) -> list[Array]:
     places.
     """
     task = plan(kind)
-    random = np.random.default_rng([PROJECT_SEED, GROUP_SEEDS["made"], TASK_KINDS.index(kind), seed])
+    random = np.random.default_rng(
+        [PROJECT_SEED, GROUP_SEEDS["made"], TASK_KINDS.index(kind), seed]
+    )
     boxes = [CARRYING_BOX if task.follow.any() else HANDS_BOX[0], HANDS_BOX[1], TOOL_BOX]
     out = []
     for box, column in zip(boxes, task.segments.T, strict=True):
         places: list[Array] = []
-        spacing_m, step_m = 0.16, 0.22  # [m] least distance from all other places, and from the one before
+        # [m] least distance from all other places, and from the one before
+        spacing_m = 0.16
+        step_m = 0.22
         while len(places) <= column.max():
             tried = _within(box, random)
             if all(np.linalg.norm(tried - place) > spacing_m for place in places) and (
                 not places or np.linalg.norm(tried - places[-1]) > step_m
             ):
                 places.append(tried)
-            spacing_m, step_m = 0.998 * spacing_m, 0.999 * step_m  # the distances shrink until all places fit
+            # the distances shrink until all places fit
+            spacing_m = 0.998 * spacing_m
+            step_m = 0.999 * step_m
         out.append(np.array(places))
     return [*out, np.array(TURNS_RAD) * random.standard_normal((len(out[0]), 3))]
 
@@ -290,7 +356,9 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> T
                 and (not carries or _reached(tried + CARRIED_M))
             ):
                 return np.asarray(tried)
-        raise ValueError(f"no room for place {index} near {usual[part][index]}")  # the boxes above prevent this
+        raise ValueError(
+            f"no room for place {index} near {usual[part][index]}"
+        )  # the boxes above prevent this
 
     parts = []
     for part in range(3):
@@ -299,7 +367,9 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> T
             places.append(placed(part, index, places[-1] if places else None))
         parts.append(np.array(places))
     turns = usual[3] + np.array(TURNS_RAD) * random.standard_normal(usual[3].shape)
-    left, right, tool = (positions[column] for positions, column in zip(parts, task.segments.T, strict=True))
+    left, right, tool = (
+        positions[column] for positions, column in zip(parts, task.segments.T, strict=True)
+    )
     turns = turns[task.segments[:, 0]]
     if task.carried:
         tool = left + Rotation.from_euler("ZYX", turns).apply(CARRIED_M)
@@ -323,7 +393,8 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
     or with one segment left out, repeated or interrupted.
     """
     order = [(i, False) for i in range(count)]
-    index, how = int(random.integers(1, count - 1)), int(random.integers(4))
+    index = int(random.integers(1, count - 1))
+    how = int(random.integers(4))
     if how == 1:
         order.pop(index)
     elif how == 2:
@@ -344,18 +415,28 @@ def _legs(
     ends = np.stack([scene.left, scene.right])
     for side, column in enumerate(task.segments[:, :2].T):
         offset_m = habit.standard_normal((len(task.names), 3))
-        offset_m *= habit.uniform(*HAND_OFF_M, (len(offset_m), 1)) / np.linalg.norm(offset_m, axis=1, keepdims=True)
+        offset_m *= habit.uniform(*HAND_OFF_M, (len(offset_m), 1)) / np.linalg.norm(
+            offset_m, axis=1, keepdims=True
+        )
         ends[side] += (offset_m + HAND_SCATTER_M * random.standard_normal(offset_m.shape))[column]
     legs: tuple[list[Leg], list[Leg]] = ([], [])
     free = [0.5, 0.5]  # [s] time from which each hand may move
     ready_s = START_REST_S + max(who.lead_s, 0.0)
 
     def go(
-        side: int, at: float, way: Array, progress: tuple[float, float], bow: Array | None, *, curve: bool = False
+        side: int,
+        at: float,
+        way: Array,
+        progress: tuple[float, float],
+        bow: Array | None,
+        *,
+        curve: bool = False,
     ) -> None:
         length = float(np.linalg.norm(way[1] - way[0]))
         lasts = (5.0 if curve else 0.9 + 1.6 * length) / who.speed * random.uniform(0.9, 1.1)
-        share, deviation = shape(who, way, None if bow is None else bow * min(1.0, length / 0.4), random)
+        share, deviation = shape(
+            who, way, None if bow is None else bow * min(1.0, length / 0.4), random
+        )
         if curve:
             along_way = (way[1] - way[0]) / length
             across = np.cross((0.0, 0.0, 1.0), along_way)
@@ -371,14 +452,24 @@ def _legs(
                         go(side, ready_s, ends[side, list(nodes)], progress, None)
                 ready_s = max(*free, ready_s) + random.uniform(1.0, 2.0)
         for side in (0, 1):
-            begin = max(free[side] + 0.1, ready_s - who.lead_s * (side == 0) + 0.1 * random.standard_normal())
-            if task.segments[a, side] == task.segments[b, side]:  # the hand rests, and the other does not wait for it
+            begin = max(
+                free[side] + 0.1,
+                ready_s - who.lead_s * (side == 0) + 0.1 * random.standard_normal(),
+            )
+            if (
+                task.segments[a, side] == task.segments[b, side]
+            ):  # the hand rests, and the other does not wait for it
                 start = ends[side, a]
-                begin, at_once = max(free[side], begin - 0.6), np.linspace(0, 1, SHAPE_STEPS)
-                legs[side].append(Leg(begin, 0.1, start, start, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1)))
+                begin = max(free[side], begin - 0.6)
+                at_once = np.linspace(0, 1, SHAPE_STEPS)
+                legs[side].append(
+                    Leg(begin, 0.1, start, start, at_once, np.zeros((SHAPE_STEPS, 3)), (i, i + 1))
+                )
                 free[side] = begin + 0.1
                 continue
-            start, goal, bow = ends[side, a], ends[side, b], who.bows[side, i % 2]
+            start = ends[side, a]
+            goal = ends[side, b]
+            bow = who.bows[side, i % 2]
             if random.random() < STRAYS and not who.lead_s > 1.0:
                 stray = start + random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.3)
                 go(side, begin, np.array([start, stray]), (i, i), None)
@@ -387,9 +478,22 @@ def _legs(
             if random.random() < task.pauses and i != task.curved:
                 half = start + random.uniform(0.35, 0.65) * (goal - start)
                 go(side, begin, np.array([start, half]), (i, i + 0.5), bow)
-                go(side, free[side] + random.uniform(0.5, 1.5), np.array([half, goal]), (i + 0.5, i + 1), bow)
+                go(
+                    side,
+                    free[side] + random.uniform(0.5, 1.5),
+                    np.array([half, goal]),
+                    (i + 0.5, i + 1),
+                    bow,
+                )
             else:
-                go(side, begin, np.array([start, goal]), (i, i + 1), bow, curve=i == task.curved and side == 0)
+                go(
+                    side,
+                    begin,
+                    np.array([start, goal]),
+                    (i, i + 1),
+                    bow,
+                    curve=i == task.curved and side == 0,
+                )
         ready_s = max(free) + random.uniform(*task.dwells)
         if random.random() < task.pauses:
             ready_s += random.uniform(1.0, 3.0)

@@ -10,7 +10,15 @@ import numpy as np
 
 from thirdhand.settings.config import Settings
 from thirdhand_sim.description import simulated
-from thirdhand_sim.world import FIELD_OF_VIEW, POSITION_GAIN, UNLIMITED, Floats, Pose, World, WorldBody
+from thirdhand_sim.world import (
+    FIELD_OF_VIEW,
+    POSITION_GAIN,
+    UNLIMITED,
+    Floats,
+    Pose,
+    World,
+    WorldBody,
+)
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a screen
@@ -43,7 +51,8 @@ class MujocoWorld(World):
         spec = mujoco.MjSpec.from_string(simulated(settings, **READ_AS))
         spec.option.timestep = self._period_s
         for shape in spec.geoms:
-            shape.contype, shape.conaffinity = int(shape.group == FELT_GROUP), 0
+            shape.contype = int(shape.group == FELT_GROUP)
+            shape.conaffinity = 0
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -53,7 +62,9 @@ class MujocoWorld(World):
             width=8,
             height=48,
         )
-        spec.worldbody.add_light(pos=(1, -1, 3), dir=(-0.3, 0.3, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        spec.worldbody.add_light(
+            pos=(1, -1, 3), dir=(-0.3, 0.3, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        )
         for name, body in bodies.items():
             self._add(spec, name, body)
         spec.visual.global_.offwidth = spec.visual.global_.offheight = MOST_PIXELS
@@ -63,7 +74,9 @@ class MujocoWorld(World):
         joints = [model.joint(name) for name in settings.joints.names]
         self._joints = np.array([joint.qposadr[0] for joint in joints])
         self._motors = np.array([joint.dofadr[0] for joint in joints])
-        self._efforts = np.array([model.jnt_actfrcrange[joint.id, 1] or UNLIMITED for joint in joints])  # [N m]
+        self._efforts = np.array(
+            [model.jnt_actfrcrange[joint.id, 1] or UNLIMITED for joint in joints]
+        )  # [N m]
         self._inertia = np.empty((model.nv, model.nv))
         self._tool = model.body(settings.arm.plate).id
         self._mocap = {name: int(model.body(name).mocapid[0]) for name in bodies}
@@ -75,7 +88,10 @@ class MujocoWorld(World):
     def _add(spec: Any, name: str, body: WorldBody) -> None:
         x, y, z = body.look.size
         spec_body = spec.worldbody.add_body(
-            name=name, pos=body.at.position, quat=_w_first(body.at.orientation), mocap=not body.solid
+            name=name,
+            pos=body.at.position,
+            quat=_w_first(body.at.orientation),
+            mocap=not body.solid,
         )
         spec_body.add_geom(
             name=name,
@@ -91,7 +107,8 @@ class MujocoWorld(World):
 
     def follow(self, position: Floats, velocity: Floats) -> None:
         """Set the motors' target positions [rad] and velocities [rad/s]."""
-        self._position, self._velocity = np.array(position), np.array(velocity)
+        self._position = np.array(position)
+        self._velocity = np.array(velocity)
 
     def step(self) -> None:
         """One period of physics."""
@@ -104,13 +121,17 @@ class MujocoWorld(World):
         """Torques of the motors [N m]. Motors that do not reach their limit reach their
         velocity.
         """
-        data, motors = self._data, self._motors
-        target_velocity = self._velocity + POSITION_GAIN / self._period_s * (self._position - data.qpos[self._joints])
+        data = self._data
+        motors = self._motors
+        target_velocity = self._velocity + POSITION_GAIN / self._period_s * (
+            self._position - data.qpos[self._joints]
+        )
         acceleration = (target_velocity - data.qvel[motors]) / self._period_s
         mujoco.mj_fullM(self._model, data, self._inertia)
         inertia = self._inertia[np.ix_(motors, motors)]
         others = (data.qfrc_bias - data.qfrc_passive - data.qfrc_constraint)[motors]
-        effort, weak = inertia @ acceleration + others, np.zeros(len(motors), bool)
+        effort = inertia @ acceleration + others
+        weak = np.zeros(len(motors), bool)
         while (share := np.where(weak, 0.0, np.abs(effort) / self._efforts)).max() > 1.0:
             weak[np.argmax(share)] = True  # its torque is at the limit; the others compensate
             effort[weak] = np.clip(effort[weak], -self._efforts[weak], self._efforts[weak])
@@ -121,13 +142,17 @@ class MujocoWorld(World):
 
     def joints(self) -> tuple[Floats, Floats]:
         """Position [rad] and velocity [rad/s] of the joints in chain order."""
-        return tuple(self._data.qpos[self._joints].tolist()), tuple(self._data.qvel[self._motors].tolist())
+        return tuple(self._data.qpos[self._joints].tolist()), tuple(
+            self._data.qvel[self._motors].tolist()
+        )
 
     def tool(self) -> tuple[Pose, Floats]:
         """Pose and velocity [m/s] of the tool."""
         w, *turn = self._data.xquat[self._tool].tolist()
         speed = np.empty(6)
-        mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0)
+        mujoco.mj_objectVelocity(
+            self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, self._tool, speed, 0
+        )
         pose = Pose(tuple(self._data.xpos[self._tool].tolist()), (*turn, w))
         return self._tool_on(pose, tuple(speed[3:].tolist()), tuple(speed[:3].tolist()))
 
@@ -141,14 +166,17 @@ class MujocoWorld(World):
         mujoco.mj_kinematics(self._model, self._data)  # bodies may have moved
         other = self._model.geom(body).id
         return min(
-            float(mujoco.mj_geomDistance(self._model, self._data, geom, other, within, None)) for geom in self._felt
+            float(mujoco.mj_geomDistance(self._model, self._data, geom, other, within, None))
+            for geom in self._felt
         )
 
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
         mujoco.mj_kinematics(self._model, self._data)
-        lens, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        lens = mujoco.MjvCamera()
+        option = mujoco.MjvOption()
         away = np.subtract(target, eye)
-        lens.lookat[:], lens.distance = target, np.linalg.norm(away)
+        lens.lookat[:] = target
+        lens.distance = np.linalg.norm(away)
         lens.azimuth = np.degrees(np.arctan2(away[1], away[0]))
         lens.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
         option.geomgroup[FELT_GROUP] = 0

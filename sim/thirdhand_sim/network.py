@@ -29,7 +29,9 @@ from thirdhand_sim.script import Array
 from thirdhand_sim.tracked_hands import TrackedHands
 
 THINGS_HZ = 10
-FINAL_STOP_S = 1.0  # the bench runs for this time after the last hands, so that the service can stop the arm
+FINAL_STOP_S = (
+    1.0  # the bench runs for this time after the last hands, so that the service can stop the arm
+)
 QUIET_S = 1.0  # missing commands are reported after this time
 MOST_QUEUED = 256  # commands wait in a queue of this length while the bench is held up
 DRIVE_HEADROOM = 1.25  # drive limits / command limits, so that the arm can catch up after a hold-up
@@ -44,7 +46,9 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
     success: bool
     events: TaskEvents
-    latency_ms: requests.Percentiles  # from a published hand to the first received command that answers it
+    latency_ms: (
+        requests.Percentiles
+    )  # from a published hand to the first received command that answers it
     answered: int  # number of hand samples among `hands` that a command answered
     hands: int
     commands: int
@@ -104,11 +108,14 @@ class Commands:
 
     def receive(self, sample: zenoh.Sample) -> None:
         """Store a command. Its latency counts only for the first answer to each hand stamp."""
-        now_ns, now = time.time_ns(), time.perf_counter_ns()
+        now_ns = time.time_ns()
+        now = time.perf_counter_ns()
         try:
             message = cdr.decode_joints(sample.payload.to_bytes())
             command = messages.in_order(message, self._names)
-            attachment = cdr.decode_attachment(sample.attachment.to_bytes()) if sample.attachment else None
+            attachment = (
+                cdr.decode_attachment(sample.attachment.to_bytes()) if sample.attachment else None
+            )
             if not messages.finite(command[0] + command[1]):
                 raise messages.WireError("a joint that is not finite")
         except messages.WireError as error:
@@ -130,7 +137,8 @@ class Commands:
     def take(self) -> tuple[tuple[float, ...], tuple[float, ...]] | tuple[None, None]:
         """The newest command, position [rad] and velocity [rad/s], if it was not taken before."""
         with self._lock:
-            newest, self._newest = self._newest, None
+            newest = self._newest
+            self._newest = None
         return newest or (None, None)
 
     def queued(self) -> list[Command]:
@@ -145,9 +153,15 @@ class Led:
     """The bench's arm, driven like a real one by `thirdhand follow`."""
 
     def __init__(self, bench: Bench, commands: Commands, gripper: Gripper) -> None:
-        self._bench, self._commands, self._gripper = bench, commands, gripper
-        names, joints = ("velocity", "acceleration", "jerk"), bench.observe().joints
-        more = {name: tuple(DRIVE_HEADROOM * limit for limit in getattr(bench.limits, name)) for name in names}
+        self._bench = bench
+        self._commands = commands
+        self._gripper = gripper
+        names = ("velocity", "acceleration", "jerk")
+        joints = bench.observe().joints
+        more = {
+            name: tuple(DRIVE_HEADROOM * limit for limit in getattr(bench.limits, name))
+            for name in names
+        }
         limits = msgspec.structs.replace(bench.limits, **more)
         self._playback = Playback(limits, joints, period_s=bench.period_s)
 
@@ -159,7 +173,8 @@ class Led:
         moved = self._playback.step(commands, elapsed_s=periods * self._bench.period_s)
         if reason := self._playback.too_slow:
             raise BenchError(f"the service: {reason}")
-        position, velocity = tuple(moved.position.tolist()), tuple(moved.velocity.tolist())
+        position = tuple(moved.position.tolist())
+        velocity = tuple(moved.velocity.tolist())
         return self._bench.step(position, velocity, gripper=self._gripper.newest), bool(commands)
 
 
@@ -172,7 +187,9 @@ class Gripper:
     def receive(self, sample: zenoh.Sample) -> None:
         """Store a command. Unreadable ones are ignored."""
         try:
-            command = messages.in_order(cdr.decode_joints(sample.payload.to_bytes()), (messages.GRIPPER,))[0]
+            command = messages.in_order(
+                cdr.decode_joints(sample.payload.to_bytes()), (messages.GRIPPER,)
+            )[0]
         except messages.WireError:
             return
         if messages.finite(command):
@@ -197,9 +214,12 @@ class Bridge:
     ) -> None:
         self.commands = Commands(names)
         self.gripper = Gripper()
-        self._names, self._observed, self._tracked = names, observed, tracked
+        self._names = names
+        self._observed = observed
+        self._tracked = tracked
         self.hands_sent = 0  # samples of both hands, published or received
-        hands, arm = tuple(f"hands/{side}" for side in SIDES), ("joints/state", "gripper/state")
+        hands = tuple(f"hands/{side}" for side in SIDES)
+        arm = ("joints/state", "gripper/state")
         suffixes = ("objects", *(() if tracked else hands), *(() if observed else arm))
         self._publishers = {suffix: Publisher(session, live.cell, suffix) for suffix in suffixes}
         # Callbacks run on another thread for 20 µs and note the time of arrival of each command.
@@ -244,13 +264,17 @@ class Bridge:
             if hand == hidden:
                 continue
             values = pose.tolist()
-            message = messages.PoseStamped(stamp_ns, messages.BASE, tuple(values[:3]), tuple(values[3:]))
+            message = messages.PoseStamped(
+                stamp_ns, messages.BASE, tuple(values[:3]), tuple(values[3:])
+            )
             self._publishers[f"hands/{hand}"].put(cdr.encode_pose(message))
         self.hands_sent += 1
 
     def publish_things(self, bench: Bench) -> None:
         """Publish the things on the bench for viewers."""
-        self._publishers["objects"].put(channels.BY_KEY["objects"].codec.encode(time.time_ns(), bench.things()))
+        self._publishers["objects"].put(
+            channels.BY_KEY["objects"].codec.encode(time.time_ns(), bench.things())
+        )
 
     def close(self) -> None:
         """Undeclare the channels."""
@@ -308,7 +332,9 @@ class _Run:
         self._key = channels.key(live.cell, "joints/command")
 
         self._index = -1  # of the newest period
-        self._ready_s: float | None = None  # time from which commands arrive and the hands wait at their start
+        self._ready_s: float | None = (
+            None  # time from which commands arrive and the hands wait at their start
+        )
         self._is_running = False  # the script runs
         self._commanded_s = 0.0
         self._is_quiet = False  # missing commands were reported
@@ -320,7 +346,8 @@ class _Run:
     def play(self, stop: threading.Event) -> None:
         """Run until `stop`, or as long as `Live` says. Raises BenchError."""
         self._say(
-            f"waiting for {self._key} (the service sends none without an arm, or in a fault: see thirdhand status)"
+            f"waiting for {self._key} (the service sends none without an arm, or in a fault: see "
+            "thirdhand status)"
         )
         while not stop.is_set():
             index = self._deadlines.wait()[0]
@@ -349,9 +376,14 @@ class _Run:
                 self._say("commands arrive again")
             self._commanded_s = now_s
             self._is_quiet = False
-        elif self._ready_s is not None and not self._is_quiet and now_s - self._commanded_s > QUIET_S:
+        elif (
+            self._ready_s is not None and not self._is_quiet and now_s - self._commanded_s > QUIET_S
+        ):
             self._is_quiet = True
-            self._say("no commands arrive: thirdhand status shows the cause, and thirdhand reset ends a fault")
+            self._say(
+                "no commands arrive: thirdhand status shows the cause, and thirdhand reset ends a "
+                "fault"
+            )
 
     def _publish(self, seen: Observation) -> None:
         """Publish hands and things, each at its rate."""
@@ -391,8 +423,15 @@ class _Run:
         elif now_s > self._live.wait_s:
             if isinstance(self._bench.world, ObservedWorld) and not self._bench.world.heard:
                 states = channels.key(self._live.cell, "joints/state")
-                raise BenchError(f"no joint states arrive on {states}: start the arm's program, or omit --hands-only")
-            refused = f" ({commands.rejected} refused: {commands.last_error})" if commands.rejected else ""
+                raise BenchError(
+                    f"no joint states arrive on {states}: start the arm's program, or omit "
+                    "--hands-only"
+                )
+            refused = (
+                f" ({commands.rejected} refused: {commands.last_error})"
+                if commands.rejected
+                else ""
+            )
             raise BenchError(
                 f"no command on {self._key} within {self._live.wait_s:g} s{refused}. "
                 "Is the service running in this cell?"
@@ -432,7 +471,11 @@ class _Run:
         commands = self._bridge.commands
         events = self._bench.events()
         latencies = list(commands.latencies_ms)
-        percentiles = np.percentile(latencies, (50, 99, 100)).round(3).tolist() if latencies else (0.0, 0.0, 0.0)
+        percentiles = (
+            np.percentile(latencies, (50, 99, 100)).round(3).tolist()
+            if latencies
+            else (0.0, 0.0, 0.0)
+        )
         return RunReport(
             success=events.success,
             events=events,
@@ -454,4 +497,7 @@ class _Run:
 def _line(name: str, event: TaskEvent) -> str:
     if math.isinf(event.error_mm):
         return f"{name}: the hands were never at its places"
-    return f"{name}: {event.error_mm:.1f} mm at {event.time_s:.1f} s{'' if event.reached else ', missed'}"
+    return (
+        f"{name}: {event.error_mm:.1f} mm at {event.time_s:.1f} "
+        f"s{'' if event.reached else ', missed'}"
+    )

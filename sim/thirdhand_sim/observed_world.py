@@ -27,7 +27,9 @@ class ObservedWorld(World):
     def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         self._names = settings.joints.names
         description = robot_description(settings)
-        self._arm, self._body, self._bodies = Arm(settings, description), body_of(settings, description), bodies
+        self._arm = Arm(settings, description)
+        self._body = body_of(settings, description)
+        self._bodies = bodies
         self._newest: tuple[Floats, Floats] = posture, (0.0,) * len(posture)
         self._states = JointStates(self._names, settings.arm.silent_ms / 1000)
 
@@ -36,14 +38,17 @@ class ObservedWorld(World):
         thread.
         """
         try:
-            joint_state = self._states.take(cdr.decode_joints(sample.payload.to_bytes()), time.monotonic())
+            joint_state = self._states.take(
+                cdr.decode_joints(sample.payload.to_bytes()), time.monotonic()
+            )
             if joint_state is None:
                 return
             state = measured(joint_state, self._names)
         except messages.WireError:
             return
         if messages.finite(state[0] + state[1]):
-            self._newest, self.heard = state, True
+            self._newest = state
+            self.heard = True
 
     def follow(self, position: Floats, velocity: Floats) -> None:
         """Do nothing: the arm follows commands itself."""
@@ -58,7 +63,8 @@ class ObservedWorld(World):
     def tool(self) -> tuple[Pose, Floats]:
         """Pose and velocity [m/s] of the tool."""
         position, velocity = self._newest
-        tool_frame, turn = self._arm.at(np.array(position)), np.empty(4)
+        tool_frame = self._arm.at(np.array(position))
+        turn = np.empty(4)
         quaternion_of(tool_frame.rotation, turn)
         x, y, z, w = turn.tolist()
         speed = tool_frame.jacobian[:3] @ velocity
@@ -69,16 +75,24 @@ class ObservedWorld(World):
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
         """Smallest distance between the arm's capsules and a hand [m], but at most `within`."""
-        capsules, near = self._body.capsules, np.empty(9)
+        capsules = self._body.capsules
+        near = np.empty(9)
         placed = np.empty((len(capsules), 2, 3))
         place(np.array(self._newest[0]), self._body.frames, self._body.axes, capsules, placed)
-        pose, look = self.pose(body), self._bodies[body].look
-        hand = np.array([pose.position, carried_by(pose, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position])
-        distances_m = [between_segments(segment, hand, near) for segment in placed] - capsules["radius"]
+        pose = self.pose(body)
+        look = self._bodies[body].look
+        hand = np.array(
+            [pose.position, carried_by(pose, Pose((-look.size[2], 0.0, 0.0), LEVEL)).position]
+        )
+        distances_m = [between_segments(segment, hand, near) for segment in placed] - capsules[
+            "radius"
+        ]
         return min(within, float(distances_m.min()) - look.size[0] / 2)
 
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:
-        raise NotImplementedError("there is no engine that draws; thirdhand view live shows the cell")
+        raise NotImplementedError(
+            "there is no engine that draws; thirdhand view live shows the cell"
+        )
 
     def close(self) -> None:
         """Do nothing: there are no resources."""

@@ -78,7 +78,8 @@ def track(endpoint: str) -> None:
     """Publish both hands forever. From SIGUSR1 on the last sample is repeated; SIGUSR2 sets the
     clock of the stamps.
     """
-    repeats, offs_ns = threading.Event(), itertools.cycle([HOUR_NS, 0])
+    repeats = threading.Event()
+    offs_ns = itertools.cycle([HOUR_NS, 0])
     off_ns = 0
 
     def set_the_clock(*_: object) -> None:
@@ -87,10 +88,12 @@ def track(endpoint: str) -> None:
 
     signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
     signal.signal(signal.SIGUSR2, set_the_clock)
-    script, sides = HandScript(Scene(), seed=Scene().seed), ("left", "right")
+    script = HandScript(Scene(), seed=Scene().seed)
+    sides = ("left", "right")
     with open_session(connect=[endpoint]) as session:
         publishers = [Publisher(session, CELL, f"hands/{side}") for side in sides]
-        clock, payloads = Deadlines(PART_HANDS_HZ), [b"", b""]
+        clock = Deadlines(PART_HANDS_HZ)
+        payloads = [b"", b""]
         print("begun", flush=True)
         while True:
             clock.wait()
@@ -98,7 +101,9 @@ def track(endpoint: str) -> None:
                 stamp_ns = time.time_ns() - off_ns
                 poses = [pose.tolist() for pose in script.sample(script_time(time.monotonic()))]
                 payloads = [
-                    cdr.encode_pose(messages.PoseStamped(stamp_ns, messages.BASE, (x, y, z), tuple(turn)))
+                    cdr.encode_pose(
+                        messages.PoseStamped(stamp_ns, messages.BASE, (x, y, z), tuple(turn))
+                    )
                     for x, y, z, *turn in poses
                 ]
             for publisher, payload in zip(publishers, payloads, strict=True):
@@ -159,7 +164,9 @@ class CellPart:
         words = self.process.stdout.readline().split()
         clock.cancel()
         if not words:
-            raise PartError(f"python -m thirdhand_sim.parts {' '.join(self._arguments)} did not begin")
+            raise PartError(
+                f"python -m thirdhand_sim.parts {' '.join(self._arguments)} did not begin"
+            )
         self.endpoint = words[-1]
 
     def send(self, number: int) -> None:
@@ -186,14 +193,27 @@ class Link:
     can be taken down. Only root may make one; raises PartError for others.
     """
 
-    ADDRESS, OTHER = "198.18.77.1", "198.18.77.2"  # in the range that is reserved for measurements
+    # in the range that is reserved for measurements
+    ADDRESS = "198.18.77.1"
+    OTHER = "198.18.77.2"
 
     def __init__(self) -> None:
         self.name = f"thirdhand{os.getpid()}"
         self._cable = f"th{os.getpid()}"
         _ip("netns", "add", self.name)
         try:
-            _ip("link", "add", self._cable, "type", "veth", "peer", "name", "th0", "netns", self.name)
+            _ip(
+                "link",
+                "add",
+                self._cable,
+                "type",
+                "veth",
+                "peer",
+                "name",
+                "th0",
+                "netns",
+                self.name,
+            )
             _ip("-n", self.name, "addr", "add", f"{self.ADDRESS}/30", "dev", "th0")
             _ip("-n", self.name, "link", "set", "th0", "up")
             _ip("-n", self.name, "link", "set", "lo", "up")
@@ -213,7 +233,8 @@ class Link:
         return (
             "-c",
             "import ctypes, os, sys\n"
-            f"if ctypes.CDLL(None).setns(os.open('/run/netns/{self.name}', os.O_RDONLY), 0): sys.exit('no namespace')\n"
+            f"if ctypes.CDLL(None).setns(os.open('/run/netns/{self.name}', os.O_RDONLY), 0): "
+            "sys.exit('no namespace')\n"
             "from thirdhand.__main__ import main\nsys.exit(main())",
         )
 
@@ -224,7 +245,9 @@ class Link:
 
 def _ip(*arguments: str) -> None:
     try:
-        done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=10, check=False)
+        done = subprocess.run(
+            ["ip", *arguments], capture_output=True, text=True, timeout=10, check=False
+        )
     except OSError as error:
         raise PartError(f"ip cannot be run: {in_words(error)}") from None
     if done.returncode != 0:
@@ -234,16 +257,24 @@ def _ip(*arguments: str) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run a part; exit code 0, 2 on bad usage."""
     p = argparse.ArgumentParser(
-        prog="python -m thirdhand_sim.parts", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m thirdhand_sim.parts",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     kinds = p.add_subparsers(dest="kind", required=True)
     tracker = kinds.add_parser("tracker", help="publish both hands, moving to and fro")
-    tracker.add_argument("endpoint", metavar="ENDPOINT", help="the endpoint of the service or of a router")
+    tracker.add_argument(
+        "endpoint", metavar="ENDPOINT", help="the endpoint of the service or of a router"
+    )
     relaying = kinds.add_parser("relay", help="a network between two ends")
-    relaying.add_argument("target", metavar="TARGET", help="the endpoint of the other end, like tcp/127.0.0.1:7447")
+    relaying.add_argument(
+        "target", metavar="TARGET", help="the endpoint of the other end, like tcp/127.0.0.1:7447"
+    )
     routing = kinds.add_parser("router", help="a Zenoh router")
     for subparser in (relaying, routing):
-        subparser.add_argument("port", metavar="PORT", type=int, help="the port to listen on; 0 for a free one")
+        subparser.add_argument(
+            "port", metavar="PORT", type=int, help="the port to listen on; 0 for a free one"
+        )
     args = p.parse_args(arguments)
     child.end_with_parent()
     before_others()

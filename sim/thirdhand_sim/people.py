@@ -17,9 +17,14 @@ from thirdhand_sim.script import Array
 Group: TypeAlias = Literal["demonstrations", "tuning", "test", "made"]
 GROUP_SEEDS = {"demonstrations": 1, "tuning": 2, "test": 3, "made": 4}
 PROJECT_SEED = 2024
-LEAST_DWELL_S, MOST_DWELL_S = 0.9, 1.8
+LEAST_DWELL_S = 0.9
+MOST_DWELL_S = 1.8
 LONGEST_LEAD_S = 2.0
-HABITS_M = (0.020, 0.008, 0.008)  # standard deviation per axis of a hand in the air, at the board, at the iron
+HABITS_M = (
+    0.020,
+    0.008,
+    0.008,
+)  # standard deviation per axis of a hand in the air, at the board, at the iron
 
 
 class Places(NamedTuple):
@@ -48,7 +53,9 @@ class Places(NamedTuple):
         """The perceived places with errors of `sigma_m` (3-D rms), except the robot's own place."""
         errors_m = sigma_m / np.sqrt(3.0) * random.standard_normal((6, 3))
         left_start, right_start, handover, glass, board, iron = np.array(self[:6]) + errors_m
-        return Places(left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m)
+        return Places(
+            left_start, right_start, handover, glass, board, iron, self.robot_start, sigma_m
+        )
 
 
 class TrackerModel(NamedTuple):
@@ -81,7 +88,9 @@ class Person(NamedTuple):
     tracker: TrackerModel
     mistakes: float = 0.25  # probability of a mistake in a session
     swaps: float = 0.25  # probability that the tracker swaps left and right for a moment
-    shapes: Sequence[tuple[Array, Array]] = ()  # recorded reaches along x: shares (M,), deviations (M, 3) per metre
+    shapes: Sequence[
+        tuple[Array, Array]
+    ] = ()  # recorded reaches along x: shares (M,), deviations (M, 3) per metre
 
 
 def person(group: Group, number: int) -> Person:
@@ -94,7 +103,8 @@ def person(group: Group, number: int) -> Person:
     bow[..., 2] = np.abs(bow[..., 2])  # paths are bowed upward
     return Person(
         name=f"{group} {number + 1}",
-        start=np.clip(0.04 * random.standard_normal((2, 3)), -0.1, 0.1) * (1.0, 1.0, 0.5) + (0.0, 0.0, 0.01),
+        start=np.clip(0.04 * random.standard_normal((2, 3)), -0.1, 0.1) * (1.0, 1.0, 0.5)
+        + (0.0, 0.0, 0.01),
         reach=random.standard_normal((3, 3)) * np.array(HABITS_M)[:, None],
         scatter=float(random.uniform(0.005, 0.012)),
         bows=bow,
@@ -108,7 +118,10 @@ def person(group: Group, number: int) -> Person:
         strays=float(random.uniform(0.0, 0.6)),
         tremor=float(random.uniform(0.0003, 0.0012)),
         tracker=TrackerModel(
-            rate, float(random.uniform(0.001, 0.003)), float(random.uniform(0, 0.4)), float(random.uniform(0, 0.1))
+            rate,
+            float(random.uniform(0.001, 0.003)),
+            float(random.uniform(0, 0.4)),
+            float(random.uniform(0, 0.1)),
         ),
     )
 

@@ -21,26 +21,35 @@ class PyBulletWorld(World):
         self._id: int = pybullet.connect(pybullet.DIRECT)
         pybullet.setTimeStep(self._period_s, physicsClientId=self._id)
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._id)
-        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self._id)
+        pybullet.setPhysicsEngineParameter(
+            deterministicOverlappingPairs=1, physicsClientId=self._id
+        )
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             file.write(simulated(settings))
             file.flush()
             self._arm: int = pybullet.loadURDF(
-                file.name, useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._id
+                file.name,
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=self._id,
             )
         count = pybullet.getNumJoints(self._arm, physicsClientId=self._id)
-        joints = [pybullet.getJointInfo(self._arm, j, physicsClientId=self._id) for j in range(count)]
+        joints = [
+            pybullet.getJointInfo(self._arm, j, physicsClientId=self._id) for j in range(count)
+        ]
         index = {info[1].decode(): info[0] for info in joints}
         self._tool = next(info[0] for info in joints if info[12].decode() == settings.arm.plate)
         self._joints = [index[name] for name in names]
         self._efforts = [joints[j][10] or UNLIMITED for j in self._joints]  # [N m]
-        self._position_gains, self._velocity_gains = [POSITION_GAIN] * len(names), [1.0] * len(names)
+        self._position_gains = [POSITION_GAIN] * len(names)
+        self._velocity_gains = [1.0] * len(names)
         for joint, angle in zip(self._joints, posture, strict=True):
             pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._id)
         self._bodies = {name: self._body(body) for name, body in bodies.items()}
 
     def _body(self, body: WorldBody) -> int:
-        size, kind = body.look.size, getattr(pybullet, f"GEOM_{body.look.shape.upper()}")
+        size = body.look.size
+        kind = getattr(pybullet, f"GEOM_{body.look.shape.upper()}")
         box = {"halfExtents": tuple(0.5 * edge for edge in size)}
         visual = box if body.look.shape == "box" else {"radius": size[0] / 2, "length": size[2]}
         felt = box if body.look.shape == "box" else {"radius": size[0] / 2, "height": size[2]}
@@ -56,7 +65,11 @@ class PyBulletWorld(World):
         shape = -1
         if body.solid or body.measured:
             shape = pybullet.createCollisionShape(
-                kind, collisionFramePosition=position, collisionFrameOrientation=turn, physicsClientId=self._id, **felt
+                kind,
+                collisionFramePosition=position,
+                collisionFrameOrientation=turn,
+                physicsClientId=self._id,
+                **felt,
             )
         body_id: int = pybullet.createMultiBody(
             baseMass=0.0,
@@ -96,7 +109,11 @@ class PyBulletWorld(World):
     def tool(self) -> tuple[Pose, Floats]:
         """Pose and velocity [m/s] of the tool."""
         state = pybullet.getLinkState(
-            self._arm, self._tool, computeLinkVelocity=True, computeForwardKinematics=True, physicsClientId=self._id
+            self._arm,
+            self._tool,
+            computeLinkVelocity=True,
+            computeForwardKinematics=True,
+            physicsClientId=self._id,
         )
         return self._tool_on(Pose(state[4], state[5]), state[6], state[7])
 
@@ -107,7 +124,9 @@ class PyBulletWorld(World):
 
     def clearance(self, body: str, *, within: float = 2.0) -> float:
         """Smallest distance between the arm and a measured body [m], but at most `within`."""
-        near = pybullet.getClosestPoints(self._arm, self._bodies[body], within, physicsClientId=self._id)
+        near = pybullet.getClosestPoints(
+            self._arm, self._bodies[body], within, physicsClientId=self._id
+        )
         return min((float(point[8]) for point in near), default=within)
 
     def _colours(self, eye: Floats, target: Floats, size: tuple[int, int]) -> Any:

@@ -8,7 +8,8 @@ import sys
 __all__ = ["pybullet"]
 
 sys.stderr.flush()
-_shown, _nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+_shown = os.dup(2)
+_nowhere = os.open(os.devnull, os.O_WRONLY)
 os.dup2(_nowhere, 2)
 try:
     import pybullet

@@ -27,11 +27,19 @@ from thirdhand.settings.file_content import SettingsError, UnusableError, text_i
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 
-TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)  # [m] position of the tool with the glass, relative to the soldering place
+TOOL_FROM_OBJECT: Point = (
+    -0.13,
+    0.0,
+    0.20,
+)  # [m] position of the tool with the glass, relative to the soldering place
 # Position of the tool that offers the board, relative to the hand that takes it: the arm is 4 cm
 # away, and the board's edge is in the hand.
 TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
-RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)  # [m] position of the hand with the iron, relative to the soldering place
+RIGHT_FROM_OBJECT: Point = (
+    0.03,
+    0.06,
+    0.05,
+)  # [m] position of the hand with the iron, relative to the soldering place
 GRASP_DISTANCE = 0.03  # [m] within this distance a thing is taken over, or is at its target
 ARRIVED_M = 0.04  # a hand within this distance of a place has arrived there
 # The tool's +z points 45° forward and down, and its y axis is level: a turn of 135° about y.
@@ -41,7 +49,9 @@ HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 
 FAR_OFF = 5.0  # [m] a place farther off is probably in other units
 IN_REACH = 0.01  # [m] places are moved this far into the arm's reach
-MOST_MOVED = 0.15  # [m] with a larger distance from the nominal places, the arm cannot reach every scene
+MOST_MOVED = (
+    0.15  # [m] with a larger distance from the nominal places, the arm cannot reach every scene
+)
 MIN_HEIGHT_M = {  # least height of places above the table
     "robot_start": 0.05,
     "handover": 0.05,
@@ -69,8 +79,16 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     solder: Point = (0.88, 0.22, 0.015)
     left_start: Point = (0.98, -0.32, 0.06)
     right_start: Point = (0.98, 0.32, 0.06)
-    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)  # handover; fetch the glass; work over the board
-    dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)  # the hands rest after each phase
+    phases_s: tuple[Duration, Duration, Duration] = (
+        3.0,
+        3.5,
+        3.0,
+    )  # handover; fetch the glass; work over the board
+    dwells_s: tuple[Duration, Duration, Duration] = (
+        0.4,
+        0.4,
+        0.3,
+    )  # the hands rest after each phase
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
     def __post_init__(self) -> None:
@@ -81,7 +99,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             if not moved <= MOST_MOVED + 1e-9:
                 raise ValueError(
                     f"{name}: {list(place)} lies {moved:.3g} m from the nominal {list(nominal)} m; "
-                    f"up to {MOST_MOVED:g} m is reachable{'. Is it in metres?' if moved > FAR_OFF else ''}"
+                    f"up to {MOST_MOVED:g} m is "
+                    f"reachable{'. Is it in metres?' if moved > FAR_OFF else ''}"
                 )
             if place[2] < lowest:
                 raise ValueError(
@@ -107,7 +126,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
         """Begin and end of each of the three motions, in script time [s]."""
-        begin, out = 0.0, []
+        begin = 0.0
+        out = []
         for phase, dwell in zip(self.phases_s, self.dwells_s, strict=True):
             out.append((begin, begin + phase))
             begin += phase + dwell
@@ -116,7 +136,9 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @property
     def dwells(self) -> tuple[tuple[float, float], ...]:
         """Begin and end of the rest after each motion, in script time [s]."""
-        return tuple((end, end + dwell) for (_, end), dwell in zip(self.segments, self.dwells_s, strict=True))
+        return tuple(
+            (end, end + dwell) for (_, end), dwell in zip(self.segments, self.dwells_s, strict=True)
+        )
 
     @property
     def duration_s(self) -> float:
@@ -129,7 +151,9 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """
         s = self
         places = (
-            _via_point("handover", left=s.handover, right=s.right_start, tool=s.offer, follow="left"),
+            _via_point(
+                "handover", left=s.handover, right=s.right_start, tool=s.offer, follow="left"
+            ),
             _via_point("glass", left=s.soldering, right=s.iron, tool=s.glass),
             _via_point("soldering", left=s.soldering, right=s.right_final, tool=s.carry),
         )
@@ -146,31 +170,51 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """The scene with all places moved horizontally into an arm's reach, and messages on the
         moved places. Raises SceneError if a place must be moved too far.
         """
-        places, centre = msgspec.structs.asdict(self), reach.centre
-        moves, lost = list[str](), list[str]()
-        for name, tool in (("handover", self.offer), ("glass", self.glass), ("soldering", self.carry)):
-            up, out = tool[2] - centre[2], math.dist(tool[:2], centre[:2])
-            low, high = (max(r * r - up * up, 0.0) ** 0.5 for r in (reach.inner + IN_REACH, reach.outer - IN_REACH))
+        places = msgspec.structs.asdict(self)
+        centre = reach.centre
+        moves = list[str]()
+        lost = list[str]()
+        for name, tool in (
+            ("handover", self.offer),
+            ("glass", self.glass),
+            ("soldering", self.carry),
+        ):
+            up = tool[2] - centre[2]
+            out = math.dist(tool[:2], centre[:2])
+            low, high = (
+                max(r * r - up * up, 0.0) ** 0.5
+                for r in (reach.inner + IN_REACH, reach.outer - IN_REACH)
+            )
             radius_m = min(max(out, low), high)
-            share, by = (radius_m - out) / out if out else 0.0, abs(radius_m - out)
+            share = (radius_m - out) / out if out else 0.0
+            by = abs(radius_m - out)
             shift = (share * (tool[0] - centre[0]), share * (tool[1] - centre[1]), 0.0)
-            place, moved_tool = _add(getattr(self, name), shift), _add(tool, shift)
+            place = _add(getattr(self, name), shift)
+            moved_tool = _add(tool, shift)
             is_in = reach.inner <= math.dist(moved_tool, centre) <= reach.outer
             if math.dist(place, _nominal(name)) > MOST_MOVED or not is_in:
-                lost.append(f"{name} needs the tool {math.dist(tool, centre):.2f} m from the shoulder")
+                lost.append(
+                    f"{name} needs the tool {math.dist(tool, centre):.2f} m from the shoulder"
+                )
             elif moved_tool[0] < reach.min_x or moved_tool[2] < reach.min_z:
-                lost.append(f"{name} needs the tool at x = {moved_tool[0]:.2f}, z = {moved_tool[2]:.2f} m")
+                lost.append(
+                    f"{name} needs the tool at x = {moved_tool[0]:.2f}, z = {moved_tool[2]:.2f} m"
+                )
             elif by:
                 places[name] = place
                 moves.append(f"{name} moved by {100 * by:.0f} cm into the arm's reach")
         if lost:
-            reaches = f"from {reach.inner:.2f} to {reach.outer:.2f} m around its shoulder at {list(centre)}"
+            reaches = (
+                f"from {reach.inner:.2f} to {reach.outer:.2f} m around its shoulder at "
+                f"{list(centre)}"
+            )
             raise SceneError(
-                f"the arm does not reach this scene, not even with each place moved by {MOST_MOVED:g} m: "
-                f"{'; '.join(lost)}. Its tool reaches {reaches}, where x is at least {reach.min_x:g} and z at least "
-                f"{reach.min_z:g} m. What to do: use a larger arm, place this one nearer (`thirdhand arm URDF --at X Y "
-                "Z`), or teach it a task of its own size (docs/tutorial.md). A scene file (--scene FILE) moves places "
-                f"by at most {MOST_MOVED:g} m"
+                "the arm does not reach this scene, not even with each place moved by "
+                f"{MOST_MOVED:g} m: {'; '.join(lost)}. Its tool reaches {reaches}, where x is at "
+                f"least {reach.min_x:g} and z at least {reach.min_z:g} m. What to do: use a larger "
+                "arm, place this one nearer (`thirdhand arm URDF --at X Y Z`), or teach it a task "
+                "of its own size (docs/tutorial.md). A scene file (--scene FILE) moves places by "
+                f"at most {MOST_MOVED:g} m"
             )
         return Scene(**places), tuple(moves)
 
@@ -189,15 +233,26 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the request that teaches a scene's via-points; exit code 0, 1 on failure, 2 on bad
     usage.
     """
-    from thirdhand.cli.usage import option  # its import is slow, and most users of this module do not need it
+    from thirdhand.cli.usage import (
+        option,
+    )  # its import is slow, and most users of this module do not need it
 
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.scene",
         description="Prints the via-points of a scene as a `via_points` request.",
-        epilog="example:\n  python -m thirdhand_sim.scene my-scene.toml | thirdhand via-points add --file -",
+        epilog=(
+            "example:\n  python -m thirdhand_sim.scene my-scene.toml | thirdhand via-points add "
+            "--file -"
+        ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    option(p, "scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)", nargs="?")
+    option(
+        p,
+        "scene",
+        "FILE",
+        "a TOML file with places [x, y, z] in metres (default: the nominal scene)",
+        nargs="?",
+    )
     about = f"{', '.join(ARMS)} or a cell's settings, FILE.toml; places are moved into its reach"
     option(p, "--arm", "ARM", about, "wam")
     p.add_argument("--gripper", action="store_true", help="include the state of the gripper")
@@ -225,8 +280,18 @@ def _add(a: Point, b: Point) -> Point:
     return (round(a[0] + b[0], 6), round(a[1] + b[1], 6), round(a[2] + b[2], 6))
 
 
-def _via_point(name: str, *, left: Point, right: Point, tool: Point, follow: str = "none") -> requests.ViaPoint:
-    return requests.ViaPoint(name=name, left=left, right=right, tool=tool, std=0.001, radius=0.03, follow=follow)  # type: ignore[arg-type]
+def _via_point(
+    name: str, *, left: Point, right: Point, tool: Point, follow: str = "none"
+) -> requests.ViaPoint:
+    return requests.ViaPoint(
+        name=name,
+        left=left,
+        right=right,
+        tool=tool,
+        std=0.001,
+        radius=0.03,
+        follow=follow,  # type: ignore[arg-type]
+    )
 
 
 if __name__ == "__main__":

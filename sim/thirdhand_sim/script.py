@@ -75,10 +75,14 @@ class Clock:
         for pause in pauses:
             if pause.lasts_s < 2 * PAUSE_RAMP_S:
                 raise ValueError(
-                    f"a pause of {pause.lasts_s} s given, at least {2 * PAUSE_RAMP_S} s needed to stop and start"
+                    f"a pause of {pause.lasts_s} s given, at least {2 * PAUSE_RAMP_S} s needed to "
+                    "stop and start"
                 )
             if not 0.0 < pause.depth <= 2.0:
-                raise ValueError(f"a pause of depth {pause.depth} given, above 0 (slower) to 2 (back as fast) accepted")
+                raise ValueError(
+                    f"a pause of depth {pause.depth} given, above 0 (slower) to 2 (back as fast) "
+                    "accepted"
+                )
         ordered = sorted(pauses)
         for earlier, other in itertools.pairwise(ordered):
             if other.at_s < earlier.at_s + earlier.lasts_s:
@@ -88,7 +92,9 @@ class Clock:
 
     def at(self, t: float) -> tuple[float, float, float]:
         """Script time [s], its rate and the rate's derivative [1/s] after `t` seconds."""
-        lost, slow, slow_rate = 0.0, 0.0, 0.0
+        lost = 0.0
+        slow = 0.0
+        slow_rate = 0.0
         for at_s, lasts_s, depth in self.pauses:
             stop, stop_rate, stop_area = _ramp((t - at_s) / PAUSE_RAMP_S)
             go, go_rate, go_area = _ramp((t - at_s - lasts_s) / PAUSE_RAMP_S + 1.0)
@@ -99,7 +105,8 @@ class Clock:
 
     def elapsed(self, script_s: float) -> float:
         """Time [s] at which the script reaches `script_s` for the last time."""
-        low, high = 0.0, script_s / self.speed + sum(p.depth * p.lasts_s for p in self.pauses)
+        low = 0.0
+        high = script_s / self.speed + sum(p.depth * p.lasts_s for p in self.pauses)
         last = max((p.at_s + p.lasts_s for p in self.pauses), default=0.0)
         if last < high and self.at(last)[0] < script_s:
             low = last  # after the last pause, script time only grows
@@ -113,25 +120,39 @@ class Path:
     """A minimum-jerk motion from point to point with rests between, through arcs where given."""
 
     def __init__(
-        self, points: Sequence[Array], segments: Sequence[tuple[float, float]], *, arcs: Sequence[Sequence[float]] = ()
+        self,
+        points: Sequence[Array],
+        segments: Sequence[tuple[float, float]],
+        *,
+        arcs: Sequence[Sequence[float]] = (),
     ) -> None:
         self._begins = [begin for begin, _ in segments]
         self._lasts = [end - begin for begin, end in segments]
         self._points = [np.asarray(point, dtype=np.float64) for point in points]
-        self._arcs = [np.asarray(arc, dtype=np.float64) for arc in arcs] or [np.zeros(3)] * len(segments)
+        self._arcs = [np.asarray(arc, dtype=np.float64) for arc in arcs] or [np.zeros(3)] * len(
+            segments
+        )
 
     def at(self, script_s: float, rate: float = 1.0, rate_change: float = 0.0) -> PointMotion:
         """The point's motion at a script time [s], for the time's rate and rate of change [1/s]."""
         i = max((k for k, begin in enumerate(self._begins) if script_s >= begin), default=0)
         lasts = self._lasts[i]
         u = min(max((script_s - self._begins[i]) / lasts, 0.0), 1.0)
-        start, chord, arc = self._points[i], self._points[i + 1] - self._points[i], self._arcs[i]
+        start = self._points[i]
+        chord = self._points[i + 1] - self._points[i]
+        arc = self._arcs[i]
         v = 1.0 - u
-        share, d_share, dd_share = u**3 * (10 - 15 * u + 6 * u * u), 30 * u * u * v * v, 60 * u * v * (v - u)
-        bump, d_bump, dd_bump = 64 * (u * v) ** 3, 192 * (u * v) ** 2 * (v - u), 384 * u * v * ((v - u) ** 2 - u * v)
+        share = u**3 * (10 - 15 * u + 6 * u * u)
+        d_share = 30 * u * u * v * v
+        dd_share = 60 * u * v * (v - u)
+        bump = 64 * (u * v) ** 3
+        d_bump = 192 * (u * v) ** 2 * (v - u)
+        dd_bump = 384 * u * v * ((v - u) ** 2 - u * v)
         d = (d_share * chord + d_bump * arc) / lasts
         dd = (dd_share * chord + dd_bump * arc) / lasts**2
-        return PointMotion(start + share * chord + bump * arc, d * rate, dd * rate * rate + d * rate_change)
+        return PointMotion(
+            start + share * chord + bump * arc, d * rate, dd * rate * rate + d * rate_change
+        )
 
 
 class HandScript:
@@ -159,7 +180,9 @@ class HandScript:
         self.seed = seed
         self.clock = Clock(speed=speed, pauses=pauses)
         self.duration_s = self.clock.elapsed(scene.duration_s)
-        ends, tremor, self._noise = (np.random.default_rng(s) for s in np.random.SeedSequence([seed, 0]).spawn(3))
+        ends, tremor, self._noise = (
+            np.random.default_rng(s) for s in np.random.SeedSequence([seed, 0]).spawn(3)
+        )
         left_start, handover, soldering, right_start, iron, final = (
             np.array(point) + offset_std * ends.standard_normal(3)
             for point in (
@@ -209,7 +232,9 @@ class HandScript:
         Tremor is a function of `t`; each call draws new noise from the seed's sequence.
         """
         hands = self.truth(t)
-        shake = self._tremor_size * np.sin(2 * math.pi * self._tremor_hz * t + self._tremor_phase).sum(axis=0)
+        shake = self._tremor_size * np.sin(
+            2 * math.pi * self._tremor_hz * t + self._tremor_phase
+        ).sum(axis=0)
         shake += self._noise_std * self._noise.standard_normal(6)
         return (
             np.concatenate((hands.left.position + shake[:3], HAND_ORIENTATION)),
@@ -222,7 +247,9 @@ class Teacher:
     clock.
     """
 
-    def __init__(self, scene: Scene, *, seed: int, clock: Clock | None = None, offset_std: float = 0.008) -> None:
+    def __init__(
+        self, scene: Scene, *, seed: int, clock: Clock | None = None, offset_std: float = 0.008
+    ) -> None:
         ends = np.random.default_rng([seed, 1])
         points = [
             np.array(point) + offset_std * ends.standard_normal(3)
@@ -230,7 +257,9 @@ class Teacher:
         ]
         self._clock = clock or Clock()
         self._path = Path(points, scene.segments, arcs=TOOL_ARCS)
-        self._opens, self._closes = (begin + GRIP_AT * (end - begin) for begin, end in scene.segments[:2])
+        self._opens, self._closes = (
+            begin + GRIP_AT * (end - begin) for begin, end in scene.segments[:2]
+        )
 
     def truth(self, t: float) -> PointMotion:
         """The tool's motion at a time `t` [s] after the script's begin."""
@@ -245,7 +274,11 @@ class Teacher:
         glass.
         """
         script_s = self._clock.at(max(t, 0.0))[0]
-        return 1.0 - _ramp((script_s - self._opens) / GRIP_S)[0] + _ramp((script_s - self._closes) / GRIP_S)[0]
+        return (
+            1.0
+            - _ramp((script_s - self._opens) / GRIP_S)[0]
+            + _ramp((script_s - self._closes) / GRIP_S)[0]
+        )
 
 
 def _ramp(u: float) -> tuple[float, float, float]:

@@ -45,7 +45,15 @@ RIGHT_REST = (0.95, 0.35, 0.07)  # [m] the right hand rests here
 VISITED = made_tasks.TaskScene(
     np.array([(0.60, -0.30, 0.07), TRAY, (0.70, 0.02, 0.22), TRAY, (0.75, -0.42, 0.25)]),
     np.array([RIGHT_REST, RIGHT_REST, (0.78, 0.20, 0.20), RIGHT_REST, RIGHT_REST]),
-    np.array([(0.42, -0.28, 0.35), (0.62, -0.20, 0.30), (0.50, 0.15, 0.25), (0.38, -0.05, 0.40), (0.45, 0.30, 0.22)]),
+    np.array(
+        [
+            (0.42, -0.28, 0.35),
+            (0.62, -0.20, 0.30),
+            (0.50, 0.15, 0.25),
+            (0.38, -0.05, 0.40),
+            (0.45, 0.30, 0.22),
+        ]
+    ),
     np.zeros((5, 3)),
 )
 
@@ -56,7 +64,8 @@ def demonstrate(
     """One demonstration of a scene at `rate_hz`: tracked hands, the measured tool, and if `gripper`
     the closure of the gripper.
     """
-    script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
+    script = HandScript(scene, seed=seed)
+    teacher = Teacher(scene, seed=seed)
     steps = np.arange(round(scene.duration_s * rate_hz) + 1)
     times = (steps / rate_hz).tolist()
     hands = [script.sample(t) for t in times]
@@ -69,7 +78,9 @@ def demonstrate(
     )
 
 
-def demonstrations(scene: Scene, *, count: int, seed: int, gripper: bool = False) -> list[Demonstration]:
+def demonstrations(
+    scene: Scene, *, count: int, seed: int, gripper: bool = False
+) -> list[Demonstration]:
     """`count` demonstrations of a scene, one a minute; each is independent of `count`."""
     return [
         demonstrate(scene, seed=1000 * seed + number, begin_s=60 * number, gripper=gripper)
@@ -81,13 +92,17 @@ def by_people(people: int) -> list[Demonstration]:
     """Two demonstrations of each modelled person, with things in their nominal places and moved,
     and with via-points.
     """
-    return [recorded(demonstration, begin_s=60 * number) for number, demonstration in enumerate(sessions.demonstrations(people))]
+    return [
+        recorded(demonstration, begin_s=60 * number)
+        for number, demonstration in enumerate(sessions.demonstrations(people))
+    ]
 
 
 def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demonstration:
     """A demonstration of a session in the service's format."""
     count = len(shown.times)
-    still, turned = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(TOOL_ORIENTATION, (count, 1))
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    turned = np.tile(TOOL_ORIENTATION, (count, 1))
     return Demonstration(
         np.round(1e9 * (shown.times + begin_s)).astype(np.int64),
         np.hstack([shown.hands[:, :3], still]),
@@ -101,7 +116,8 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
     """The via-points of the task in the order of the tool's motion, with their standard deviations
     per axis: the error of the places (3-D rms) / sqrt(3).
     """
-    p, std = places, max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
+    p = places
+    std = max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
     named = (
         ("start", p.left_start, p.right_start, p.robot_start),
         ("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND),
@@ -111,7 +127,10 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
     rows = [
         {
             "name": name,
-            **{part: np.round(position, 6).tolist() for part, position in zip(("left", "right", "tool"), ends, strict=True)},
+            **{
+                part: np.round(position, 6).tolist()
+                for part, position in zip(("left", "right", "tool"), ends, strict=True)
+            },
             "std": std,
             "radius": RADIUS_M,
             "follow": "left" if name == "handover" else "none",
@@ -122,30 +141,53 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
 
 
 def perform(
-    scene: Scene, *, seed: int, connect: Sequence[str], cell: str, speed: float, wait_s: float, rate_hz: int = 100
+    scene: Scene,
+    *,
+    seed: int,
+    connect: Sequence[str],
+    cell: str,
+    speed: float,
+    wait_s: float,
+    rate_hz: int = 100,
 ) -> bool:
     """Publish one demonstration of the soldering scene, see `publish`."""
-    script, teacher = HandScript(scene, seed=seed, speed=speed), Teacher(scene, seed=seed, clock=Clock(speed=speed))
+    script = HandScript(scene, seed=seed, speed=speed)
+    teacher = Teacher(scene, seed=seed, clock=Clock(speed=speed))
 
     def poses(t: float) -> tuple[Array, ...]:
         return (*script.sample(t), teacher.sample(t))
 
     return publish(
-        poses, script.duration_s, REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s, rate_hz=rate_hz
+        poses,
+        script.duration_s,
+        REST_BEFORE_S / speed,
+        connect=connect,
+        cell=cell,
+        wait_s=wait_s,
+        rate_hz=rate_hz,
     )
 
 
-def perform_visits(number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float) -> bool:
+def perform_visits(
+    number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float
+) -> bool:
     """Publish a person's run of the task that visits a place twice, see `publish`."""
     demonstration = visits(number)
     times = demonstration.period_s * np.arange(len(demonstration.tool)) / speed
 
     def poses(t: float) -> tuple[Array, ...]:
         row = int(np.clip(np.searchsorted(times, t), 0, len(times) - 1))
-        positions = ([np.interp(t, times, column) for column in part[:, :3].T] for part in demonstration[1:4])
-        return tuple(np.append(position, part[row, 3:]) for position, part in zip(positions, demonstration[1:4], strict=True))
+        positions = (
+            [np.interp(t, times, column) for column in part[:, :3].T] for part in demonstration[1:4]
+        )
+        return tuple(
+            np.append(position, part[row, 3:])
+            for position, part in zip(positions, demonstration[1:4], strict=True)
+        )
 
-    return publish(poses, float(times[-1]), REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s)
+    return publish(
+        poses, float(times[-1]), REST_BEFORE_S / speed, connect=connect, cell=cell, wait_s=wait_s
+    )
 
 
 def visits(number: int) -> Demonstration:
@@ -172,12 +214,14 @@ def publish(
     with client_settings(connect=connect, cell=cell).session(timeout_s=wait_s) as session:
         names = ("hands/left", "hands/right", "tool/pose")
         publishers = [Publisher(session, cell, name) for name in names]
-        until, of_hands = time.monotonic() + wait_s, publishers[:2]
+        until = time.monotonic() + wait_s
+        of_hands = publishers[:2]
         while not _are_heard(of_hands):
             if time.monotonic() > until:
                 return False
             time.sleep(0.02)
-        begin, step = time.monotonic() + before_s, 0
+        begin = time.monotonic() + before_s
+        step = 0
         while _are_heard(of_hands):
             t = time.monotonic() - begin
             if t > lasts_s + REST_AFTER_S:
@@ -185,7 +229,9 @@ def publish(
             stamp_ns = time.time_ns()
             for publisher, pose in zip(publishers, poses(t), strict=True):
                 row = pose.tolist()
-                publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))))
+                publisher.put(
+                    cdr.encode_pose(PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
+                )
             step += 1
             time.sleep(max(0.0, begin - before_s + step / rate_hz - time.monotonic()))
         return t >= lasts_s
@@ -200,7 +246,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Make or publish demonstrations; exit code 0, 1 on failure, 2 on bad usage."""
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.teach",
-        description="Demonstrations of the soldering scene with hands and tool at 100 Hz, as MCAP files or live.",
+        description=(
+            "Demonstrations of the soldering scene with hands and tool at 100 Hz, as MCAP files or "
+            "live."
+        ),
         epilog=TEACH_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -213,10 +262,18 @@ def main(arguments: list[str] | None = None) -> int:
     option(p, "--wait", "S", "wait this long for a subscriber", 60.0)
     option(p, "--count", None, "the number of demonstrations", 6, type=int)
     option(p, "--seed", None, "the seed of their scatter (default: the scene's)", type=int)
-    option(p, "--scene", "FILE", "a TOML file with places [x, y, z] in metres (default: the nominal scene)")
+    option(
+        p,
+        "--scene",
+        "FILE",
+        "a TOML file with places [x, y, z] in metres (default: the nominal scene)",
+    )
     people = "two demonstrations each by modelled people, with moved things and via-points"
     p.add_argument("--people", action="store_true", help=people)
-    visit = "another task, between five named via-points, with one place visited twice; with --live or --places"
+    visit = (
+        "another task, between five named via-points, with one place visited twice; with --live or "
+        "--places"
+    )
     p.add_argument("--visits", action="store_true", help=visit)
     option(p, "--places", "FILE", "with --visits: write its via-points for `record --places`")
     option(p, "--cell", "NAME", "prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
@@ -266,11 +323,21 @@ def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) 
     """Publish all demonstrations; exit code 1 if one had no subscriber until its end."""
     seed = scene.seed if args.seed is None else args.seed
     for number in range(1, args.count + 1):
-        to = {"connect": reach.connect, "cell": reach.cell, "speed": args.speed, "wait_s": args.wait}
-        heard = perform_visits(number, **to) if args.visits else perform(scene, seed=1000 * seed + number, **to)
+        to = {
+            "connect": reach.connect,
+            "cell": reach.cell,
+            "speed": args.speed,
+            "wait_s": args.wait,
+        }
+        heard = (
+            perform_visits(number, **to)
+            if args.visits
+            else perform(scene, seed=1000 * seed + number, **to)
+        )
         if not heard:
             print(
-                f"python -m thirdhand_sim.teach: demonstration {number} had no subscriber until its end",
+                f"python -m thirdhand_sim.teach: demonstration {number} had no subscriber until "
+                "its end",
                 file=sys.stderr,
             )
             return 1

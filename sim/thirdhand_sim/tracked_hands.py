@@ -16,7 +16,9 @@ from thirdhand_sim.scene import ARRIVED_M, HAND_ORIENTATION, Point, Scene
 from thirdhand_sim.script import Array, HandMotions, PointMotion, TaskProgress
 from thirdhand_sim.world import LEVEL
 
-OBSERVED_S = 0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
+OBSERVED_S = (
+    0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
+)
 PLACE_OPACITY = 0.3
 HAND_COLOURS = dict(zip(SIDES, (palette.LEFT, palette.RIGHT), strict=True))
 AT_REST = np.zeros(3)
@@ -34,7 +36,10 @@ def hand_places(scene: Scene) -> tuple[tuple[HandPlace, ...], ...]:
     """The places of the hands at each of the three events."""
     return (
         (HandPlace("left", scene.handover, "take the board"),),
-        (HandPlace("left", scene.soldering, "lay the board here"), HandPlace("right", scene.iron, "take the iron")),
+        (
+            HandPlace("left", scene.soldering, "lay the board here"),
+            HandPlace("right", scene.iron, "take the iron"),
+        ),
         (
             HandPlace("left", scene.soldering, "stay at the board"),
             HandPlace("right", scene.right_final, "solder here"),
@@ -56,9 +61,13 @@ class TrackedHands:
         begin, reached or not.
         """
         self.scene = scene
-        self._settings, self._timeout_s, self._places = settings, timeout_s, hand_places(scene)
+        self._settings = settings
+        self._timeout_s = timeout_s
+        self._places = hand_places(scene)
         self._newest: dict[str, Point] = {}  # [m] frame `base`
-        self.foreign = ""  # a frame that the settings do not know, in which hands arrived; they are ignored
+        self.foreign = (
+            ""  # a frame that the settings do not know, in which hands arrived; they are ignored
+        )
         self.begin()
 
     def receive(self, side: str, pose: PoseStamped) -> None:
@@ -88,7 +97,9 @@ class TrackedHands:
 
     def begin(self) -> None:
         """Begin the task anew."""
-        self._over, self._reached_s, self._ended_s = 0, math.inf, self._timeout_s
+        self._over = 0
+        self._reached_s = math.inf
+        self._ended_s = self._timeout_s
 
     def truth(self, t: float) -> HandMotions:
         """The newest positions of both hands; before the first sample, the scene's start."""
@@ -109,11 +120,15 @@ class TrackedHands:
         hands = self.truth(t)._asdict()
         if self._over == len(self._places):
             return TaskProgress(None, self._over)
-        arrived = all(math.dist(hands[side].position, position) <= ARRIVED_M for side, position, _ in self._places[self._over])
+        arrived = all(
+            math.dist(hands[side].position, position) <= ARRIVED_M
+            for side, position, _ in self._places[self._over]
+        )
         if reached > self._over:
             self._reached_s = min(self._reached_s, t)
             if not arrived or t - self._reached_s >= OBSERVED_S:
-                self._over, self._reached_s = self._over + 1, math.inf
+                self._over = self._over + 1
+                self._reached_s = math.inf
                 if self._over == len(self._places):
                     self._ended_s = min(t, self._timeout_s)
                 return TaskProgress(None, self._over)
@@ -126,7 +141,9 @@ class TrackedHands:
         size = (2 * ARRIVED_M,) * 3
         return tuple(
             SceneObject(f"{side} hand: {task}", "ball", BASE, position, LEVEL, size, _faint(side))
-            for side, position, task in (self._places[self._over] if self._over < len(self._places) else ())
+            for side, position, task in (
+                self._places[self._over] if self._over < len(self._places) else ()
+            )
         )
 
 

@@ -26,7 +26,9 @@ POSITION_GAIN = 0.3  # a motor corrects this share of its position error in one 
 TABLE_THICKNESS = 0.04  # [m]
 UNLIMITED = 1e6  # [N m] effort of a motor without a limit in the description
 FIELD_OF_VIEW = 45.0  # [degrees] vertical field of view of pictures
-NEAR_PLANE_M, FAR_PLANE_M = 0.1, 5.0  # distances between which a camera draws
+# distances between which a camera draws
+NEAR_PLANE_M = 0.1
+FAR_PLANE_M = 5.0
 BOARD_RGBA = (0.1, 0.5, 0.2, 1.0)
 STEEL_RGBA = (0.7, 0.7, 0.75, 1.0)
 WOOD_RGBA = (0.75, 0.6, 0.4, 1.0)
@@ -42,7 +44,9 @@ class Pose(NamedTuple):
 
 
 AT_ITS_FRAME = Pose((0.0, 0.0, 0.0), LEVEL)
-BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))  # held by its edge
+BOARD_IN_TOOL = Pose(
+    (0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
+)  # held by its edge
 
 
 class Look(NamedTuple):
@@ -70,7 +74,13 @@ class WorldBody(NamedTuple):
 class World(abc.ABC):
     """The simulated bench: an arm that follows joint commands, and movable bodies by name."""
 
-    arm, board, glass, iron, solder, left, right = "arm", "board", "glass", "iron", "solder", "left", "right"
+    arm = "arm"
+    board = "board"
+    glass = "glass"
+    iron = "iron"
+    solder = "solder"
+    left = "left"
+    right = "right"
     things: dict[str, Look]  # the things on the bench that can be grasped
 
     def __init__(self, scene: Scene, settings: Settings, *, posture: Floats) -> None:
@@ -78,7 +88,9 @@ class World(abc.ABC):
         x, y, z, *turn = settings.tool.plate_from_tool
         self.plate_from_tool = Pose((x, y, z), (turn[0], turn[1], turn[2], turn[3]))
         bodies = furniture(scene, settings)
-        self.things = {name: bodies[name].look for name in (self.board, self.glass, self.iron, self.solder)}
+        self.things = {
+            name: bodies[name].look for name in (self.board, self.glass, self.iron, self.solder)
+        }
         self._poses = {name: body.at for name, body in bodies.items()}
         self._build(settings, bodies, posture)
         self.follow(posture, (0.0,) * len(posture))
@@ -137,7 +149,9 @@ class World(abc.ABC):
         self._poses[body] = pose
         self._place(body, pose)
 
-    def picture(self, *, eye: Floats, target: Floats, size: tuple[int, int] = (640, 480)) -> tuple[Any, Any]:
+    def picture(
+        self, *, eye: Floats, target: Floats, size: tuple[int, int] = (640, 480)
+    ) -> tuple[Any, Any]:
         """The picture of a camera (height, width, 3), and the matrix (4, 4) from positions [m] to
         normalized coordinates in it, -1 to 1.
         """
@@ -151,7 +165,8 @@ def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any
     ahead = np.subtract(target, eye) / math.dist(target, eye)
     aside = np.cross(ahead, (0.0, 0.0, 1.0))
     aside /= np.linalg.norm(aside)
-    view, projection = np.eye(4), np.zeros((4, 4))
+    view = np.eye(4)
+    projection = np.zeros((4, 4))
     view[:3, :3] = aside, np.cross(aside, ahead), -ahead
     view[:3, 3] = view[:3, :3] @ np.negative(eye)
     scale = 1 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
@@ -166,14 +181,17 @@ def camera(eye: Floats, target: Floats, size: tuple[int, int]) -> tuple[Any, Any
 
 def furniture(scene: Scene, settings: Settings) -> dict[str, WorldBody]:
     """All bodies around the arm, by name."""
-    people, (x, y, top) = settings.people, settings.table.centre
+    people = settings.people
+    x, y, top = settings.table.centre
     width, depth = settings.table.half_size
     slab = Look("box", (2 * width, 2 * depth, TABLE_THICKNESS), WOOD_RGBA)
     bodies = {"table": WorldBody(slab, Pose((x, y, top - TABLE_THICKNESS / 2), LEVEL), solid=True)}
     for name in ("soldering", "glass", "iron"):  # stands below these things
         position = getattr(scene, name)
         stand = Look("box", (0.06, 0.06, position[2]), WOOD_RGBA)
-        bodies[f"stand of {name}"] = WorldBody(stand, Pose((position[0], position[1], position[2] / 2), LEVEL))
+        bodies[f"stand of {name}"] = WorldBody(
+            stand, Pose((position[0], position[1], position[2] / 2), LEVEL)
+        )
     for name, shape, size, colour, position in (
         (World.board, "box", (0.08, 0.05, 0.002), BOARD_RGBA, (0.0, 0.0, 0.0)),
         (World.glass, "cylinder", (0.10, 0.10, 0.006), STEEL_RGBA, scene.glass),

@@ -32,7 +32,11 @@ SAWYER = Path(__file__).with_name("sawyer.urdf")
 def published(name: str) -> Path:
     """A description of `example-robot-data`; who asks is skipped where that is not installed."""
     try:
-        return next(Path(str(file.locate())) for file in files("example-robot-data") or () if file.name == name)
+        return next(
+            Path(str(file.locate()))
+            for file in files("example-robot-data") or ()
+            if file.name == name
+        )
     except PackageNotFoundError:
         pytest.skip("example-robot-data, whose descriptions these are, is not installed")
 
@@ -68,13 +72,16 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.one_case
-def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name: str, tmp_path: Path) -> None:
+def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(
+    name: str, tmp_path: Path
+) -> None:
     where, plate = ARMS[name]
     path = where()
     proposal = proposed(path, plate=plate)
     cell = load(in_folder(proposal, path, tmp_path))
     robot = robot_description(cell)
-    arm, posture = Arm(cell, robot), np.array(cell.arm.posture)
+    arm = Arm(cell, robot)
+    posture = np.array(cell.arm.posture)
     pose = arm.at(posture)
     assert pose.rotation[2, 2] < -math.cos(math.radians(50.0))
     low = [cell.table.centre[i] - cell.table.half_size[i] for i in range(2)]
@@ -85,7 +92,8 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(name:
     beyond_m = Separation(cell, robot).clearance(posture, np.empty((0, 3)))[0]
     assert beyond_m > 0.0
     assert proposal.clearance[0] == pytest.approx(beyond_m + cell.obstacles.clearance)
-    lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
+    lower = np.array(cell.joints.lower)
+    upper = np.array(cell.joints.upper)
     assert (np.minimum(posture - lower, upper - posture) > 0.05 * (upper - lower)).all()
 
     scene, moved = Scene().in_reach(cell.reach)

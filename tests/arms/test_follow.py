@@ -96,7 +96,8 @@ class Joints:
 
     def _take(self, sample: zenoh.Sample) -> None:
         state = cdr.decode_joints(sample.payload.to_bytes())
-        self.position, self.velocity = np.array(state.position), np.array(state.velocity)
+        self.position = np.array(state.position)
+        self.velocity = np.array(state.velocity)
 
     def moving(self) -> bool:
         return bool(np.abs(self.velocity).max() > 0.05)
@@ -109,8 +110,11 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
     config = folder / "arm.toml"
     config.write_text(network)
     with hub(folder) as session, Tracker(session) as tracker:
-        connect, joints = ("--connect", *endpoints(session)), Joints(session)
-        with following(arm, *connect, "--config", str(config), *more) as running:  # it waits for the daemon
+        connect = ("--connect", *endpoints(session))
+        joints = Joints(session)
+        with following(
+            arm, *connect, "--config", str(config), *more
+        ) as running:  # it waits for the daemon
             with serving(folder, *connect, network=network) as daemon:
                 running.until("commands arrive")
                 for attempt in range(20):
@@ -131,7 +135,9 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
                 daemon.end()
                 running.until("the arm brakes", times=2)
             assert running.ended() == 0
-    assert re.search(r"ended at rest; delay -?\d+\.\d ticks; 0 commands were refused", running.said[-1])
+    assert re.search(
+        r"ended at rest; delay -?\d+\.\d ticks; 0 commands were refused", running.said[-1]
+    )
 
 
 PATIENT = """[network]
@@ -143,7 +149,9 @@ fault_error_rad = 0.5
 
 
 @pytest.mark.thorough
-def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(tmp_path: Path) -> None:
+def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(
+    tmp_path: Path,
+) -> None:
     killed_and_started_again(tmp_path, "simulated", PATIENT)
 
 
@@ -152,7 +160,11 @@ def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path
     network = franka_toml().replace("[arm]\n", "[arm]\nsilent_ms = 1000\nfault_error_rad = 0.5\n")
     with robot(tmp_path) as device:
         killed_and_started_again(
-            tmp_path, "franka", network + PATIENT.split("[arm]", maxsplit=1)[0], "--robot", device.address
+            tmp_path,
+            "franka",
+            network + PATIENT.split("[arm]", maxsplit=1)[0],
+            "--robot",
+            device.address,
         )
     assert device.new.mean() > 0.99
     assert_allowed(device.velocity[device.new], device.joints[device.new])
@@ -171,13 +183,19 @@ def refused(*arguments: str) -> str:
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     assert "no arm 'frankia'; franka or simulated accepted" in refused("frankia")
-    assert "is a daemon or a router running" in refused("simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2")
+    assert "is a daemon or a router running" in refused(
+        "simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2"
+    )
     six = tmp_path / "six.toml"
     six.write_text(toml_of(MODELS["ur5"]))
     with serving(tmp_path) as daemon:
         connect = ("--connect", daemon.endpoint)
-        assert "only daemons of other cells run" in refused("simulated", *connect, "--cell", "nowhere", "--wait", "0.2")
-        assert "commands 7 joints, wam/base_yaw_joint, " in (line := refused("simulated", *connect, "--config", str(six)))
+        assert "only daemons of other cells run" in refused(
+            "simulated", *connect, "--cell", "nowhere", "--wait", "0.2"
+        )
+        assert "commands 7 joints, wam/base_yaw_joint, " in (
+            line := refused("simulated", *connect, "--config", str(six))
+        )
         assert "the settings here have 6" in line
         assert "give the daemon's settings by --config" in line
         assert "give --config with its own URDF" in refused("franka", *connect)
@@ -189,28 +207,33 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
     with following("simulated", "--connect", endpoint) as running:
         running.until("waiting, up to 60 s: ")
         time.sleep(3.0)  # longer than a connection or a request is tried
-        with serving(tmp_path, network=f'[network]\nlisten = ["{endpoint}"]\n') as daemon, Tracker(daemon.session):
+        with (
+            serving(tmp_path, network=f'[network]\nlisten = ["{endpoint}"]\n') as daemon,
+            Tracker(daemon.session),
+        ):
             running.until("commands arrive, the arm follows")
             assert running.ended() == 0
 
 
 @pytest.mark.parametrize("program", ["follow", "sim"])
 @pytest.mark.one_case
-def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(program: str, tmp_path: Path) -> None:
+def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(
+    program: str, tmp_path: Path
+) -> None:
     with serving(tmp_path, "--rate", "50") as daemon, Tracker(daemon.session):
-        done = thirdhand(program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint)
+        done = thirdhand(
+            program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint
+        )
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(
-        "50 Hz is too slow: commands would arrive every 20 ms, and an arm brakes 20 ms after its last command; "
-        "67 Hz or more needed"
+        "50 Hz is too slow: commands would arrive every 20 ms, and an arm brakes 20 ms after its "
+        "last command; 67 Hz or more needed"
     )
 
 
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
-    arm, told_so = (
-        SimulatedArm(Settings()),
-        r"no command arrived on thirdhand/joints/command within 0\.3 s: is the daemon",
-    )
+    arm = SimulatedArm(Settings())
+    told_so = r"no command arrived on thirdhand/joints/command within 0\.3 s: is the daemon"
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
         follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)

@@ -20,17 +20,22 @@ from thirdhand.core.arm.stage import Arm
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.settings.config import JointSettings, Settings, robot_description
 
-TICK, PERIOD = 0.002, franka.FRANKA_PERIOD_S  # [s]
+# [s]
+TICK = 0.002
+PERIOD = franka.FRANKA_PERIOD_S
 Vector = npt.NDArray[np.float64]
 
 
 def motion(wanted: Vector) -> list[Command]:
     """Commands as the service gives them, from where the arm stands."""
-    limiter, state = Limiter(fr3(), TICK), (STANDS, np.zeros(7), np.zeros(7))
+    limiter = Limiter(fr3(), TICK)
+    state = (STANDS, np.zeros(7), np.zeros(7))
     commands = [Command(0, tuple(STANDS), (0.0,) * 7, 0, 0, 0)]
     for tick, velocity in enumerate(wanted, start=1):
         state = limiter.step(*state, velocity)[:3]
-        commands.append(Command(round(1e9 * TICK * tick), tuple(state[0]), tuple(state[1]), tick, 0, 0))
+        commands.append(
+            Command(round(1e9 * TICK * tick), tuple(state[0]), tuple(state[1]), tick, 0, 0)
+        )
     return commands
 
 
@@ -44,10 +49,12 @@ def sway(seconds: float) -> Vector:
 @pytest.mark.parametrize("lost", [0.0, 0.2])
 def test_toward_its_ends_each_joint_is_slower_as_the_robot_asks(way: float, lost: float) -> None:
     """Commands go there faster than it allows, as fast as they may."""
-    rng, commands = np.random.default_rng(1), motion(np.full((2000, 7), way * 1.5))
+    rng = np.random.default_rng(1)
+    commands = motion(np.full((2000, 7), way * 1.5))
     limits = franka.limits_of(fr3())
     playback = Playback(limits, STANDS, period_s=PERIOD, speed_limits=franka.speed_limits)
-    joints, velocity = [STANDS], []
+    joints = [STANDS]
+    velocity = []
     for i in range(4000):
         came = [commands[i // 2]] if i % 2 == 0 and rng.uniform() >= lost else []
         moved = playback.step(came, measured=joints[-1])
@@ -58,18 +65,31 @@ def test_toward_its_ends_each_joint_is_slower_as_the_robot_asks(way: float, lost
 
 
 @simulated
-@pytest.mark.parametrize(("jitter_s", "lost", "rms_rad"), [(0.0, 0.0, 4e-3), (0.001, 0.0, 4e-3), (0.003, 0.05, 4.7e-3)])
+@pytest.mark.parametrize(
+    ("jitter_s", "lost", "rms_rad"), [(0.0, 0.0, 4e-3), (0.001, 0.0, 4e-3), (0.003, 0.05, 4.7e-3)]
+)
 def test_it_follows_within_its_limits_where_it_is_told_to_be(
     tmp_path: Path, jitter_s: float, lost: float, rms_rad: float
 ) -> None:
     rng = np.random.default_rng(2)
     commands = motion(np.vstack((sway(5.0), np.zeros((750, 7)))))
-    late = np.where(rng.uniform(size=len(commands)) < lost, math.inf, rng.uniform(0.0, 1.0, len(commands)) * jitter_s)
-    arriving = sorted(((i * TICK + late[i], command) for i, command in enumerate(commands)), key=lambda one: one[0])
-    measured, passed_s, index = [], 0.0, 0
+    late = np.where(
+        rng.uniform(size=len(commands)) < lost,
+        math.inf,
+        rng.uniform(0.0, 1.0, len(commands)) * jitter_s,
+    )
+    arriving = sorted(
+        ((i * TICK + late[i], command) for i, command in enumerate(commands)),
+        key=lambda one: one[0],
+    )
+    measured = []
+    passed_s = 0.0
+    index = 0
     with robot(tmp_path, "--fast") as device:
         arm = franka.FrankaArm(cell(), device.address)
-        playback = Playback(arm.limits, arm.stands_at(), period_s=arm.period_s, speed_limits=arm.speed_limits)
+        playback = Playback(
+            arm.limits, arm.stands_at(), period_s=arm.period_s, speed_limits=arm.speed_limits
+        )
         with arm:
             while passed_s < 6.3:
                 now = arm.read()
@@ -84,18 +104,29 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     assert playback.refused == 0
     assert device.new.mean() > 0.999
     assert_allowed(device.velocity, device.joints)
-    times, commanded = TICK * np.arange(len(commands)), np.array([command.position for command in commands])
+    times = TICK * np.arange(len(commands))
+    commanded = np.array([command.position for command in commands])
     speeds = np.array([command.velocity for command in commands])
-    when, where = np.array([sample[0] for sample in measured]), np.array([sample[1] for sample in measured])
-    expected, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (commanded, speeds))
+    when = np.array([sample[0] for sample in measured])
+    where = np.array([sample[1] for sample in measured])
+    expected, fast = (
+        np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1)
+        for x in (commanded, speeds)
+    )
     error = where - expected
     late_s = -float((error * fast).sum() / (fast * fast).sum())
     rms = float(np.sqrt((error**2).mean()))
-    print(f"jitter {jitter_s}: {1e3 * rms:.2f} mrad rms, {1e3 * np.abs(error).max():.1f} worst, {1e3 * late_s:.1f} ms")
+    print(
+        f"jitter {jitter_s}: {1e3 * rms:.2f} mrad rms, {1e3 * np.abs(error).max():.1f} worst, "
+        f"{1e3 * late_s:.1f} ms"
+    )
     assert rms <= rms_rad
     assert late_s <= 0.010
     kinematics = Arm(cell(), robot_description(cell()))
-    distance_m = max(math.dist(kinematics.at(q).position, kinematics.at(commanded[-1]).position) for q in where[-100:])
+    distance_m = max(
+        math.dist(kinematics.at(q).position, kinematics.at(commanded[-1]).position)
+        for q in where[-100:]
+    )
     assert distance_m <= 1e-3, "at rest the tool is within 1 mm"
 
 
@@ -103,7 +134,9 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
 def test_what_is_configured_for_another_arm_is_refused(which: str) -> None:
     joints = Settings().joints
     if which == "six joints":
-        joints = JointSettings(**{name: getattr(joints, name)[:6] for name in JointSettings.__struct_fields__})
+        joints = JointSettings(
+            **{name: getattr(joints, name)[:6] for name in JointSettings.__struct_fields__}
+        )
     with pytest.raises(DriveError, match="give --config with its own URDF"):
         franka.limits_of(joints)
 

@@ -22,10 +22,13 @@ from thirdhand.settings.config import JointSettings
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()
 STRONG = JointSettings(velocity=(2.0,) * 7, acceleration=(30.0,) * 7, jerk=(4000.0,) * 7)
-WEAK = JointSettings(acceleration=(4.0,) * 7, jerk=(60.0,) * 7)  # cannot follow all that is commanded
+WEAK = JointSettings(
+    acceleration=(4.0,) * 7, jerk=(60.0,) * 7
+)  # cannot follow all that is commanded
 DRIVES = {"as commanded": COMMANDED, "stronger": STRONG, "weaker": WEAK}
 AT = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])
-LOWER, UPPER = np.array(COMMANDED.lower), np.array(COMMANDED.upper)
+LOWER = np.array(COMMANDED.lower)
+UPPER = np.array(COMMANDED.upper)
 Vector = npt.NDArray[np.float64]
 
 
@@ -43,14 +46,17 @@ class Sent(NamedTuple):
     command: Command
 
 
-def commanded(tick: int, position: Iterable[float], velocity: Iterable[float], stamp_ns: int | None = None) -> Command:
+def commanded(
+    tick: int, position: Iterable[float], velocity: Iterable[float], stamp_ns: int | None = None
+) -> Command:
     stamp_ns = round(1e9 * TICK * tick) if stamp_ns is None else stamp_ns
     return Command(stamp_ns, tuple(position), tuple(velocity), tick, 0, 0)
 
 
 def motion(wanted: Vector, *, at: Vector = AT, tick: int = 0) -> list[Command]:
     """Commands as the service gives them, each tick, from rest."""
-    limiter, state = Limiter(COMMANDED, TICK), (at, np.zeros(7), np.zeros(7))
+    limiter = Limiter(COMMANDED, TICK)
+    state = (at, np.zeros(7), np.zeros(7))
     commands = [commanded(tick, at, np.zeros(7))]
     for i, velocity in enumerate(wanted, start=1):
         state = limiter.step(*state, velocity)[:3]
@@ -65,7 +71,9 @@ def sway(seconds: float) -> Vector:
     return swayed
 
 
-def sent(commands: Sequence[Command], late_s: Sequence[float] = (0.0,), begin_s: float = 0.0) -> list[Sent]:
+def sent(
+    commands: Sequence[Command], late_s: Sequence[float] = (0.0,), begin_s: float = 0.0
+) -> list[Sent]:
     """Commands on their way, tick by tick, each so late."""
     return [
         Sent(begin_s + i * TICK + late_s[i % len(late_s)], command)
@@ -75,9 +83,14 @@ def sent(commands: Sequence[Command], late_s: Sequence[float] = (0.0,), begin_s:
 
 
 def play(
-    playback: Playback, arriving: Iterable[Sent], seconds: float, period: float, elapsed: Sequence[float] = (-1.0,)
+    playback: Playback,
+    arriving: Iterable[Sent],
+    seconds: float,
+    period: float,
+    elapsed: Sequence[float] = (-1.0,),
 ) -> Written:
-    queue, written = sorted(arriving, key=lambda one: -one.at_s), []
+    queue = sorted(arriving, key=lambda one: -one.at_s)
+    written = []
     for i in range(round(seconds / period)):
         came: list[Command] = []
         while queue and queue[-1].at_s <= i * period:
@@ -87,7 +100,8 @@ def play(
 
 
 def assert_held(limits: JointSettings, written: Written, period: float, begin: Vector = AT) -> None:
-    position, velocity = np.vstack((begin, written.position)), np.vstack((np.zeros((2, 7)), written.velocity))
+    position = np.vstack((begin, written.position))
+    velocity = np.vstack((np.zeros((2, 7)), written.velocity))
     acceleration = np.diff(velocity, axis=0) / period
     jerk = np.diff(acceleration, axis=0) / period
     assert np.isfinite(position).all()
@@ -97,7 +111,10 @@ def assert_held(limits: JointSettings, written: Written, period: float, begin: V
     assert (np.abs(acceleration) <= np.array(limits.acceleration) * (1 + 1e-6)).all()
     assert (np.abs(jerk) <= np.array(limits.jerk) * (1 + 1e-6)).all()
     between = 0.5 * (velocity[2:] + velocity[1:-1])
-    assert (np.abs(np.diff(position, axis=0) / period - between) <= np.array(limits.jerk) * period**2 + 2e-6).all()
+    assert (
+        np.abs(np.diff(position, axis=0) / period - between)
+        <= np.array(limits.jerk) * period**2 + 2e-6
+    ).all()
 
 
 # --- whatever comes ------------------------------------------------------------------------------
@@ -109,7 +126,9 @@ late = st.lists(
     min_size=1,
     max_size=40,
 )
-clocks = st.lists(st.sampled_from([0.001, 0.002, 0.0, 0.02, -1.0, 1e9, math.nan]), min_size=1, max_size=9)
+clocks = st.lists(
+    st.sampled_from([0.001, 0.002, 0.0, 0.02, -1.0, 1e9, math.nan]), min_size=1, max_size=9
+)
 numbers = st.one_of(st.floats(), st.floats(-3.2, 3.2))
 hostile = st.builds(
     commanded,
@@ -119,14 +138,23 @@ hostile = st.builds(
     st.none() | st.integers(-(10**9), 10**12),
 )
 restarts = st.tuples(
-    st.integers(0, 150), st.integers(0, 2000), st.floats(-0.06, 0.06), st.sampled_from([0.0, 0.04, 0.5])
+    st.integers(0, 150),
+    st.integers(0, 2000),
+    st.floats(-0.06, 0.06),
+    st.sampled_from([0.0, 0.04, 0.5]),
 )
 
 
 @pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
 @pytest.mark.parametrize("limits", DRIVES.values(), ids=DRIVES)
 @settings(derandomize=True, deadline=None, max_examples=40)
-@given(wishes, late, clocks, st.lists(st.tuples(st.floats(0.0, 0.4), hostile), max_size=6), st.none() | restarts)
+@given(
+    wishes,
+    late,
+    clocks,
+    st.lists(st.tuples(st.floats(0.0, 0.4), hostile), max_size=6),
+    st.none() | restarts,
+)
 @pytest.mark.one_case
 def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
     limits: JointSettings,
@@ -142,8 +170,11 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
     arriving = [*sent(commands, late), *(Sent(*pair) for pair in hostile)]
     if restart is not None:  # by a daemon that counts anew, and takes the arm to be somewhere near
         after, tick, offset_rad, silent_s = restart
-        commands, end = commands[:after], commands[min(after, len(commands) - 1)]
-        restarted = motion(-wishes_radps, at=(np.array(end.position) + offset_rad).clip(LOWER, UPPER), tick=tick)
+        end = commands[min(after, len(commands) - 1)]
+        commands = commands[:after]
+        restarted = motion(
+            -wishes_radps, at=(np.array(end.position) + offset_rad).clip(LOWER, UPPER), tick=tick
+        )
         arriving = [*sent(commands, late), *sent(restarted, late, len(commands) * TICK + silent_s)]
     playback = Playback(limits, AT, period_s=period)
     written = play(playback, arriving, len(wishes_radps) * TICK + 1.0, period, clocks)
@@ -154,7 +185,8 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
 @pytest.mark.parametrize("which", ["position", "velocity"])
 def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, which: str) -> None:
     playback = Playback(COMMANDED, AT, period_s=0.001)
-    position, velocity = [*AT], [0.0] * 7
+    position = [*AT]
+    velocity = [0.0] * 7
     (position if which == "position" else velocity)[3] = bad
     arriving = sent([commanded(i, position, velocity) for i in range(100)])
     assert (play(playback, arriving, 0.3, 0.001).position == AT).all()
@@ -164,7 +196,10 @@ def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, whic
 
 def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
     commands = motion(sway(1.0))
-    jumping = [Sent(message.at_s, message.command._replace(position=tuple(AT))) for message in sent(commands)[300::50]]
+    jumping = [
+        Sent(message.at_s, message.command._replace(position=tuple(AT)))
+        for message in sent(commands)[300::50]
+    ]
     playback = Playback(COMMANDED, AT, period_s=0.001)
     regular = [message for i, message in enumerate(sent(commands)) if i < 300 or i % 50]
     written = play(playback, [*regular, *jumping], 1.0, 0.001)
@@ -184,19 +219,22 @@ def test_another_number_of_joints_is_refused_and_named() -> None:
 
 
 def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow() -> None:
-    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(np.full((400, 7), 0.5))
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    commands = motion(np.full((400, 7), 0.5))
     written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
     moving = np.abs(written.velocity).max(axis=1)
     silent = round((len(commands) - 1) * TICK / 0.001)
     assert moving[silent + round(BRAKE_AFTER_S / 0.001) - 2] == pytest.approx(0.5, abs=1e-3)
-    slowest, jerk = min(COMMANDED.acceleration), min(COMMANDED.jerk)
+    slowest = min(COMMANDED.acceleration)
+    jerk = min(COMMANDED.jerk)
     stop_s = BRAKE_AFTER_S + 0.5 / slowest + slowest / jerk
     assert not moving[silent + round(stop_s / 0.001) + 3 :].any()
     assert_held(COMMANDED, written, 0.001)
 
 
 def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
-    playback, commands = Playback(STRONG, AT, period_s=0.001), motion(sway(2.0))
+    playback = Playback(STRONG, AT, period_s=0.001)
+    commands = motion(sway(2.0))
     cut = [message for message in sent(commands) if not 1.0 < message.at_s < 1.06]
     written = play(playback, cut, 2.0, 0.001)
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.01
@@ -204,16 +242,20 @@ def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "speed", "followed"), [(0.0, 0.0, True), (0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.1, False)]
+    ("off", "speed", "followed"),
+    [(0.0, 0.0, True), (0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.1, False)],
 )
 @pytest.mark.parametrize("at_start", [True, False])
 def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
     off: float, speed: float, followed: bool, at_start: bool
 ) -> None:
     assert REJOIN_RAD == 0.05
-    playback, arm = Playback(COMMANDED, AT, period_s=0.001), AT
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    arm = AT
     if not at_start:
-        arm = play(playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S, 0.001).position[-1]
+        arm = play(
+            playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S, 0.001
+        ).position[-1]
     where = arm + off * np.eye(7)[2]
     after = [commanded(900 + i, where + i * TICK * speed, [speed] * 7) for i in range(40)]
     written = play(playback, sent(after), 0.2, 0.001)
@@ -224,15 +266,20 @@ def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
 
 def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
     """Half a second of motion comes at once, half a second late."""
-    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.5))
-    held = [Sent(1.0, message.command) if 0.5 < message.at_s < 1.0 else message for message in sent(commands[:500])]
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    commands = motion(sway(1.5))
+    held = [
+        Sent(1.0, message.command) if 0.5 < message.at_s < 1.0 else message
+        for message in sent(commands[:500])
+    ]
     written = play(playback, held, 1.5, 0.001)
     assert (written.position[1000:] == written.position[999]).all()
     assert playback.refused > 200
 
 
 def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -> None:
-    playback, commands = Playback(COMMANDED, AT, period_s=0.001), motion(sway(1.0), tick=70_000)
+    playback = Playback(COMMANDED, AT, period_s=0.001)
+    commands = motion(sway(1.0), tick=70_000)
     before = play(playback, sent(commands[:400]), 0.8 + 0.5, 0.001)
     stands = before.position[-1]
     restarted = motion(sway(1.0), at=stands)
@@ -243,7 +290,8 @@ def test_a_daemon_that_starts_anew_in_motion_is_followed_once_the_arm_stands() -
 
 def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
     """The one that came first is followed; the other's ticks are none of that sequence."""
-    first, other = motion(sway(1.0)), motion(-sway(1.0), tick=40_000)
+    first = motion(sway(1.0))
+    other = motion(-sway(1.0), tick=40_000)
     playback = Playback(COMMANDED, AT, period_s=0.001)
     written = play(playback, [*sent(first), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
     assert np.abs(written.position[-1] - first[-1].position).max() < 0.01
@@ -253,46 +301,67 @@ def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
 # --- the length of a tick ------------------------------------------------------------------------
 
 
-def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT, begin_s: float = 0.0, tick: int = 0) -> list[Sent]:
+def at_rate(
+    rate_hz: int, seconds: float, *, at: Vector = AT, begin_s: float = 0.0, tick: int = 0
+) -> list[Sent]:
     """Commands of a daemon of this rate: from rest, 0.15 rad to and fro at 0.4 Hz."""
-    pace, arriving = 2 * math.pi * 0.4, []
+    pace = 2 * math.pi * 0.4
+    arriving = []
     for k in range(round(seconds * rate_hz)):
         t = k / rate_hz
-        position, velocity = at + 0.15 * (1 - math.cos(pace * t)), np.full(7, 0.15 * pace * math.sin(pace * t))
-        command = commanded(tick + k, position, velocity, stamp_ns=10**18 + round(1e9 * (begin_s + t)))
+        position = at + 0.15 * (1 - math.cos(pace * t))
+        velocity = np.full(7, 0.15 * pace * math.sin(pace * t))
+        command = commanded(
+            tick + k, position, velocity, stamp_ns=10**18 + round(1e9 * (begin_s + t))
+        )
         arriving.append(Sent(begin_s + t, command))
     return arriving
 
 
 def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> float:
     """The largest distance between what is written and what was commanded by then [rad]."""
-    when, where = [message.at_s for message in arriving], [message.command.position[0] for message in arriving]
+    when = [message.at_s for message in arriving]
+    where = [message.command.position[0] for message in arriving]
     expected_rad = np.interp(period * np.arange(1, len(written.position) + 1), when, where)
     return float(np.abs(written.position[:, 0] - expected_rad).max())
 
 
 @pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
 @pytest.mark.parametrize("rate_hz", [67, 100, 250, 500, 700, 1000])
-def test_commands_of_any_rate_are_played_back_at_their_own_pace(rate_hz: int, period: float) -> None:
-    playback, arriving = Playback(STRONG, AT, period_s=period), at_rate(rate_hz, 4.0)
+def test_commands_of_any_rate_are_played_back_at_their_own_pace(
+    rate_hz: int, period: float
+) -> None:
+    playback = Playback(STRONG, AT, period_s=period)
+    arriving = at_rate(rate_hz, 4.0)
     written = play(playback, arriving, 4.0, period)
     assert playback.tick_s == pytest.approx(1 / rate_hz, rel=1e-3)
     assert playback.refused == 0
-    assert farthest_rad(written, arriving, period) < 0.4 * (2 / rate_hz + 2 * period)  # at 0.38 rad/s
+    assert farthest_rad(written, arriving, period) < 0.4 * (
+        2 / rate_hz + 2 * period
+    )  # at 0.38 rad/s
 
 
 @pytest.mark.parametrize(
     ("since", "stamped"),
     [
         (800, lambda stamp_ns, k: stamp_ns + 3_600_000_000_000),
-        (800, lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799)),  # creeps until time has caught up
+        (
+            800,
+            lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799),
+        ),  # creeps until time has caught up
         (0, lambda stamp_ns, k: stamp_ns + 20_000 * (k % 7)),
     ],
     ids=["set ahead", "set back", "trembles"],
 )
-def test_a_clock_that_is_set_does_not_change_the_pace(since: int, stamped: Callable[[int, int], int]) -> None:
+def test_a_clock_that_is_set_does_not_change_the_pace(
+    since: int, stamped: Callable[[int, int], int]
+) -> None:
     arriving = [
-        message if k < since else message._replace(command=message.command._replace(stamp_ns=stamped(message.command.stamp_ns, k)))
+        message
+        if k < since
+        else message._replace(
+            command=message.command._replace(stamp_ns=stamped(message.command.stamp_ns, k))
+        )
         for k, message in enumerate(at_rate(500, 4.0))
     ]
     playback = Playback(STRONG, AT, period_s=0.001)
@@ -302,7 +371,8 @@ def test_a_clock_that_is_set_does_not_change_the_pace(since: int, stamped: Calla
 
 
 def test_a_daemon_of_another_rate_that_takes_over_is_followed_at_its_own() -> None:
-    playback, first = Playback(STRONG, AT, period_s=0.001), at_rate(250, 1.0)
+    playback = Playback(STRONG, AT, period_s=0.001)
+    first = at_rate(250, 1.0)
     stands = play(playback, first, 1.5, 0.001).position[-1]
     second = at_rate(1000, 3.0, at=stands)
     assert farthest_rad(play(playback, second, 3.0, 0.001), second, 0.001) < 0.003
@@ -316,14 +386,17 @@ def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_
     period = f"{1000 / rate_hz:.0f} ms"
     assert playback.reason == playback.too_slow
     assert playback.too_slow == (
-        f"{rate_hz} Hz is too slow: commands would arrive every {period}, and an arm brakes 20 ms after its last "
-        "command; 67 Hz or more needed"
+        f"{rate_hz} Hz is too slow: commands would arrive every {period}, and an arm brakes 20 ms "
+        "after its last command; 67 Hz or more needed"
     )
 
 
 def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
     playback = Playback(COMMANDED, AT, period_s=0.001)
-    unstamped = [message._replace(command=message.command._replace(stamp_ns=0)) for message in at_rate(500, 1.0)]
+    unstamped = [
+        message._replace(command=message.command._replace(stamp_ns=0))
+        for message in at_rate(500, 1.0)
+    ]
     assert (play(playback, unstamped, 0.1, 0.001).position == AT).all()
     assert "no length of a tick" in playback.reason
     assert playback.reason.endswith("1 to 20 ms a tick needed")
@@ -336,9 +409,15 @@ def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
 def behind(written: Written, commands: Sequence[Command], period: float) -> tuple[float, float]:
     """By how much it is late [s], and how far off it is beside that [rad]."""
     times = TICK * np.arange(len(commands))
-    positions, speed = (np.array([getattr(command, name) for command in commands]) for name in ("position", "velocity"))
+    positions, speed = (
+        np.array([getattr(command, name) for command in commands])
+        for name in ("position", "velocity")
+    )
     when = period * np.arange(1, len(written.position) + 1)
-    where, fast = (np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1) for x in (positions, speed))
+    where, fast = (
+        np.stack([np.interp(when, times, x[:, j]) for j in range(7)], axis=1)
+        for x in (positions, speed)
+    )
     error = written.position - where
     late = -float((error * fast).sum() / (fast * fast).sum())
     return late, float(np.abs(error + late * fast).max())
@@ -347,14 +426,20 @@ def behind(written: Written, commands: Sequence[Command], period: float) -> tupl
 @pytest.mark.parametrize("period", [0.001, 0.002, 0.004])
 @pytest.mark.parametrize(
     ("jitter_s", "lost", "delay_s", "off_rad", "share"),
-    [(0.0, 0.0, 0.004, 3e-4, 1.05), (0.001, 0.0, 0.006, 3e-4, 1.05), (0.006, 0.1, 0.016, 6e-3, 2.0)],
+    [
+        (0.0, 0.0, 0.004, 3e-4, 1.05),
+        (0.001, 0.0, 0.006, 3e-4, 1.05),
+        (0.006, 0.1, 0.016, 6e-3, 2.0),
+    ],
 )
 def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as_commanded(
     period: float, jitter_s: float, lost: float, delay_s: float, off_rad: float, share: float
 ) -> None:
     rng = np.random.default_rng(3)
     commands = motion(sway(6.0))
-    late_s = np.where(rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands)))
+    late_s = np.where(
+        rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands))
+    )
     playback = Playback(STRONG, AT, period_s=period)
     written = play(playback, sent(commands, late_s.tolist()), 6.0, period)
     late, error_rad = behind(written, commands, period)
@@ -381,7 +466,8 @@ def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(sh
 def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
     """The loop stands for 60 ms each second; the network is as punctual as ever."""
     commands = motion(sway(6.0))
-    playback, queue = Playback(STRONG, AT, period_s=0.001), list(reversed(sent(commands)))
+    playback = Playback(STRONG, AT, period_s=0.001)
+    queue = list(reversed(sent(commands)))
     velocity: list[Vector] = []
     now_s = before_s = 0.0
     while now_s < 5.9:
@@ -389,7 +475,8 @@ def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
         came = []
         while queue and queue[-1].at_s <= now_s:
             came.append(queue.pop().command)
-        moved, before_s = playback.step(came, elapsed_s=now_s - before_s), now_s
+        moved = playback.step(came, elapsed_s=now_s - before_s)
+        before_s = now_s
         velocity.append(moved.velocity)
         assert not playback.following or playback.delay_ticks < 3.0 or len(velocity) % 1000 < 5
     assert np.abs(moved.position - commands[round(now_s / TICK)].position).max() < 0.015
@@ -398,14 +485,20 @@ def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
 
 def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
     """Ticks jump over these, but the motion goes on by one period."""
-    commands, jumped, tick = motion(sway(3.0)), [], 0
+    commands = motion(sway(3.0))
+    jumped = []
+    tick = 0
     for i, command in enumerate(commands):
         tick += 3 if i % 200 == 199 else 1
-        jumped.append(Sent(tick * TICK, command._replace(tick=tick, stamp_ns=round(1e9 * TICK * tick))))
+        jumped.append(
+            Sent(tick * TICK, command._replace(tick=tick, stamp_ns=round(1e9 * TICK * tick)))
+        )
     playback = Playback(STRONG, AT, period_s=0.001)
     written = play(playback, jumped, tick * TICK + 0.02, 0.001)
     assert np.abs(np.diff(written.velocity, axis=0) / 0.001).max() < 6.0
-    assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(COMMANDED.jerk)
+    assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(
+        COMMANDED.jerk
+    )
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.03
 
 
@@ -413,7 +506,8 @@ def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None
     rng = np.random.default_rng(5)
     commands = motion(sway(6.0))
     late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))
-    playback, delays = Playback(STRONG, AT, period_s=0.001), []
+    playback = Playback(STRONG, AT, period_s=0.001)
+    delays = []
     for begin in range(0, 3000, 500):
         play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0, 0.001)
         delays.append(playback.delay_ticks)

@@ -51,14 +51,19 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
     assert 'urdf = "my.urdf"  # beside this file' in (folder / "cell.toml").read_text()
     with Image.open(folder / "cell.png") as picture:
         assert min(picture.size) > 500
-        assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20  # something is drawn
+        assert (
+            len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20
+        )  # something is drawn
 
 
 def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     folder, _ = made
     before = {file: file.read_bytes() for file in folder.iterdir()}
     done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
-    assert (done.returncode, "cell.toml exists already: name another file by --output" in done.stderr) == (1, True)
+    assert (
+        done.returncode,
+        "cell.toml exists already: name another file by --output" in done.stderr,
+    ) == (1, True)
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
 
 

@@ -19,8 +19,10 @@ def followed(commanded: np.ndarray, lag_s: float) -> np.ndarray:
     """
     if not lag_s:
         return commanded.copy()
-    kp, kv = 4.0 / lag_s**2, 4.0 / lag_s
-    measured, velocity = np.empty_like(commanded), np.zeros(commanded.shape[1])
+    kp = 4.0 / lag_s**2
+    kv = 4.0 / lag_s
+    measured = np.empty_like(commanded)
+    velocity = np.zeros(commanded.shape[1])
     position = commanded[0].copy()
     for i, target in enumerate(commanded):
         measured[i] = position
@@ -30,7 +32,13 @@ def followed(commanded: np.ndarray, lag_s: float) -> np.ndarray:
 
 
 def simulated(
-    servo: str, lag_s: float, *, state_hz: float = 500.0, noise_rad: float = 0.0, size: float = 0.3, seed: int = 0
+    servo: str,
+    lag_s: float,
+    *,
+    state_hz: float = 500.0,
+    noise_rad: float = 0.0,
+    size: float = 0.3,
+    seed: int = 0,
 ) -> Lag | None:
     """The lag that is measured in 3 s: joints on smooth paths, followed by a pure delay or by a
     servo.
@@ -43,30 +51,43 @@ def simulated(
             2 * np.pi * frequency_hz * times[:, None] + rng.uniform(0, 6, 3)
         )
     if servo == "delay":
-        measured = np.column_stack([np.interp(times - lag_s, times, column) for column in commanded.T])
+        measured = np.column_stack(
+            [np.interp(times - lag_s, times, column) for column in commanded.T]
+        )
     else:
         measured = followed(commanded, lag_s)
     measured += np.array([0.02, -0.01, 0.0])  # what gravity bends
     window = times >= 2.0
     every = round(1 / (state_hz * PERIOD_S))
 
-    def arrived(values: np.ndarray, step: int, noise_rad: float) -> dict[str, list[tuple[float, float]]]:
+    def arrived(
+        values: np.ndarray, step: int, noise_rad: float
+    ) -> dict[str, list[tuple[float, float]]]:
         stamps_s = times[window][::step] + rng.uniform(0, 0.0015, len(times[window][::step]))
         noisy = values[window][::step] + rng.normal(0, noise_rad, (len(stamps_s), 3))
-        return {name: list(zip(stamps_s.tolist(), noisy[:, i].tolist(), strict=True)) for i, name in enumerate(NAMES)}
+        return {
+            name: list(zip(stamps_s.tolist(), noisy[:, i].tolist(), strict=True))
+            for i, name in enumerate(NAMES)
+        }
 
     return lag(arrived(commanded, 1, 0.0), arrived(measured, every, noise_rad))
 
 
 @pytest.mark.parametrize("lag_ms", LAGS_MS)
 @pytest.mark.parametrize("servo", SERVOS)
-@pytest.mark.parametrize(("state_hz", "noise_rad"), [(500, 0.0), (500, 0.001), (50, 0.001), (100, 0.003)])
+@pytest.mark.parametrize(
+    ("state_hz", "noise_rad"), [(500, 0.0), (500, 0.001), (50, 0.001), (100, 0.003)]
+)
 @pytest.mark.one_case
-def test_the_lag_of_a_servo_is_measured(servo: str, lag_ms: int, state_hz: float, noise_rad: float) -> None:
+def test_the_lag_of_a_servo_is_measured(
+    servo: str, lag_ms: int, state_hz: float, noise_rad: float
+) -> None:
     """Within 1 ms; a servo is late by up to 2 % less than its constant at these frequencies."""
     errors_ms = []
     for seed in range(3):
-        estimate = simulated(servo, lag_ms / 1000, state_hz=state_hz, noise_rad=noise_rad, seed=seed)
+        estimate = simulated(
+            servo, lag_ms / 1000, state_hz=state_hz, noise_rad=noise_rad, seed=seed
+        )
         assert estimate is not None
         errors_ms.append(1000 * estimate.lag_s - lag_ms)
     assert max(errors_ms) < 1.0

@@ -50,19 +50,26 @@ def test_one_thing_has_one_word_and_an_example(command: str) -> None:
         ("7447", "tcp/127.0.0.1:7447"),
     ],
 )
-@pytest.mark.parametrize("command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")])
+@pytest.mark.parametrize(
+    "command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")]
+)
 def test_an_endpoint_without_all_its_parts_is_told_with_what_was_meant(
     given: str, meant: str, command: tuple[str, ...]
 ) -> None:
     done = told(*command, given)
-    assert (done.returncode, done.stderr.rstrip().endswith(f": {meant} ?")) == (2, True), done.stderr
+    assert (done.returncode, done.stderr.rstrip().endswith(f": {meant} ?")) == (2, True), (
+        done.stderr
+    )
 
 
 # --- exit codes, as docs/incidents.md promises them -----------------------------------------------
 
 
-def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(tmp_path: Path) -> None:
-    config, takes = tmp_path / "cell.toml", [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
+def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(
+    tmp_path: Path,
+) -> None:
+    config = tmp_path / "cell.toml"
+    takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
     config.write_text("rate_hz = 3\n")
     missing = str(tmp_path / "none.toml")
     for command in (
@@ -82,11 +89,19 @@ REFUSED = [  # exit code, words on standard error, command
     (1, "", "doctor {nobody}"),
     (1, "50 Hz is too slow: commands would arrive every 20 ms", "demo --rate 50"),
     (1, "not a recording of thirdhand", "replay {take}"),
-    (1, "has checksums instead of frames: thirdhand replay {golden} --output whole.mcap", "report {golden}"),
+    (
+        1,
+        "has checksums instead of frames: thirdhand replay {golden} --output whole.mcap",
+        "report {golden}",
+    ),
     (1, "the last ones of the arm are tool0; did you mean tool0?", "arm {ur5} --plate tool"),
     (1, "no take 'a' in ", "record a --delete"),
     (1, "exists already: give another name, or --delete it first", "record there"),
-    (1, "points, entry 2, name: 'glass' given twice, names once each needed", "record a --places twice.json"),
+    (
+        1,
+        "points, entry 2, name: 'glass' given twice, names once each needed",
+        "record a --places twice.json",
+    ),
     (1, "Without a daemon, use --listen tcp/127.0.0.1:7447", "record a {nobody}"),
     (1, "cannot read configuration nowhere.toml", "calibrate --config nowhere.toml"),
     (1, "nowhere.log: No such file or directory", "bundle --log nowhere.log {nobody}"),
@@ -106,10 +121,18 @@ REFUSED = [  # exit code, words on standard error, command
     (2, "--web and --screenshot given", "view live --web --screenshot a.png"),
     (2, "--tab chooses the tab of a picture", "view live --web --tab timing"),
     (2, "--workers: --each needed", "replay a.mcap b.mcap --workers 2"),
-    (2, "--output writes the frames of one recording", "replay a.mcap b.mcap --each --output new.mcap"),
+    (
+        2,
+        "--output writes the frames of one recording",
+        "replay a.mcap b.mcap --each --output new.mcap",
+    ),
     (2, "there is no folder no/such", "report {golden} --html no/such/folder.html"),
     (2, "is a file; a folder needed", "report {golden} --csv {golden}"),
-    (2, "many given; a number of processes, or dask:tcp://HOST:8786", "report a.mcap b.mcap --workers many"),
+    (
+        2,
+        "many given; a number of processes, or dask:tcp://HOST:8786",
+        "report a.mcap b.mcap --workers many",
+    ),
     (2, "cannot read nowhere.urdf", "arm nowhere.urdf"),
     (2, "cell.txt: a name that ends in .toml needed", "arm {ur5} --output cell.txt"),
     (2, "9 given, -3 to 3 needed", "arm {ur5} --at 9 0 0"),
@@ -138,10 +161,14 @@ PATHS = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """The working folder, with files that cannot be used; commands soon give up to connect."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp()))  # else Matplotlib keeps its own folder
+    monkeypatch.setenv(
+        "MPLCONFIGDIR", str(tmp_path_factory.getbasetemp())
+    )  # else Matplotlib keeps its own folder
     for command in ("record", "calibrate"):
         monkeypatch.setattr(f"thirdhand.workbench.cli.{command}.CONNECT_TIMEOUT_S", 0.2)
     working = tmp_path / "working"
@@ -166,7 +193,9 @@ def test_what_cannot_be_done_is_refused_with_the_promised_exit_code_and_writes_n
     assert sorted(folder.rglob("*")) == before
 
 
-def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     done = told("view", str(RECORDINGS / "golden.mcap"))
@@ -180,14 +209,28 @@ def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(monkeypatch
         (0, "thirdhand 0.", ("--version",)),
         (1, "nowhere.mcap", ("replay", "nowhere.mcap")),
         (1, "nowhere.npz", ("serve", "--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
-        (1, "/proc/x: No such file or directory", ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0")),
+        (
+            1,
+            "/proc/x: No such file or directory",
+            ("serve", "--record", "/proc/x", "--listen", "tcp/127.0.0.1:0"),
+        ),
         (2, "COMMAND", ()),
-        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("demo", "--arm", "panda")),
-        (1, "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed", ("sim", "--arm", "panda")),
+        (
+            1,
+            "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed",
+            ("demo", "--arm", "panda"),
+        ),
+        (
+            1,
+            "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed",
+            ("sim", "--arm", "panda"),
+        ),
     ],
 )
 @pytest.mark.one_case
-def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, ...], tmp_path: Path) -> None:
+def test_so_are_those_of_a_process(
+    code: int, words: str, arguments: tuple[str, ...], tmp_path: Path
+) -> None:
     done = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path)})
     assert (done.returncode, done.stderr == "") == (code, code == 0), done.stderr
     assert words in (done.stderr if code else done.stdout)
@@ -198,10 +241,14 @@ def test_so_are_those_of_a_process(code: int, words: str, arguments: tuple[str, 
 def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
     done = thirdhand("status", *NOBODY)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("thirdhand status: nothing listens at tcp/127.0.0.1:1: is a daemon")
+    assert done.stderr.startswith(
+        "thirdhand status: nothing listens at tcp/127.0.0.1:1: is a daemon"
+    )
     done = thirdhand("status", "--connect", "tcp/bench.invalid:1")
     assert (done.returncode, done.stdout) == (1, "")
-    assert re.fullmatch(r"thirdhand status: tcp/bench\.invalid:1 cannot be reached: .+\n", done.stderr)
+    assert re.fullmatch(
+        r"thirdhand status: tcp/bench\.invalid:1 cannot be reached: .+\n", done.stderr
+    )
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = thirdhand("status", "--connect", f"tcp/127.0.0.1:{silent.getsockname()[1]}")
     assert done.returncode == 1
@@ -209,9 +256,13 @@ def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
-def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(command: tuple[str, ...]) -> None:
+def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(
+    command: tuple[str, ...],
+) -> None:
     with started(*command, *NOBODY) as process:
-        assert process.stderr.readline().startswith("waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1")
+        assert process.stderr.readline().startswith(
+            "waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1"
+        )
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
         assert process.stderr.read() == "thirdhand: interrupted\n"
@@ -224,7 +275,10 @@ def test_a_bench_that_is_interrupted_is_130() -> None:
                 pass
             process.send_signal(number)
             assert process.wait(30) == code
-            ended = "ended: the bench of cell thirdhand, after 0 complete runs; without --output no report was written"
+            ended = (
+                "ended: the bench of cell thirdhand, after 0 complete runs; without --output no "
+                "report was written"
+            )
             assert process.stderr.read().splitlines()[-1] == ended
 
 
@@ -256,6 +310,11 @@ def test_a_port_in_use_is_said_in_words(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        words = f"cannot listen on {endpoint}: Address already in use; another program has it; another port"
-        done = assert_refused(1, words, "record", "take", "--folder", str(tmp_path), "--listen", endpoint)
+        words = (
+            f"cannot listen on {endpoint}: Address already in use; another program has it; another "
+            "port"
+        )
+        done = assert_refused(
+            1, words, "record", "take", "--folder", str(tmp_path), "--listen", endpoint
+        )
     assert "os error" not in done.stderr

@@ -25,7 +25,14 @@ from thirdhand.contract.records import Mode, Reason
 from thirdhand.daemon.launch import launched, played
 from thirdhand.recordings.recording import Recording
 from thirdhand.settings.config import WAM, Settings
-from thirdhand.workbench.cli.demo import DEMO_ATTEMPTS, EVENT_TITLES, SLOW_RATE_HZ, TOO_BUSY, exit_code, text
+from thirdhand.workbench.cli.demo import (
+    DEMO_ATTEMPTS,
+    EVENT_TITLES,
+    SLOW_RATE_HZ,
+    TOO_BUSY,
+    exit_code,
+    text,
+)
 from thirdhand.workbench.report.columns import read
 from thirdhand_sim.scene import Scene
 
@@ -41,7 +48,9 @@ seed = 7
 def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
     """The report of a demo that succeeds."""
     command = [sys.executable, "-m", "thirdhand", "demo", "--json", *arguments]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=320, check=False)
+    done = subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, timeout=320, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["success"]
@@ -50,14 +59,20 @@ def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
 
 @timed
 @pytest.mark.timeout(330)
-def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(tmp_path: Path) -> None:
+def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
-    report = demonstrated("--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
+    report = demonstrated(
+        "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")
+    )
     assert report["missing"] == ""
     for name in ("handover", "grasp", "carry"):
         assert report["events"][name]["reached"]
         assert report["events"][name]["error_mm"] <= 30
-    recorded = [step.tick for step in Recording.open(report["recording"]).steps() if step.frame is not None]
+    recorded = [
+        step.tick for step in Recording.open(report["recording"]).steps() if step.frame is not None
+    ]
     assert drawn_ticks(Path(report["rrd"]), "/joints/velocity") == recorded
     succeeded("replay", "--exact", report["recording"])
     left = {"joints/command", "tool/target", "frame", "objects"}
@@ -96,7 +111,9 @@ def test_the_live_view_of_a_demo_is_open_in_the_browser_before_the_arm_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "browser.py").write_text(BROWSER)
-    monkeypatch.setenv("BROWSER", f"{sys.executable} {tmp_path / 'browser.py'} %s {tmp_path / 'opened'}")
+    monkeypatch.setenv(
+        "BROWSER", f"{sys.executable} {tmp_path / 'browser.py'} %s {tmp_path / 'opened'}"
+    )
     report = demonstrated("--open", "--output", str(tmp_path / "out"))
     assert report["rate_hz"] == pytest.approx(SLOW_RATE_HZ, rel=0.05)
     for line in (tmp_path / "opened").read_text().splitlines():
@@ -108,7 +125,9 @@ def test_the_live_view_of_a_demo_is_open_in_the_browser_before_the_arm_moves(
 @timed
 def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text("handover = [1.5, 0.0, 0.3]\n")
-    done = thirdhand("demo", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml"))
+    done = thirdhand(
+        "demo", "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")
+    )
     assert done.returncode == 1
     assert "handover" in done.stderr
 
@@ -116,7 +135,9 @@ def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) 
 @timed
 def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
     """A person's hands are still there when the bench reports, so the arm still follows them."""
-    settings, stop, ends = Settings(rate_hz=100), threading.Event(), list[tuple[str, int]]()
+    settings = Settings(rate_hz=100)
+    stop = threading.Event()
+    ends = list[tuple[str, int]]()
     with (
         launched(tmp_path, "--joints", "state", settings=settings, record=tmp_path) as service,
         open_session(connect=[service.endpoint]) as session,
@@ -148,13 +169,27 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
 def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, Any]:
     """The report of a demo: an event is reached unless there is a reason why not."""
     events = {
-        name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0} | ({"why": why} if why else {})
+        name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0}
+        | ({"why": why} if why else {})
         for name, why in zip(EVENT_TITLES, whys, strict=True)
     }
     few = {"p50": 1.0, "p99": 2.0, "max": 3.0}
-    figures = {"rate_hz": 500.0, "ticks": 9, "missed": 0, "latency_ms": few, "lateness_us": few, "work_us": few}
+    figures = {
+        "rate_hz": 500.0,
+        "ticks": 9,
+        "missed": 0,
+        "latency_ms": few,
+        "lateness_us": few,
+        "work_us": few,
+    }
     files = {"recording": "a.mcap", "rrd": None}
-    outcome = {"success": not any(whys), "events": events, "realtime": True, "missing": missing, "busy": ""}
+    outcome = {
+        "success": not any(whys),
+        "events": events,
+        "realtime": True,
+        "missing": missing,
+        "busy": "",
+    }
     return outcome | figures | files | more
 
 
@@ -167,7 +202,9 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
         ("the arm held", "1 of 9000 ticks are not recorded", 1),
     ],
 )
-def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(why: str | None, missing: str, code: int) -> None:
+def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(
+    why: str | None, missing: str, code: int
+) -> None:
     report = report_of(None, None, why, missing=missing)
     assert exit_code(report) == code
     printed = text(report)
@@ -185,7 +222,14 @@ SILENT = report_of(None, None, None) | {"busy": "nobody answers"}
     [
         ([HELD | {"busy": BUSY}, report_of(None, None, None)], 2, 0),
         ([HELD | {"busy": BUSY}] * 4, 3, 1),
-        ([report_of(None, None, None, missing="1 of 9000 ticks are not recorded") | {"busy": BUSY}], 1, 1),
+        (
+            [
+                report_of(None, None, None, missing="1 of 9000 ticks are not recorded")
+                | {"busy": BUSY}
+            ],
+            1,
+            1,
+        ),
     ],
 )
 def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
@@ -196,7 +240,9 @@ def test_a_task_that_fails_on_a_busy_machine_is_tried_again(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    attempts = [report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)]
+    attempts = [
+        report | {"recording": str(tmp_path / f"{i}.mcap")} for i, report in enumerate(reports)
+    ]
     left = iter(attempts)
 
     rates_hz: list[int | None] = []

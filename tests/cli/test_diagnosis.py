@@ -58,7 +58,9 @@ HEALTHY = Status(
 )
 
 
-def diagnosed(before: Status = HEALTHY, more: Any = MappingProxyType({}), **changed: Any) -> list[Finding]:
+def diagnosed(
+    before: Status = HEALTHY, more: Any = MappingProxyType({}), **changed: Any
+) -> list[Finding]:
     """The findings of a healthy cell of which something has become otherwise, two seconds later."""
     now = msgspec.structs.replace(before, tick=2000, time_ns=HEALTHY.time_ns + 2 * 10**9)
     now = msgspec.structs.replace(now, **changed)
@@ -77,7 +79,17 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     diagnosis = diagnosed()
     assert {finding.level for finding in diagnosis} == {"ok"}
     subjects = {finding.what for finding in diagnosis}
-    assert subjects >= {"mode", "left hand", "right hand", "arm", "arm's driver", "loop", "real time", "memory", "disk"}
+    assert subjects >= {
+        "mode",
+        "left hand",
+        "right hand",
+        "arm",
+        "arm's driver",
+        "loop",
+        "real time",
+        "memory",
+        "disk",
+    }
 
 
 def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
@@ -85,7 +97,10 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
     below = {"right": 0.05, "left": 0.01}
     (text,) = wrongs(diagnosed(msgspec.structs.replace(HEALTHY, below_table_m=below)))
     assert "calibration        below the table top: right hand 5 cm" in text
-    assert "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose" in text
+    assert (
+        "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose"
+        in text
+    )
     assert wrongs(diagnosed(below_table_m=below)) == []
 
 
@@ -94,11 +109,23 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
     [
         ({"version": "0.9"}, "daemon", ("version 0.9", "version 0.1.0", "update")),
         ({"tick": -1}, "loop", ("no tick yet", "wait")),
-        ({"sources": source("left", rate_hz=12.0)}, "left hand", ("12 Hz", "30 to 500 Hz", "as often")),
-        ({"lateness_us": Percentiles(1, 3000, 9000)}, "loop", ("late by 3000 µs", "what else runs")),
+        (
+            {"sources": source("left", rate_hz=12.0)},
+            "left hand",
+            ("12 Hz", "30 to 500 Hz", "as often"),
+        ),
+        (
+            {"lateness_us": Percentiles(1, 3000, 9000)},
+            "loop",
+            ("late by 3000 µs", "what else runs"),
+        ),
         ({"realtime": False}, "real time", ("not granted", "SCHED_FIFO", "docs/hardware.md")),
         ({"memory_locked": False}, "memory", ("not locked", "memlock")),
-        ({"scribe": {"state": "recording", "free_mb": 300.0}}, "disk", ("0.3 GB free", "more than 2 GB", "keep_mb")),
+        (
+            {"scribe": {"state": "recording", "free_mb": 300.0}},
+            "disk",
+            ("0.3 GB free", "more than 2 GB", "keep_mb"),
+        ),
         (
             {
                 "mode": "fault",
@@ -127,9 +154,16 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
                 )
             },
             "right hand",
-            ("100 messages/s rejected as wrong_frame: frame 'camera'; 'base' or none accepted", "[hands] frame"),
+            (
+                "100 messages/s rejected as wrong_frame: frame 'camera'; 'base' or none accepted",
+                "[hands] frame",
+            ),
         ),
-        ({"sources": source("arm", rate_hz=0.0, age_ms=None, fresh=False)}, "arm", ("joints a, b", "the driver")),
+        (
+            {"sources": source("arm", rate_hz=0.0, age_ms=None, fresh=False)},
+            "arm",
+            ("joints a, b", "the driver"),
+        ),
         (
             {"sources": source("arm", rejected={"older": 90})},
             "arm",
@@ -145,7 +179,11 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
             "left hand",
             ("scatter by 9 mm on each axis", "at most 8 mm", "look at what the tracker sees"),
         ),
-        ({"sources": source("left", clock_ms=-4000.0)}, "left hand's clock", ("4 s after it arrives", "chrony")),
+        (
+            {"sources": source("left", clock_ms=-4000.0)},
+            "left hand's clock",
+            ("4 s after it arrives", "chrony"),
+        ),
         ({"command_heard": False}, "arm's driver", ("nobody listens to lab/joints/command",)),
         (
             {"hands_m": {"left": (0.8, -0.2, 0.9), "right": (0.9, 0.3, 0.1)}},
@@ -161,7 +199,11 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
             "right hand's place",
             ("left and right look swapped",),
         ),
-        ({"deviation_m": 0.9}, "skill", ("deviate by 90.0 cm", "up to 70.0 cm", "demonstrate this too")),
+        (
+            {"deviation_m": 0.9},
+            "skill",
+            ("deviate by 90.0 cm", "up to 70.0 cm", "demonstrate this too"),
+        ),
         ({"missed": 100}, "loop", ("97 of 1000 deadlines missed", "less than 1% missed", "bench")),
         (
             {"scribe": {"state": "interrupted", "lost": 7, "errors": ["disk full"]}},
@@ -169,7 +211,14 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
             ("7 ticks lost", "full"),
         ),
         (
-            {"scribe": {"state": "recording", "free_mb": 2400.0, "mb_per_hour": 3600.0, "keep_mb_left": 9000.0}},
+            {
+                "scribe": {
+                    "state": "recording",
+                    "free_mb": 2400.0,
+                    "mb_per_hour": 3600.0,
+                    "keep_mb_left": 9000.0,
+                }
+            },
             "disk",
             ("2.4 GB free", "3.6 GB an hour written: full in 40 min", "1 h", "keep_mb"),
         ),
@@ -178,7 +227,11 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
 def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
     changed: dict[str, Any], what: str, words: tuple[str, ...]
 ) -> None:
-    lines = [finding.text() for finding in diagnosed(**changed) if finding.level == "wrong" and finding.what == what]
+    lines = [
+        finding.text()
+        for finding in diagnosed(**changed)
+        if finding.level == "wrong" and finding.what == what
+    ]
     assert lines
     assert all(word in "\n".join(lines) for word in words), lines
     assert all(re.fullmatch(r"wrong .*\n +required: .*\n +what to do: .*", line) for line in lines)
@@ -188,7 +241,9 @@ def test_what_need_not_be_mended_is_a_note() -> None:
     assumed = {name: entry for name, entry in HEALTHY.sources.items() if name != "arm"}
     levels = {
         finding.what: finding.level
-        for finding in diagnosed(mode="hold", reason="operator", sources=assumed, scribe={"state": "off"})
+        for finding in diagnosed(
+            mode="hold", reason="operator", sources=assumed, scribe={"state": "off"}
+        )
     }
     assert (levels["mode"], levels["arm"], levels["recording"]) == ("note", "note", "note")
     assert "wrong" not in levels.values()
@@ -196,7 +251,10 @@ def test_what_need_not_be_mended_is_a_note() -> None:
 
 def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_near() -> None:
     ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
-    assert rows(ahead)["latency"] == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
+    assert (
+        rows(ahead)["latency"]
+        == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
+    )
     assert rows(HEALTHY)["latency"] == "p50 1.00, p99 2.00, max 3.00 ms"
     lost_hand = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
     status = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": lost_hand})
@@ -207,16 +265,30 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
 
 def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
     silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
-    diagnosis = diagnosed(mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False)
+    diagnosis = diagnosed(
+        mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False
+    )
     ranked = [(finding.level, finding.what) for finding in diagnosis]
-    assert [subject for level, subject in ranked if level == "wrong"] == ["arm", "arm's driver", "mode", "real time"]
+    assert [subject for level, subject in ranked if level == "wrong"] == [
+        "arm",
+        "arm's driver",
+        "mode",
+        "real time",
+    ]
     assert [level for level, _ in ranked] == sorted((level for level, _ in ranked), reverse=True)
 
 
-def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> None:
+def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> (
+    None
+):
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
     lines = wrongs(
-        diagnosed(more={"travels": travels}, mode="fault", reason="arm_error", because="a joint was 0.102 rad off")
+        diagnosed(
+            more={"travels": travels},
+            mode="fault",
+            reason="arm_error",
+            because="a joint was 0.102 rad off",
+        )
     )
     assert "b was commanded to move by 0.31 rad, but has not moved since commands began" in lines[0]
     assert "are the drives on?" in lines[0]
@@ -227,17 +299,28 @@ def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_tha
 @pytest.mark.parametrize(
     ("lag_ms", "level", "words"),
     [
-        (None, "ok", "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"),
+        (
+            None,
+            "ok",
+            "not measured, because the arm did not follow a motion evenly: "
+            "move the hands meanwhile",
+        ),
         (12.3, "ok", "the arm follows its commands 12 ms late"),
         (51.7, "note", "the arm follows its commands 52 ms late"),
     ],
 )
-def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, level: str, words: str) -> None:
+def test_the_lag_of_the_arm_is_reported_with_what_to_do(
+    lag_ms: float | None, level: str, words: str
+) -> None:
     diagnosis = diagnosed(more={"lag_ms": lag_ms})
     (lag_finding,) = (finding for finding in diagnosis if finding.what == "arm's lag")
     assert (lag_finding.level, lag_finding.found) == (level, words)
-    assert ("lead by the lag: write position + lag * velocity" in lag_finding.text()) == (level == "note")
-    assert "arm's lag" not in {finding.what for finding in diagnosed(sources={"left": GOOD, "right": GOOD})}
+    assert ("lead by the lag: write position + lag * velocity" in lag_finding.text()) == (
+        level == "note"
+    )
+    assert "arm's lag" not in {
+        finding.what for finding in diagnosed(sources={"left": GOOD, "right": GOOD})
+    }
 
 
 @pytest.mark.parametrize(
@@ -247,11 +330,20 @@ def test_the_lag_of_the_arm_is_reported_with_what_to_do(lag_ms: float | None, le
         {"mode": "fault", "reason": "arm_error"},
         {"sources": source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)},
         {"sources": source("left", clock_ms=400.0)},
-        {"sources": source("right", rejected={"ahead": 90}, cause="ahead", refused="stamped 0.2 s after the newest")},
+        {
+            "sources": source(
+                "right",
+                rejected={"ahead": 90},
+                cause="ahead",
+                refused="stamped 0.2 s after the newest",
+            )
+        },
     ],
     ids=["silent", "error", "nothing comes", "clock", "ahead"],
 )
-def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(changed: dict[str, Any]) -> None:
+def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(
+    changed: dict[str, Any],
+) -> None:
     words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
     first, *others = wrongs(diagnosed(busy=words, **changed))
     assert first.startswith(f"wrong  machine            too busy: {words}")
@@ -285,7 +377,9 @@ def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
 def test_hands_that_slide_over_the_table_are_of_no_tracker_whose_y_points_up() -> None:
     inside = [((0.8, -0.3 + shift_m, 0.1), (0.9, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
     outside = [((1.4, -0.3 + shift_m, 0.1), (1.4, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
-    assert not any(finding.what == "tracker's axes" for hands in (inside, outside) for finding in paths(*hands))
+    assert not any(
+        finding.what == "tracker's axes" for hands in (inside, outside) for finding in paths(*hands)
+    )
 
 
 def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
@@ -294,8 +388,14 @@ def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
     lines = wrongs(diagnosed(first, **now))
     assert "tool               15 cm or more from its target for 2.0 s" in lines[0]
     diagnosis = diagnosed(first, flags=("separation",), **now)
-    assert [(finding.level, "give it room" in finding.remedy) for finding in diagnosis if finding.what == "tool"] == [("note", True)]
-    assert not any(finding.what == "tool" for finding in diagnosed(first, target_m=HEALTHY.target_m))
+    assert [
+        (finding.level, "give it room" in finding.remedy)
+        for finding in diagnosis
+        if finding.what == "tool"
+    ] == [("note", True)]
+    assert not any(
+        finding.what == "tool" for finding in diagnosed(first, target_m=HEALTHY.target_m)
+    )
 
 
 def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
@@ -308,10 +408,20 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     }
     diagnosis = diagnosed(**unseen)
     assert {finding.level for finding in diagnosis} == {"ok"}
-    assert "right hand         nothing arrives; the skill does not need it" in [finding.text()[7:] for finding in diagnosis]
+    assert "right hand         nothing arrives; the skill does not need it" in [
+        finding.text()[7:] for finding in diagnosis
+    ]
     assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
-    lost_fields = {"sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False), "hand_age_ms": HEALTHY.hand_age_ms}
-    assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]  # it may be anywhere
+    lost_fields = {
+        "sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False),
+        "hand_age_ms": HEALTHY.hand_age_ms,
+    }
+    assert (
+        "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]
+    )  # it may be anywhere
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
-    assert rows(msgspec.structs.replace(now, hands="both"))["target"] == "none: the skill needs both hands"
+    assert (
+        rows(msgspec.structs.replace(now, hands="both"))["target"]
+        == "none: the skill needs both hands"
+    )

@@ -44,9 +44,12 @@ OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 @contextlib.contextmanager
 def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
     """The template's fake arm, driven on a session of its own."""
-    stop, arm = threading.Event(), own_arm.FakeArm(Settings())
+    stop = threading.Event()
+    arm = own_arm.FakeArm(Settings())
     with open_session(connect=[endpoint]) as session:
-        driver = threading.Thread(target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop})
+        driver = threading.Thread(
+            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
+        )
         driver.start()
         try:
             yield arm
@@ -58,7 +61,8 @@ def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
 @contextlib.contextmanager
 def misnamed(session: zenoh.Session) -> Iterator[None]:
     """A tracker that publishes under a key of another name."""
-    stop, pose = threading.Event(), messages.PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))
+    stop = threading.Event()
+    pose = messages.PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))
 
     def publish() -> None:
         while not stop.wait(0.02):
@@ -71,7 +75,9 @@ def misnamed(session: zenoh.Session) -> Iterator[None]:
     thread.join(10)
 
 
-def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, list[dict[str, str]]]:
+def findings(
+    daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str
+) -> tuple[int, list[dict[str, str]]]:
     """Exit code and findings of `thirdhand doctor`, without those of this machine."""
     capsys.readouterr()
     code = main(["doctor", "--json", "--seconds", "0.5", "--connect", daemon.endpoint, *more])
@@ -80,7 +86,9 @@ def findings(daemon: Daemon, capsys: pytest.CaptureFixture[str], *more: str) -> 
 
 
 @pytest.mark.thorough
-def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_with_ones_own_arm_and_tracker(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     own_arm = example("own_arm")
     with (
         launched(tmp_path, record=tmp_path / "records", network=PATIENT) as service,
@@ -91,7 +99,10 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         with misnamed(daemon.session):
             code, report = findings(daemon, capsys)
         wrong = {finding["what"]: finding for finding in report if finding["level"] == "wrong"}
-        assert (code, wrong.keys()) == (1, {"mode", "left hand", "right hand", "arm", "arm's driver"})
+        assert (code, wrong.keys()) == (
+            1,
+            {"mode", "left hand", "right hand", "arm", "arm's driver"},
+        )
         assert all(finding["wanted"] and finding["remedy"] for finding in wrong.values())
         assert "no joint states arrived yet" in wrong["mode"]["found"]
         assert wrong["left hand"]["found"] == "nothing arrives, but on thirdhand/hands/Left"
@@ -106,7 +117,9 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
                 if all(finding["level"] == "ok" for finding in report):
                     break
             assert {finding["level"] for finding in report} == {"ok"}, report
-            assert {"left hand", "right hand", "arm", "recording"} <= {finding["what"] for finding in report}
+            assert {"left hand", "right hand", "arm", "recording"} <= {
+                finding["what"] for finding in report
+            }
 
             tracker.left = NEAR_LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
@@ -117,7 +130,9 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
             assert main(["resume", "--connect", daemon.endpoint]) == 0
             assert "there was no hold to end" in capsys.readouterr().out
 
-            watch = watching.enter_context(started("status", "--watch", "--connect", daemon.endpoint))
+            watch = watching.enter_context(
+                started("status", "--watch", "--connect", daemon.endpoint)
+            )
             line = watch.stdout.readline()
             assert " | follow" in line
             assert line.count("Hz") == 2
@@ -132,7 +147,10 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
                 return "wrong_frame" in str(status["because"])
 
             refusal = daemon.until(refused)
-            assert (refusal["reason"], refusal["remedy"][:19]) == ("stale_hand", "find [hands] frame ")
+            assert (refusal["reason"], refusal["remedy"][:19]) == (
+                "stale_hand",
+                "find [hands] frame ",
+            )
             assert "frame 'camera'; 'base', 'optitrack' or none accepted" in refusal["because"]
             assert set(refusal["hands_m"]) == {"left", "right"}
             time.sleep(1.5)  # for a line of the watch
@@ -151,7 +169,9 @@ def test_a_cell_with_ones_own_arm_and_tracker(tmp_path: Path, capsys: pytest.Cap
         assert "nothing listens on 127.0.0.1 port" in capsys.readouterr().out
 
 
-def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -165,11 +185,15 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
         assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
         token.undeclare()  # type: ignore[no-untyped-call]
     output = capsys.readouterr().out
-    assert "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in output
+    assert (
+        "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in output
+    )
     assert "give the name of the cell by --cell" in output
 
 
-def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = occupy(near, "lab")
         reach = ["--connect", endpoints(near)[0], "--cell", "lab"]

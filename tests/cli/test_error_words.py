@@ -12,7 +12,10 @@ from support.cell import thirdhand, told
 from support.paths import RECORDINGS
 from thirdhand.contract.explain import in_file
 
-INTERNAL = re.compile(r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at 0x|\b(?:OS|Type|Value|Key|Validation)Error")
+INTERNAL = re.compile(
+    r"\$[.:\[]|\[Errno|os error|codec|Traceback|object at "
+    r"0x|\b(?:OS|Type|Value|Key|Validation)Error"
+)
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
 TAKES: dict[str, tuple[str, ...]] = {  # commands, and the file that each of them reads last
     "configuration": ("serve", "--config"),
@@ -45,10 +48,18 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    suffix = {"configuration": ".toml", "arm of the bench": ".toml", "skill": ".npz", "drawing": ".rrd"}
-    path = tmp_path / f"given{suffix.get(takes, '.mcap' if takes in ('recording', 'played', 'replayed') else '')}"
+    suffix = {
+        "configuration": ".toml",
+        "arm of the bench": ".toml",
+        "skill": ".npz",
+        "drawing": ".rrd",
+    }
+    is_recording = takes in ("recording", "played", "replayed")
+    path = tmp_path / f"given{suffix.get(takes, '.mcap' if is_recording else '')}"
     WRONG[wrong](path)
-    run = thirdhand if takes in ("skill", "arm of the bench", "scene") else told  # the others leave no process behind
+    run = (
+        thirdhand if takes in ("skill", "arm of the bench", "scene") else told
+    )  # the others leave no process behind
     done = run(*TAKES[takes], str(path))
     assert done.returncode in (1, 2), done.stdout
     assert not INTERNAL.search(done.stderr), done.stderr
@@ -70,6 +81,8 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
         ("$XDG_CONFIG_HOME/x and ${y} cost 3 $.", "$XDG_CONFIG_HOME/x and ${y} cost 3 $."),
     ],
 )
-def test_a_path_in_json_is_named_as_in_a_file_except_in_what_was_given(text: str, words: str) -> None:
+def test_a_path_in_json_is_named_as_in_a_file_except_in_what_was_given(
+    text: str, words: str
+) -> None:
     assert in_file(text) == words
     assert in_file(words) == words

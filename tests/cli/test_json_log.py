@@ -10,7 +10,9 @@ from support.cell import serving, thirdhand
 from support.cell_commands import python
 
 
-def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(tmp_path: Path) -> None:
+def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(
+    tmp_path: Path,
+) -> None:
     with serving(tmp_path, "--joints", "assumed", "--log", "json") as daemon:
         daemon.client.ask("hold")
         daemon.client.ask("resume")
@@ -24,9 +26,15 @@ def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(tmp
         (1, "cannot read configuration", ("--config", "nowhere.toml")),
         (1, "nowhere.npz", ("--skill", "nowhere.npz", "--listen", "tcp/127.0.0.1:0")),
     ):
-        done = thirdhand("serve", "--log", "json", *arguments, env=os.environ | {"HOME": str(tmp_path)})
+        done = thirdhand(
+            "serve", "--log", "json", *arguments, env=os.environ | {"HOME": str(tmp_path)}
+        )
         last = json.loads(done.stderr.splitlines()[-1])
-        assert (done.returncode, last["level"], words in last["message"]) == (code, "error", True), done.stderr
+        assert (done.returncode, last["level"], words in last["message"]) == (
+            code,
+            "error",
+            True,
+        ), done.stderr
 
 
 def test_an_unexpected_failure_is_an_object_with_its_exception(tmp_path: Path) -> None:

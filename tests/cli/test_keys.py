@@ -9,9 +9,14 @@ import pytest
 from support.cell_commands import python
 
 WAITS = (
-    "from thirdhand.workbench.cli.keys import EnterPressed; p = EnterPressed(); print(p(), p.listens, p(), p.listens)"
+    "from thirdhand.workbench.cli.keys import EnterPressed; p = EnterPressed(); print(p(), "
+    "p.listens, p(), p.listens)"
 )
-INPUTS = {"closed": "False False False False", "empty": "False False False False", "a line": "True True False False"}
+INPUTS = {
+    "closed": "False False False False",
+    "empty": "False False False False",
+    "a line": "True True False False",
+}
 
 
 @pytest.mark.parametrize("given", INPUTS)

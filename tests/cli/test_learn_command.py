@@ -28,14 +28,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) -> None:
-    out, plot = tmp_path / "skill.npz", tmp_path / "skill.png"
+    out = tmp_path / "skill.npz"
+    plot = tmp_path / "skill.png"
     done = thirdhand("learn", *map(str, files), "--output", str(out), "--plot", str(plot))
     assert done.returncode == 0, done.stderr
     assert "demonstration-2 " in done.stdout
     assert "gate " in done.stdout
     assert plot.stat().st_size > 10_000
     skill = decoded(out.read_bytes(), origin="skill")
-    assert f"the target's standard deviation is above {1000 * skill.threshold:.0f} mm" in done.stdout
+    assert (
+        f"the target's standard deviation is above {1000 * skill.threshold:.0f} mm" in done.stdout
+    )
 
 
 def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> None:
@@ -64,19 +67,27 @@ def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_pa
         done = succeeded("learn", *map(str, takes), "--output", str(out), *option)
         assert "residual risk: 1" in done.stdout
         assert says in done.stderr
-        assert ("accepted by Ada: 1" in decoded(out.read_bytes(), origin="skill").residual_risk) == bool(option)
+        assert (
+            "accepted by Ada: 1" in decoded(out.read_bytes(), origin="skill").residual_risk
+        ) == bool(option)
 
 
 def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Path) -> None:
-    theirs, mine = tmp_path / "theirs.npz", tmp_path / "mine.npz"
+    theirs = tmp_path / "theirs.npz"
+    mine = tmp_path / "mine.npz"
     done = succeeded("learn", *map(str, files), "--output", str(theirs))
     own_paths = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
-    for path, demonstration in zip(own_paths, demonstrations(Scene(), count=2, seed=5), strict=True):
+    for path, demonstration in zip(
+        own_paths, demonstrations(Scene(), count=2, seed=5), strict=True
+    ):
         write_demonstration(path, demonstration.every(8))
     refine = ("learn", *map(str, own_paths), "--output", str(mine), "--from")
     done = succeeded(*refine, str(theirs))
     assert "the weight of your demonstrations against the skill's, with errors; " in done.stdout
-    names = [demonstration.name for demonstration in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))]
+    names = [
+        demonstration.name
+        for demonstration in stored_demonstrations(decoded(mine.read_bytes(), origin="mine"))
+    ]
     assert names == [path.stem for path in (*own_paths, *files)]
     for skill, says in (
         (RECORDINGS / "experiments" / "as-paper.npz", "its file does not hold the demonstrations"),

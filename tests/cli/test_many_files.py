@@ -37,7 +37,9 @@ def files(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Three short recordings, and among them one that is cut."""
     folder = tmp_path_factory.mktemp("many")
     controller = Controller(ASSUMED, skill, urdf=URDF)
-    with Recorder(folder / "a.mcap", settings=ASSUMED, skill=skill.file, state=controller.state) as recorder:
+    with Recorder(
+        folder / "a.mcap", settings=ASSUMED, skill=skill.file, state=controller.state
+    ) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
             recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
@@ -53,16 +55,20 @@ def named_failures(errors: str) -> list[str]:
     return [line for line in errors.splitlines() if line.startswith("thirdhand ")]
 
 
-@pytest.mark.parametrize("command", [("replay", "--each", "--exact"), ("report",)], ids=["replay", "report"])
+@pytest.mark.parametrize(
+    "command", [("replay", "--each", "--exact"), ("report",)], ids=["replay", "report"]
+)
 @pytest.mark.one_case
 def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neither(
     command: tuple[str, ...], files: list[str]
 ) -> None:
     alone = told(*command, *files)
     assert alone.returncode == 1
-    assert [name for name in NAMES if f"{name}: 200 ticks" in alone.stdout or f"{name}\n" in alone.stdout] == [
-        name for name in NAMES if name != "broken.mcap"
-    ]
+    assert [
+        name
+        for name in NAMES
+        if f"{name}: 200 ticks" in alone.stdout or f"{name}\n" in alone.stdout
+    ] == [name for name in NAMES if name != "broken.mcap"]
     first, last = named_failures(alone.stderr)
     assert "broken.mcap is cut" in first
     assert last == f"thirdhand {command[0]}: 1 of 4 files cannot be used"
@@ -78,7 +84,12 @@ def test_cluster_prints_what_one_process_prints(files: list[str], tmp_path: Path
     script.write_text(DASK, encoding="utf-8")
     command = ["replay", "--each", *files]
     done = subprocess.run(
-        [sys.executable, str(script), *command], capture_output=True, text=True, timeout=110, check=False, cwd=ROOT
+        [sys.executable, str(script), *command],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+        cwd=ROOT,
     )
     alone = told(*command)
     assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr

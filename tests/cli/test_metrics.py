@@ -34,7 +34,9 @@ def samples(text: str) -> Samples:
     values = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
-            labels = frozenset((name, value) for name, value in sample.labels.items() if name != "cell")
+            labels = frozenset(
+                (name, value) for name, value in sample.labels.items() if name != "cell"
+            )
             assert (sample.name, labels) not in values
             values[sample.name, labels] = sample.value
     return values
@@ -53,7 +55,9 @@ def page(endpoint: str) -> Iterator[str]:
         yield url_match[0]
 
 
-def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(tmp_path: Path) -> None:
+def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_daemon(
+    tmp_path: Path,
+) -> None:
     network = f"[network]\nlisten = ['tcp/127.0.0.1:{free_port()}']\n"
     arguments = ("--joints", "assumed", "--record", str(tmp_path / "records"))
 
@@ -67,12 +71,18 @@ def test_a_scrape_holds_the_figures_of_the_status_and_ends_and_returns_with_the_
             address = closing.enter_context(page(daemon.endpoint))
             with Tracker(daemon.session):
                 daemon.session.put("thirdhand/hands/left", b"no message")
-                now = daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
+                now = daemon.until(
+                    lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording"
+                )
                 scraped = scrape()
             later = Client(daemon.session).status()
             assert value(scraped, "up") == 1
             assert value(scraped, "info", version=later.version, skill=later.skill) == 1
-            assert [value(scraped, "mode", mode=mode) for mode in ("hold", "follow", "fault")] == [0, 1, 0]
+            assert [value(scraped, "mode", mode=mode) for mode in ("hold", "follow", "fault")] == [
+                0,
+                1,
+                0,
+            ]
             assert value(scraped, "reason", reason="operator") == 0
             assert now["tick"] < (value(scraped, "ticks_total") or 0) <= later.tick + 1
             assert value(scraped, "rejected_samples_total", cause="malformed hands/left") == 1
@@ -106,8 +116,17 @@ STATUS = {
     "hand_age_ms": {},
     "hand_distance_m": 0.25,
     "hand_limit_m_s": 0.3,
-    **{name: {"p50": 1.0, "p99": 2.0, "max": 4.0} for name in ("lateness_us", "work_us", "latency_ms")},
-    "scribe": {"state": "recording", "lost": 5, "restarts": 1, "free_mb": 1000, "mb_per_hour": 500.0},
+    **{
+        name: {"p50": 1.0, "p99": 2.0, "max": 4.0}
+        for name in ("lateness_us", "work_us", "latency_ms")
+    },
+    "scribe": {
+        "state": "recording",
+        "lost": 5,
+        "restarts": 1,
+        "free_mb": 1000,
+        "mb_per_hour": 500.0,
+    },
     "endpoints": [],
     "version": "0.1.0",
     "sources": {"left": {"rate_hz": 100.0, "age_ms": 20.0}, "right": {}},
@@ -151,7 +170,9 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
         ("info", ("version", "0.1.0"), ("skill", 'a "skill"\\')): 1,
     }
     for (name, *labels), figure in expected.items():
-        assert value(scraped, name, **dict(labels)) == (None if figure is None else pytest.approx(figure)), name
+        assert value(scraped, name, **dict(labels)) == (
+            None if figure is None else pytest.approx(figure)
+        ), name
     for kind, codes in (("mode", Mode), ("reason", Reason)):
         states = [state for (name, _), state in scraped.items() if name == f"thirdhand_{kind}"]
         assert (len(states), sum(states)) == (len(codes) - (codes is Reason), 1)
@@ -162,8 +183,12 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
 
 
 def test_the_alerts_use_metrics_that_exist() -> None:
-    rules = [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
-    exported = {name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))}
+    rules = [
+        rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]
+    ]
+    exported = {
+        name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))
+    }
     named = {name for rule in rules for name in re.findall(r"thirdhand_\w+", rule["expr"])}
     assert len(rules) == 11
     assert len(named) > 8

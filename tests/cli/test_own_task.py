@@ -20,8 +20,11 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.skills.skill_file import decoded
 from thirdhand_sim import teach
 
-BLOCKS = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL)
-SPEED, REST_S = "4", "0.6"
+BLOCKS = re.findall(
+    r"```sh\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"), re.DOTALL
+)
+SPEED = "4"
+REST_S = "0.6"
 
 
 class Shell:
@@ -35,16 +38,32 @@ class Shell:
 
     def run(self, line: str) -> None:
         words = shlex.split(line.replace(ENDPOINT, self.at).replace("--rest 2", f"--rest {REST_S}"))
-        words = [argument for word in words for argument in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
+        words = [
+            argument
+            for word in words
+            for argument in (sorted(map(str, Path().glob(word))) if "*" in word else [word])
+        ]
         match words:
             case ["python", "-m", "thirdhand_sim.teach", *options, "&"]:
                 options += ["--connect", self.at, "--speed", SPEED, "--wait", "30"]
-                self.teachers.append(threading.Thread(target=lambda: self.codes.append(teach.main(options)), daemon=True))
+                self.teachers.append(
+                    threading.Thread(
+                        target=lambda: self.codes.append(teach.main(options)), daemon=True
+                    )
+                )
                 self.teachers[-1].start()
             case ["python", "-m", "thirdhand_sim.teach", *options]:
                 assert teach.main(options) == 0
             case ["thirdhand", "serve", *options, "&"]:
-                command = [sys.executable, "-m", "thirdhand", "serve", *options, "--listen", self.at]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "thirdhand",
+                    "serve",
+                    *options,
+                    "--listen",
+                    self.at,
+                ]
                 self.daemon = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert self.daemon.stdout is not None
                 assert self.daemon.stdout.readline().startswith("listening on ")

@@ -23,22 +23,38 @@ def rows(path: Path) -> list[list[str]]:
 def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page, folder = tmp_path / "report.html", tmp_path / "tables"
-    assert main(["report", str(golden), str(golden), "--html", str(page), "--csv", str(folder)]) == 0
+    page = tmp_path / "report.html"
+    folder = tmp_path / "tables"
+    assert (
+        main(["report", str(golden), str(golden), "--html", str(page), "--csv", str(folder)]) == 0
+    )
     output = capsys.readouterr().out
-    for words in ("Nothing is missing in it.", "hold: stale_hand", "Side by side", "difference", "same"):
+    for words in (
+        "Nothing is missing in it.",
+        "hold: stale_hand",
+        "Side by side",
+        "difference",
+        "same",
+    ):
         assert words in output
     assert "Settings, versions" not in output  # one file twice: none differs
 
     verdict = output.splitlines()[0]
     counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 4 holds and no faults"
     assert re.fullmatch(
-        rf"{counted}; the worst was hold: far_from_demonstrations, for 0\.8 s from 13\.2 s on\.", verdict
+        rf"{counted}; the worst was hold: far_from_demonstrations, for 0\.8 s from 13\.2 s on\.",
+        verdict,
     )
 
     text = page.read_text(encoding="utf-8")
     assert verdict in text
-    for axis in ("distance [cm]", "error, deviation [mm]", "speed [m/s]", "time since the first tick [s]", ">0.1<"):
+    for axis in (
+        "distance [cm]",
+        "error, deviation [mm]",
+        "speed [m/s]",
+        "time since the first tick [s]",
+        ">0.1<",
+    ):
         assert axis in text
     assert text.count("<svg") == text.count("</svg>") == 4
     for drawn in re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL):
@@ -46,7 +62,12 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
     assert [url for url in fetched if not url.startswith("#")] == []
     assert "far_from_demonstrations" in text
-    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.BY_MODE.values()):  # as in the viewer
+    for colour in (
+        palette.LEFT,
+        palette.RIGHT,
+        palette.TOOL,
+        *palette.BY_MODE.values(),
+    ):  # as in the viewer
         assert palette.written(colour) in text
 
     assert {path.name for path in folder.iterdir()} == {"golden", "golden-2", "comparison.csv"}
@@ -71,7 +92,8 @@ def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
     files = [tmp_path / f"thirdhand-20261128-1200{number:02}.mcap" for number in range(12)]
     for file in files:
         file.symlink_to(golden)
-    page, folder = tmp_path / "report.html", tmp_path / "tables"
+    page = tmp_path / "report.html"
+    folder = tmp_path / "tables"
     assert main(["report", *map(str, files), "--html", str(page), "--csv", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 30

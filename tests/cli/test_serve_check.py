@@ -20,7 +20,9 @@ from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
 from thirdhand.daemon.launch import free_port
 
-TLS, FOREIGN = "tls/127.0.0.1:0", "tcp/192.0.2.1:7447"  # the second is an address that no machine has
+# the second is an address that no machine has
+TLS = "tls/127.0.0.1:0"
+FOREIGN = "tcp/192.0.2.1:7447"
 CELL = """
 [network]
 listen = ["{listen}"]
@@ -32,10 +34,19 @@ record = "{folder}/recordings"
 """
 
 
-def cell(folder: Path, *, listen: str = "tcp/127.0.0.1:0", network: str = "", files: str = "", before: str = "") -> str:
+def cell(
+    folder: Path,
+    *,
+    listen: str = "tcp/127.0.0.1:0",
+    network: str = "",
+    files: str = "",
+    before: str = "",
+) -> str:
     """The path of a cell's settings in a folder."""
     path = folder / "cell.toml"
-    path.write_text(before + CELL.format(listen=listen, folder=folder, network=network, files=files))
+    path.write_text(
+        before + CELL.format(listen=listen, folder=folder, network=network, files=files)
+    )
     return str(path)
 
 
@@ -79,22 +90,55 @@ def test_too_few_files_that_may_be_open_prevent_a_start(tmp_path: Path, option: 
     )
     done = python(program)
     assert done.returncode == 1
-    assert "this process may open 100 files, 256 or more needed: raise its limit with" in done.stdout + done.stderr
+    assert (
+        "this process may open 100 files, 256 or more needed: raise its limit with"
+        in done.stdout + done.stderr
+    )
 
 
 @pytest.mark.parametrize(
     ("condition", "words", "settings", "arguments"),
     [
-        ("configuration", "rate_hz: 3 given; a whole number from 50 to 1000", {"before": "rate_hz = 3\n"}, ()),
-        ("configuration", "other machines could move the arm", {}, ("--listen", "tcp/10.0.0.1:7447")),
+        (
+            "configuration",
+            "rate_hz: 3 given; a whole number from 50 to 1000",
+            {"before": "rate_hz = 3\n"},
+            (),
+        ),
+        (
+            "configuration",
+            "other machines could move the arm",
+            {},
+            ("--listen", "tcp/10.0.0.1:7447"),
+        ),
         ("skill", "nowhere.npz", {}, ("--skill", "nowhere.npz")),
         ("state", "is not a folder", {"before": "cell = 'lab/x'\n"}, ()),
-        ("recordings", "README.md is not a folder", {}, ("--record", str(ROOT / "README.md" / "x"))),
+        (
+            "recordings",
+            "README.md is not a folder",
+            {},
+            ("--record", str(ROOT / "README.md" / "x")),
+        ),
         ("disk", "room on that disk needed", {"files": "segment_mb = 9e8"}, ()),
-        ("certificates", "certificate.pem: a folder with", {"listen": TLS, "network": "certificate = 'none'"}, ()),
-        ("router", "Connection refused; a program that listens there needed", {}, ("--connect", "tcp/127.0.0.1:1")),
+        (
+            "certificates",
+            "certificate.pem: a folder with",
+            {"listen": TLS, "network": "certificate = 'none'"},
+            (),
+        ),
+        (
+            "router",
+            "Connection refused; a program that listens there needed",
+            {},
+            ("--connect", "tcp/127.0.0.1:1"),
+        ),
         ("port", "Address already in use", {}, ("--listen", "TAKEN")),
-        ("port", "Cannot assign requested address", {"network": "allow_insecure = true"}, ("--listen", FOREIGN)),
+        (
+            "port",
+            "Cannot assign requested address",
+            {"network": "allow_insecure = true"},
+            ("--listen", FOREIGN),
+        ),
     ],
 )
 def test_what_prevents_a_start_is_one_line_and_exit_code_1(
@@ -103,7 +147,10 @@ def test_what_prevents_a_start_is_one_line_and_exit_code_1(
     if condition == "state":
         (tmp_path / "state").write_text("a file")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        options = [f"tcp/127.0.0.1:{taken.getsockname()[1]}" if argument == "TAKEN" else argument for argument in arguments]
+        options = [
+            f"tcp/127.0.0.1:{taken.getsockname()[1]}" if argument == "TAKEN" else argument
+            for argument in arguments
+        ]
         checks = lines(tmp_path, *options, code=1, **settings)
     assert [level for level in checks if level.startswith("wrong ")] == [f"wrong {condition}"]
     assert words in checks[f"wrong {condition}"][0]
@@ -155,7 +202,9 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
             pytest.skip(f"other users cannot read {folder}")
     lines(tmp_path, code=0)  # all imports and files of this check have been read
     for folder in tmp_path.parents:
-        if folder.stat().st_mode & 0o005 != 0o005:  # the folders of this run, which only its user can read
+        if (
+            folder.stat().st_mode & 0o005 != 0o005
+        ):  # the folders of this run, which only its user can read
             folder.chmod(0o755)
     tmp_path.chmod(0o555)
     try:
@@ -167,12 +216,17 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
     assert done.stdout.count(f"{tmp_path} cannot be written by user") == 2, done.stdout
 
 
-def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(tmp_path: Path) -> None:
+def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(
+    tmp_path: Path,
+) -> None:
     listen = f"tcp/127.0.0.1:{free_port()}"
-    network, sabotage = f"[network]\nlisten = ['{listen}']\n", SABOTAGE.format(folder=str(tmp_path))
+    network = f"[network]\nlisten = ['{listen}']\n"
+    sabotage = SABOTAGE.format(folder=str(tmp_path))
     with serving(tmp_path, "--joints", "assumed", network=network, before=sabotage) as daemon:
         checks = lines(tmp_path, code=0, listen=listen)
-        assert checks["ok port"] == [f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"]
+        assert checks["ok port"] == [
+            f"{listen} is in use by this cell's running daemon, process {daemon.process.pid}"
+        ]
         checks = lines(tmp_path, "--cell", "another", code=1, listen=listen)
         assert "Address already in use" in checks["wrong port"][0]
         status = ("status", "--exit-code", "--connect", daemon.endpoint)

@@ -28,14 +28,20 @@ class Page:
     """The page of a running daemon, and requests to it."""
 
     def __init__(self, daemon: Daemon, url: str) -> None:
-        self.daemon, self.url = daemon, url
+        self.daemon = daemon
+        self.url = url
         self.host = urlsplit(url).netloc
 
     def ask(self, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, str]:
         """The code and the text of an answer."""
         connection = http.client.HTTPConnection(self.host, timeout=TIMEOUT_S)
         try:
-            connection.request(method, path, body or None, {name.replace("_", "-"): v for name, v in headers.items()})
+            connection.request(
+                method,
+                path,
+                body or None,
+                {name.replace("_", "-"): v for name, v in headers.items()},
+            )
             answer = connection.getresponse()
             return answer.status, answer.read().decode(errors="replace")
         finally:
@@ -49,7 +55,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """
     arguments = ("--joints", "assumed", "--live", "0", "--rate", "100")
     with serving(tmp_path_factory.mktemp("cell"), *arguments) as daemon, Tracker(daemon.session):
-        daemon.until(lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S)
+        daemon.until(
+            lambda status: status["mode"] == "follow" and status["scribe"]["live"], TIMEOUT_S
+        )
         with served(daemon) as url:
             yield Page(daemon, url)
 
@@ -80,12 +88,25 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     assert page.ask("POST", "/hold", X_Thirdhand_Token="guessed")[0] == 403
     assert page.ask("POST", "/hold", X_Thirdhand_Token="gü\xff")[0] == 403
     token = token_in(text)
-    assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin="http://elsewhere.example")[0] == 403
+    assert (
+        page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin="http://elsewhere.example")[0]
+        == 403
+    )
     for origin in ("null", "http://[", f"http://{page.host}.example"):
         assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin=origin)[0] == 403
-    for host in ("elsewhere.example", '"@127.0.0.1', "[", ""):  # the first is a name that was made to point here
+    for host in (
+        "elsewhere.example",
+        '"@127.0.0.1',
+        "[",
+        "",
+    ):  # the first is a name that was made to point here
         assert page.ask("GET", "/", Host=host)[0] == 403
-    for method, path in (("POST", "/shutdown"), ("GET", "/favicon.ico"), ("GET", "/hold"), ("DELETE", "/status")):
+    for method, path in (
+        ("POST", "/shutdown"),
+        ("GET", "/favicon.ico"),
+        ("GET", "/hold"),
+        ("DELETE", "/status"),
+    ):
         expected = 405 if path in ("/hold", "/status") else 404
         assert page.ask(method, path, X_Thirdhand_Token=token) == (expected, UNKNOWN)
     assert page.ask("POST", "/hold", bytes(10_000), X_Thirdhand_Token=token)[0] == 413
@@ -101,8 +122,12 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     page.daemon.until(lambda status: status["mode"] == "follow")
 
 
-@pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
-def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium"
+)
+def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(
+    page: Page, tmp_path: Path
+) -> None:
     with chromium.opened(page.url, tmp_path, size=(1200, 600), timeout_s=TIMEOUT_S) as tab:
 
         def click(name: str, *, until: str) -> Any:
@@ -111,7 +136,10 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
 
         def grey() -> list[str]:
             button_ids: list[str] = json.loads(
-                tab.ask("JSON.stringify([...document.querySelectorAll('button:disabled')].map(one => one.id))")
+                tab.ask(
+                    "JSON.stringify([...document.querySelectorAll('button:disabled')].map(one => "
+                    "one.id))"
+                )
             )
             return button_ids
 
@@ -120,7 +148,9 @@ def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(page: P
         tab.picture(tmp_path / "follow.png")
         click("hold", until="hold: operator request")
         tab.until("document.getElementById('answer').textContent != 'hold ...'")
-        assert tab.ask("document.getElementById('answer').textContent").startswith("hold carried out at tick ")
+        assert tab.ask("document.getElementById('answer').textContent").startswith(
+            "hold carried out at tick "
+        )
         assert grey() == ["reset"]
         tab.picture(tmp_path / "hold.png")
         assert "What to do: press Resume" in tab.until("document.getElementById('why').textContent")

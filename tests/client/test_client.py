@@ -14,7 +14,15 @@ import pytest
 import zenoh
 
 from support.cell import until
-from thirdhand.client import Client, RefusedError, UncertainError, UnreachableError, endpoints, living, open_session
+from thirdhand.client import (
+    Client,
+    RefusedError,
+    UncertainError,
+    UnreachableError,
+    endpoints,
+    living,
+    open_session,
+)
 from thirdhand.client.presence import is_connected
 from thirdhand.contract import channels, requests
 from thirdhand.contract.requests import ViaPoint
@@ -46,7 +54,9 @@ def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
     def answer(key: str, with_what: Answer) -> None:
         cell = key.rsplit("/", 1)[0]
         if not living(daemon, cell):
-            declared.append(daemon.liveliness().declare_token(channels.presence(cell, str(daemon.zid()))))
+            declared.append(
+                daemon.liveliness().declare_token(channels.presence(cell, str(daemon.zid())))
+            )
 
         def reply(query: zenoh.Query) -> None:
             with query:
@@ -89,7 +99,9 @@ def ready(query: zenoh.Query) -> None:
 # --- sessions ------------------------------------------------------------------------------------
 
 
-def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: zenoh.Session) -> None:
+def test_sessions_find_each_other_by_name_only(
+    daemon: zenoh.Session, session: zenoh.Session
+) -> None:
     """No scouting: who was not told where another listens does not meet it."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as stranger:
         time.sleep(0.5)
@@ -101,7 +113,10 @@ def test_sessions_find_each_other_by_name_only(daemon: zenoh.Session, session: z
 def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
     with pytest.raises(
         UnreachableError,
-        match=r"nobody answers at tcp/127.0.0.1:1: is a daemon, `thirdhand record --listen` or a router listening",
+        match=(
+            r"nobody answers at tcp/127.0.0.1:1: is a daemon, `thirdhand record --listen` or a "
+            r"router listening"
+        ),
     ):
         open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 
@@ -153,7 +168,10 @@ def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:
 
 @pytest.mark.parametrize("suffix", ["hold", "status"])
 def test_a_query_that_is_lost_is_asked_again_if_nothing_is_done_twice(
-    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None], suffix: str
+    daemon: zenoh.Session,
+    session: zenoh.Session,
+    answering: Callable[[str, Answer], None],
+    suffix: str,
 ) -> None:
     lost: list[zenoh.Query] = []
     client = Client(session, "bench", timeout_s=2.0)
@@ -184,12 +202,17 @@ def test_a_query_that_is_lost_is_asked_again_if_nothing_is_done_twice(
 def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
     """A session to the daemon, and a call that breaks its connection for 0.3 s."""
     (target,) = endpoints(daemon)
-    relays, timers = [CountingRelay(target)], list[threading.Timer]()
+    relays = [CountingRelay(target)]
+    timers = list[threading.Timer]()
     endpoint = relays[0].endpoint
 
     def cut() -> None:
         relays[-1].__exit__()
-        timers.append(threading.Timer(0.3, lambda: relays.append(CountingRelay(target, int(endpoint.rpartition(":")[2])))))
+        timers.append(
+            threading.Timer(
+                0.3, lambda: relays.append(CountingRelay(target, int(endpoint.rpartition(":")[2])))
+            )
+        )
         timers[-1].start()
 
     with open_session(connect=[endpoint]) as session:
@@ -255,8 +278,11 @@ def test_an_answer_of_a_daemon_once_known_needs_no_further_question(
     daemon: zenoh.Session, session: zenoh.Session
 ) -> None:
     """Its token may be out of sight at the moment of the answer, which is no less true."""
-    with daemon.declare_queryable("bench/status", lambda query: query.reply(query.key_expr, encoded)):
-        client, encoded = Client(session, "bench", timeout_s=1.0), requests.encode_json(STATUS)
+    with daemon.declare_queryable(
+        "bench/status", lambda query: query.reply(query.key_expr, encoded)
+    ):
+        client = Client(session, "bench", timeout_s=1.0)
+        encoded = requests.encode_json(STATUS)
         with daemon.liveliness().declare_token(channels.presence("bench", str(daemon.zid()))):
             assert client.wait_until_ready() == STATUS
         assert client.status() == STATUS

@@ -28,7 +28,9 @@ def test_an_option_goes_before_the_environment_the_file_and_the_default(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert (client_settings().cell, client_settings().connect) == ("thirdhand", ())
-    file.write_text('connect = "tcp/127.0.0.1:1"\ncell = "filed"\ncertificate = "secrets/operator"\n')
+    file.write_text(
+        'connect = "tcp/127.0.0.1:1"\ncell = "filed"\ncertificate = "secrets/operator"\n'
+    )
     settings = client_settings()
     assert (settings.cell, settings.connect) == ("filed", ("tcp/127.0.0.1:1",))
     assert settings.certificate == str(file.parent / "secrets" / "operator")
@@ -37,7 +39,11 @@ def test_an_option_goes_before_the_environment_the_file_and_the_default(
     settings = client_settings()
     assert (settings.cell, settings.connect) == ("told", ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3"))
     settings = client_settings(cell="said", connect=["tcp/127.0.0.1:4"], certificate="mine")
-    assert (settings.cell, settings.connect, settings.certificate) == ("said", ("tcp/127.0.0.1:4",), "mine")
+    assert (settings.cell, settings.connect, settings.certificate) == (
+        "said",
+        ("tcp/127.0.0.1:4",),
+        "mine",
+    )
 
 
 def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
@@ -53,7 +59,11 @@ def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
     ("text", "said"),
     [
         ("cell = ", r"client\.toml: "),
-        ('cel = "lab"', r"client\.toml: unknown field 'cel'; known are connect, cell, certificate, zenoh_config"),
+        (
+            'cel = "lab"',
+            r"client\.toml: unknown field 'cel'; known are connect, cell, "
+            "certificate, zenoh_config",
+        ),
         ('cell = "*"', r"client\.toml: cell: '\*' given; words joined by"),
         ('cell = "a/.."', r"client\.toml: cell: 'a/\.\.' given; no \. or"),
         ('connect = "127.0.0.1:1"', r"client\.toml: connect, entry 1: .*: tcp/127\.0\.0\.1:1 \?"),

@@ -14,14 +14,17 @@ from thirdhand.contract import channels
 from thirdhand.daemon.cell_streams import Arrivals, CellStreams
 from thirdhand.settings.config import Settings
 
-COUNT, BYTES = 2000, 50_000  # 100 MB, more than sockets and queues hold
+# 100 MB, more than sockets and queues hold
+COUNT = 2000
+BYTES = 50_000
 
 
 class Starved(Watch):
     """A watch whose program does not come to take messages until `free`."""
 
     def __init__(self, *arguments: Any, free: threading.Event) -> None:
-        self.free, self.taken = free, 0
+        self.free = free
+        self.taken = 0
         super().__init__(*arguments)
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
@@ -30,29 +33,42 @@ class Starved(Watch):
         raise ValueError("its content is of no interest")
 
 
-def test_a_starved_subscriber_knows_how_many_messages_it_lost(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_starved_subscriber_knows_how_many_messages_it_lost(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     free = threading.Event()
     with open_session(listen=["tcp/127.0.0.1:0"]) as daemon:
-        streams = CellStreams(daemon, Settings(), arrivals={c: Arrivals() for c in channels.BY_KEY}, failed=print)
-        with open_session(connect=endpoints(daemon)) as session, Starved(
-            session, "thirdhand", "joints/command", free=free
-        ) as watch:  # fmt: skip
+        streams = CellStreams(
+            daemon, Settings(), arrivals={c: Arrivals() for c in channels.BY_KEY}, failed=print
+        )
+        with (
+            open_session(connect=endpoints(daemon)) as session,
+            Starved(session, "thirdhand", "joints/command", free=free) as watch,
+        ):
             until(lambda: streams.is_followed)
             for _ in range(COUNT):
                 streams.publish("joints/command", bytes(BYTES))
             free.set()
 
             def all_counted() -> bool:
-                if watch.taken > 1 and watch.lost > 0 and watch.taken + watch.lost == COUNT + len(sent):
+                if (
+                    watch.taken > 1
+                    and watch.lost > 0
+                    and watch.taken + watch.lost == COUNT + len(sent)
+                ):
                     return True
-                streams.publish("joints/command", b"")  # what was lost before it is counted when it arrives
+                streams.publish(
+                    "joints/command", b""
+                )  # what was lost before it is counted when it arrives
                 sent.append(1)
                 return False
 
             sent: list[int] = []
             until(all_counted)
     assert watch.lost > COUNT / 10
-    warning = "messages on thirdhand/joints/command are lost: this program or its network is too slow"
+    warning = (
+        "messages on thirdhand/joints/command are lost: this program or its network is too slow"
+    )
     assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [warning]
 
 

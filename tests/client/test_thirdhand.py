@@ -54,7 +54,11 @@ def test_the_bare_distribution_is_the_client(editable: bool, tmp_path: Path) -> 
     assert imported == str((ROOT / "service" if editable else site) / "thirdhand" / "__init__.py")
     assert set(ast.literal_eval(modules)) == {"__main__", "thirdhand", *DEPENDENCIES}
     metadata = (next(site.glob("*.dist-info")) / "METADATA").read_text(encoding="utf-8")
-    needs = [line for line in metadata.splitlines() if line.startswith("Requires-Dist: ") and ";" not in line]
+    needs = [
+        line
+        for line in metadata.splitlines()
+        if line.startswith("Requires-Dist: ") and ";" not in line
+    ]
     assert [line.split()[1].partition(">")[0] for line in needs] == ["eclipse-zenoh", "msgspec"]
 
 
@@ -62,9 +66,14 @@ def test_the_bare_distribution_is_the_client(editable: bool, tmp_path: Path) -> 
     ("command", "extra"),
     [("serve", "cell"), ("learn take.mcap --output skill.npz", "cell"), ("sim", "sim")],
 )
-def test_a_command_whose_extra_is_missing_says_what_to_install(command: str, extra: str, tmp_path: Path) -> None:
+def test_a_command_whose_extra_is_missing_says_what_to_install(
+    command: str, extra: str, tmp_path: Path
+) -> None:
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
-    code = f"import sys\nsys.argv[1:] = {command.split()}\nfrom thirdhand.__main__ import main\nsys.exit(main())"
+    code = (
+        f"import sys\nsys.argv[1:] = {command.split()}\nfrom thirdhand.__main__ import "
+        "main\nsys.exit(main())"
+    )
     done = isolated(site, code, *DEPENDENCIES)
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
@@ -94,7 +103,9 @@ def cell(listener: zenoh.Session) -> Iterator[Connection]:
 
 
 GREEN = (0.0, 0.5, 0.0, 1.0)
-BOX = SceneObject("board", "box", "base", (0.6, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0), (0.1, 0.2, 0.01), GREEN)
+BOX = SceneObject(
+    "board", "box", "base", (0.6, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0), (0.1, 0.2, 0.01), GREEN
+)
 TURNED = (0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8)
 PUBLISHED: dict[str, tuple[Callable[[Connection], None], dict[str, Any]]] = {
     "both hands": (
@@ -138,7 +149,10 @@ PUBLISHED: dict[str, tuple[Callable[[Connection], None], dict[str, Any]]] = {
 
 @pytest.mark.parametrize(("call", "messages"), PUBLISHED.values(), ids=PUBLISHED)
 def test_one_call_publishes_what_is_then_received(
-    call: Callable[[Connection], None], messages: dict[str, Any], cell: Connection, listener: zenoh.Session
+    call: Callable[[Connection], None],
+    messages: dict[str, Any],
+    cell: Connection,
+    listener: zenoh.Session,
 ) -> None:
     watches = {suffix: Watch(listener, "bench", suffix, timeout_s=10) for suffix in messages}
     call(cell)
@@ -150,31 +164,85 @@ def test_one_call_publishes_what_is_then_received(
 WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "no hand": (lambda cell: cell.hands(), "no hand given; left, right or both needed"),
     "six numbers": (lambda cell: cell.tool((0,) * 6), "tool: 6 numbers given; x y z"),
-    "not a number": (lambda cell: cell.hands(right=(0, 0, math.nan)), r"right: \[0.0, 0.0, nan\] given; finite"),
-    "no rotation": (lambda cell: cell.tool((0, 0, 0, 0, 0, 0, 2)), r"tool: quaternion .* has norm 2; 1 needed"),
+    "not a number": (
+        lambda cell: cell.hands(right=(0, 0, math.nan)),
+        r"right: \[0.0, 0.0, nan\] given; finite",
+    ),
+    "no rotation": (
+        lambda cell: cell.tool((0, 0, 0, 0, 0, 0, 2)),
+        r"tool: quaternion .* has norm 2; 1 needed",
+    ),
     "no clutch": (lambda cell: cell.clutch(1), "clutch: 1 given; True or False needed"),  # type: ignore[arg-type]
-    "too far closed": (lambda cell: cell.gripper(1.5), r"closure: 1.5 given; 0 \(open\) to 1 \(closed\) needed"),
-    "a joint too few": (lambda cell: cell.joints(["a", "b"], [1]), "positions and velocities of 2 joints needed"),
+    "too far closed": (
+        lambda cell: cell.gripper(1.5),
+        r"closure: 1.5 given; 0 \(open\) to 1 \(closed\) needed",
+    ),
+    "a joint too few": (
+        lambda cell: cell.joints(["a", "b"], [1]),
+        "positions and velocities of 2 joints needed",
+    ),
     "a joint in words": (lambda cell: cell.joints(["a"], ["up"]), "of 1 joints needed"),  # type: ignore[list-item]
-    "a joint nowhere": (lambda cell: cell.joints(["a"], [math.nan]), r"joints: \[nan\] .* finite numbers needed"),
+    "a joint nowhere": (
+        lambda cell: cell.joints(["a"], [math.nan]),
+        r"joints: \[nan\] .* finite numbers needed",
+    ),
     "no closure": (lambda cell: cell.gripper(None), r"closure: \[None\] given; 0 \(open\)"),  # type: ignore[arg-type]
-    "a shape": (lambda cell: cell.objects([BOX._replace(shape="cone")]), "shape 'cone' given; one of box, ball, cyl"),
-    "no size": (lambda cell: cell.objects([BOX._replace(size=(0.1, 0.1, 0.0))]), "object 'board': .* or no size"),
+    "a shape": (
+        lambda cell: cell.objects([BOX._replace(shape="cone")]),
+        "shape 'cone' given; one of box, ball, cyl",
+    ),
+    "no size": (
+        lambda cell: cell.objects([BOX._replace(size=(0.1, 0.1, 0.0))]),
+        "object 'board': .* or no size",
+    ),
     "no object": (lambda cell: cell.objects([("a", "box")]), "a SceneObject needed"),  # type: ignore[list-item]
-    "a channel": (lambda cell: cell.watch("tool/targets"), "channel 'tool/targets' given; one of hands/left, .*status"),
+    "a channel": (
+        lambda cell: cell.watch("tool/targets"),
+        "channel 'tool/targets' given; one of hands/left, .*status",
+    ),
     "a request": (lambda cell: cell.watch("hold"), "channel 'hold' given"),
     "bytes": (lambda cell: cell.tool(b"123"), "tool: b'123' given; x y z"),
-    "seconds": (lambda cell: cell.hands(left=(1, 2, 3), stamp_ns=1.7e9), "stamp_ns: 1700000000.0 given; whole nanos"),  # type: ignore[arg-type]
-    "a time in words": (lambda cell: cell.gripper(0.5, stamp_ns="now"), "stamp_ns: 'now' given; whole"),  # type: ignore[arg-type]
-    "before 1970": (lambda cell: cell.tool((1, 2, 3), stamp_ns=-1), "stamp_ns: -1 given; whole nanoseconds"),
-    "after 2038": (lambda cell: cell.tool((1, 2, 3), stamp_ns=2**62), "stamp_ns: .* given; whole nanoseconds"),
-    "a frame by number": (lambda cell: cell.hands(left=(1, 2, 3), frame_id=5), "frame_id: 5 given; a name"),  # type: ignore[arg-type]
-    "a frame with an end": (lambda cell: cell.tool((1, 2, 3), frame_id="a\0b"), "frame_id: .* given; a name"),
-    "half a letter": (lambda cell: cell.hands(left=(1, 2, 3), frame_id="\ud800"), "frame_id: .* given; a name"),
-    "a long frame": (lambda cell: cell.hands(left=(1, 2, 3), frame_id="a" * 65), "frame_id: .* up to 64 printable"),
-    "objects that are none": (lambda cell: cell.objects(None), "objects: None given; SceneObjects needed"),  # type: ignore[arg-type]
-    "a place": (lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)), "left: 2 numbers given; x"),
-}  # fmt: skip
+    "seconds": (
+        lambda cell: cell.hands(left=(1, 2, 3), stamp_ns=1.7e9),
+        "stamp_ns: 1700000000.0 given; whole nanos",
+    ),  # type: ignore[arg-type]
+    "a time in words": (
+        lambda cell: cell.gripper(0.5, stamp_ns="now"),
+        "stamp_ns: 'now' given; whole",
+    ),  # type: ignore[arg-type]
+    "before 1970": (
+        lambda cell: cell.tool((1, 2, 3), stamp_ns=-1),
+        "stamp_ns: -1 given; whole nanoseconds",
+    ),
+    "after 2038": (
+        lambda cell: cell.tool((1, 2, 3), stamp_ns=2**62),
+        "stamp_ns: .* given; whole nanoseconds",
+    ),
+    "a frame by number": (
+        lambda cell: cell.hands(left=(1, 2, 3), frame_id=5),
+        "frame_id: 5 given; a name",
+    ),  # type: ignore[arg-type]
+    "a frame with an end": (
+        lambda cell: cell.tool((1, 2, 3), frame_id="a\0b"),
+        "frame_id: .* given; a name",
+    ),
+    "half a letter": (
+        lambda cell: cell.hands(left=(1, 2, 3), frame_id="\ud800"),
+        "frame_id: .* given; a name",
+    ),
+    "a long frame": (
+        lambda cell: cell.hands(left=(1, 2, 3), frame_id="a" * 65),
+        "frame_id: .* up to 64 printable",
+    ),
+    "objects that are none": (
+        lambda cell: cell.objects(None),
+        "objects: None given; SceneObjects needed",
+    ),  # type: ignore[arg-type]
+    "a place": (
+        lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)),
+        "left: 2 numbers given; x",
+    ),
+}
 
 
 POSES: dict[str, tuple[Any, str]] = {
@@ -190,7 +258,10 @@ POSES: dict[str, tuple[Any, str]] = {
     "many": ([0.0] * 100_000, "left: 100000 numbers given; x y z"),
     "a table": (np.eye(3), "left: array.* given; x y z"),
 }
-WRONG |= {name: (lambda cell, value=value: cell.hands(left=value), error) for name, (value, error) in POSES.items()}
+WRONG |= {
+    name: (lambda cell, value=value: cell.hands(left=value), error)
+    for name, (value, error) in POSES.items()
+}
 
 
 @pytest.mark.parametrize(("call", "error"), WRONG.values(), ids=WRONG)
@@ -202,20 +273,37 @@ def test_a_wrong_value_is_refused_before_anything_is_sent(
         call(cell)
 
 
-def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(listener: zenoh.Session, cell: Connection) -> None:
+def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(
+    listener: zenoh.Session, cell: Connection
+) -> None:
     with (
         Watch(listener, "bench", "hands/left"),
         Watch(listener, "bench", "hands/right"),
         Tracker(cell.session, "bench", timeout_s=10) as tracker,
         Follower(cell.session, ("a", "b"), "bench") as follower,
     ):
-        positions: tuple[Any, ...] = ((0, 0), (0, 0, 0, 0), "abc", None, 5, [[0, 0, 0]], ("x", "y", "z"))
+        positions: tuple[Any, ...] = (
+            (0, 0),
+            (0, 0, 0, 0),
+            "abc",
+            None,
+            5,
+            [[0, 0, 0]],
+            ("x", "y", "z"),
+        )
         for position in positions:
             with pytest.raises(ValueError, match=r"left hand: .* given; a position x y z"):
                 tracker.publish("left", position)
-        joints: tuple[Any, ...] = (([1], [1, 2]), ([1, 2], [1]), ("ab", "cd"), ([1, 2, 3], [1, 2, 3]))
+        joints: tuple[Any, ...] = (
+            ([1], [1, 2]),
+            ([1, 2], [1]),
+            ("ab", "cd"),
+            ([1, 2, 3], [1, 2, 3]),
+        )
         for position, velocity in joints:
-            with pytest.raises(ValueError, match="given; positions and velocities of 2 joints needed"):
+            with pytest.raises(
+                ValueError, match="given; positions and velocities of 2 joints needed"
+            ):
                 follower.tell(position, velocity)
         tracker.publish("left", np.zeros(3), np.array([0, 0, 0, 1.0]), stamp_ns=np.int64(5))  # type: ignore[arg-type]
         follower.tell(np.zeros(2), ())  # type: ignore[arg-type]
@@ -228,10 +316,14 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
         connect(endpoints(listener)[0], cell="bench") as cell,
     ):
         cell.hands(left=(0, 0, 0))
-        tracker, follower = Tracker(cell.session, "bench", timeout_s=10), Follower(cell.session, ("a",), "bench")
+        tracker = Tracker(cell.session, "bench", timeout_s=10)
+        follower = Follower(cell.session, ("a",), "bench")
         received: list[list[Any]] = []
         watches = [cell.watch("tool/target"), cell.watch("status", timeout_s=60)]
-        loops = [threading.Thread(target=lambda one=watch: received.append(list(one)), daemon=True) for watch in watches]
+        loops = [
+            threading.Thread(target=lambda one=watch: received.append(list(one)), daemon=True)
+            for watch in watches
+        ]
         for loop in loops:
             loop.start()
         alone = cell.watch("tool/pose")
@@ -253,7 +345,9 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
             lambda: follower.tell([0.0], [0.0]),
         )
         for call in calls:
-            with pytest.raises(UnreachableError, match="the connection was closed in this program: open a new one"):
+            with pytest.raises(
+                UnreachableError, match="the connection was closed in this program: open a new one"
+            ):
                 call()
 
 

@@ -26,7 +26,8 @@ SOON_S = 5.0  # on a machine that does much else; what is quadratic takes minute
 
 @pytest.mark.parametrize("name", DECODERS)
 def test_mutated_messages_are_taken_or_refused_in_words(name: str) -> None:
-    random, corpus = Random(name), seeds(name)
+    random = Random(name)
+    corpus = seeds(name)
     taken = 0
     for _ in range(MANY):
         data = mutated(name, random.choice(corpus), random)
@@ -71,7 +72,9 @@ def test_what_is_nested_deep_is_refused_at_any_depth(name: str) -> None:
         (cdr.decode_transforms, 32768),
     ],
 )
-def test_what_the_loop_reads_is_refused_by_its_size_alone(decode: Callable[[bytes], object], most: int) -> None:
+def test_what_the_loop_reads_is_refused_by_its_size_alone(
+    decode: Callable[[bytes], object], most: int
+) -> None:
     with pytest.raises(WireError, match=f"a message of {most + 1} bytes, at most {most} accepted"):
         decode(b"x" * (most + 1))
 

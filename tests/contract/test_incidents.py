@@ -18,7 +18,12 @@ STUCK_S = TUNING.decision.stuck_s
 TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s
 
 
-MEMBERS = [member for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind if member is not Reason.NONE]
+MEMBERS = [
+    member
+    for kind in (Mode, Reason, Flag, Cause, Condition)
+    for member in kind
+    if member is not Reason.NONE
+]
 
 
 def test_each_member_has_one_row_with_words_of_its_own() -> None:
@@ -60,7 +65,10 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Condition.ARM_UNSETTLED, f"for {TUNING.intake.max_late_s:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
-    assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (0.25, 3)  # in words: a quarter, three
+    assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (
+        0.25,
+        3,
+    )  # in words: a quarter, three
 
 
 @pytest.mark.parametrize("busy", ["", "the loop was up to 45 ms late"])
@@ -76,7 +84,9 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
 def test_an_arm_error_amid_states_that_contradict_each_other_is_explained_by_two_drivers(
     busy: str, share: float, cause: str, told: str
 ) -> None:
-    arm = Source(rate_hz=500.0, fresh=True, contested=share, cause=cause, refused="elbow from 1 to 2 rad")
+    arm = Source(
+        rate_hz=500.0, fresh=True, contested=share, cause=cause, refused="elbow from 1 to 2 rad"
+    )
     evidence = Evidence({"arm": arm}, contested=0.1, busy=busy)
     evidence = evidence._replace(error_rad=(0.12, 0.1), worst_joint=("elbow", 0.24, "rad"))
     explanation = explained(Reason.ARM_ERROR, evidence)

@@ -25,7 +25,10 @@ STATE = JointState(1, NAMES, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
         (STATE._replace(velocity=(0.1, 0.2)), (0.0, 0.0, 0.0)),
         (STATE._replace(velocity=(0.1,) * 9), (0.0, 0.0, 0.0)),
         (STATE._replace(velocity=(0.1, math.inf, 0.3)), (0.1, math.inf, 0.3)),
-        (JointState(1, ("c", "x", "a", "b"), (3.0, NAN, 1.0, 2.0), (0.3, NAN, 0.1, 0.2)), (0.1, 0.2, 0.3)),
+        (
+            JointState(1, ("c", "x", "a", "b"), (3.0, NAN, 1.0, 2.0), (0.3, NAN, 0.1, 0.2)),
+            (0.1, 0.2, 0.3),
+        ),
     ],
 )
 def test_a_velocity_that_is_not_measured_is_zero_and_all_else_is_as_given(
@@ -34,7 +37,9 @@ def test_a_velocity_that_is_not_measured_is_zero_and_all_else_is_as_given(
     assert measured(message, NAMES) == ((1.0, 2.0, 3.0), velocity)
 
 
-@pytest.mark.parametrize("message", [STATE._replace(position=(1.0, 2.0)), JointState(1, ("a",), (1.0,), ())])
+@pytest.mark.parametrize(
+    "message", [STATE._replace(position=(1.0, 2.0)), JointState(1, ("a",), (1.0,), ())]
+)
 def test_joints_or_positions_that_are_missing_are_an_error(message: JointState) -> None:
     with pytest.raises(WireError):
         measured(message, NAMES)
@@ -45,7 +50,8 @@ def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
 
 
 def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_comes() -> None:
-    states, fingers = JointStates(NAMES, 0.1), part("xy", 1)
+    states = JointStates(NAMES, 0.1)
+    fingers = part("xy", 1)
     for k in range(300):
         at_s = k / 1000
         assert states.take(fingers, at_s) is None
@@ -60,12 +66,16 @@ def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_
 
 @pytest.mark.parametrize("split", ["a bc", "c ba", "a b c", "ab bc ca", "ax by cz"])
 def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(split: str) -> None:
-    states, samples, parts = JointStates(NAMES, 0.1), [], split.split()
+    states = JointStates(NAMES, 0.1)
+    samples = []
+    parts = split.split()
     dice = random.Random(1)
     for k in range(500):
         at_s = k / 1000
         for number in dice.sample(range(len(parts)), len(parts)):
-            if k % (1 + 9 * (number == 0)) == 0:  # the first publishes at 100 Hz, the others at 1000 Hz
+            if (
+                k % (1 + 9 * (number == 0)) == 0
+            ):  # the first publishes at 100 Hz, the others at 1000 Hz
                 state = states.take(part(parts[number], k + 1, value=at_s), at_s)
                 samples += [] if state is None else [(at_s, state)]
     assert len(samples) >= 49
@@ -75,7 +85,9 @@ def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(sp
         assert state.velocity == (0.0, 0.0, 0.0)
     stamps = [state.stamp_ns for _, state in samples]
     assert stamps == sorted(stamps)
-    assert len(set(stamps)) == len(stamps) or split == "ab bc ca"  # two publishers of a joint may repeat a stamp
+    assert (
+        len(set(stamps)) == len(stamps) or split == "ab bc ca"
+    )  # two publishers of a joint may repeat a stamp
 
 
 def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> None:

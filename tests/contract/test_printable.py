@@ -30,8 +30,12 @@ def test_any_text_becomes_one_printable_line_and_stays_so(text: str) -> None:
     assert all(line.isprintable() for line in printable_lines(text).split("\n"))
 
 
-def test_errors_logs_and_replies_quote_without_effects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert str(SkillError(f"no array {WICKED}")) == "\n".join(map(printable, f"no array {WICKED}".splitlines()))
+def test_errors_logs_and_replies_quote_without_effects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert str(SkillError(f"no array {WICKED}")) == "\n".join(
+        map(printable, f"no array {WICKED}".splitlines())
+    )
     record = logging.LogRecord("", logging.INFO, "", 0, WICKED, (), None)
     assert "\x1b" not in PrintableFormatter("%(message)s").format(record)
     assert main(["replay", str(tmp_path / "no\x1b[31m such.mcap")]) == 1

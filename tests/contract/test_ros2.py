@@ -11,7 +11,11 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
-from zenoh_ros2_sdk.keyexpr import endpoint_liveliness_keyexpr, node_liveliness_keyexpr, topic_keyexpr
+from zenoh_ros2_sdk.keyexpr import (
+    endpoint_liveliness_keyexpr,
+    node_liveliness_keyexpr,
+    topic_keyexpr,
+)
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 from zenoh_ros2_sdk.utils import ros2_to_dds_type
 
@@ -20,12 +24,19 @@ from thirdhand.settings.config import parse
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.network import Ros2
 
-CELL, DOMAIN, SESSION = "lab/bench2", 7, "1a2b"
-COMMANDS, TRAJECTORY, STATES = "/forward/commands", "/arm_controller/joint_trajectory", "/joint_states"
+CELL = "lab/bench2"
+DOMAIN = 7
+SESSION = "1a2b"
+COMMANDS = "/forward/commands"
+TRAJECTORY = "/arm_controller/joint_trajectory"
+STATES = "/joint_states"
 VIEWED = {"tf": "/arm/tf", "robot_description": "/robot_description", "diagnostics": "/diagnostics"}
 HANDS = {"hands": ["/tf:left_wrist", "/mocap/tf:right"], "tool": "/tf:iron"}
 NAMED = msgspec.convert(
-    VIEWED | HANDS | {"position_commands": COMMANDS, "trajectory": TRAJECTORY, "joint_states": STATES}, Ros2
+    VIEWED
+    | HANDS
+    | {"position_commands": COMMANDS, "trajectory": TRAJECTORY, "joint_states": STATES},
+    Ros2,
 )
 FRAMES = ("/tf", "/mocap/tf")
 LATCHED = ("/arm/tf_static", "/robot_description")
@@ -45,35 +56,68 @@ def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -
     tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
     node = NodeEntity(DOMAIN, SESSION, 0, ros2.NODE, f"/{CELL}")
     assert tokens.pop(("", False)) == node_liveliness_keyexpr(node)
-    streams = [c.key for c in channels.CHANNELS if c.direction == "out" or (c.direction == "in" and c.event)]
+    streams = [
+        c.key
+        for c in channels.CHANNELS
+        if c.direction == "out" or (c.direction == "in" and c.event)
+    ]
     stream_names = [f"/{CELL}/{suffix}" for suffix in streams]
-    assert {name for name, _ in tokens} == {*stream_names, COMMANDS, TRAJECTORY, STATES, *VIEWED.values(), *LATCHED, *FRAMES}
-    once = [*{(topic.name, topic.heard): topic for topic in topics}.values()]  # three frames are heard on two topics
+    assert {name for name, _ in tokens} == {
+        *stream_names,
+        COMMANDS,
+        TRAJECTORY,
+        STATES,
+        *VIEWED.values(),
+        *LATCHED,
+        *FRAMES,
+    }
+    once = [
+        *{(topic.name, topic.heard): topic for topic in topics}.values()
+    ]  # three frames are heard on two topics
     assert [(topic.frame, topic.channel) for topic in topics if topic.frame] == [
         ("left_wrist", "hands/left"),
         ("right", "hands/right"),
         ("iron", "tool/pose"),
     ]
-    for number, (((name, _), token), topic) in enumerate(zip(tokens.items(), once, strict=True), start=1):
+    for number, (((name, _), token), topic) in enumerate(
+        zip(tokens.items(), once, strict=True), start=1
+    ):
         named = (name, ros2_to_dds_type(topic.type), f"RIHS01_{ros2.TYPE_HASHES[topic.type]}")
-        is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name in (STATES, *FRAMES)
-        quality = QosProfile(reliability=QosReliability.BEST_EFFORT if is_in else QosReliability.RELIABLE)
+        is_in = name.removeprefix(f"/{CELL}/") in [c.key for c in ros2.HEARD] or name in (
+            STATES,
+            *FRAMES,
+        )
+        quality = QosProfile(
+            reliability=QosReliability.BEST_EFFORT if is_in else QosReliability.RELIABLE
+        )
         if name in LATCHED:
             quality = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
         entity = EntityKind.SUBSCRIPTION if is_in else EntityKind.PUBLISHER
-        assert token == endpoint_liveliness_keyexpr(EndpointEntity(node, number, entity, *named, quality.encode()))
+        assert token == endpoint_liveliness_keyexpr(
+            EndpointEntity(node, number, entity, *named, quality.encode())
+        )
         assert ros2.key(DOMAIN, topic) == topic_keyexpr(DOMAIN, *named)
 
 
 def test_what_controllers_are_told_is_read_by_others() -> None:
     types = get_typestore(Stores.ROS2_JAZZY)
-    array: Any = types.deserialize_cdr(cdr.encode_numbers((0.5, -1.0, 2.0)), "std_msgs/msg/Float64MultiArray")
-    assert (array.data.tolist(), array.layout.dim, array.layout.data_offset) == ([0.5, -1.0, 2.0], [], 0)
+    array: Any = types.deserialize_cdr(
+        cdr.encode_numbers((0.5, -1.0, 2.0)), "std_msgs/msg/Float64MultiArray"
+    )
+    assert (array.data.tolist(), array.layout.dim, array.layout.data_offset) == (
+        [0.5, -1.0, 2.0],
+        [],
+        0,
+    )
     for names in (("a",), ("base", "elbow", "wrist_1")):
         raw = cdr.encode_trajectory(names, (0.1,) * len(names), (-0.2,) * len(names), 2_000_000)
         trajectory: Any = types.deserialize_cdr(raw, "trajectory_msgs/msg/JointTrajectory")
         [point] = trajectory.points
-        assert (trajectory.header.stamp.sec, trajectory.header.stamp.nanosec, tuple(trajectory.joint_names)) == (0, 0, names)
+        assert (
+            trajectory.header.stamp.sec,
+            trajectory.header.stamp.nanosec,
+            tuple(trajectory.joint_names),
+        ) == (0, 0, names)
         assert point.positions.tolist() == [0.1] * len(names)
         assert point.velocities.tolist() == [-0.2] * len(names)
         assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 2_000_000)
@@ -83,9 +127,15 @@ def test_what_controllers_are_told_is_read_by_others() -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ('ros2.trajectory = "/a/b"', r"\[network\] ros2_domain: none given; for /a/b one from 0 to 232 needed"),
+        (
+            'ros2.trajectory = "/a/b"',
+            r"\[network\] ros2_domain: none given; for /a/b one from 0 to 232 needed",
+        ),
         ('ros2.tf = "tf"', r"\[ros2\] tf: 'tf' given; a topic's full name, /like/this, accepted"),
-        ('ros2.hands = ["/tf:l", ""]', r"\[network\] ros2_domain: none given; for /tf one from 0 to 232 needed"),
+        (
+            'ros2.hands = ["/tf:l", ""]',
+            r"\[network\] ros2_domain: none given; for /tf one from 0 to 232 needed",
+        ),
         (
             'ros2.hands = ["/tf:l", "/tf"]',
             r"hands, entry 2: '/tf' given; a topic and a frame, like /tf:left_wrist, acc",
@@ -94,12 +144,18 @@ def test_what_controllers_are_told_is_read_by_others() -> None:
             'ros2.hands = ["/tf:l", "/tf:l"]',
             r"entry 2: '/tf:l' given; another frame than that of \[ros2\] hands, entry 1",
         ),
-        ('ros2.hands = ["", "/tf_static:l"]', r"entry 2: '/tf_static:l' given; a topic of frames that move needed"),
+        (
+            'ros2.hands = ["", "/tf_static:l"]',
+            r"entry 2: '/tf_static:l' given; a topic of frames that move needed",
+        ),
         (
             'ros2.hands = ["/tf:left_hand", ""]\nros2.tf = "/tf"',
             r"'/tf:left_hand' given, which this cell publishes its",
         ),
-        ('ros2.joints = ["elbow"]', r"\[ros2\] joints: \['elbow'\] given; those of \[joints\] names needed, in any"),
+        (
+            'ros2.joints = ["elbow"]',
+            r"\[ros2\] joints: \['elbow'\] given; those of \[joints\] names needed, in any",
+        ),
     ],
 )
 def test_controllers_that_cannot_be_told_are_refused(given: str, told: str) -> None:
@@ -109,17 +165,26 @@ def test_controllers_that_cannot_be_told_are_refused(given: str, told: str) -> N
 
 def test_what_rides_with_a_message_is_read_by_others() -> None:
     gid = ros2.gid("token")
-    assert Attachment.from_bytes(ros2.encode_attachment(3, 1_700_000_000_000_000_001, gid)) == Attachment(
-        3, 1_700_000_000_000_000_001, gid
-    )
+    assert Attachment.from_bytes(
+        ros2.encode_attachment(3, 1_700_000_000_000_000_001, gid)
+    ) == Attachment(3, 1_700_000_000_000_000_001, gid)
     assert len(ros2.encode_attachment(1, 1, gid)) == 33
 
 
 @pytest.mark.parametrize(
     ("cell", "ok"),
-    [("thirdhand", True), ("lab_1/b2", True), ("bench-2", False), ("2nd", False), ("a__b", False), ("a/", False)],
+    [
+        ("thirdhand", True),
+        ("lab_1/b2", True),
+        ("bench-2", False),
+        ("2nd", False),
+        ("a__b", False),
+        ("a/", False),
+    ],
 )
-def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(cell: str, ok: bool) -> None:
+def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(
+    cell: str, ok: bool
+) -> None:
     assert ros2.is_name(cell) == ok
     if cell.endswith("/"):
         return
@@ -128,12 +193,15 @@ def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(cel
     if ok:
         assert parse(domain, origin="cell.toml").network.ros2_domain == 0
     else:
-        with pytest.raises(SettingsError, match=r"cell\.toml: cell: .* given; with \[network\] ros2_domain names"):
+        with pytest.raises(
+            SettingsError, match=r"cell\.toml: cell: .* given; with \[network\] ros2_domain names"
+        ):
             parse(domain, origin="cell.toml")
 
 
 def test_a_domain_that_is_none_is_refused() -> None:
     with pytest.raises(
-        SettingsError, match=r"\[network\] ros2_domain: 233 given; a whole number from 0 to 232 accepted"
+        SettingsError,
+        match=r"\[network\] ros2_domain: 233 given; a whole number from 0 to 232 accepted",
     ):
         parse("network.ros2_domain = 233", origin="cell.toml")

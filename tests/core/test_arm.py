@@ -36,9 +36,19 @@ DH = (
 )
 START = np.array([0.45, -0.05, 0.35])  # [m]
 AHEAD_AND_DOWN = np.array([1.0, 0.0, -1.0]) / math.sqrt(2.0)
-POSTURE = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] at START, pointing ahead and down
+POSTURE = (
+    0.1761,
+    0.8604,
+    -0.5,
+    2.5414,
+    -0.4273,
+    -1.0823,
+    0.0,
+)  # [rad] at START, pointing ahead and down
 CELL = Settings(arm=ArmSettings(posture=POSTURE))
-LOWER, UPPER, FASTEST = (np.array(getattr(CELL.joints, name)) for name in ("lower", "upper", "velocity"))
+LOWER, UPPER, FASTEST = (
+    np.array(getattr(CELL.joints, name)) for name in ("lower", "upper", "velocity")
+)
 STILL = np.zeros(3)
 ARM = Arm(CELL, URDF)
 
@@ -47,7 +57,11 @@ def facing(direction: Vector) -> Vector:
     """A quaternion (4,) that turns +z there, the shortest way."""
     x, y, z = direction / np.linalg.norm(direction)
     quaternion = np.array([-y, x, 0.0, 1.0 + z])
-    return np.asarray(quaternion / np.linalg.norm(quaternion)) if quaternion.any() else np.array([1.0, 0.0, 0.0, 0.0])
+    return (
+        np.asarray(quaternion / np.linalg.norm(quaternion))
+        if quaternion.any()
+        else np.array([1.0, 0.0, 0.0, 0.0])
+    )
 
 
 AHEAD = facing(AHEAD_AND_DOWN)
@@ -59,7 +73,10 @@ def dh_frames(q: Vector) -> list[Vector]:
     frame[:3, 3] = CELL.reach.centre
     frames = []
     for theta, (alpha, a, d) in zip(q, DH, strict=True):
-        c, s, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
+        c = math.cos(theta)
+        s = math.sin(theta)
+        ca = math.cos(alpha)
+        sa = math.sin(alpha)
         frame = frame @ np.array(
             [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
         )
@@ -85,8 +102,12 @@ class Followed(NamedTuple):
 def follow(q: Vector, path: Vector, velocity: Vector, direction: Vector) -> Followed:
     """The tool led along a path (N, 3) with the limiter in the loop, from rest at q."""
     limiter = Limiter(CELL.joints, CELL.period_s)
-    dq, ddq = np.zeros(7), np.zeros(7)
-    errors, joints, accelerations, speed_limited = [], [], [], 0
+    dq = np.zeros(7)
+    ddq = np.zeros(7)
+    errors = []
+    joints = []
+    accelerations = []
+    speed_limited = 0
     for target, speed in zip(path, velocity, strict=True):
         solution = ARM.step(q, target, speed, facing(direction))
         q, dq, ddq, _ = limiter.step(q, dq, ddq, solution.velocity)
@@ -107,21 +128,27 @@ def test_forward_kinematics_is_as_published() -> None:
     values.
     """
     for q in random_joints(200, seed=1):
-        position, rotation = ARM.at(q).position, ARM.at(q).rotation
+        position = ARM.at(q).position
+        rotation = ARM.at(q).rotation
         expected = dh_frames(q)[-1]
         assert np.abs(position - expected[:3, 3]).max() < 1e-9
         assert np.abs(rotation - expected[:3, :3]).max() < 1e-9
     assert ARM.at(np.zeros(7)).position == pytest.approx([0, 0, 1.256])
-    assert ARM.at(np.array([0, -2, 0, 3.13, 0, 0, 0])).position == pytest.approx([-0.2125, 0, 0.3523], abs=1e-4)
+    assert ARM.at(np.array([0, -2, 0, 3.13, 0, 0, 0])).position == pytest.approx(
+        [-0.2125, 0, 0.3523], abs=1e-4
+    )
 
 
 def test_tool_sits_on_the_plate() -> None:
     """The tool sits on the plate where the settings say."""
     half = math.sqrt(0.5)
-    arm = Arm(changed(CELL, tool={"plate_from_tool": (0.01, 0.02, 0.1, 0.0, half, 0.0, half)}), URDF)
+    arm = Arm(
+        changed(CELL, tool={"plate_from_tool": (0.01, 0.02, 0.1, 0.0, half, 0.0, half)}), URDF
+    )
     q = random_joints(1, seed=2)[0]
     plate = dh_frames(q)[-1]
-    position, rotation = arm.at(q).position, arm.at(q).rotation
+    position = arm.at(q).position
+    rotation = arm.at(q).rotation
     assert position == pytest.approx(plate[:3, 3] + plate[:3, :3] @ [0.01, 0.02, 0.1], abs=1e-9)
     assert rotation[:, 2] == pytest.approx(plate[:3, 0], abs=1e-9)
 
@@ -143,7 +170,8 @@ def test_tool_velocity_is_the_derivative() -> None:
     """Tool velocity is the derivative of its position."""
     step = 1e-6
     for q, dq in zip(random_joints(50, seed=4), random_joints(50, seed=5), strict=True):
-        ahead, behind = ARM.at(q + step * dq).position, ARM.at(q - step * dq).position
+        ahead = ARM.at(q + step * dq).position
+        behind = ARM.at(q - step * dq).position
         assert ARM.at(q).tasks[:3] @ dq == pytest.approx((ahead - behind) / (2 * step), abs=1e-7)
 
 
@@ -153,7 +181,9 @@ def test_position_has_priority_over_direction() -> None:
         assert wait(np.array(POSTURE), START, direction, seconds=5.0).error[-1] < 1e-4
 
 
-@pytest.mark.parametrize("target", [(2.0, 0, 0.5), (0, 0.5, 3.0), (50.0, 50, 0), (0.05, 0, 0.4), (0.3, 0, -3.0)])
+@pytest.mark.parametrize(
+    "target", [(2.0, 0, 0.5), (0, 0.5, 3.0), (50.0, 50, 0), (0.05, 0, 0.4), (0.3, 0, -3.0)]
+)
 def test_unreachable_target_causes_no_chatter(target: tuple[float, float, float]) -> None:
     """A target out of reach does not make the arm chatter."""
     run = wait(np.array(POSTURE), np.array(target), AHEAD_AND_DOWN, seconds=8.0)
@@ -184,7 +214,10 @@ def test_joint_slows_toward_its_limit() -> None:
         q[3] = LOWER[3] + distance
         outward = ARM.at(q).tasks[:3] @ np.array([0, 0, 0, -1.0, 0, 0, 0])
         solution = ARM.step(q, ARM.at(q).position, outward, AHEAD)
-        assert solution.velocity[3] >= -max(distance, 0.0) * 0.5 * CELL.joints.acceleration[3] / FASTEST[3] - 1e-9
+        assert (
+            solution.velocity[3]
+            >= -max(distance, 0.0) * 0.5 * CELL.joints.acceleration[3] / FASTEST[3] - 1e-9
+        )
         assert solution.near_limit == (distance < 0.1)
 
 
@@ -203,7 +236,8 @@ def test_fast_task_is_scaled() -> None:
 
 
 def numbers(size: int) -> st.SearchStrategy[Vector]:
-    usual, any_finite = st.floats(-3, 3), st.floats(allow_nan=False, allow_infinity=False)
+    usual = st.floats(-3, 3)
+    any_finite = st.floats(allow_nan=False, allow_infinity=False)
     return st.tuples(*[st.one_of(usual, any_finite)] * size).map(np.array)
 
 

@@ -23,22 +23,29 @@ SETTINGS = Settings()
 POSTURE = SETTINGS.arm.posture
 ELSEWHERE = (POSTURE[0] + 1.2, *POSTURE[1:])
 HOUR_NS = 3600 * 10**9
-LOWER, UPPER = np.array(SETTINGS.joints.lower), np.array(SETTINGS.joints.upper)
+LOWER = np.array(SETTINGS.joints.lower)
+UPPER = np.array(SETTINGS.joints.upper)
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "10"))
 
 
 def rejected(loop: Loop) -> dict[Cause, int]:
     """How many samples were rejected, by cause."""
-    return {cause: int(n) for cause, n in zip(Cause, loop.steps[-1][1]["rejected"], strict=True) if n}
+    return {
+        cause: int(n) for cause, n in zip(Cause, loop.steps[-1][1]["rejected"], strict=True) if n
+    }
 
 
 @pytest.mark.parametrize("ahead_ns", [10**9, HOUR_NS])
 @pytest.mark.parametrize("posture", [POSTURE, ELSEWHERE])
-def test_one_state_ahead_changes_nothing(skill: Skill, ahead_ns: int, posture: tuple[float, ...]) -> None:
+def test_one_state_ahead_changes_nothing(
+    skill: Skill, ahead_ns: int, posture: tuple[float, ...]
+) -> None:
     """A single state with a stamp ahead causes no fault, no motion and no later rejection."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
-    frames = loop.run(1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5)
+    frames = loop.run(
+        1000, {3: arm(posture, stamp_ns(503) + ahead_ns), 200: order("reset")}, every=5
+    )
     assert set(frames["reason"].tolist()) == {Reason.NONE}
     assert rejected(loop) == {Cause.AHEAD: 1}
     assert_limits_hold(loop.frames)
@@ -49,9 +56,13 @@ def test_state_ahead_is_no_start_after_reset(skill: Skill) -> None:
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     shifted_rad = tuple(q + 0.15 for q in loop.joints)
-    fault = loop.run(300, {k: arm(shifted_rad, stamp_ns(500 + k)) for k in range(0, 300, 5)}, every=0)
+    fault = loop.run(
+        300, {k: arm(shifted_rad, stamp_ns(500 + k)) for k in range(0, 300, 5)}, every=0
+    )
     assert fault["reason"][-1] == Reason.ARM_ERROR
-    frames = loop.run(600, {10: arm(ELSEWHERE, stamp_ns(810) + HOUR_NS), 11: order("reset")}, every=5)
+    frames = loop.run(
+        600, {10: arm(ELSEWHERE, stamp_ns(810) + HOUR_NS), 11: order("reset")}, every=5
+    )
     assert frames["mode"][-1] == Mode.FOLLOW
     assert np.abs(frames["joints"][:, 0] - loop.frames[799]["joints"][0]).max() < 0.2
     assert_limits_hold(frames)
@@ -62,7 +73,9 @@ def test_state_ahead_is_no_start_after_reset(skill: Skill) -> None:
 def test_two_arms_in_turns_are_not_ready(skill: Skill, every: int) -> None:
     """Two alternating arms do not count as ready."""
     loop = Loop(SETTINGS, skill)
-    frames = loop.run(2000, {k: arm(ELSEWHERE, stamp_ns(k) + 1) for k in range(0, 2000, every)}, every=5)
+    frames = loop.run(
+        2000, {k: arm(ELSEWHERE, stamp_ns(k) + 1) for k in range(0, 2000, every)}, every=5
+    )
     assert not frames["commanded"].any()
     assert frames["reason"][-1] == Reason.TWO_SOURCES
     assert rejected(loop)[Cause.JUMPED] > 300
@@ -72,7 +85,9 @@ def test_second_arm_is_refused_while_following(skill: Skill) -> None:
     """A second arm while following is refused and holds until it ends."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
-    frames = loop.run(1500, {k: arm(ELSEWHERE, stamp_ns(500 + k) + 1) for k in range(0, 1500, 5)}, every=5)
+    frames = loop.run(
+        1500, {k: arm(ELSEWHERE, stamp_ns(500 + k) + 1) for k in range(0, 1500, 5)}, every=5
+    )
     assert set(frames["reason"].tolist()) == {Reason.NONE, Reason.TWO_SOURCES}
     assert frames["commanded"].all()
     assert np.abs(frames["joints"] - frames["joints"][0]).max() < 0.1
@@ -93,7 +108,9 @@ def test_joint_that_jumps_is_refused_then_faults(skill: Skill) -> None:
     assert_limits_hold(frames)
 
 
-@pytest.mark.parametrize(("joint", "value"), [(0, 2.6 + 0.15), (3, -0.9 - 0.05), (5, 1.5707 + 1e-4)])
+@pytest.mark.parametrize(
+    ("joint", "value"), [(0, 2.6 + 0.15), (3, -0.9 - 0.05), (5, 1.5707 + 1e-4)]
+)
 def test_arm_outside_limits_is_brought_back(skill: Skill, joint: int, value: float) -> None:
     """An arm a little outside its limits is brought back and then followed."""
     start = list(POSTURE)
@@ -106,7 +123,9 @@ def test_arm_outside_limits_is_brought_back(skill: Skill, joint: int, value: flo
     outside = ((sent["joints"] < LOWER) | (sent["joints"] > UPPER)).any(axis=1)
     assert set(sent["reason"][outside].tolist()) == {Reason.ARM_NOT_READY}
     assert np.abs(sent["joint_velocities"][outside]).max() < 0.11
-    assert (np.diff(np.maximum(sent["joints"] - UPPER, LOWER - sent["joints"])[outside][60:, joint]) < 0).all()
+    assert (
+        np.diff(np.maximum(sent["joints"] - UPPER, LOWER - sent["joints"])[outside][60:, joint]) < 0
+    ).all()
     assert frames["mode"][-1] == Mode.FOLLOW
 
 
@@ -156,13 +175,18 @@ STRANGERS = st.tuples(
 @example_settings(max_examples=MANY, deadline=None, derandomize=True)
 @given(STRANGERS, st.lists(st.integers(0, 1500), max_size=6), st.integers(1, 20))
 def test_no_stranger_makes_a_command_jump(
-    skill: Skill, stranger: tuple[int, int, int, list[float], int, int], resets: list[int], every: int
+    skill: Skill,
+    stranger: tuple[int, int, int, list[float], int, int],
+    resets: list[int],
+    every: int,
 ) -> None:
     period, phase, offset_ns, shift_rad, begin, count = stranger
     loop = Loop(SETTINGS, replace(skill, threshold=np.inf))
     other = tuple((np.clip(np.array(POSTURE) + shift_rad, LOWER - 0.1, UPPER + 0.1)).tolist())
     events: dict[int, Event] = {
-        k: arm(other, stamp_ns(k) + offset_ns) for k in range(begin, begin + count) if k % period == phase % period
+        k: arm(other, stamp_ns(k) + offset_ns)
+        for k in range(begin, begin + count)
+        if k % period == phase % period
     }
     loop.run(1600, events | {k: order("reset") for k in resets}, every=every)
     frames = loop.frames
@@ -171,5 +195,9 @@ def test_no_stranger_makes_a_command_jump(
     begins = np.flatnonzero(np.diff(frames["commanded"].astype(int)) == 1) + 1
     real = [k for k in range(1600) if k % every == 0]
     for k in begins:
-        if np.abs(frames["joints"][k] - other).max() < 0.02 < np.abs(np.array(other) - POSTURE).max():
+        if (
+            np.abs(frames["joints"][k] - other).max()
+            < 0.02
+            < np.abs(np.array(other) - POSTURE).max()
+        ):
             assert not [r for r in real if k - 40 <= r <= k], "adopted while the arm was heard"

@@ -35,7 +35,9 @@ def assert_every_bound_is_kept(seed: int, arm: str, *, engages: bool) -> None:
     happened = "\n  ".join(played.what_happens)
     passed = "\n  ".join(broken(played.session))
     assert not passed, f"seed {seed}\n  {passed}\nIn this session:\n  {happened}"
-    assert not played.replayed_otherwise, f"seed {seed}: played again, frames differ {played.replayed_otherwise}"
+    assert not played.replayed_otherwise, (
+        f"seed {seed}: played again, frames differ {played.replayed_otherwise}"
+    )
 
 
 @pytest.mark.timeout(600)
@@ -47,7 +49,9 @@ def test_bounds_hold_in_drawn_sessions(arm: str, seed: int) -> None:
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], 500 + seed) for seed in SEEDS[:9]])
+@pytest.mark.parametrize(
+    ("arm", "seed"), [(ARMS[seed % len(ARMS)], 500 + seed) for seed in SEEDS[:9]]
+)
 @pytest.mark.one_case
 def test_bounds_hold_with_engaging_and_clutch(arm: str, seed: int) -> None:
     """Every bound is kept while the setpoint engages and a clutch chatters."""
@@ -97,10 +101,15 @@ def test_a_bound_that_is_passed_is_found(kept: Session, bound: Bound) -> None:
 
 def test_entered_clearance_is_found(kept: Session) -> None:
     """A part in a clearance and a setpoint that leaves are found."""
-    low, folded, frames = kept.placed.copy(), kept.placed.copy(), kept.frames.copy()
+    low = kept.placed.copy()
+    folded = kept.placed.copy()
+    frames = kept.frames.copy()
     low[-100:, :, :, 2] -= 1.0
     folded[-100:] = folded[-100:, :1]
-    for bound, placed in ((bounds.arm_keeps_clear_of_the_table, low), (bounds.arm_keeps_clear_of_itself, folded)):
+    for bound, placed in (
+        (bounds.arm_keeps_clear_of_the_table, low),
+        (bounds.arm_keeps_clear_of_itself, folded),
+    ):
         spoiled = replace(kept)
         spoiled.__dict__["placed"] = placed
         assert bound(spoiled).max() > 0.0
@@ -113,9 +122,12 @@ def test_entered_clearance_is_found(kept: Session) -> None:
 def test_parts_and_tool_are_where_pinocchio_has_them(arm: str) -> None:
     random = np.random.default_rng(1)
     settings = drawn_cell(random, arm)
-    urdf, tool = robot_description(settings), np.array(settings.tool.plate_from_tool[:3])
-    geometry, model = ArmGeometry(settings, urdf), pin.buildModelFromXML(urdf)
-    data, plate = model.createData(), model.getFrameId(settings.arm.plate)
+    urdf = robot_description(settings)
+    tool = np.array(settings.tool.plate_from_tool[:3])
+    geometry = ArmGeometry(settings, urdf)
+    model = pin.buildModelFromXML(urdf)
+    data = model.createData()
+    plate = model.getFrameId(settings.arm.plate)
     joints = [model.getJointId(name) for name in settings.joints.names]
     postures = random.uniform(settings.joints.lower, settings.joints.upper, (50, len(joints)))
     capsules, tools = geometry.place(postures)
@@ -128,5 +140,9 @@ def test_parts_and_tool_are_where_pinocchio_has_them(arm: str) -> None:
         pin.framesForwardKinematics(model, data, full)
         np.testing.assert_allclose(position_m, data.oMf[plate].act(tool), atol=1e-9)
         for link, moved, still in zip(geometry.links, ends, at_zero[0], strict=True):
-            place = data.oMi[joints[link - 1]] * zero[link - 1].inverse() if link else pin.SE3.Identity()
+            place = (
+                data.oMi[joints[link - 1]] * zero[link - 1].inverse()
+                if link
+                else pin.SE3.Identity()
+            )
             np.testing.assert_allclose(moved, [place.act(end) for end in still], atol=1e-9)

@@ -48,7 +48,9 @@ def reasons(settings: Settings, skill: Skill, ticks: list[Tick]) -> np.ndarray:
 def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
     """The arm holds from the tick in which the release arrives."""
     release = rate_hz
-    ticks = resting(0, 2 * rate_hz, at({release: clutch(False)}, every=rate_hz // SENT_HZ), every=rate_hz // 100)
+    ticks = resting(
+        0, 2 * rate_hz, at({release: clutch(False)}, every=rate_hz // SENT_HZ), every=rate_hz // 100
+    )
     reason = reasons(cell(rate_hz=rate_hz), taught, ticks)
     assert (reason[:release] == Reason.NONE).all()
     assert (reason[release:] == Reason.CLUTCH).all()
@@ -58,7 +60,9 @@ def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
 def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
     """A clutch whose messages cease counts as released."""
     pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
-    reason = reasons(cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100))
+    reason = reasons(
+        cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100)
+    )
     silent = 10 + round(STALE_S * rate_hz)
     assert (reason[:silent] == Reason.NONE).all()
     assert (reason[silent:] == Reason.CLUTCH).all()
@@ -66,7 +70,10 @@ def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
 
 def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
     ticks = resting(0, 20, lambda k: (clutch(True),) if k == 0 else ())
-    late = [Tick(k, tick.inbox) for k, tick in zip(range(149, 169), resting(20, 20, every=1), strict=True)]
+    late = [
+        Tick(k, tick.inbox)
+        for k, tick in zip(range(149, 169), resting(20, 20, every=1), strict=True)
+    ]
     reason = reasons(cell(), taught, [*ticks, *late])
     assert (reason[:21] == Reason.NONE).all()  # tick 149 is the last one
     assert (reason[21:] == Reason.CLUTCH).all()
@@ -113,9 +120,18 @@ def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
     wishes = cell(gripper="key")
     events = {50: wish(0.2), 350: wish(0.7), 400: wish(0.95), 420: wish(0.0)}
     states = gripper(wishes, taught, events)
-    assert [states[k] for k in (49, 50, 399, 400, 420, 649)] == [UNKNOWN, OPEN, OPEN, CLOSED, CLOSED, CLOSED]
+    assert [states[k] for k in (49, 50, 399, 400, 420, 649)] == [
+        UNKNOWN,
+        OPEN,
+        OPEN,
+        CLOSED,
+        CLOSED,
+        CLOSED,
+    ]
     assert states[650:] == [OPEN] * 250  # half a second after it began to close
-    held = gripper(wishes, taught, {50: wish(0.2), 390: order("hold"), 400: wish(1.0), 500: order("resume")})
+    held = gripper(
+        wishes, taught, {50: wish(0.2), 390: order("hold"), 400: wish(1.0), 500: order("resume")}
+    )
     assert held[50:500] == [OPEN] * 450
     assert held[500:] == [CLOSED] * 400
 

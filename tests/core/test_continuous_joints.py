@@ -37,7 +37,8 @@ def turns_on(cell: Settings) -> Vector:
 def session(cell: Settings, skill: Skill, counts: Counts, start: Vector) -> Loop:
     """A loop whose arm reports its joints as `counts` says, with the hands of a scene."""
     loop = Loop(cell, skill, start)
-    loop.hands, loop.reports = script_hands(HandScript(Scene(), seed=3)), lambda q, dq: (counts(q), dq)
+    loop.hands = script_hands(HandScript(Scene(), seed=3))
+    loop.reports = lambda q, dq: (counts(q), dq)
     return loop
 
 
@@ -73,7 +74,14 @@ def test_task_crosses_the_seam(reference: Vector) -> None:
 
 @pytest.mark.parametrize(
     ("turns", "how"),
-    [(0, "counted"), (1, "counted"), (-3, "counted"), (-900, "counted"), (0, "wrapped"), (40, "wrapped")],
+    [
+        (0, "counted"),
+        (1, "counted"),
+        (-3, "counted"),
+        (-900, "counted"),
+        (0, "wrapped"),
+        (40, "wrapped"),
+    ],
 )
 @pytest.mark.one_case
 def test_any_turn_is_followed_alike(
@@ -87,7 +95,9 @@ def test_any_turn_is_followed_alike(
     np.testing.assert_allclose(sent[0], counts(start), atol=1e-3)
     assert_limits_hold(frames, cell)
     in_turn = sent - TURN * np.rint((sent - reference) / TURN)
-    np.testing.assert_allclose(in_turn, reference, atol=1e-3)  # rounding differs by the turn, and grows
+    np.testing.assert_allclose(
+        in_turn, reference, atol=1e-3
+    )  # rounding differs by the turn, and grows
     assert np.ptp(np.rint((sent - reference) / TURN), axis=0).max() == 0.0
     assert not frames["rejected"][-1].any()
 
@@ -107,7 +117,9 @@ def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_
 
 def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
     """A silence of the longest accepted duration changes no turn."""
-    loop = session(cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05)  # beyond the seam
+    loop = session(
+        cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05
+    )  # beyond the seam
     loop.joints[0] = math.pi + 0.01
     for k in range(1500):
         loop.step(is_heard=k <= 300 or k % 50 == 0)
@@ -133,7 +145,9 @@ def test_narrow_limits_hold_in_their_turn(tmp_path: Path, skill: Skill) -> None:
     cell = continuous_cell(tmp_path)
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     limits = "lower = [2.0, -6.0, -3.0, -6.0, -6.0, -6.0]\nupper = [4.0, 6.0, 3.0, 6.0, 6.0, 6.0]"
-    (tmp_path / "cell.toml").write_text(text.replace("[joints]", f"[joints]\n{limits}"), encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(
+        text.replace("[joints]", f"[joints]\n{limits}"), encoding="utf-8"
+    )
     narrow = load(tmp_path / "cell.toml")
     assert narrow.joints.lower[0] == 2.0
     assert cell.joints.lower[0] == -6000.0

@@ -59,12 +59,16 @@ def test_demonstrated_relation_with_little_tremor() -> None:
     script = HandScript(Scene(), seed=6)
     trace = followed(taught, ticks_of(script))
     time_s = np.arange(len(trace)) * PERIOD_S - 1.5
-    hands = np.array([np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s])
+    hands = np.array(
+        [np.concatenate([m.position for m in script.truth(max(0.0, t))]) for t in time_s]
+    )
     ideal = taught.mean(hands)
     inner = slice(750, -100)
     error = np.linalg.norm(trace["tool"][inner] - ideal[inner], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.014
-    speed, ideal_speed = (np.linalg.norm(np.gradient(x, PERIOD_S, axis=0), axis=1) for x in (trace["tool"], ideal))
+    speed, ideal_speed = (
+        np.linalg.norm(np.gradient(x, PERIOD_S, axis=0), axis=1) for x in (trace["tool"], ideal)
+    )
     score = [float(ideal_speed[inner] @ np.roll(speed, -shift)[inner]) for shift in range(-40, 41)]
     assert (int(np.argmax(score)) - 40) * PERIOD_S <= 0.075
     shaken = trace["tool"][-150:]
@@ -91,7 +95,10 @@ def test_first_setpoint_is_at_the_tool(taught: Skill) -> None:
 
 def unseen(ticks: Iterable[Tick], when: range, *kinds: str) -> list[Tick]:
     """Ticks without the samples of these kinds at that time."""
-    return [Tick(t.index, tuple(e for e in t.inbox if not (e.kind in kinds and t.index in when))) for t in ticks]
+    return [
+        Tick(t.index, tuple(e for e in t.inbox if not (e.kind in kinds and t.index in when)))
+        for t in ticks
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +113,12 @@ def without(unseen_ms: float) -> Settings:
     return changed(ASSUMED, hands={"unseen_ms": unseen_ms})
 
 
-@pytest.mark.parametrize(("side", "most"), [("left", 1.0), ("right", 0.6)], ids=["it conducts", "the other does"])
-def test_tool_moves_while_one_hand_is_unseen(taught: Skill, moving: Session, side: str, most: float) -> None:
+@pytest.mark.parametrize(
+    ("side", "most"), [("left", 1.0), ("right", 0.6)], ids=["it conducts", "the other does"]
+)
+def test_tool_moves_while_one_hand_is_unseen(
+    taught: Skill, moving: Session, side: str, most: float
+) -> None:
     """The tool keeps moving while one hand is out of sight for a moment."""
     ticks, whole = moving
     away = range(3300, 3500)
@@ -116,7 +127,8 @@ def test_tool_moves_while_one_hand_is_unseen(taught: Skill, moving: Session, sid
     assert modes(going[1:]) == [("follow", "none")]
     assert modes(held[1:]) == [("follow", "none"), ("hold", "stale_hand"), ("follow", "none")]
     deviation_m, off_held = (
-        np.linalg.norm(trace["tool"] - whole["tool"][: len(trace)], axis=1)[away.start :].max() for trace in (going, held)
+        np.linalg.norm(trace["tool"] - whole["tool"][: len(trace)], axis=1)[away.start :].max()
+        for trace in (going, held)
     )
     assert deviation_m < most * off_held
 
@@ -126,7 +138,11 @@ def test_waits_for_an_unseen_hand_that_matters(taught: Skill, moving: Session) -
     ticks = unseen(moving[0][:2400], range(1650, 2400), "hands/left")
     trace = followed(taught, ticks, without(1000.0))
     assert modes(trace[1:]) == [("follow", "none"), ("hold", "stale_hand")]
-    needed = np.flatnonzero(trace["reason"] == Reason.STALE_HAND)[-1] + 1 - np.sum(trace["reason"] == Reason.STALE_HAND)
+    needed = (
+        np.flatnonzero(trace["reason"] == Reason.STALE_HAND)[-1]
+        + 1
+        - np.sum(trace["reason"] == Reason.STALE_HAND)
+    )
     assert 1650 + 50 < needed < 1650 + 490
     assert (trace["flags"][needed - 1] & Flag.UNSURE) > 0
 
@@ -162,7 +178,11 @@ def test_far_hands_are_held_with_hysteresis(taught: Skill) -> None:
     hands = np.tile((LEFT, RIGHT), (1600, 1, 1))
     hands[400:800, 0, 2] += 0.5
     trace = followed(taught, led(hands))
-    assert modes(trace[1:]) == [("follow", "none"), ("hold", "far_from_demonstrations"), ("follow", "none")]
+    assert modes(trace[1:]) == [
+        ("follow", "none"),
+        ("hold", "far_from_demonstrations"),
+        ("follow", "none"),
+    ]
 
 
 def test_an_operator_holds_and_resumes(taught: Skill) -> None:
@@ -222,7 +242,8 @@ def test_a_tool_measured_too_fast_is_a_fault(loop: Loop) -> None:
 
 def test_reset_waits_for_rest(taught: Skill) -> None:
     """A reset while the arm still moves lets it come to rest first."""
-    loop, was_fault = Loop(Settings(), taught), False
+    loop = Loop(Settings(), taught)
+    was_fault = False
     loop.hands = script_hands(HandScript(Scene(), seed=11), wait_s=0.5)
     for k in range(3000):
         velocity = 9.0 if 1400 <= k < 1420 else 0.0
@@ -243,9 +264,16 @@ def test_reset_without_fault_changes_nothing(taught: Skill) -> None:
 
 def test_new_skill_is_approached_within_limits(skill: Skill, taught: Skill) -> None:
     """A new skill is adopted at its tick and approached within the limits."""
-    moved = adapted(skill, Scene(handover=(0.66, -0.22, 0.33), glass=(0.45, 0.30, 0.2)).via_points(), tolerance=0.05)
+    moved = adapted(
+        skill,
+        Scene(handover=(0.66, -0.22, 0.33), glass=(0.45, 0.30, 0.2)).via_points(),
+        tolerance=0.05,
+    )
     controller = Controller(ASSUMED, taught, urdf=URDF)
-    trace = frames(controller, resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()))
+    trace = frames(
+        controller,
+        resting(0, 1500, lambda k: (Event("skill", moved.file, moved),) if k == 700 else ()),
+    )
     assert controller.skill is moved
     assert controller.state["skill"].tobytes() == moved.digest
     assert_limits_hold(trace)
@@ -289,15 +317,23 @@ def test_frames_are_read_only(taught: Skill) -> None:
     frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
     with pytest.raises(ValueError, match="read-only"):
         frame["joints"][0] = 1.0
-    assert definitions(7)["thirdhand/Frame"].startswith("int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n")
+    assert definitions(7)["thirdhand/Frame"].startswith(
+        "int64 tick\nint64 hand_stamp_ns\nfloat64[6] hands\n"
+    )
 
 
 def test_every_event_has_a_case(taught: Skill) -> None:
     """Every kind of event has a case and any other is refused."""
     controller = Controller(ASSUMED, taught, urdf=URDF)
     for index, kind in enumerate(channels.EVENT_NUMBERS):
-        values = {"hands": hand("left", LEFT, 1).value, "joints": arm(POSTURE, 1).value, "skill": taught}
-        controller.step(Tick(index, (Event(kind, order(kind).payload, values.get(kind.split("/")[0])),)))
+        values = {
+            "hands": hand("left", LEFT, 1).value,
+            "joints": arm(POSTURE, 1).value,
+            "skill": taught,
+        }
+        controller.step(
+            Tick(index, (Event(kind, order(kind).payload, values.get(kind.split("/")[0])),))
+        )
     with pytest.raises(ValueError, match="nothing is done with an event of kind 'pedal'"):
         controller.step(Tick(100, (Event("pedal", b"", None),)))
 

@@ -19,7 +19,13 @@ from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.core.frame import Event, Tick, Vector, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
-from thirdhand.settings.config import Settings, SettingsError, ToolSettings, parse, robot_description
+from thirdhand.settings.config import (
+    Settings,
+    SettingsError,
+    ToolSettings,
+    parse,
+    robot_description,
+)
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -36,7 +42,9 @@ inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.
 wild = st.tuples(*(st.floats(-1e3, 1e3),) * 3)
 
 
-def cell(base: Settings = ASSUMED, rate_hz: int = 500, engage_speed: float = E, **hands: Any) -> Settings:
+def cell(
+    base: Settings = ASSUMED, rate_hz: int = 500, engage_speed: float = E, **hands: Any
+) -> Settings:
     return changed(base, rate_hz=rate_hz, tool={"engage_speed": engage_speed}, hands=hands)
 
 
@@ -44,7 +52,9 @@ def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
     """Ticks of the script in which the arm is held until the hands are on their way."""
     orders = {0: order("hold"), RESUMED: order("resume")}
     for tick in ticks_of(script, wait_s=0.0, tail_s=tail_s):
-        yield Tick(tick.index, (*tick.inbox, *([orders[tick.index]] if tick.index in orders else [])))
+        yield Tick(
+            tick.index, (*tick.inbox, *([orders[tick.index]] if tick.index in orders else []))
+        )
 
 
 def engages(seen: np.ndarray) -> np.ndarray:
@@ -74,14 +84,18 @@ def test_tool_engages_slowly_after_a_hold(
     hands, targets = reached
     between = np.linalg.norm(targets[:, None] - targets, axis=2)
     before, after = np.unravel_index(np.abs(between - apart_m).argmin(), between.shape)
-    start_s, hold_s, resume_s, end_s = 0.0, 5.5, 6.5, 12.5
+    start_s = 0.0
+    hold_s = 5.5
+    resume_s = 6.5
+    end_s = 12.5
     orders = {round(hold_s * rate_hz): order("hold"), round(resume_s * rate_hz): order("resume")}
     moved = round((hold_s + 0.5) * rate_hz)
     path = (hands[before] if k < moved else hands[after] for k in range(round(end_s * rate_hz)))
     settings = cell(rate_hz=rate_hz)
     ticks = led(path, lambda k: (orders[k],) if k in orders else (), every=rate_hz // 100)
     frames = followed(taught, ticks, settings)
-    slow, speed = engages(frames), tool_speeds(settings, frames)
+    slow = engages(frames)
+    speed = tool_speeds(settings, frames)
     assert np.linalg.norm(frames["setpoint_velocity"][slow], axis=1).max() <= E
     assert speed[slow].max() <= E + TOOL_RISE_MPS
     for begin_s in (start_s, resume_s):
@@ -90,7 +104,9 @@ def test_tool_engages_slowly_after_a_hold(
         lasts = int(np.argmin(slow[first:]))
         gap = float(np.linalg.norm(frames["target"][first] - frames["tool"][first]))
         assert lasts / rate_hz <= 0.4 + max(gap - ENGAGED_GAP_M, 0.0) / (0.95 * E)
-        assert not slow[first + lasts : round(hold_s * rate_hz) if begin_s == start_s else None].any(), "engaged once"
+        assert not slow[
+            first + lasts : round(hold_s * rate_hz) if begin_s == start_s else None
+        ].any(), "engaged once"
     assert np.linalg.norm(frames["tool"][-1] - frames["target"][-1]) < 0.005
 
 
@@ -113,7 +129,9 @@ def test_brief_hold_by_hands_does_not_engage(
     loop.hands = lambda k: RAISED
     assert not engages(loop.run(3000))[-1]
     loop.hands = None
-    unseen = loop.run(round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()})
+    unseen = loop.run(
+        round(unseen_s / PERIOD_S), {round(s / PERIOD_S): order(name) for s, name in orders.items()}
+    )
     assert unseen["mode"][-1] != Mode.FOLLOW
     loop.hands = lambda k: np.array((LEFT, RIGHT))
     frames = loop.run(1000)
@@ -129,7 +147,8 @@ def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
     loop = Loop(cell(Settings(), engage_speed=0.02), taught)
     loop.hands = lambda k: RAISED
     assert engages(loop.run(1000))[-1]
-    moving, loop.hands = loop.hands, None
+    moving = loop.hands
+    loop.hands = None
     assert loop.run(150)["mode"][-1] == Mode.HOLD
     loop.hands = moving
     frames = loop.run(500)
@@ -141,7 +160,8 @@ def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
 @pytest.mark.parametrize("what", ["resume", "clutch"])
 def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) -> None:
     """At random, for one tick up to a third of a second, while the hands move."""
-    random, count = np.random.default_rng(rate_hz), 3 * rate_hz
+    random = np.random.default_rng(rate_hz)
+    count = 3 * rate_hz
     lengths = np.maximum(1, (rate_hz * 10 ** random.uniform(-3, -0.5, count)).astype(int))
     is_on = np.repeat(np.arange(count) % 2 == 0, lengths)[:count]
     messages: Callable[[int], tuple[Event, ...]] = {
@@ -157,7 +177,8 @@ def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) 
     assert not (frames["mode"] == Mode.FAULT).any()
     held = frames["reason"] == {"resume": Reason.OPERATOR, "clutch": Reason.CLUTCH}[what]
     assert np.array_equal(held, ~is_on)
-    speed, slow = np.linalg.norm(frames["setpoint_velocity"], axis=1), engages(frames)
+    speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
+    slow = engages(frames)
     follows = (frames["mode"] == Mode.FOLLOW)[:-1] & slow[1:]
     assert (speed[1:] <= np.maximum(E, speed[:-1]) + 1e-9)[follows].all()
 
@@ -175,15 +196,21 @@ def test_engaging_setpoint_keeps_its_bounds(
     """From any speed, toward any target; `driven` asserts the bounds of the position."""
     tool = ToolSettings(engage_speed=engage_speed)
     start = np.array([MIDDLE, (speed, 0.0, 0.0), (0.0, 0.0, 0.0)])
-    targets = [np.array(target) for target in told for _ in range(ticks)] + [at_rest(told[-1][0])] * 10
+    targets = [np.array(target) for target in told for _ in range(ticks)] + [
+        at_rest(told[-1][0])
+    ] * 10
     states, _ = driven(targets, start=start, tool=tool)
     speeds = np.linalg.norm(states[:, 1], axis=1)
-    near = np.linalg.norm(states[:-1, 0] - [target[0] for target in targets], axis=1) < ENGAGED_GAP_M
+    near = (
+        np.linalg.norm(states[:-1, 0] - [target[0] for target in targets], axis=1) < ENGAGED_GAP_M
+    )
     end = int(np.argmax(near)) if near.any() else len(near)
     assert (speeds[1 : end + 1] <= np.maximum(speeds[:end], engage_speed) + 1e-9).all()
     assert speeds.max() <= tool.max_speed + 1e-9
     assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
-    assert np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
+    assert (
+        np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
+    )
 
 
 def test_turn_is_slowed_in_proportion(taught: Skill) -> None:
@@ -208,7 +235,11 @@ def test_without_engage_speed_nothing_engages(taught: Skill) -> None:
     [
         ("engage_speed = 0.1\nmax_speed = 0.1", 0.1, ""),
         ("max_speed = 0.1", 0.1, ""),
-        ("engage_speed = 0.3\nmax_speed = 0.25", 0.0, r"engage_speed: 0.3 given; at most .*max_speed = 0.25 accepted"),
+        (
+            "engage_speed = 0.3\nmax_speed = 0.25",
+            0.0,
+            r"engage_speed: 0.3 given; at most .*max_speed = 0.25 accepted",
+        ),
         ("engage_speed = -0.1", 0.0, "engage_speed"),
     ],
 )

@@ -9,10 +9,14 @@ import pytest
 from support.setpoints import FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 
 
-@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)])
+@pytest.mark.parametrize(
+    "direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.577, 0.577, -0.577), (0.9, 0.1, -0.3)]
+)
 @pytest.mark.parametrize("distance_m", [0.01, 0.1, 0.3])
 @pytest.mark.one_case
-def test_jump_is_approached_without_overshoot(direction: tuple[float, ...], distance_m: float) -> None:
+def test_jump_is_approached_without_overshoot(
+    direction: tuple[float, ...], distance_m: float
+) -> None:
     """A jump is approached without overshoot."""
     offset_m = distance_m * np.array(direction) / np.linalg.norm(direction)
     states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + offset_m)] * 2000)
@@ -24,17 +28,22 @@ def test_jump_is_approached_without_overshoot(direction: tuple[float, ...], dist
 @pytest.mark.parametrize(("acceleration", "jerk"), [(5.0, 120.0), (7.5, 170.0), (10.0, 231.0)])
 def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: float) -> None:
     """After a hard stop it does not swing back."""
-    costs, direction = FREE.copy(), np.array([0.6, -0.8, 0.0])
+    costs = FREE.copy()
+    direction = np.array([0.6, -0.8, 0.0])
     for joint in range(3):
-        costs[1, joint, joint], costs[2, joint, joint] = 1 / acceleration, 1 / jerk
+        costs[1, joint, joint] = 1 / acceleration
+        costs[2, joint, joint] = 1 / jerk
     time_s = np.arange(-500, 400) * PERIOD_S
     velocity = speed * np.clip(1.0 - time_s / 0.02, 0.0, 1.0)
     position = np.cumsum(velocity[::-1])[::-1] * -PERIOD_S
     braking = np.where((time_s > 0.0) & (time_s < 0.02), -speed / 0.02, 0.0)
     targets = [
-        np.array([MIDDLE + direction * x, direction * v, direction * a]) for x, v, a in zip(position, velocity, braking, strict=True)
+        np.array([MIDDLE + direction * x, direction * v, direction * a])
+        for x, v, a in zip(position, velocity, braking, strict=True)
     ]
-    states, _ = driven(targets, costs=costs, start=np.array([targets[0][0], targets[0][1], (0.0,) * 3]))
+    states, _ = driven(
+        targets, costs=costs, start=np.array([targets[0][0], targets[0][1], (0.0,) * 3])
+    )
     overshoot_m = ((states[:, 0] - MIDDLE) @ direction)[500:]
     after = overshoot_m[overshoot_m.argmax() :]
     assert after.min() > -0.002
@@ -44,7 +53,9 @@ def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: 
 # --- quiet motion ------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("rate_hz", "max_jerk"), [(500, 5.0), (500, 2.0), (250, 1.0), (100, 50.0), (50, 20.0)])
+@pytest.mark.parametrize(
+    ("rate_hz", "max_jerk"), [(500, 5.0), (500, 2.0), (250, 1.0), (100, 50.0), (50, 20.0)]
+)
 def test_comes_to_rest_at_any_rate_and_jerk(rate_hz: int, max_jerk: float) -> None:
     """The setpoint comes to rest at any jerk limit and loop rate."""
     tool = msgspec.structs.replace(TOOL, max_jerk=max_jerk)
@@ -63,14 +74,25 @@ def test_comes_to_rest_at_any_rate_and_jerk(rate_hz: int, max_jerk: float) -> No
         np.testing.assert_allclose(states[-1, 0], MIDDLE + offset_m, atol=1e-4)
 
 
-@pytest.mark.parametrize(("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)])
+@pytest.mark.parametrize(
+    ("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)]
+)
 def test_fast_oscillation_is_still_met(brake: float, hz: float, most_m: float) -> None:
     """Without a stop planned before the target's own speed it would run 120 to 200 mm off."""
-    costs, rate, far = FREE.copy(), 2.0 * np.pi * hz, np.array([0.12 if hz < 1.5 else 0.08, 0.0, 0.0])
+    costs = FREE.copy()
+    rate = 2.0 * np.pi * hz
+    far = np.array([0.12 if hz < 1.5 else 0.08, 0.0, 0.0])
     costs[1, :, 0] = 1.0 / brake
     phases = rate * PERIOD_S * np.arange(2000)
     targets = [
-        np.array([MIDDLE + far * np.sin(phase), rate * far * np.cos(phase), -(rate**2) * far * np.sin(phase)]) for phase in phases
+        np.array(
+            [
+                MIDDLE + far * np.sin(phase),
+                rate * far * np.cos(phase),
+                -(rate**2) * far * np.sin(phase),
+            ]
+        )
+        for phase in phases
     ]
     states, _ = driven(targets, costs=costs)
     error_m = np.linalg.norm(states[1:, 0] - np.array(targets)[:, 0], axis=1)
@@ -89,6 +111,8 @@ def test_steady_target_is_followed_at_every_rate(rate_hz: int) -> None:
     """At 50 Hz it was 37 mm behind: in a long tick a stop's way is no straight line of the jerk."""
     for velocity in np.array([[0.2, 0.0, 0.0], [0.1, -0.05, 0.03]]):
         places = [MIDDLE + velocity * (k / rate_hz - 1.0) for k in range(2 * rate_hz)]
-        states, _ = driven([np.array([place, velocity, (0.0,) * 3]) for place in places], rate_hz=rate_hz)
+        states, _ = driven(
+            [np.array([place, velocity, (0.0,) * 3]) for place in places], rate_hz=rate_hz
+        )
         assert np.linalg.norm(states[-1, 0] - places[-1]) < 0.003
         assert np.abs(states[-2 * rate_hz // 5 :, 2]).max() < 1e-3

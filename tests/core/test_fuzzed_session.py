@@ -22,7 +22,9 @@ from thirdhand.recordings.recording import Recorder
 from thirdhand.settings.config import Settings
 
 SETTINGS = Settings()
-SECONDS, EVERY = 12.0, 5  # between samples [ticks]
+# between samples [ticks]
+SECONDS = 12.0
+EVERY = 5
 ORDERS = ("hold", "resume", "reset")
 
 
@@ -42,10 +44,12 @@ def event(key: str, payload: bytes) -> Event | None:
 @pytest.mark.one_case
 def test_spoilt_bytes_replay_within_bounds(seed: int, skill: Skill, tmp_path: Path) -> None:
     """A session with damaged bytes replays within every bound."""
-    traffic, path = Traffic(seed), tmp_path / "fuzzed.mcap"
+    traffic = Traffic(seed)
+    path = tmp_path / "fuzzed.mcap"
     traffic.joints = np.array(SETTINGS.arm.posture)
     controller = Controller(SETTINGS, skill, urdf=URDF)
-    count, refused = round(SECONDS / SETTINGS.period_s), 0
+    count = round(SECONDS / SETTINGS.period_s)
+    refused = 0
     sent: list[Tick] = []
 
     def told() -> object:
@@ -53,7 +57,10 @@ def test_spoilt_bytes_replay_within_bounds(seed: int, skill: Skill, tmp_path: Pa
         for k in range(count):
             inbox: list[Event] = []
             if k % EVERY == 0:
-                came = [event(*message) for message in traffic.at(k * SETTINGS.period_s, 2_000_000 * (k + 1))]
+                came = [
+                    event(*message)
+                    for message in traffic.at(k * SETTINGS.period_s, 2_000_000 * (k + 1))
+                ]
                 refused += came.count(None)
                 inbox = [item for item in came if item is not None]
             sent.append(Tick(k, tuple(inbox)))

@@ -25,7 +25,8 @@ def guided(led: bool) -> Event:
 
 def lead(loop: Loop, ticks: int, by: float = LED_RAD, *, is_reported: bool = True) -> np.ndarray:
     """The frames while a hand moves two joints of the arm, by so much in the whole time."""
-    start, shape = loop.joints.copy(), np.array([1.0, 0, 0, -1.0, 0, 0, 0])
+    start = loop.joints.copy()
+    shape = np.array([1.0, 0, 0, -1.0, 0, 0, 0])
     for k in range(ticks):
         loop.joints = start + by * shape * (0.5 - 0.5 * np.cos(np.pi * (k + 1) / ticks))
         loop.speed = by * shape * 0.5 * np.pi * np.sin(np.pi * (k + 1) / ticks) / (0.002 * ticks)
@@ -45,7 +46,9 @@ def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, firs
     led = lead(loop, 800)
     assert (led["reason"] == Reason.GUIDED).all()
     assert not led["commanded"][200:].any()  # after the stop of an arm that followed
-    np.testing.assert_allclose(led["joints"][-1], loop.joints, atol=1e-2)  # what is drawn is the led arm
+    np.testing.assert_allclose(
+        led["joints"][-1], loop.joints, atol=1e-2
+    )  # what is drawn is the led arm
     ended = loop.run(300, {0: guided(False)})
     assert (ended["reason"][100:] == Reason.OPERATOR).all()
     assert (np.abs(ended["joints"][100:] - loop.joints) < 1e-9).all()
@@ -79,7 +82,9 @@ def test_hold_knows_hands_that_were_seen(taught: Skill) -> None:
     assert loop.controller.state["held"] == HELD_UNSEEN
     loop.hands = lambda k: np.array((LEFT, RIGHT))
     loop.run(100)
-    assert loop.controller.state["held"] == HELD_UNSEEN  # hands that come later are not those of this hold
+    assert (
+        loop.controller.state["held"] == HELD_UNSEEN
+    )  # hands that come later are not those of this hold
     loop.run(100, {0: order("resume"), 50: order("hold")})
     assert loop.controller.state["held"] == HELD_SEEN
 

@@ -58,7 +58,8 @@ def test_noise_is_reduced_and_measured(noise_m: float) -> None:
 
 def test_jump_over_ticks_equals_single_ticks() -> None:
     """A jump over missed ticks predicts as single ticks do."""
-    single, many = Hands(), Hands()
+    single = Hands()
+    many = Hands()
     for hands in (single, many):
         follow(hands, lambda t: np.array([0.3 * t * t, -0.2 * t, 0.1]), until_s=0.5)
     for _ in range(20):
@@ -66,7 +67,9 @@ def test_jump_over_ticks_equals_single_ticks() -> None:
     many.advance(20)
     assert single.state["tick"] == many.state["tick"]
     np.testing.assert_allclose(many.state["hands"], single.state["hands"], rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(many.state["mode_covariances"], single.state["mode_covariances"], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        many.state["mode_covariances"], single.state["mode_covariances"], rtol=1e-9, atol=1e-15
+    )
 
 
 def test_pause_of_minutes_keeps_position() -> None:
@@ -85,7 +88,9 @@ def test_covariances_stay_positive() -> None:
     for tick in range(3000):
         hands.advance()
         if tick % 7 == 0:
-            position_m = random.choice([0.0, 0.05, 0.3]) + random.normal(0.0, random.choice([0.0, 0.01]), 3)
+            position_m = random.choice([0.0, 0.05, 0.3]) + random.normal(
+                0.0, random.choice([0.0, 0.01]), 3
+            )
             hands.hand(tick + 1, tuple(position_m.tolist()))
     state = hands.state
     for mode, whole in enumerate(state["mode_covariances"][LEFT]):
@@ -105,9 +110,12 @@ def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
     noise = np.random.default_rng(11).normal(0.0, 0.0005, (601, 3))
     x = np.array([1.0, 0.0, 0.0])
     motion = np.array([0.0, speed, 0.0])
-    states = follow(Hands(), lambda t: motion * t + size_m * np.sin(2 * np.pi * hz * t) * x, until_s=6.0, noise=noise)[
-        1500:
-    ]
+    states = follow(
+        Hands(),
+        lambda t: motion * t + size_m * np.sin(2 * np.pi * hz * t) * x,
+        until_s=6.0,
+        noise=noise,
+    )[1500:]
     times = PERIOD_S * np.arange(1500, 1500 + len(states))
     return states[:, 0] - times[:, None] * motion, states[:, 1] - motion
 
@@ -115,7 +123,9 @@ def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
 def part_at(hz: float, deviation: Vector) -> float:
     """Amplitude of the part of a deviation (T, 3) that has a frequency."""
     waves = np.exp(2j * np.pi * hz * PERIOD_S * np.arange(len(deviation)))
-    return float(np.linalg.norm(2.0 * (deviation - deviation.mean(axis=0)).T @ waves / len(deviation)))
+    return float(
+        np.linalg.norm(2.0 * (deviation - deviation.mean(axis=0)).T @ waves / len(deviation))
+    )
 
 
 @pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 8.0, 10.0, 12.0])
@@ -138,8 +148,16 @@ def test_tremor_hardly_ripples_velocity(hz: float, size_m: float, speed: float) 
 @pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
 def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_s: float) -> None:
     """A resting hand that is out of sight for a moment makes no jump."""
-    hands, still, random = Hands(), np.array([0.5, 0.0, 0.2]), np.random.default_rng(9)
-    follow(hands, lambda t: still, until_s=4.0, rate_hz=rate_hz, noise=random.normal(0.0, noise_m, (4 * rate_hz, 3)))
+    hands = Hands()
+    still = np.array([0.5, 0.0, 0.2])
+    random = np.random.default_rng(9)
+    follow(
+        hands,
+        lambda t: still,
+        until_s=4.0,
+        rate_hz=rate_hz,
+        noise=random.normal(0.0, noise_m, (4 * rate_hz, 3)),
+    )
     hands.advance(round(unseen_s / PERIOD_S))
     fastest = 0.0
     for k in range(rate_hz):
@@ -154,7 +172,13 @@ def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_
 @pytest.mark.parametrize("rate_hz", [30, 100, 240])
 def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
     noise = np.random.default_rng(7).normal(0.0, 0.0005, (8 * rate_hz, 3))
-    states = follow(Hands(), lambda t: np.array([speed * t, 0.0, 0.0]), until_s=8.0, rate_hz=rate_hz, noise=noise)[1500:]
+    states = follow(
+        Hands(),
+        lambda t: np.array([speed * t, 0.0, 0.0]),
+        until_s=8.0,
+        rate_hz=rate_hz,
+        noise=noise,
+    )[1500:]
     assert states[:, 1, 0].std() < 0.001
     assert states[:, 1, 0].mean() == pytest.approx(speed, abs=1e-3)
 
@@ -170,7 +194,9 @@ def test_quickest_reaches_are_not_lost(rate_hz: int) -> None:
 
     states = follow(Hands(), hand, until_s=2.0, rate_hz=rate_hz)
     truth_m = np.array([hand(PERIOD_S * tick) for tick in range(len(states))])
-    assert np.linalg.norm(states[:, 0] - truth_m, axis=1).max() < (0.02 if rate_hz == 100 else 0.014)
+    assert np.linalg.norm(states[:, 0] - truth_m, axis=1).max() < (
+        0.02 if rate_hz == 100 else 0.014
+    )
 
 
 # --- hands that rest ---

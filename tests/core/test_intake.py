@@ -29,19 +29,25 @@ QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
 def test_tracker_is_scaled_turned_and_moved() -> None:
     """A tracker's positions are scaled, then rotated, then translated."""
     hands = Hands(HandSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)))
-    np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003])
+    np.testing.assert_allclose(
+        hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 + 0.003]
+    )
 
 
 def test_left_handed_axes_are_mirrored() -> None:
     """Left-handed axes become right-handed by their z before all else."""
     mapping = (1.0, 2.0, 3.0, *QUARTER_TURN)
     hands = Hands(HandSettings(unit="mm", axes="left-handed", base_from_tracker=mapping))
-    np.testing.assert_allclose(hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 - 0.003])
+    np.testing.assert_allclose(
+        hands.hand(1, (100.0, 20.0, 3.0)), [1.0 - 0.02, 2.0 + 0.1, 3.0 - 0.003]
+    )
     mirrored = np.diag([1.0, 1.0, -1.0])
     for turn in (QUARTER_TURN, (0.1, -0.5, 0.7, 0.5)):
         sample = z_reversed(PoseStamped(1, "unity", (0.1, 0.2, 0.3), turn))
         assert sample.position == (0.1, 0.2, -0.3)
-        np.testing.assert_allclose(rotation(sample.orientation), mirrored @ rotation(turn) @ mirrored, atol=1e-15)
+        np.testing.assert_allclose(
+            rotation(sample.orientation), mirrored @ rotation(turn) @ mirrored, atol=1e-15
+        )
     unity_hands = Hands(HandSettings(frame="unity", axes="left-handed"))
     np.testing.assert_allclose(unity_hands.hand(1, (0.5, 0.1, 0.2)), [0.5, 0.1, 0.2])
 
@@ -83,7 +89,8 @@ TRACKERS = {
     "optitrack": TrackerSettings(unit="mm", base_from_tracker=(1.0, 2.0, 3.0, *QUARTER_TURN)),
     "vicon/world": TrackerSettings(),
 }
-MAPPED, IN_BASE = (0.5004, 0.0002, 0.0001), (0.4, 0.2, 0.1)
+MAPPED = (0.5004, 0.0002, 0.0001)
+IN_BASE = (0.4, 0.2, 0.1)
 BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
 
 
@@ -102,9 +109,13 @@ BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
         ("base", "base\0", None),
     ],
 )
-def test_frame_decides_the_mapping(configured: str, frame: str, at: tuple[float, ...] | None) -> None:
+def test_frame_decides_the_mapping(
+    configured: str, frame: str, at: tuple[float, ...] | None
+) -> None:
     """A hand is mapped as its frame is configured or refused."""
-    settings = HandSettings(frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT))
+    settings = HandSettings(
+        frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT)
+    )
     hands = Hands(settings, trackers=TRACKERS)
     hands.intake.take_hand(hands.state, LEFT, PoseStamped(1, frame, (0.4, 0.2, 0.1), STRAIGHT))
     assert hands.fresh() == (at is not None)
@@ -150,9 +161,12 @@ def test_hand_is_stale_after_configured_time(rate_hz: int, stale_ms: float, tick
 @pytest.mark.parametrize(("stale_max_ms", "most"), [(0.0, 50), (200.0, 100)])
 def test_bursts_extend_the_stale_time(stale_max_ms: float, most: int) -> None:
     """The link is blocked again and again, for 0 to 150 ms."""
-    hands, random = Hands(HandSettings(stale_max_ms=stale_max_ms)), np.random.default_rng(8)
+    hands = Hands(HandSettings(stale_max_ms=stale_max_ms))
+    random = np.random.default_rng(8)
     arrivals: dict[int, list[int]] = {}
-    blocked_until, limits, stale = 0, [], 0
+    blocked_until = 0
+    limits = []
+    stale = 0
     for k in range(0, 3000, 5):
         while blocked_until < k:
             blocked_until += 1 + int(random.uniform(0.0, 75.0))
@@ -243,8 +257,17 @@ def test_joints_are_taken_in_any_order() -> None:
     """Joints are taken in any order among others."""
     hands = Hands()
     values = {name: 0.1 * i for i, name in enumerate(JOINT_NAMES)} | {"gripper": 3.0}
-    for stamp, names in ((1, tuple(values)), (2, tuple(reversed(values))), (3, tuple(sorted(values)))):
-        hands.arm(stamp, names, tuple(values[name] for name in names), tuple(2 * values[name] for name in names))
+    for stamp, names in (
+        (1, tuple(values)),
+        (2, tuple(reversed(values))),
+        (3, tuple(sorted(values))),
+    ):
+        hands.arm(
+            stamp,
+            names,
+            tuple(values[name] for name in names),
+            tuple(2 * values[name] for name in names),
+        )
         np.testing.assert_allclose(hands.state["measured"], 0.1 * np.arange(7))
         np.testing.assert_allclose(hands.state["measured_velocities"], 0.2 * np.arange(7))
     assert hands.rejected() == {}
@@ -296,7 +319,8 @@ def test_arm_is_silent_after_configured_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("position", "unit"), [((98.0, -32.0, 6.0), "cm"), ((980.0, -320.0, 60.0), "mm"), ((40.0, 30.0, 20.0), "cm")]
+    ("position", "unit"),
+    [((98.0, -32.0, 6.0), "cm"), ((980.0, -320.0, 60.0), "mm"), ((40.0, 30.0, 20.0), "cm")],
 )
 def test_the_unit_that_fits_best_is_named(position: tuple[float, ...], unit: str) -> None:
     assert f"which looks like {unit};" in too_far(position, "m")

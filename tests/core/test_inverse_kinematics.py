@@ -24,8 +24,11 @@ GAP_SLOW_M = TUNING.setpoint.gap_slow_m
 def test_bounded_least_squares(seed: int) -> None:
     """The bounded least squares are those of another solver."""
     random = np.random.default_rng(seed)
-    tasks, target, posture = random.normal(size=(6, 7)), random.normal(size=6), 0.1 * random.normal(size=7)
-    damping, width = 10 ** random.uniform(-4, -1), 10 ** random.uniform(-1.5, 0.5)
+    tasks = random.normal(size=(6, 7))
+    target = random.normal(size=6)
+    posture = 0.1 * random.normal(size=7)
+    damping = 10 ** random.uniform(-4, -1)
+    width = 10 ** random.uniform(-1.5, 0.5)
     bounds = np.sort(random.normal(size=(2, 7)), axis=0) * width
     bounds[0], bounds[1] = np.minimum(bounds[0], -1e-3), np.maximum(bounds[1], 1e-3)
     solution = np.empty(7)
@@ -50,7 +53,9 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     assert total == pytest.approx(columns @ (np.abs(dq) + ddq**2 / (2 * jerk)), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
     error, fast = measured_error(
-        parameters(measured=measured, measured_velocities=dq), state, parameters(per_rad=np.ones(len(dq)))
+        parameters(measured=measured, measured_velocities=dq),
+        state,
+        parameters(per_rad=np.ones(len(dq))),
     )
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
@@ -58,8 +63,10 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
 @pytest.mark.parametrize("name", ["wam", "franka", "ur5"])
 def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
     """The tool's speed after a joint displacement is that of Pinocchio."""
-    random, settings = np.random.default_rng(3), cell_of(name)
-    arm, joints = Arm(settings, robot_description(settings)), len(settings.joints.names)
+    random = np.random.default_rng(3)
+    settings = cell_of(name)
+    arm = Arm(settings, robot_description(settings))
+    joints = len(settings.joints.names)
     for _ in range(20):
         q, step_rad, dq = random.uniform(-1, 1, (3, joints))
         speed = tool_speed_after(arm.at(q).record, step_rad, dq)
@@ -68,11 +75,15 @@ def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
 
 def test_setpoint_waits_for_a_late_tool() -> None:
     """A setpoint waits for a tool that is behind."""
-    setpoint, tool = np.zeros((3, 3)), np.zeros(3)
+    setpoint = np.zeros((3, 3))
+    tool = np.zeros(3)
     limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)
-    setpoint[0, 0], setpoint[1, 0] = GAP_FREE_M + GAP_SLOW_M, 0.2
+    setpoint[0, 0] = GAP_FREE_M + GAP_SLOW_M
+    setpoint[1, 0] = 0.2
     assert slow_down(setpoint, tool, 1.0, limits) == pytest.approx(0.5)
-    assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(0.1)  # of 0.8 m/s, where 0.08 are allowed
+    assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(
+        0.1
+    )  # of 0.8 m/s, where 0.08 are allowed
     setpoint[1, 0] = -0.2  # it comes back
     assert slow_down(setpoint, tool, 1.0, limits) == 1.0
 
@@ -84,17 +95,24 @@ def test_setpoint_waits_for_a_late_tool() -> None:
 def test_least_squares_under_inequalities(seed: int) -> None:
     """Least squares under inequalities are those of another solver."""
     random = np.random.default_rng(seed)
-    tasks, target, posture = random.normal(size=(5, 7)), random.normal(size=5), 0.1 * random.normal(size=7)
-    damping, count = 10 ** random.uniform(-4, -1), int(random.integers(1, 12))
+    tasks = random.normal(size=(5, 7))
+    target = random.normal(size=5)
+    posture = 0.1 * random.normal(size=7)
+    damping = 10 ** random.uniform(-4, -1)
+    count = int(random.integers(1, 12))
     bounds = np.sort(random.normal(size=(2, 7)), axis=0) * 0.5
     bounds[0], bounds[1] = np.minimum(bounds[0], 0), np.maximum(bounds[1], 0)
-    rows, limits = random.normal(size=(count, 7)), np.maximum(0.2 * random.normal(size=count), 0)
+    rows = random.normal(size=(count, 7))
+    limits = np.maximum(0.2 * random.normal(size=count), 0)
     if seed % 3 == 0 and count > 1:
-        rows[1], limits[1] = 2 * rows[0], 2 * limits[0]  # said twice
+        # said twice
+        rows[1] = 2 * rows[0]
+        limits[1] = 2 * limits[0]
     if seed % 5 == 0:
         limits[0] = 0.3 * rows[0] @ np.where(rows[0] > 0, bounds[0], bounds[1])  # it is to be left
         count = min(count, 3)
-        rows, limits = rows[:count], limits[:count]
+        rows = rows[:count]
+        limits = limits[:count]
     solution = np.empty(7)
     least_squares(tasks, target, posture, damping, bounds, solution)
     before = solution.copy()
@@ -119,8 +137,13 @@ def test_least_squares_under_inequalities(seed: int) -> None:
 
 def test_way_along_two_obstacles_is_free() -> None:
     """Between two things that cannot both be left the way along them is free."""
-    tasks, target, bounds = np.eye(3), np.array([0.3, 0.1, 0.0]), np.tile([[-1.0], [1.0]], 3)
-    rows, solution = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), np.empty(3)
+    tasks = np.eye(3)
+    target = np.array([0.3, 0.1, 0.0])
+    bounds = np.tile([[-1.0], [1.0]], 3)
+    rows = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    solution = np.empty(3)
     least_squares(tasks, target, np.zeros(3), 1e-3, bounds, solution)
-    assert keep_under(tasks, target, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), solution)
+    assert keep_under(
+        tasks, target, np.zeros(3), 1e-3, bounds, rows, np.array([-0.02, -0.02]), solution
+    )
     np.testing.assert_allclose(solution, [0.3, 0.0, 0.0], atol=1e-3)

@@ -27,13 +27,22 @@ def moving(t: Vector) -> Vector:
 
 
 def told(
-    made_s: Vector, late_s: Vector, *, stamps: Callable[[Vector], Vector] = lambda made_s: made_s, until_s: float
+    made_s: Vector,
+    late_s: Vector,
+    *,
+    stamps: Callable[[Vector], Vector] = lambda made_s: made_s,
+    until_s: float,
 ) -> tuple[Hands, Vector]:
     """An intake that was told of where a hand was at times, so much later; and the estimates (T, 3)
     [m] at each tick.
     """
-    hands, places, come_s, estimates = Hands(), moving(made_s), made_s + late_s, []
-    order, stamps_s, nth = np.argsort(come_s, kind="stable"), stamps(made_s), 0
+    hands = Hands()
+    places = moving(made_s)
+    come_s = made_s + late_s
+    estimates = []
+    order = np.argsort(come_s, kind="stable")
+    stamps_s = stamps(made_s)
+    nth = 0
     for tick in range(round(until_s / PERIOD_S)):
         if tick:
             hands.advance()
@@ -57,8 +66,12 @@ def test_order_of_arrival_does_not_matter(rate_hz: int, latest_s: float, seed: i
     in_order = told(made_s, 0.0 * late_s, until_s=until_s)[0]
     shuffled = told(made_s, late_s, until_s=until_s)[0]
     assert shuffled.rejected() == in_order.rejected() == {}
-    np.testing.assert_allclose(shuffled.state["hands"], in_order.state["hands"], rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(shuffled.state["noise_variance"], in_order.state["noise_variance"], rtol=1e-6)
+    np.testing.assert_allclose(
+        shuffled.state["hands"], in_order.state["hands"], rtol=0.0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        shuffled.state["noise_variance"], in_order.state["noise_variance"], rtol=1e-6
+    )
     np.testing.assert_array_equal(shuffled.state["kept_ticks"], in_order.state["kept_ticks"])
 
 

@@ -21,10 +21,13 @@ from thirdhand.settings.config import JointSettings
 PERIOD = 0.002  # [s]
 LIMITS = JointSettings()
 LOWERED = JointSettings(velocity=(0.3,) * 7, acceleration=(0.5,) * 7, jerk=(4.0,) * 7)
-LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
+LOWER = np.array(LIMITS.lower)
+UPPER = np.array(LIMITS.upper)
 REST = np.zeros(7)
 START = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])  # amid the limits
-HOME = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])  # as published: joints 2 and 4 outside their limits
+HOME = np.array(
+    [0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0]
+)  # as published: joints 2 and 4 outside their limits
 Vector = npt.NDArray[np.float64]
 
 
@@ -62,7 +65,9 @@ def assert_held(limits: JointSettings, q: Vector, run: Run) -> None:
     between = 0.5 * (run.velocity[1:] + run.velocity[:-1])
     # what jerk makes of one tick between the trapezoid's value and the true one
     slack = np.array(limits.jerk) * PERIOD**2 + 1e-6
-    assert (np.abs(np.diff(run.position, axis=0) / PERIOD - between) <= slack).all(), "position follows velocity"
+    assert (np.abs(np.diff(run.position, axis=0) / PERIOD - between) <= slack).all(), (
+        "position follows velocity"
+    )
     assert np.array_equal(run.position, run.position.round(9))
 
 
@@ -132,7 +137,10 @@ def test_announced_ramp_is_followed_without_lag() -> None:
     rate = np.array([5.0, -5.0, 5.0, 4.0, -5.0, 5.0, -3.0])
     target = np.clip(PERIOD * np.arange(1, 201)[:, None], 0.0, 0.25) * rate
     changing = np.where(target == 0.25 * rate, 0.0, rate)
-    announced, untold = (np.abs(drive(LIMITS, START, target, derivative).velocity - target) for derivative in (changing, None))
+    announced, untold = (
+        np.abs(drive(LIMITS, START, target, derivative).velocity - target)
+        for derivative in (changing, None)
+    )
     last = slice(80, 124)  # of the ramp
     assert announced[last].max() < 1e-6
     late = rate**2 / (2.0 * np.array(LIMITS.jerk))
@@ -158,8 +166,10 @@ def moving() -> tuple[Vector, Vector, Vector]:
 
 def test_stop_is_shortest_and_ends_together() -> None:
     """A stop takes the shortest time that the limits allow and all joints end it together."""
-    limiter, start = Limiter(LIMITS, PERIOD), (np.zeros(7), np.full(7, 1.2), np.zeros(7))
-    a, j = np.array(LIMITS.acceleration), np.array(LIMITS.jerk)
+    limiter = Limiter(LIMITS, PERIOD)
+    start = (np.zeros(7), np.full(7, 1.2), np.zeros(7))
+    a = np.array(LIMITS.acceleration)
+    j = np.array(LIMITS.jerk)
     shortest = np.where(a**2 / j > 1.2, 2 * np.sqrt(1.2 / j), 1.2 / a + a / j)
     q, dq, ddq = start
     stopped = np.zeros(7)
@@ -172,8 +182,11 @@ def test_stop_is_shortest_and_ends_together() -> None:
 
 def test_joints_together_stay_on_their_way() -> None:
     """Synchronised joints stay between their present velocities and the wanted ones."""
-    limiter, target = Limiter(LIMITS, PERIOD), np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
-    is_reached = np.isclose(drive(LIMITS, START, np.tile(target, (300, 1))).velocity, target, rtol=1e-6, atol=0.0)
+    limiter = Limiter(LIMITS, PERIOD)
+    target = np.array([0.4, -0.1, 0.02, 0.3, -0.6, 0.001, 0.5])
+    is_reached = np.isclose(
+        drive(LIMITS, START, np.tile(target, (300, 1))).velocity, target, rtol=1e-6, atol=0.0
+    )
     alone = int(np.argmax(is_reached.all(axis=1)))
     state: tuple[Vector, Vector, Vector] = (START, REST, REST)
     for _ in range(round(1.5 * alone)):
@@ -181,7 +194,9 @@ def test_joints_together_stay_on_their_way() -> None:
         assert step is not None
         assert np.ptp(step.velocity / target) < 1e-6
         assert (step.velocity / target).max() < 1.001  # of what is left of a tick
-        assert (np.abs(step.acceleration - state[2]) <= np.array(LIMITS.jerk) * PERIOD * (1 + 1e-9)).all()
+        assert (
+            np.abs(step.acceleration - state[2]) <= np.array(LIMITS.jerk) * PERIOD * (1 + 1e-9)
+        ).all()
         assert (np.abs(step.acceleration) <= np.array(LIMITS.acceleration) * (1 + 1e-9)).all()
         state = step[:3]
     assert np.allclose(state[1], target, rtol=1e-6, atol=0.0)
@@ -189,7 +204,8 @@ def test_joints_together_stay_on_their_way() -> None:
 
 
 def test_a_nan_stops_all_joints() -> None:
-    limiter, state = Limiter(LIMITS, PERIOD), moving()
+    limiter = Limiter(LIMITS, PERIOD)
+    state = moving()
     target = np.array([0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0])
     for _ in range(300):
         q, dq, ddq, limited = limiter.step(*state, target)
@@ -205,7 +221,10 @@ def test_unusable_state_neither_raises_nor_moves(bad: float, which: int) -> None
     state = [REST.copy(), REST.copy(), REST.copy()]
     state[which][3] = bad
     q, dq, ddq = state
-    for result in (Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)), Limiter(LIMITS, PERIOD).stop(q, dq, ddq)):
+    for result in (
+        Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)),
+        Limiter(LIMITS, PERIOD).stop(q, dq, ddq),
+    ):
         assert result.limited
         assert not result.velocity.any()
         assert np.array_equal(result.position, state[0], equal_nan=True)
@@ -215,7 +234,10 @@ def test_unusable_state_neither_raises_nor_moves(bad: float, which: int) -> None
 @given(st.tuples(*[st.floats(-1e4, 1e4)] * 21))
 def test_no_finite_state_raises_or_gives_nan(values: tuple[float, ...]) -> None:
     q, dq, ddq = np.array(values).reshape(3, 7)
-    for result in (Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)), Limiter(LIMITS, PERIOD).stop(q, dq, ddq)):
+    for result in (
+        Limiter(LIMITS, PERIOD).step(q, dq, ddq, np.ones(7)),
+        Limiter(LIMITS, PERIOD).stop(q, dq, ddq),
+    ):
         for array in result[:3]:
             assert np.isfinite(array).all()
 
@@ -223,7 +245,9 @@ def test_no_finite_state_raises_or_gives_nan(values: tuple[float, ...]) -> None:
 def test_too_fast_joint_is_brought_back() -> None:
     """A joint that comes too fast is brought back into its limits."""
     limiter = Limiter(LIMITS, PERIOD)
-    q, dq, ddq = REST, np.full(7, 2.5), np.full(7, 30.0)
+    q = REST
+    dq = np.full(7, 2.5)
+    ddq = np.full(7, 30.0)
     for _ in range(600):
         q, dq, ddq, _ = limiter.step(q, dq, ddq, np.full(7, 0.1))
     assert np.abs(dq - 0.1).max() < 1e-9

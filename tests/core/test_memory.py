@@ -45,12 +45,15 @@ def both_remembered(
 ) -> tuple[np.ndarray, np.ndarray]:
     """That, and the rows (T, TURNS, 18) of how hands are turned, told so (T, 18)."""
     states = np.zeros(1, [(field.name, field.type, field.shape) for field in FIELDS])
-    state, out, turned = states[0], [], []
+    state = states[0]
+    out = []
+    turned = []
     state["hand_ticks"] = state["memory_ticks"] = -1
     for tick, (pair, turn) in enumerate(zip(hands, turns, strict=True)):
         state["tick"] = tick
         if tick not in unseen:
-            state["hand_ticks"], state["hands"][:, 0] = tick, pair.reshape(2, 3)
+            state["hand_ticks"] = tick
+            state["hands"][:, 0] = pair.reshape(2, 3)
             state["hand_turns"] = turn.reshape(2, 9)
             remember(states, period_s, MEMORY_LAG_S, TURN_LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
@@ -62,7 +65,9 @@ def both_remembered(
 def test_memory_is_that_of_learning(rate_hz: int) -> None:
     """The service's memory is the learned one, at any rate."""
     learned = features(motion(np.arange(0.0, 6.0, 0.02))[0], 0.02, ORDER)
-    live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[:: rate_hz // 50]
+    live = remembered(motion(np.arange(0.0, 6.0, 1.0 / rate_hz))[0], 1.0 / rate_hz)[
+        :: rate_hz // 50
+    ]
     behind = learned[:, 6:].reshape(-1, ORDER, 6) + learned[:, None, :6]
     assert np.abs(live - behind).max() < 0.004
 
@@ -93,7 +98,9 @@ def test_inputs_move_with_their_derivatives() -> None:
     moving = motion(times)
     memory, turns = both_remembered(moving[0], np.tile(moving[0], 3), h)
     inputs = np.empty((len(times), 3, 6 * (1 + ORDER) + 18))
-    for out, now, memory_row, turned in zip(inputs, moving.transpose(1, 0, 2), memory, turns, strict=True):
+    for out, now, memory_row, turned in zip(
+        inputs, moving.transpose(1, 0, 2), memory, turns, strict=True
+    ):
         moving_features(np.ascontiguousarray(now), memory_row, turned, out)
     late = slice(3000, None)
     for order in (0, 1):
@@ -111,16 +118,27 @@ def takes(count: int, *, remembers: bool) -> list[Demonstration]:
     """Hands that come from either side to the same place; the tool goes where they did not
     come from, or where they are.
     """
-    out, times = [], np.arange(0.0, 5.0, 0.02)
+    out = []
+    times = np.arange(0.0, 5.0, 0.02)
     for i in range(count):
-        rng, side = np.random.default_rng(i), (-1.0, 1.0)[i % 2]
+        rng = np.random.default_rng(i)
+        side = (-1.0, 1.0)[i % 2]
         share = np.clip((times - 0.5 - 0.2 * rng.random()) / 1.5, 0.0, 1.0)
         progress = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
-        left = (0.6, -0.2, 0.2) + (1.0 - progress) * (0.0, 0.25 * side, 0.0) + rng.normal(0.0, 0.004, 3)
+        left = (
+            (0.6, -0.2, 0.2)
+            + (1.0 - progress) * (0.0, 0.25 * side, 0.0)
+            + rng.normal(0.0, 0.004, 3)
+        )
         right = (0.7, 0.3, 0.2) + 0.0 * left
-        tool = (0.5, 0.1, 0.4) + progress * np.array((0.0, -0.15 * side if remembers else 0.15, 0.1))
+        tool = (0.5, 0.1, 0.4) + progress * np.array(
+            (0.0, -0.15 * side if remembers else 0.15, 0.1)
+        )
         turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
-        poses = (np.hstack([positions + rng.normal(0.0, 0.0005, positions.shape), turn]) for positions in (left, right, tool))
+        poses = (
+            np.hstack([positions + rng.normal(0.0, 0.0005, positions.shape), turn])
+            for positions in (left, right, tool)
+        )
         out.append(Demonstration((times * 1e9).astype(np.int64), *poses))
     return out
 

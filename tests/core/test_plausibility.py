@@ -24,12 +24,14 @@ from thirdhand.contract.records import Cause, Reason
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 
-PLACE, ELSEWHERE = (0.5, 0.1, 0.2), (0.5, 0.3, 0.2)
+PLACE = (0.5, 0.1, 0.2)
+ELSEWHERE = (0.5, 0.3, 0.2)
 
 
 def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int) -> list[float]:
     """Samples at a rate, one after the other (None: missing); y of the estimate after each."""
-    every, estimates_m = 500 // rate_hz, []
+    every = 500 // rate_hz
+    estimates_m = []
     for place in places:
         hands.advance(every)
         if place is not None:
@@ -57,27 +59,45 @@ def test_jump_is_believed_after_three_samples(rate_hz: int) -> None:
 @pytest.mark.parametrize("length", [1, 2])
 def test_momentary_jump_leaves_no_trace(rate_hz: int, length: int) -> None:
     """Short outliers leave no trace in the estimate."""
-    disturbed, missing = Hands(), Hands()
-    head, tail = [PLACE] * 40, [PLACE] * 20
+    disturbed = Hands()
+    missing = Hands()
+    head = [PLACE] * 40
+    tail = [PLACE] * 20
     tell(disturbed, [*head, *[ELSEWHERE] * length, *tail], rate_hz)
     tell(missing, [*head, *[None] * length, *tail], rate_hz)
     assert disturbed.rejected() == {Cause.JUMPED: length}
-    for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "even_samples", "mode_probabilities"):
+    for name in (
+        "hands",
+        "mode_means",
+        "mode_covariances",
+        "noise_variance",
+        "even_samples",
+        "mode_probabilities",
+    ):
         assert disturbed.state[name].tobytes() == missing.state[name].tobytes(), name
 
 
 def test_wrong_samples_are_dropped_by_the_next() -> None:
     """They make the hand seem to move at 2 m/s."""
-    rate_hz, off_m = 30, (0.068, 0.08)
-    hands, random, place = Hands(), np.random.default_rng(5), np.array([0.5, 0.1, 0.2])
+    rate_hz = 30
+    off_m = (0.068, 0.08)
+    hands = Hands()
+    random = np.random.default_rng(5)
+    place = np.array([0.5, 0.1, 0.2])
     offsets_m = {2 * rate_hz: off_m[0], 2 * rate_hz + 1: off_m[1]}
     for k in range(3 * rate_hz):
-        sample_m = place + random.normal(0.0, 0.0005, 3) + offsets_m.get(k, 0.0) * np.array([0.0, 0.6, 0.8])
+        sample_m = (
+            place
+            + random.normal(0.0, 0.0005, 3)
+            + offsets_m.get(k, 0.0) * np.array([0.0, 0.6, 0.8])
+        )
         estimate_m = hands.hand(round(1e9 * (1 + k / rate_hz)), tuple(sample_m.tolist()))
         if k == 2 * rate_hz + 2:
             assert np.linalg.norm(estimate_m - place) < 0.005  # it would run off otherwise
             assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 1]) < 0.1
-            assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05  # separation counts with both places
+            assert (
+                hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05
+            )  # separation counts with both places
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
     assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
 
@@ -85,7 +105,9 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
 @pytest.mark.parametrize("rate_hz", [30, 100])
 def test_quick_motion_is_not_dropped(rate_hz: int) -> None:
     """It starts within 50 ms to 1.2 m/s; none of its samples is dropped."""
-    hands, random, counts = Hands(), np.random.default_rng(6), []
+    hands = Hands()
+    random = np.random.default_rng(6)
+    counts = []
     for k in range(2 * rate_hz):
         t = k / rate_hz
         moved = 1.2 * max(0.0, t - 1.0 - 0.025 * min(1.0, max(0.0, t - 1.0) / 0.05))
@@ -127,17 +149,21 @@ class BothHands(Hands):
 
     def __init__(self, rate_hz: int) -> None:
         super().__init__()
-        self.every, self.noise = 500 // rate_hz, np.random.default_rng(8)
+        self.every = 500 // rate_hz
+        self.noise = np.random.default_rng(8)
 
     def at(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         up = 0.2 + 0.15 * math.sin(0.006 * float(self.state["tick"]))  # up to 0.45 m/s
         return (0.5, 0.1, up), (0.6, 0.5, up)
 
-    def tell(self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()) -> tuple[Vector, Vector]:
+    def tell(
+        self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()
+    ) -> tuple[Vector, Vector]:
         """How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by
         tick, while some labels are hidden.
         """
-        errors_m, fresh = [], []
+        errors_m = []
+        fresh = []
         for _ in range(round(500 * seconds)):
             self.advance()
             if int(self.state["tick"]) % self.every == 0:
@@ -147,7 +173,12 @@ class BothHands(Hands):
                         continue
                     sample_m = np.array(place) + 0.002 * self.noise.standard_normal(3)
                     self.hand(10**9 + int(self.state["tick"]), tuple(sample_m.tolist()), side=side)
-            errors_m.append([abs(self.state["hands"][side, 0, 1] - place[1]) for side, place in enumerate(self.at())])
+            errors_m.append(
+                [
+                    abs(self.state["hands"][side, 0, 1] - place[1])
+                    for side, place in enumerate(self.at())
+                ]
+            )
             fresh.append([self.fresh(side) for side in (0, 1)])
         return np.array(errors_m), np.array(fresh)
 
@@ -200,7 +231,8 @@ def test_one_hand_may_go_where_the_other_is() -> None:
     hands.tell(1.0)
     for _ in range(20):
         hands.advance(5)
-        stamp_ns, right = 10**9 + int(hands.state["tick"]), hands.at()[1]
+        stamp_ns = 10**9 + int(hands.state["tick"])
+        right = hands.at()[1]
         hands.hand(stamp_ns, (right[0], right[1] - 0.04, right[2]), side=0)
         hands.hand(stamp_ns, right, side=1)
     assert hands.fresh(0)
@@ -209,9 +241,12 @@ def test_one_hand_may_go_where_the_other_is() -> None:
 
 
 NUMBERS = st.one_of(
-    st.floats(width=64), st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e-310, 1.0, 0.5, math.nan, math.inf, 1e308, 5.0])
+    st.floats(width=64),
+    st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e-310, 1.0, 0.5, math.nan, math.inf, 1e308, 5.0]),
 )
-STAMPS = st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from([-(2**63), -1, 0, 1, 2**63 - 1]))
+STAMPS = st.one_of(
+    st.integers(-(2**63), 2**63 - 1), st.sampled_from([-(2**63), -1, 0, 1, 2**63 - 1])
+)
 SAMPLES = st.tuples(
     st.integers(0, 60),
     STAMPS,
@@ -232,13 +267,22 @@ def test_any_samples_leave_a_usable_state(
     for k, (ticks, stamp_ns, frame, position, turn) in enumerate(samples):
         if ticks:
             hands.advance(ticks)
-        newest_ns, count = int(hands.state["hand_stamps_ns"][LEFT_SIDE]), sum(hands.rejected().values())
+        newest_ns = int(hands.state["hand_stamps_ns"][LEFT_SIDE])
+        count = sum(hands.rejected().values())
         hands.intake.take_hand(hands.state, LEFT_SIDE, PoseStamped(stamp_ns, frame, position, turn))  # type: ignore[arg-type]
         taken = sum(hands.rejected().values()) == count
         late = taken and int(hands.state["hand_stamps_ns"][LEFT_SIDE]) == newest_ns != stamp_ns
         assert not late or 0 < newest_ns - stamp_ns <= 100_000_000
-        assert taken <= (late or int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])), k
-        for name in ("hands", "mode_means", "mode_covariances", "noise_variance", "mode_probabilities"):
+        assert taken <= (
+            late or int(hands.state["hand_ticks"][LEFT_SIDE]) == int(hands.state["tick"])
+        ), k
+        for name in (
+            "hands",
+            "mode_means",
+            "mode_covariances",
+            "noise_variance",
+            "mode_probabilities",
+        ):
             assert np.isfinite(hands.state[name]).all(), name
         assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 0]) < 10.0
 

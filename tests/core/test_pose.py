@@ -34,7 +34,9 @@ from thirdhand_sim.script import HandScript
 PLANNED_SPEED_SHARE = TUNING.arm.planned_limit_shares[0]
 
 
-PERIOD_S, FASTEST, HARDEST = 0.002, Settings().tool.max_turn_speed, Settings().tool.max_turn_acceleration
+PERIOD_S = 0.002
+FASTEST = Settings().tool.max_turn_speed
+HARDEST = Settings().tool.max_turn_acceleration
 
 
 def random_rotations(count: int, seed: int) -> Rotation:
@@ -43,7 +45,10 @@ def random_rotations(count: int, seed: int) -> Rotation:
 
 def test_rotations_are_those_of_scipy() -> None:
     for rotation, other in zip(random_rotations(50, 1), random_rotations(50, 2), strict=True):
-        a, b, turn, axis = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
+        a = np.empty(4)
+        b = np.empty(4)
+        turn = np.empty(3)
+        axis = np.empty(3)
         quaternion_of(rotation.as_matrix(), a)
         quaternion_of(other.as_matrix(), b)
         assert abs(a @ rotation.as_quat()) == pytest.approx(1.0, abs=1e-8)
@@ -55,34 +60,46 @@ def test_rotations_are_those_of_scipy() -> None:
         swing(axis, b, turn)
         np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(axis), to, atol=1e-7)
         turn_on(a, turn)
-        assert abs(a @ (Rotation.from_rotvec(turn) * rotation).as_quat()) == pytest.approx(1.0, abs=1e-8)
+        assert abs(a @ (Rotation.from_rotvec(turn) * rotation).as_quat()) == pytest.approx(
+            1.0, abs=1e-8
+        )
 
 
 def test_learned_orientation_is_that_of_kmp() -> None:
     """A learned orientation is that of kmp with its angular velocity."""
     random = np.random.default_rng(3)
-    inputs, zeta = random.normal(size=(12, 6)), 0.5 * random.normal(size=(12, 3))
+    inputs = random.normal(size=(12, 6))
+    zeta = 0.5 * random.normal(size=(12, 3))
     reference = Gaussians.of(zeta, deviation=0.01)
     primitive = KMP.fit(inputs, reference, kernel=GaussianKernel(0.3), lambda_mean=1.0)
     auxiliary = random_rotations(1, 4)[0].as_quat()
-    ours, kmp = LearnedOrientation(primitive, auxiliary), OrientationKMP(primitive, auxiliary)
+    ours = LearnedOrientation(primitive, auxiliary)
+    kmp = OrientationKMP(primitive, auxiliary)
     for query, velocity in zip(inputs + 0.1, random.normal(size=(12, 6)), strict=True):
-        prediction, (mean, covariance) = ours.predict(query, velocity), kmp.predict(query[None])
+        prediction = ours.predict(query, velocity)
+        mean, covariance = kmp.predict(query[None])
         assert abs(prediction.orientation @ mean[0]) == pytest.approx(1.0, abs=1e-9)
-        np.testing.assert_allclose(prediction.velocity, kmp.angular_velocity(query, velocity), atol=2e-5)
-        np.testing.assert_allclose(prediction.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max())
+        np.testing.assert_allclose(
+            prediction.velocity, kmp.angular_velocity(query, velocity), atol=2e-5
+        )
+        np.testing.assert_allclose(
+            prediction.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max()
+        )
         repeated = ours.predict(query, velocity, covariance=prediction.covariance)
         assert repeated.orientation.tobytes() == prediction.orientation.tobytes()
         ahead = Rotation.from_quat(ours.predict(query + 1e-3 * velocity, velocity).orientation)
         turned = (ahead * Rotation.from_quat(prediction.orientation).inv()).as_rotvec() / 1e-3
-        np.testing.assert_allclose(prediction.velocity, turned, atol=0.05 * np.linalg.norm(turned) + 1e-2)
+        np.testing.assert_allclose(
+            prediction.velocity, turned, atol=0.05 * np.linalg.norm(turned) + 1e-2
+        )
 
 
 @pytest.mark.parametrize("about", [False, True])
 def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
     """An orientation that jumps is approached within speed and acceleration limits."""
     settings = changed(Settings(), tool={"orientation": "full"}) if about else Settings()
-    lead, state = OrientationSetpoint(settings), blank(state_layout(7))
+    lead = OrientationSetpoint(settings)
+    state = blank(state_layout(7))
     lead.begin(state, np.eye(3), np.zeros(3))
     target = Rotation.from_rotvec(math.radians(120) * np.array([1.0, 2.0, 2.0]) / 3.0)
     turnings = []
@@ -95,15 +112,20 @@ def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
     residual = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])
     assert np.linalg.norm(axis - target.apply([0, 0, 1.0])) < 1e-3
-    assert (residual.magnitude() < 1e-3) == about  # where a direction is followed, it does not turn about it
+    assert (
+        residual.magnitude() < 1e-3
+    ) == about  # where a direction is followed, it does not turn about it
     assert np.linalg.norm(speeds[-1]) < 1e-2
 
 
 def test_full_orientation_costs_no_position() -> None:
     """The arm follows the full orientation if the settings require it."""
     settings = changed(Settings(), tool={"orientation": "full"})
-    arm, limiter = Arm(settings, URDF), Limiter(settings.joints, PERIOD_S)
-    q, dq, ddq = np.array(settings.arm.posture), np.zeros(7), np.zeros(7)
+    arm = Arm(settings, URDF)
+    limiter = Limiter(settings.joints, PERIOD_S)
+    q = np.array(settings.arm.posture)
+    dq = np.zeros(7)
+    ddq = np.zeros(7)
     pose = arm.at(q)
     target = Rotation.from_rotvec([0.3, -0.2, 0.5]) * Rotation.from_matrix(pose.rotation)
     farthest = 0.0
@@ -118,10 +140,18 @@ def test_full_orientation_costs_no_position() -> None:
 def test_taught_orientation_is_followed(skill: Skill) -> None:
     """An orientation taught at a place is predicted and followed there."""
     places = Scene().via_points()
-    turned = (Rotation.from_euler("y", -40, degrees=True) * Rotation.from_quat(TOOL_ORIENTATION)).as_quat()
+    turned = (
+        Rotation.from_euler("y", -40, degrees=True) * Rotation.from_quat(TOOL_ORIENTATION)
+    ).as_quat()
     x, y, z, w = turned.tolist()
-    taught = adapted(skill, (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))), tolerance=0.05)
-    script = HandScript(msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0)
+    taught = adapted(
+        skill,
+        (*places[:2], msgspec.structs.replace(places[2], orientation=(x, y, z, w))),
+        tolerance=0.05,
+    )
+    script = HandScript(
+        msgspec.structs.replace(Scene(), dwells_s=(0.4, 0.4, 1.5)), seed=1, offset_std=0.0
+    )
     frames = followed(taught, ticks_of(script))
     last = frames[-300:]
     assert np.abs(last["orientation"] @ turned).min() > math.cos(math.radians(1.0))
@@ -145,17 +175,25 @@ def test_gripper_has_hysteresis() -> None:
     assert decided(CLOSED, 0.05) == OPEN
     assert decided(CLOSED, 0.05, since_s=0.5 * GRIPPER_MOVES_S) == CLOSED  # it is still on its way
     assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is not there yet
-    assert [decided(state, NO_GRIPPER) for state in (UNKNOWN, OPEN, CLOSED)] == [UNKNOWN, OPEN, CLOSED]
+    assert [decided(state, NO_GRIPPER) for state in (UNKNOWN, OPEN, CLOSED)] == [
+        UNKNOWN,
+        OPEN,
+        CLOSED,
+    ]
 
 
 def test_orientation_and_gripper_are_sent() -> None:
     """Orientation covariance and gripper go out with a frame."""
     frame = blank(FRAME)
-    frame["covariance"], frame["orientation_covariance"] = np.eye(3), np.arange(9).reshape(3, 3)
-    frame["orientation"], frame["setpoint_orientation"] = (0, 0, 0, 1), (0, 1, 0, 0)
+    frame["covariance"] = np.eye(3)
+    frame["orientation_covariance"] = np.arange(9).reshape(3, 3)
+    frame["orientation"] = (0, 0, 0, 1)
+    frame["setpoint_orientation"] = (0, 1, 0, 0)
     sent = dict(outgoing(frame, 1, Settings().joints.names))
     assert "gripper/command" not in sent  # nothing is known of one
-    covariance = np.array(cdr.decode_pose_with_covariance(sent["tool/target"]).covariance).reshape(6, 6)
+    covariance = np.array(cdr.decode_pose_with_covariance(sent["tool/target"]).covariance).reshape(
+        6, 6
+    )
     np.testing.assert_array_equal(covariance[3:, 3:], np.arange(9).reshape(3, 3))
     assert not covariance[:3, 3:].any()
     assert cdr.decode_pose(sent["tool/setpoint"]).orientation == (0, 1, 0, 0)

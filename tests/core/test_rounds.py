@@ -12,7 +12,8 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
-BACK_S, REST_S = 2.0, (1.5, 0.5, 1.0, 3.0, 0.5, 0.5)
+BACK_S = 2.0
+REST_S = (1.5, 0.5, 1.0, 3.0, 0.5, 0.5)
 HALF = 3  # the round that is broken off half-way
 EVENTS = {  # what happens in a round, and when
     1: ((3.0, "hold"), (4.0, "resume")),
@@ -31,7 +32,9 @@ def test_every_round_is_as_the_first(taught: Skill) -> None:
     """After a hold, a fault, a round that was broken off, and with rests of 0.5 to 3 s."""
     script = HandScript(Scene(), seed=1)
     period_s = ASSUMED.period_s
-    whole = np.array([np.array(script.sample(t))[:, :3] for t in np.arange(0.0, script.duration_s, period_s)])
+    whole = np.array(
+        [np.array(script.sample(t))[:, :3] for t in np.arange(0.0, script.duration_s, period_s)]
+    )
     hands: list[Vector] = []
     begins: list[int] = []
     events: dict[int, Event] = {}
@@ -39,11 +42,16 @@ def test_every_round_is_as_the_first(taught: Skill) -> None:
         if number:
             hands.append(way(hands[-1][-1], whole[0], period_s))
         rests = round(rest_s / period_s)
-        rests += -(sum(map(len, hands)) + rests) % 5  # the tracker samples each round at the same moments
+        rests += (
+            -(sum(map(len, hands)) + rests) % 5
+        )  # the tracker samples each round at the same moments
         hands.append(np.repeat(whole[:1], rests, axis=0))
         begins.append(sum(map(len, hands)))
         hands.append(whole[: len(whole) // 2] if number == HALF else whole)
-        events |= {begins[-1] + round(at_s / period_s): order(kind) for at_s, kind in EVENTS.get(number, ())}
+        events |= {
+            begins[-1] + round(at_s / period_s): order(kind)
+            for at_s, kind in EVENTS.get(number, ())
+        }
     positions = np.concatenate(hands)
 
     loop = Loop(ASSUMED, taught)

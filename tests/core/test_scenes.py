@@ -22,7 +22,17 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from support.arms import MODELS, cell_of
-from support.in_process import ASSUMED, LEFT, RIGHT, assert_limits_hold, assert_replays, frames, led, seen, ticks_of
+from support.in_process import (
+    ASSUMED,
+    LEFT,
+    RIGHT,
+    assert_limits_hold,
+    assert_replays,
+    frames,
+    led,
+    seen,
+    ticks_of,
+)
 from support.paths import RECORDINGS
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.controller import Controller, start_state
@@ -41,7 +51,9 @@ HAND_BRAKE_MPS2 = TUNING.setpoint.hand_brake_mps2
 
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "0"))
-RISE, RISE_MPS = 1.01, 0.01  # docs/bounds.md: speed of the tool in a stop
+# docs/bounds.md: speed of the tool in a stop
+RISE = 1.01
+RISE_MPS = 0.01
 AT_REST_RADPS2 = 0.02  # root mean square of each joint
 PERIOD_S = ASSUMED.period_s
 NOISE_M = 0.0005  # of a tracker, each axis
@@ -59,7 +71,9 @@ def stored(name: str) -> Skill:
     return everywhere(decoded((RECORDINGS / f"{name}.npz").read_bytes(), origin=name))
 
 
-def played(cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector | None = None) -> np.ndarray:
+def played(
+    cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector | None = None
+) -> np.ndarray:
     """The frames (T,) of a scene: without a fault, within every limit of the joints, and with the
     tool within its speed limit, in stops too.
     """
@@ -68,7 +82,9 @@ def played(cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector
         state["joints"][0] = start
     trace = frames(Controller(cell, skill, state, urdf=robot_description(cell)), ticks)
     faults = trace["mode"] == Mode.FAULT
-    assert not faults.any(), f"tick {faults.argmax()}: {Reason(trace['reason'][faults.argmax()]).name}"
+    assert not faults.any(), (
+        f"tick {faults.argmax()}: {Reason(trace['reason'][faults.argmax()]).name}"
+    )
     assert_limits_hold(trace, cell)
     speeds = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1) / cell.period_s
     assert speeds[trace["mode"][1:] == Mode.FOLLOW].max(initial=0.0) <= 1.001 * cell.tool.max_speed
@@ -87,8 +103,15 @@ def changed(
 ) -> Settings:
     """A cell whose joints have a share of their speed, acceleration and jerk, with another tool."""
     shares = {"velocity": speed, "acceleration": acceleration, "jerk": jerk}
-    limits = {name: tuple(share * x for x in getattr(cell.joints, name)) for name, share in shares.items()}
-    return replace(cell, rate_hz=rate_hz, tool=replace(cell.tool, **tool), joints=replace(cell.joints, **limits))
+    limits = {
+        name: tuple(share * x for x in getattr(cell.joints, name)) for name, share in shares.items()
+    }
+    return replace(
+        cell,
+        rate_hz=rate_hz,
+        tool=replace(cell.tool, **tool),
+        joints=replace(cell.joints, **limits),
+    )
 
 
 def every(cell: Settings) -> int:
@@ -119,7 +142,8 @@ def test_legal_hands_are_hardly_held_for(
     """Reaches there and back at up to 1.5 m/s, with noise, late samples and dropouts of 30 to 90
     ms.
     """
-    random, lasts_s = np.random.default_rng(seed), 2.0
+    random = np.random.default_rng(seed)
+    lasts_s = 2.0
     offsets_m = random.standard_normal((2, 3))
     offsets_m *= random.uniform(0.05, 0.3) / np.linalg.norm(offsets_m, axis=1, keepdims=True)
     far = np.linalg.norm(offsets_m, axis=1).max()
@@ -128,12 +152,16 @@ def test_legal_hands_are_hardly_held_for(
     stamps = np.arange(0.0, lasts_s, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
     for begin_s in random.uniform(0.0, lasts_s, 2):
-        missing |= (stamps > begin_s) & (stamps < begin_s + random.uniform(0.03, 0.09) - 1.0 / rate_hz)
+        missing |= (stamps > begin_s) & (
+            stamps < begin_s + random.uniform(0.03, 0.09) - 1.0 / rate_hz
+        )
     inboxes = {}
     for stamp in stamps[~missing]:
         turns, u = divmod(stamp / reach_s, 1.0)
         progress = smooth(u)
-        moved = offsets_m * (1.0 - progress if turns % 2 else progress) + noise_m * random.standard_normal((2, 3))
+        moved = offsets_m * (
+            1.0 - progress if turns % 2 else progress
+        ) + noise_m * random.standard_normal((2, 3))
         k = math.ceil(stamp * loop_hz - 1e-9)
         inboxes[k] = seen(np.array((LEFT, RIGHT)) + moved, k)
     ticks = (Tick(k, inboxes.get(k, ())) for k in range(round(lasts_s * loop_hz)))
@@ -155,12 +183,16 @@ def reaches(skill: Skill, cell: Settings, random: np.random.Generator, count: in
     hands_m = places[random.integers(len(places))].copy()
     path = [hands_m] * cell.rate_hz
     for _ in range(count):
-        to, seconds, goal = hands_m.copy(), random.uniform(0.3, 0.7), places[random.integers(len(places))]
+        to = hands_m.copy()
+        seconds = random.uniform(0.3, 0.7)
+        goal = places[random.integers(len(places))]
         for side in (0, 1):
             if random.random() < 0.7:
                 to[side] = goal[side] + random.normal(0.0, 0.02, 3)
         ticks = int(seconds * cell.rate_hz)
-        path += list(hands_m + smooth(np.arange(1, ticks + 1) / ticks)[:, None, None] * (to - hands_m))
+        path += list(
+            hands_m + smooth(np.arange(1, ticks + 1) / ticks)[:, None, None] * (to - hands_m)
+        )
         path += [to] * int(random.uniform(0.2, 1.0) * cell.rate_hz)
         hands_m = to
     return np.array(path)
@@ -185,7 +217,11 @@ def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> N
     hands = reaches(taught, cell, random, 3)
     stops = set(random.integers(0, len(hands), 2).tolist())
     orders = dict.fromkeys(stops, "hold") | {k + cell.rate_hz // 4: "resume" for k in stops}
-    trace = played(cell, candidate, led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)))
+    trace = played(
+        cell,
+        candidate,
+        led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)),
+    )
     speeds = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1) / cell.period_s
     assert speeds.max() >= 0.3 * slower * cell.tool.engaging_speed  # the arm did move
 
@@ -193,7 +229,9 @@ def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> N
 # --- hands that rest ---
 
 
-def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], seconds: float) -> None:
+def settled(
+    cell: Settings, skill: Skill, start: Vector, hands: list[Vector], seconds: float
+) -> None:
     """Assert that an arm that starts somewhere rests in the last second; the hands (2, 3) move from
     the first place to the second at 2 s, and rest there.
     """
@@ -208,8 +246,10 @@ def settled(cell: Settings, skill: Skill, start: Vector, hands: list[Vector], se
 @pytest.mark.one_case
 def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
     """The arm comes to rest in every cell."""
-    random, cell = np.random.default_rng(number), cell_of(("wam", "panda", "ur5")[number % 3])
-    rate_hz, slower = int(random.choice([250, 500, 1000])), float(random.choice([0.3, 1.0]))
+    random = np.random.default_rng(number)
+    cell = cell_of(("wam", "panda", "ur5")[number % 3])
+    rate_hz = int(random.choice([250, 500, 1000]))
+    slower = float(random.choice([0.3, 1.0]))
     cell = changed(
         cell,
         rate_hz=rate_hz,
@@ -221,8 +261,15 @@ def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
         plate_from_tool=(0.0, 0.0, float(random.choice([0.0, 0.2])), 0.0, 0.0, 0.0, 1.0),
     )
     places = taught.hands.reshape(-1, 2, 3)
-    first, second = places[random.integers(len(places))], places[random.integers(len(places))]
-    settled(cell, taught, np.array(cell.arm.posture), [first, second + random.normal(0, 0.03, (2, 3))], 20.0)
+    first = places[random.integers(len(places))]
+    second = places[random.integers(len(places))]
+    settled(
+        cell,
+        taught,
+        np.array(cell.arm.posture),
+        [first, second + random.normal(0, 0.03, (2, 3))],
+        20.0,
+    )
 
 
 # --- the scripted task on other arms ---
@@ -231,14 +278,19 @@ def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
 @pytest.fixture(scope="module")
 def reach() -> Skill:
     """A coarse skill of two demonstrations, with which the tool moves a metre."""
-    return learn([demonstration.every(2) for demonstration in demonstrations(Scene(), count=2, seed=1)], components=5, points=60)
+    return learn(
+        [demonstration.every(2) for demonstration in demonstrations(Scene(), count=2, seed=1)],
+        components=5,
+        points=60,
+    )
 
 
 @pytest.mark.parametrize("arm", ["wam", *MODELS])
 @pytest.mark.one_case
 def test_targets_are_followed_to_half_a_mm(arm: str, reach: Skill, tmp_path: Path) -> None:
     """Moving targets are followed to half a millimetre."""
-    cell, ticks = cell_of(arm), list(ticks_of(HandScript(Scene(), seed=3)))
+    cell = cell_of(arm)
+    ticks = list(ticks_of(HandScript(Scene(), seed=3)))
     trace = played(cell, reach, ticks)
     assert_replays(tmp_path / "a.mcap", cell, reach, list(zip(ticks, trace, strict=True))[:1500])
     assert (trace["mode"] == Mode.FOLLOW).all()
@@ -267,13 +319,17 @@ def above_4_hz(values: Vector) -> float:
 @pytest.mark.parametrize("name", ["soldering", "experiments/as-paper"])
 def test_tremor_does_not_reach_the_tool(name: str, size_m: float) -> None:
     """A tremor of hands at rest does not reach the tool."""
-    skill, random, t = stored(name), np.random.default_rng(0), np.arange(0.0, 5.0, PERIOD_S)
+    skill = stored(name)
+    random = np.random.default_rng(0)
+    t = np.arange(0.0, 5.0, PERIOD_S)
     hands = np.tile(skill.hands.mean(axis=0), (len(t), 1))
     for side in (0, 3):
         rates = np.interp(t, np.arange(0.0, 6.0, 0.5), random.uniform(8.0, 12.0, 12))
         direction = random.standard_normal(3)
         tremor = np.sin(2.0 * np.pi * np.cumsum(rates) * PERIOD_S)
-        hands[:, side : side + 3] += size_m * tremor[:, None] * direction / np.linalg.norm(direction)
+        hands[:, side : side + 3] += (
+            size_m * tremor[:, None] * direction / np.linalg.norm(direction)
+        )
     trace = tracked(skill, hands)
     assert above_4_hz(trace["tool"]) < 0.0002
     axes = Rotation.from_quat(trace["tool_orientation"]).apply((0.0, 0.0, 1.0))
@@ -284,12 +340,15 @@ def along(speed: float, parts: slice) -> Vector:
     """Speeds (T,) [m/s] of the tool on its way while hands, those parts of (6,), move evenly. The
     skill is a function of where the hands are alone.
     """
-    skill, t = stored("experiments/as-paper"), np.arange(0.0, 9.0, PERIOD_S)
+    skill = stored("experiments/as-paper")
+    t = np.arange(0.0, 9.0, PERIOD_S)
     hands = np.tile(skill.hands.mean(axis=0), (len(t), 1))
     direction = np.array([0.3, 0.9, 0.3] * 2)[parts] / np.linalg.norm([0.3, 0.9, 0.3])
     hands[:, parts] += speed * np.maximum(t - COMES_S, 0.0)[:, None] * direction
     tool = tracked(skill, hands)["tool"][round((COMES_S + KNOWN_S) / PERIOD_S) :]
-    return np.asarray(np.diff(tool, axis=0) / PERIOD_S @ (tool[-1] - tool[0]) / np.linalg.norm(tool[-1] - tool[0]))
+    return np.asarray(
+        np.diff(tool, axis=0) / PERIOD_S @ (tool[-1] - tool[0]) / np.linalg.norm(tool[-1] - tool[0])
+    )
 
 
 @pytest.mark.parametrize("speed", [0.002, 0.005, 0.02])

@@ -43,8 +43,10 @@ SLIP_SPEED_MPS = TUNING.separation.slip_speed_mps
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS
 
 
-ARM, BODY = Arm(ASSUMED, URDF), body_of(ASSUMED, URDF)
-LOWER, UPPER = np.array(ASSUMED.joints.lower), np.array(ASSUMED.joints.upper)
+ARM = Arm(ASSUMED, URDF)
+BODY = body_of(ASSUMED, URDF)
+LOWER = np.array(ASSUMED.joints.lower)
+UPPER = np.array(ASSUMED.joints.upper)
 POSTURE = np.array(ASSUMED.arm.posture)
 ARMS = ("wam", *MODELS)
 FRAME = blank(frame_layout(7))
@@ -66,7 +68,8 @@ def test_capsules_cover_collision_shapes() -> None:
     """Capsules enclose the collision shapes as Pinocchio places them."""
     model = pin.buildModelFromXML(URDF)
     shapes = pin.buildGeomFromUrdfString(model, URDF, pin.GeometryType.COLLISION)
-    data, geometry = model.createData(), pin.GeometryData(shapes)
+    data = model.createData()
+    geometry = pin.GeometryData(shapes)
     random = np.random.default_rng(1)
     assert len(BODY.capsules) == len(shapes.geometryObjects)
     for q in random.uniform(LOWER, UPPER, (20, 7)):
@@ -75,15 +78,23 @@ def test_capsules_cover_collision_shapes() -> None:
         covered = set()
         for shape, placement in zip(shapes.geometryObjects, geometry.oMg, strict=True):
             if isinstance(shape.geometry, coal.Box):
-                corners = shape.geometry.halfSide * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
+                corners = (
+                    shape.geometry.halfSide * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
+                )
             else:
                 angles = np.linspace(0, 2 * math.pi, 12)
-                r, h = shape.geometry.radius, shape.geometry.halfLength
-                corners = np.array([[r * math.cos(a), r * math.sin(a), z] for a in angles for z in (-h, h)])
+                r = shape.geometry.radius
+                h = shape.geometry.halfLength
+                corners = np.array(
+                    [[r * math.cos(a), r * math.sin(a), z] for a in angles for z in (-h, h)]
+                )
             points = np.array([placement.act(corner) for corner in corners])
             for k in np.flatnonzero(BODY.capsules["link"] == shape.parentJoint):
                 far = [between_segments(np.array([p, p]), capsules[k], np.empty(9)) for p in points]
-                if max(far) <= BODY.capsules["radius"][k] + 1e-9 and max(far) > BODY.capsules["radius"][k] - 1e-3:
+                if (
+                    max(far) <= BODY.capsules["radius"][k] + 1e-9
+                    and max(far) > BODY.capsules["radius"][k] - 1e-3
+                ):
                     covered.add(int(k))
                     break
             else:
@@ -96,12 +107,15 @@ def coal_capsule(segment: Vector) -> tuple[Any, Any]:
     axis = segment[1] - segment[0]
     along = axis if axis.any() else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
-    return coal.Capsule(0.01, float(np.linalg.norm(axis))), coal.Transform3s(turn, segment.mean(axis=0))
+    return coal.Capsule(0.01, float(np.linalg.norm(axis))), coal.Transform3s(
+        turn, segment.mean(axis=0)
+    )
 
 
 def test_capsule_distances_are_those_of_coal() -> None:
     """Distances of capsules are those of Coal."""
-    random, near = np.random.default_rng(2), np.empty(9)
+    random = np.random.default_rng(2)
+    near = np.empty(9)
     for _ in range(300):
         segment, other = random.uniform(-0.5, 0.5, (2, 2, 3))
         if random.random() < 0.2:
@@ -110,7 +124,10 @@ def test_capsule_distances_are_those_of_coal() -> None:
             segment[1] = segment[0]  # a ball
         distance_m = between_segments(segment, other, near)
         expected = coal.distance(
-            *coal_capsule(segment), *coal_capsule(other), coal.DistanceRequest(), coal.DistanceResult()
+            *coal_capsule(segment),
+            *coal_capsule(other),
+            coal.DistanceRequest(),
+            coal.DistanceResult(),
         )
         assert distance_m - 0.02 == pytest.approx(expected, abs=1e-5)
         assert np.linalg.norm(near[3:6] - near[:3]) == pytest.approx(distance_m, abs=1e-12)
@@ -119,7 +136,8 @@ def test_capsule_distances_are_those_of_coal() -> None:
 
 def test_distance_of_capsule_and_box() -> None:
     """The distance of a capsule and a box is the minimum along the capsule, and negative inside."""
-    random, near = np.random.default_rng(3), np.empty(9)
+    random = np.random.default_rng(3)
+    near = np.empty(9)
     box = np.array([[-0.2, -0.3, -0.1], [0.2, 0.3, 0.1]])
     for _ in range(300):
         segment = random.uniform(-0.6, 0.6, (2, 3))
@@ -144,16 +162,21 @@ def test_stop_from_allowed_speed_keeps_clear(hand_speed: float) -> None:
 
 def test_constraints_are_derivatives_of_distance() -> None:
     """Constraints are the rates at which distances shrink."""
-    settings = changed(ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),)))
-    separation, table = Separation(settings, URDF), settings.table
-    low, high = (
-        np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M],
-        np.add(table.centre, [*table.half_size, 0.0]),
+    settings = changed(
+        ASSUMED, obstacles=Obstacles(boxes=(Box(centre=(0.5, 0, 0.2), half_size=(0.05,) * 3),))
     )
+    separation = Separation(settings, URDF)
+    table = settings.table
+    low = np.array(table.centre) - [*table.half_size, TABLE_DEPTH_M]
+    high = np.add(table.centre, [*table.half_size, 0.0])
     boxes = np.array([[low, high], [(0.45, -0.05, 0.15), (0.55, 0.05, 0.25)]])
     state = with_hands(*(np.array([LEFT, RIGHT]) - [0.3, 0.0, -0.2]), settings)
-    random, near, total = np.random.default_rng(4), np.empty(9), 0
-    for q, dq in zip(random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True):
+    random = np.random.default_rng(4)
+    near = np.empty(9)
+    total = 0
+    for q, dq in zip(
+        random.uniform(LOWER, UPPER, (20, 7)), random.uniform(-1, 1, (20, 7)), strict=True
+    ):
         pose = ARM.at(q)
         separation.step(state, FRAME, pose.record)
         total += separation.count
@@ -163,23 +186,35 @@ def test_constraints_are_derivatives_of_distance() -> None:
         for side in range(2):
             arm = state["hands"][side, 0] + np.array([[0.0, 0, 0], [0.24, 0, 0]])
             for k in np.flatnonzero(BODY.capsules["link"]):
-                rates.append(-np.diff([between_segments(capsules[k], arm, near) for capsules in pair])[0] / 2e-6)
+                rates.append(
+                    -np.diff([between_segments(capsules[k], arm, near) for capsules in pair])[0]
+                    / 2e-6
+                )
         for i, j in BODY.pairs:
-            rates.append(-np.diff([between_segments(capsules[i], capsules[j], near) for capsules in pair])[0] / 2e-6)
+            rates.append(
+                -np.diff([between_segments(capsules[i], capsules[j], near) for capsules in pair])[0]
+                / 2e-6
+            )
         for k in np.flatnonzero(BODY.capsules["link"]):
             for box in boxes:
                 for share in (nearest_to_box(placed(q)[k], box), 0.0, 1.0):
-                    rates.append(-np.diff([to_box(capsules[k], share, box, near) for capsules in pair])[0] / 2e-6)
+                    rates.append(
+                        -np.diff([to_box(capsules[k], share, box, near) for capsules in pair])[0]
+                        / 2e-6
+                    )
         expected = np.array(rates)
         assert all(np.abs(expected - speed).min() < 1e-5 for speed in speeds)
     assert total > 50
 
 
 class _Nothing:
-    digest, orientation = bytes(16), (0.0, 0.0, 0.0, 1.0)
+    digest = bytes(16)
+    orientation = (0.0, 0.0, 0.0, 1.0)
 
 
-def with_hands(left: npt.ArrayLike, right: npt.ArrayLike = RIGHT, settings: Settings = ASSUMED) -> Record:
+def with_hands(
+    left: npt.ArrayLike, right: npt.ArrayLike = RIGHT, settings: Settings = ASSUMED
+) -> Record:
     """A state in which hands are seen at positions (3,) [m], at rest."""
     state = start_state(settings, _Nothing())  # type: ignore[arg-type]
     state["hand_ticks"] = 0
@@ -187,16 +222,22 @@ def with_hands(left: npt.ArrayLike, right: npt.ArrayLike = RIGHT, settings: Sett
     return state
 
 
-def nearest(seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED) -> tuple[Vector, Vector, Vector, Vector]:
+def nearest(
+    seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED
+) -> tuple[Vector, Vector, Vector, Vector]:
     """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
     near its links come to each other and to the table (T,).
     """
     joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
-    distance, speed, _, link_gap, table = measured(settings, body_of(settings, robot_description(settings)), joints, hands)
+    distance, speed, _, link_gap, table = measured(
+        settings, body_of(settings, robot_description(settings)), joints, hands
+    )
     return distance, speed, link_gap, table
 
 
-def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5) -> Iterator[tuple[Tick, Vector]]:
+def thrust(
+    place: tuple[float, float, float], at_s: float, seconds: float = 3.5
+) -> Iterator[tuple[Tick, Vector]]:
     """Hands of the nominal scene from its handover on, the right of which is at a place from a time
     on, within a tenth of a second.
     """
@@ -205,7 +246,9 @@ def thrust(place: tuple[float, float, float], at_s: float, seconds: float = 3.5)
         t = max(0.0, k * 0.002 - 0.5)
         motions = script.truth(t)
         share = min(max((t - at_s) / 0.1, 0.0), 1.0)
-        hands = np.array([motions.left.position, (1 - share) * motions.right.position + share * np.array(place)])
+        hands = np.array(
+            [motions.left.position, (1 - share) * motions.right.position + share * np.array(place)]
+        )
         yield Tick(k, seen(hands, k) if k % 5 == 0 else ()), hands
 
 
@@ -220,7 +263,9 @@ def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     assert distance.min() > 0
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
     least_m = cell.people.clearance + cell.people.position_uncertainty
-    allowed = np.array([allowed_speed(d, 0.0, cell.people.brake, 0.13, least_m) for d in distance[late].ravel()])
+    allowed = np.array(
+        [allowed_speed(d, 0.0, cell.people.brake, 0.13, least_m) for d in distance[late].ravel()]
+    )
     assert (speed[late].ravel() - allowed).max() <= SLIP_SPEED_MPS + 1e-3
 
 
@@ -243,11 +288,17 @@ def test_table_and_box_are_not_touched(taught: Skill, arm: str) -> None:
         behind = 0.1 if len(settings.joints.names) > 6 else 0.15  # six joints have no way around
         assert np.linalg.norm(frames["setpoint"] - frames["tool"], axis=1).max() < behind
         if settings.obstacles.boxes:
-            corners = np.array([np.subtract(box.centre, box.half_size), np.add(box.centre, box.half_size)])
+            corners = np.array(
+                [np.subtract(box.centre, box.half_size), np.add(box.centre, box.half_size)]
+            )
         else:
             corners = np.array([[0.35, -0.6, -0.73], [1.25, 0.6, 0.27]])
-        distances_m = np.array([_apart_from(corners, placed(q, body), body) for q in frames["joints"][::5]])
-        least = np.minimum(distances_m[0], settings.obstacles.clearance)  # one that starts nearer goes away
+        distances_m = np.array(
+            [_apart_from(corners, placed(q, body), body) for q in frames["joints"][::5]]
+        )
+        least = np.minimum(
+            distances_m[0], settings.obstacles.clearance
+        )  # one that starts nearer goes away
         assert (distances_m > least - 0.001).all(), distances_m.min(axis=0)
 
 
@@ -255,7 +306,8 @@ def _apart_from(corners: Vector, capsules: Vector, body: Body) -> list[float]:
     """The distances of the moving capsules from a box."""
     near = np.empty(9)
     return [
-        to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near) - body.capsules["radius"][k]
+        to_box(capsules[k], nearest_to_box(capsules[k], corners), corners, near)
+        - body.capsules["radius"][k]
         for k in np.flatnonzero(body.capsules["link"])
     ]
 
@@ -265,13 +317,17 @@ def test_near_parts_move_apart(arm: str) -> None:
     """Small errors of many stops add up otherwise."""
     cell = cell_of(arm)
     urdf = robot_description(cell)
-    separation, kinematics, random = Separation(cell, urdf), Arm(cell, urdf), np.random.default_rng(3)
+    separation = Separation(cell, urdf)
+    kinematics = Arm(cell, urdf)
+    random = np.random.default_rng(3)
     planned = []
     for q in random.uniform(cell.joints.lower, cell.joints.upper, (4000, len(cell.joints.names))):
         clear, _, thing = separation.clearance(q, NOBODY)
         if thing != NEAR_ITSELF or not -0.009 < clear < -0.001:
             continue
-        separation.step(start_state(cell, shipped_skill()), blank(frame_layout(len(q))), kinematics.at(q).record)
+        separation.step(
+            start_state(cell, shipped_skill()), blank(frame_layout(len(q))), kinematics.at(q).record
+        )
         least = separation.constraints[: separation.count]
         assert least["allowed"].min() == pytest.approx(0.1 * SLIP_SPEED_MPS)
         planned.append(least["planned"].min())
@@ -287,10 +343,18 @@ def test_leaving_motion_is_not_slowed() -> None:
     for velocity in ([-0.4, 0.0, 0.0], [-0.2, 0.1, 0.3]):
         separation.step(state, FRAME, pose.record)
         free = ARM.step(POSTURE, pose.position, np.array(velocity), orientation_of(pose))
-        guarded = ARM.step(POSTURE, pose.position, np.array(velocity), orientation_of(pose), separation=separation)
+        guarded = ARM.step(
+            POSTURE, pose.position, np.array(velocity), orientation_of(pose), separation=separation
+        )
         assert separation.count
         assert (guarded.separated, guarded.velocity.tobytes()) == (False, free.velocity.tobytes())
-    toward = ARM.step(POSTURE, pose.position, np.array([0.4, 0.0, 0.0]), orientation_of(pose), separation=separation)
+    toward = ARM.step(
+        POSTURE,
+        pose.position,
+        np.array([0.4, 0.0, 0.0]),
+        orientation_of(pose),
+        separation=separation,
+    )
     assert toward.separated
     assert pose.tasks[0] @ toward.velocity < 0.05
 
@@ -298,13 +362,18 @@ def test_leaving_motion_is_not_slowed() -> None:
 @pytest.mark.parametrize("hand_speed", [0.0, 0.05, 1.5])
 def test_passing_hand_is_foreseen(hand_speed: float) -> None:
     """The tool leaves the hand now, but goes where a fast one will be a tenth of a second later."""
-    separation, pose, velocity, near = Separation(ASSUMED, URDF), ARM.at(POSTURE), np.array([0.3, 0.4, 0.0]), np.empty(9)
+    separation = Separation(ASSUMED, URDF)
+    pose = ARM.at(POSTURE)
+    velocity = np.array([0.3, 0.4, 0.0])
+    near = np.empty(9)
     state = with_hands(np.add(pose.position, (0.14, -0.16, 0.0)))
     state["hands"][0, 1, 1] = hand_speed
     free = ARM.step(POSTURE, pose.position, velocity, orientation_of(pose))
     state["joints"][1] = free.velocity
     separation.step(state, FRAME, pose.record)
-    guarded = ARM.step(POSTURE, pose.position, velocity, orientation_of(pose), separation=separation)
+    guarded = ARM.step(
+        POSTURE, pose.position, velocity, orientation_of(pose), separation=separation
+    )
     forearm = state["hands"][0, 0] + np.array([[0.0, 0.0, 0.0], [0.24, 0.0, 0.0]])
     for k in np.flatnonzero(BODY.capsules["link"] == 7):
         distance_m = between_segments(placed(POSTURE + 1e-6 * free.velocity)[k], forearm, near)
@@ -326,33 +395,48 @@ def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
         state = with_hands(Scene().handover, Scene().right_start)
         state["hands"][:, 0, 2] += offset_m
         separation.step(state, FRAME, pose.record)
-        limits = sorted(set(separation.constraints["planned"][: separation.count].round(6).tolist()))
+        limits = sorted(
+            set(separation.constraints["planned"][: separation.count].round(6).tolist())
+        )
         assert tool.sum() == 1
         assert all(limit >= 0 for limit in limits)
-        state["hands"][0, 0] = pose.position  # the hand is at the tool: only where it receives it may be touched
+        state["hands"][0, 0] = (
+            pose.position
+        )  # the hand is at the tool: only where it receives it may be touched
         if gentle:
             place, *others = taught.via_points
-            separation.set_contacts([msgspec.structs.replace(place, left=tuple(pose.position.tolist())), *others])
+            separation.set_contacts(
+                [msgspec.structs.replace(place, left=tuple(pose.position.tolist())), *others]
+            )
         separation.step(state, FRAME, pose.record)
         allowed = separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
-        state["hands"][0, 0], state["hands"][1, 0] = Scene().handover, pose.position  # the other hand receives nothing
+        # the other hand receives nothing
+        state["hands"][0, 0] = Scene().handover
+        state["hands"][1, 0] = pose.position
         separation.step(state, FRAME, pose.record)
-        assert not (abs(separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS - 0.25) < 1e-9).any()
-        state["hands"][0, 0], state["hands"][1, 0] = pose.position, Scene().right_start
+        assert not (
+            abs(separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS - 0.25)
+            < 1e-9
+        ).any()
+        state["hands"][0, 0] = pose.position
+        state["hands"][1, 0] = Scene().right_start
         separation.step(state, FRAME, pose.record)
         assert separation.speed_limit == 0.0  # no other part may come nearer
 
 
 def test_a_hand_just_seen_counts_as_fast() -> None:
-    separation, pose = Separation(ASSUMED, URDF), ARM.at(POSTURE)
+    separation = Separation(ASSUMED, URDF)
+    pose = ARM.at(POSTURE)
     state = with_hands(np.add(pose.position, (0.25, 0.0, 0.0)))
     state["mode_probabilities"] = 1 / 3
     separation.step(state, FRAME, pose.record)
     limit_mps = separation.speed_limit
     state["mode_covariances"][0, :, 1, 1] = 0.3**2
     separation.step(state, FRAME, pose.record)
-    assert separation.speed_limit == pytest.approx(allowed_speed(separation.nearest_m, 1.6, 3.0, 0.13, 0.03))
+    assert separation.speed_limit == pytest.approx(
+        allowed_speed(separation.nearest_m, 1.6, 3.0, 0.13, 0.03)
+    )
     assert separation.speed_limit < 0.5 * limit_mps
 
 
@@ -362,14 +446,22 @@ def test_braking_joints_do_not_take_turns() -> None:
     """
     cell = cell_of("panda")
     urdf = robot_description(cell)
-    arm, separation, state, frame = Arm(cell, urdf), Separation(cell, urdf), blank(STATE), blank(frame_layout(7))
+    arm = Arm(cell, urdf)
+    separation = Separation(cell, urdf)
+    state = blank(STATE)
+    frame = blank(frame_layout(7))
     segment = LimiterStage(cell, arm)
     segment.begin(state, np.array(cell.arm.posture))
-    state["joints"][1:] = [[-0.4, -0.17, 0.33, 0.12, 0.18, -0.28, -0.1], [-1.29, -3.0, -2.22, -1.79, -1.4, -1.89, 1.32]]
+    state["joints"][1:] = [
+        [-0.4, -0.17, 0.33, 0.12, 0.18, -0.28, -0.1],
+        [-1.29, -3.0, -2.22, -1.79, -1.4, -1.89, 1.32],
+    ]
     separation.constraints["row"][0] = row = np.array([-0.5, 0.03, -0.48, -0.1, 0.12, 0.06, -0.01])
-    separation.constraints["planned"][0], separation.constraints["allowed"][0] = 0.0, 0.006
+    separation.constraints["planned"][0] = 0.0
+    separation.constraints["allowed"][0] = 0.006
     separation.count = 1
-    target, approach = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1]), []
+    target = np.array([-0.5, -0.02, 0.54, 0.12, 0.2, -0.12, -0.1])
+    approach = []
     for _ in range(100):
         segment.step(state, frame, target, np.zeros(7), separation)
         approach.append(row @ state["joints"][1])
@@ -379,8 +471,11 @@ def test_braking_joints_do_not_take_turns() -> None:
 
 def test_stop_does_not_approach_passing_hand() -> None:
     """The direction to a hand that sweeps past turns, until a straight stop approaches it."""
-    separation, state, frame = Separation(ASSUMED, URDF), blank(STATE), blank(frame_layout(7))
-    segment, approach = LimiterStage(ASSUMED, ARM), []
+    separation = Separation(ASSUMED, URDF)
+    state = blank(STATE)
+    frame = blank(frame_layout(7))
+    segment = LimiterStage(ASSUMED, ARM)
+    approach = []
     for is_heeded in (False, True):
         segment.begin(state, POSTURE)
         state["joints"][1] = [0.8, -0.35, 1.0, 0.25, 1.4, 0.45, 0.0]
@@ -391,8 +486,11 @@ def test_stop_does_not_approach_passing_hand() -> None:
         speeds = []
         for tick in range(90):
             turn = 0.0044 * tick - 0.1
-            row = (math.sin(turn) * along + math.cos(turn) * away) @ ARM.at(state["joints"][0]).tasks[:3]
-            separation.constraints["row"][0], separation.constraints["allowed"][0] = row, SLIP_SPEED_MPS
+            row = (math.sin(turn) * along + math.cos(turn) * away) @ ARM.at(
+                state["joints"][0]
+            ).tasks[:3]
+            separation.constraints["row"][0] = row
+            separation.constraints["allowed"][0] = SLIP_SPEED_MPS
             separation.count = int(is_heeded)
             segment.stop(state, frame, separation)
             speeds.append(row @ state["joints"][1])

@@ -41,9 +41,15 @@ def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings
     assert np.isfinite(states).all()
     assert np.linalg.norm(states[:, 1], axis=1).max() <= tool.max_speed + 1e-9
     assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
-    assert np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
-    trapezia = 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])  # of constant jerk: wrong by jerk period³ / 12
-    np.testing.assert_allclose(np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.jerk * PERIOD_S**3 / 12)
+    assert (
+        np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
+    )
+    trapezia = (
+        0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])
+    )  # of constant jerk: wrong by jerk period³ / 12
+    np.testing.assert_allclose(
+        np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.jerk * PERIOD_S**3 / 12
+    )
     assert (states[:, 0] >= BOX[0] - 1e-9).all()
     assert (states[:, 0] <= BOX[1] + 1e-9).all()
     positions = np.array([states[0, 0], *(target[0] for target in targets)])
@@ -58,7 +64,9 @@ def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings
 
 @properties
 @given(st.lists(st.tuples(inside, moving, wild), min_size=1, max_size=25), st.integers(1, 120))
-def test_every_bound_holds_whatever_is_asked(told: list[tuple[tuple[float, ...], ...]], ticks: int) -> None:
+def test_every_bound_holds_whatever_is_asked(
+    told: list[tuple[tuple[float, ...], ...]], ticks: int
+) -> None:
     targets = [np.array(target) for target in told for _ in range(ticks)]
     states, _ = driven(targets)
     assert_bounds_hold(states, targets)
@@ -66,20 +74,29 @@ def test_every_bound_holds_whatever_is_asked(told: list[tuple[tuple[float, ...],
 
 @properties
 @given(st.lists(inside, min_size=2, max_size=6), st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_alternating_targets_keep_bounds(places: list[tuple[float, ...]], ticks: int, seed: int) -> None:
+def test_alternating_targets_keep_bounds(
+    places: list[tuple[float, ...]], ticks: int, seed: int
+) -> None:
     """Targets that alternate or tremble make no setpoint run away."""
     random = np.random.default_rng(seed)
     targets = []
     for place in itertools.islice(itertools.cycle(places), 1500 // ticks):
         for _ in range(ticks):
             position = np.clip(np.array(place) + random.normal(0.0, 0.005, 3), *BOX)
-            targets.append(np.array([position, random.normal(0.0, 2.0, 3), random.normal(0.0, 50.0, 3)]))
+            targets.append(
+                np.array([position, random.normal(0.0, 2.0, 3), random.normal(0.0, 50.0, 3)])
+            )
     states, _ = driven(targets)
     assert_bounds_hold(states, targets)
 
 
 @properties
-@given(st.lists(inside, min_size=2, max_size=4), inside, st.integers(1, 40), st.sampled_from([0.0, 1e2, 1e4, 1e6]))
+@given(
+    st.lists(inside, min_size=2, max_size=4),
+    inside,
+    st.integers(1, 40),
+    st.sampled_from([0.0, 1e2, 1e4, 1e6]),
+)
 def test_starved_axis_comes_back(
     places: list[tuple[float, ...]], start: tuple[float, ...], ticks: int, wild: float
 ) -> None:
@@ -108,18 +125,24 @@ def test_rests_on_a_side_of_the_workspace(seed: int) -> None:
     )
     rate_hz = int(random.choice([50, 70, 100, 125, 250, 333, 500, 700, 1000]))
     settings = Settings(rate_hz=rate_hz, tool=tool if seed % 3 else TOOL)
-    target, sides = random.uniform(*BOX), random.integers(0, 3, 3)
+    target = random.uniform(*BOX)
+    sides = random.integers(0, 3, 3)
     sides[random.integers(3)] = random.integers(2)
     for axis, side in enumerate(sides):
         if side < 2:
             hair = random.choice([0.0, 1e-9, 1e-6, 1e-5, 1e-4])
             target[axis] = BOX[side, axis] + hair * (1 - 2 * side)
     start = target + random.uniform(0, 0.2) * (BOX.mean(axis=0) - target)
-    generator, state = SetpointGenerator(settings), blank(STATE)
+    generator = SetpointGenerator(settings)
+    state = blank(STATE)
     generator.begin(state, at_rest(start))
-    slowest_s = max(JERK_WEIGHT ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3))
+    slowest_s = max(
+        JERK_WEIGHT ** (1 / 6), 1.5 * tool.acceleration / tool.jerk, (100 * tool.jerk) ** (-1 / 3)
+    )
     accelerations = []
-    for _ in range(round((3.0 + 2.0 * np.linalg.norm(target - start) / speed + 30 * slowest_s) * rate_hz)):
+    for _ in range(
+        round((3.0 + 2.0 * np.linalg.norm(target - start) / speed + 30 * slowest_s) * rate_hz)
+    ):
         generator.step(state, Target(*at_rest(target), clamped=True), BOX, FREE, 1.0)
         accelerations.append(np.abs(state["setpoint"][2]).max())
     assert max(accelerations[-rate_hz:]) <= 1e-6
@@ -128,7 +151,8 @@ def test_rests_on_a_side_of_the_workspace(seed: int) -> None:
 
 def test_waits_for_a_tool_that_cannot_come() -> None:
     """Bounded for good: it used to creep on to its target."""
-    generator, state = Explained(Settings(tool=TOOL)), blank(STATE)
+    generator = Explained(Settings(tool=TOOL))
+    state = blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
     gaps_m = TUNING.setpoint.gap_waiting_m, TUNING.setpoint.gap_stopped_m
@@ -173,10 +197,16 @@ def test_slow_joints_slow_it_on_its_way() -> None:
 
 def test_broken_bound_is_named() -> None:
     """A setpoint beyond a bound is detected."""
-    generator, state = SetpointGenerator(Settings()), blank(STATE)
+    generator = SetpointGenerator(Settings())
+    state = blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
     before = state["setpoint"].copy()
-    for bound, row, value in (("speed", 1, 0.9), ("acceleration", 2, 10.1), ("jerk", 2, 1.0), ("position", 0, 9.0)):
+    for bound, row, value in (
+        ("speed", 1, 0.9),
+        ("acceleration", 2, 10.1),
+        ("jerk", 2, 1.0),
+        ("position", 0, 9.0),
+    ):
         state["setpoint"] = before
         state["setpoint"][row, 0] = value
         assert generator.name_of_broken_bound(state, before, BOX) == bound
@@ -197,18 +227,28 @@ def test_fastest_stop_is_that_of_ruckig(
     profile = ruckig_stop(velocity, acceleration, max_acceleration, max_jerk)
     out = np.empty(6)
     fastest_stop(velocity, acceleration, max_acceleration, max_jerk, PERIOD_S, out)
-    position, speed, change = (value[0] for value in profile.at_time(min(PERIOD_S, profile.duration)))
+    position, speed, change = (
+        value[0] for value in profile.at_time(min(PERIOD_S, profile.duration))
+    )
     np.testing.assert_allclose(out[:3], [speed, change, position], atol=1e-7)
     extrema = profile.position_extrema[0]
-    np.testing.assert_allclose(out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0), profile.duration], atol=1e-7)
+    np.testing.assert_allclose(
+        out[3:], [min(extrema.min, 0.0), max(extrema.max, 0.0), profile.duration], atol=1e-7
+    )
 
 
-def ruckig_stop(velocity: float, acceleration: float, max_acceleration: float, max_jerk: float) -> ruckig.Trajectory:
+def ruckig_stop(
+    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float
+) -> ruckig.Trajectory:
     """Ruckig's stop of one axis from 0."""
-    question, profile = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    question = ruckig.InputParameter(1)
+    profile = ruckig.Trajectory(1)
     question.control_interface = ruckig.ControlInterface.Velocity
-    question.current_velocity, question.current_acceleration = [velocity], [acceleration]
+    question.current_velocity = [velocity]
+    question.current_acceleration = [acceleration]
     question.target_velocity = [0.0]
-    question.max_velocity, question.max_acceleration, question.max_jerk = [9.0], [max_acceleration], [max_jerk]
+    question.max_velocity = [9.0]
+    question.max_acceleration = [max_acceleration]
+    question.max_jerk = [max_jerk]
     ruckig.Ruckig(1).calculate(question, profile)
     return profile

@@ -29,8 +29,10 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Settings:
 
 def test_the_body_moves_as_the_links_do(cell: Settings) -> None:
     urdf = robot_description(cell)
-    body, model = body_of(cell, urdf), pin.buildModelFromXML(urdf)
-    data, rng = model.createData(), np.random.default_rng(2)
+    body = body_of(cell, urdf)
+    model = pin.buildModelFromXML(urdf)
+    data = model.createData()
+    rng = np.random.default_rng(2)
     for _ in range(20):
         q = rng.uniform(cell.joints.lower, cell.joints.upper)
         pin.forwardKinematics(model, data, q)
@@ -42,7 +44,8 @@ def test_the_body_moves_as_the_links_do(cell: Settings) -> None:
 
 
 def test_no_part_is_faster_than_its_bound(cell: Settings) -> None:
-    body, rng = body_of(cell, robot_description(cell)), np.random.default_rng(3)
+    body = body_of(cell, robot_description(cell))
+    rng = np.random.default_rng(3)
     ends = np.empty((2, len(body.capsules), 2, 3))
     for _ in range(300):
         q = rng.uniform(cell.joints.lower, cell.joints.upper)
@@ -53,13 +56,17 @@ def test_no_part_is_faster_than_its_bound(cell: Settings) -> None:
         assert (speed <= body.capsules["max_speed"] * (1 + 1e-4)).all()
 
 
-def test_rail_follows_within_limits_and_replays(cell: Settings, skill: Skill, tmp_path: Path) -> None:
+def test_rail_follows_within_limits_and_replays(
+    cell: Settings, skill: Skill, tmp_path: Path
+) -> None:
     """It follows with every limit held and replays."""
     loop = Loop(cell, skill)
     loop.hands = script_hands(HandScript(Scene(), seed=3))
     frames = loop.run(3500)
     assert (frames["mode"][1000:] == Mode.FOLLOW).all()
-    assert np.ptp(frames["joints"][frames["commanded"] != 0], axis=0)[0] > 0.05, "the rail is not used"
+    assert np.ptp(frames["joints"][frames["commanded"] != 0], axis=0)[0] > 0.05, (
+        "the rail is not used"
+    )
     assert_limits_hold(frames, cell)
     off_mm = 1000 * np.linalg.norm(frames["tool"] - frames["setpoint"], axis=1)[1000:]
     assert np.sqrt(np.mean(off_mm**2)) < 1.0, off_mm.max()
@@ -67,17 +74,23 @@ def test_rail_follows_within_limits_and_replays(cell: Settings, skill: Skill, tm
 
 
 @pytest.mark.parametrize(("off_m", "reason"), [(0.04, Reason.NONE), (0.06, Reason.ARM_ERROR)])
-def test_rail_that_does_not_follow_is_a_fault(cell: Settings, skill: Skill, off_m: float, reason: Reason) -> None:
+def test_rail_that_does_not_follow_is_a_fault(
+    cell: Settings, skill: Skill, off_m: float, reason: Reason
+) -> None:
     """A rail that does not follow is a fault."""
-    loop, rail = Loop(cell, skill), np.eye(7)[0]
+    loop = Loop(cell, skill)
+    rail = np.eye(7)[0]
     loop.reports = lambda q, dq: (q + off_m * max(0, loop.index - 200) / 100 * rail, 0.0 * dq)
     assert int(loop.run(300)["reason"][-1]) == reason
 
 
 @pytest.mark.parametrize(
-    ("rail_m", "cause"), [(0.2, None), (0.38, None), (0.42, Cause.OUT_OF_RANGE), (200.0, Cause.OUT_OF_RANGE)]
+    ("rail_m", "cause"),
+    [(0.2, None), (0.38, None), (0.42, Cause.OUT_OF_RANGE), (200.0, Cause.OUT_OF_RANGE)],
 )
-def test_rail_outside_limits_returns(cell: Settings, skill: Skill, rail_m: float, cause: Cause | None) -> None:
+def test_rail_outside_limits_returns(
+    cell: Settings, skill: Skill, rail_m: float, cause: Cause | None
+) -> None:
     """A rail outside its limits is brought back or refused."""
     loop = Loop(cell, skill, (rail_m, *cell.arm.posture[1:]))
     loop.hands = None

@@ -31,7 +31,9 @@ def there_and_back() -> np.ndarray:
         segments["begins"][k, 0] = (0.5 if k % 2 == 0 else 0.9, 0.0, 0.1)
         segments["way"][k, 0] = (0.4 * sign, 0.0, 0.0)
         segments["begins"][k, 1] = (0.8, 0.3, 0.1)
-    segments["square"], segments["off"], segments["follow"] = (segments["way"] ** 2).sum(axis=2), 0.03, -1
+    segments["square"] = (segments["way"] ** 2).sum(axis=2)
+    segments["off"] = 0.03
+    segments["follow"] = -1
     return segments
 
 
@@ -39,7 +41,8 @@ def motion(x: np.ndarray) -> np.ndarray:
     """Hands (T, 3, 6) whose left one goes along x so."""
     out = np.zeros((len(x), 3, 6))
     out[:, 0] = (0.0, 0.0, 0.1, 0.8, 0.3, 0.1)
-    out[:, 0, 0], out[:, 1, 0] = x, np.gradient(x, PERIOD_S)
+    out[:, 0, 0] = x
+    out[:, 1, 0] = np.gradient(x, PERIOD_S)
     return out
 
 
@@ -53,7 +56,8 @@ def legs(*ends: float) -> np.ndarray:
 
 
 def beliefs(segments: np.ndarray, x: np.ndarray) -> np.ndarray:
-    belief, out = np.zeros(MOST_SEGMENTS), []
+    belief = np.zeros(MOST_SEGMENTS)
+    out = []
     for moving in motion(x):
         recognise(belief, moving, PERIOD_S, segments, FIRST_SEGMENT_ODDS)
         out.append(belief.copy())
@@ -75,7 +79,8 @@ def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
 def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
     """The hands' places distinguish segments with other paths; earlier ones are forgotten."""
     segments = there_and_back.copy()
-    segments["begins"][3, 0], segments["way"][3, 0] = (0.5, 0.4, 0.1), (0.4, 0.0, 0.0)
+    segments["begins"][3, 0] = (0.5, 0.4, 0.1)
+    segments["way"][3, 0] = (0.4, 0.0, 0.0)
     belief = np.zeros(MOST_SEGMENTS)
     belief[0] = 1.0
     for moving in motion(np.full(100, 0.7)):
@@ -87,10 +92,13 @@ def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
 def test_resting_hand_near_an_end_is_there(there_and_back: np.ndarray) -> None:
     """A hand that rests near an end counts as there, a moving one as on its way."""
     segment = there_and_back[0]
-    near, half = np.array([0.54, 0.02, 0.1]), np.array([0.7, 0.0, 0.1])
+    near = np.array([0.54, 0.02, 0.1])
+    half = np.array([0.7, 0.0, 0.1])
     assert along_way(near, 1.0, segment, 0) < 0.01
     assert along_way(near, 0.0, segment, 0) == pytest.approx(0.1)
-    assert along_way(half, 1.0, segment, 0) == along_way(half, 0.0, segment, 0) == pytest.approx(0.5)
+    assert (
+        along_way(half, 1.0, segment, 0) == along_way(half, 0.0, segment, 0) == pytest.approx(0.5)
+    )
     assert along_way(half, 0.0, segment, 1) == 1.0  # the right hand stays
 
 
@@ -99,20 +107,25 @@ def test_hands_are_delayed_as_learned() -> None:
     times = np.arange(0.0, 4.0, PERIOD_S)
     hands = np.tile(0.2 * np.sin(times)[:, None], (1, 6))
     rows = along(hands, PERIOD_S, 0.3 / 4, 4)
-    out, index = np.empty((3, 6)), 350
+    out = np.empty((3, 6))
+    index = 350
     moving = np.stack([hands[index], np.gradient(hands, PERIOD_S, axis=0)[index], -hands[index]])
     behind = np.ascontiguousarray(rows[index])
     delayed(moving, behind, 0.3, out)
     time_s = times[index] - 0.3
-    np.testing.assert_allclose(out[:, 0], [0.2 * np.sin(time_s), 0.2 * np.cos(time_s), -0.2 * np.sin(time_s)], atol=0.01)
+    np.testing.assert_allclose(
+        out[:, 0], [0.2 * np.sin(time_s), 0.2 * np.cos(time_s), -0.2 * np.sin(time_s)], atol=0.01
+    )
     delayed(moving, behind, -0.1, out)
     assert out[0, 0] == pytest.approx(0.2 * np.sin(times[index] + 0.1), abs=0.002)
 
 
 def test_segment_is_set_kept_and_reset() -> None:
     """The segment is set kept over a hold and begun anew by another task."""
-    settings, skill = Settings(), shipped_skill()
-    segment, state = SkillStage(settings, skill), start_state(settings, skill)
+    settings = Settings()
+    skill = shipped_skill()
+    segment = SkillStage(settings, skill)
+    state = start_state(settings, skill)
     segment.set_segment(state, "glass")
     assert state["segment_belief"].argmax() == skill.model.names.index("glass")
     segment.set_segment(state, "nowhere")

@@ -30,7 +30,9 @@ from thirdhand.core.way_out import WayOut
 from thirdhand.settings.config import Settings, robot_description
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "4"))
-SOUGHT_S, AGAIN_S = 0.3, 2.0  # that a search takes, and until the next one
+# that a search takes, and until the next one
+SOUGHT_S = 0.3
+AGAIN_S = 2.0
 THERE_M = 0.02
 
 
@@ -45,27 +47,43 @@ class Run(NamedTuple):
 
 
 def session(
-    cell: Settings, skill: Skill, start: Vector, hands: Vector, *, seconds: float = 20.0, finds: bool = True
+    cell: Settings,
+    skill: Skill,
+    start: Vector,
+    hands: Vector,
+    *,
+    seconds: float = 20.0,
+    finds: bool = True,
 ) -> Run:
     """Resting hands (2, 3) and an arm that starts somewhere; where it is stuck a way is looked for,
     as the daemon does.
     """
-    urdf, dt = robot_description(cell), cell.period_s
+    urdf = robot_description(cell)
+    dt = cell.period_s
     state = start_state(cell, skill)
     state["joints"][0] = start
-    controller, way_out = Controller(cell, skill, state, urdf=urdf), WayOut(cell, urdf)
+    controller = Controller(cell, skill, state, urdf=urdf)
+    way_out = WayOut(cell, urdf)
     steps: list[tuple[Tick, Frame]] = []
     ways: list[list[Vector]] = []
     coming: dict[int, Event] = {}
-    asked, every = -round(AGAIN_S / dt), max(1, round(0.02 / dt))
+    asked = -round(AGAIN_S / dt)
+    every = max(1, round(0.02 / dt))
     for k in range(1, round(seconds / dt)):
-        inbox = (*(seen(hands, k) if k % every == 1 else ()), *([coming.pop(k)] if k in coming else ()))
+        inbox = (
+            *(seen(hands, k) if k % every == 1 else ()),
+            *([coming.pop(k)] if k in coming else ()),
+        )
         frame = controller.step(Tick(k, inbox))
         steps.append((Tick(k, inbox), frame))
         now = controller.state
         if now["stuck"] and not now["way_count"] and k - asked >= AGAIN_S / dt:
             asked = k
-            ways.append(way_out.find(now["joints"][0], frame["target"], frame["orientation"], hands) if finds else [])
+            ways.append(
+                way_out.find(now["joints"][0], frame["target"], frame["orientation"], hands)
+                if finds
+                else []
+            )
             postures = json.dumps([posture.tolist() for posture in ways[-1]])
             coming[k + round(SOUGHT_S / dt)] = order("way", postures)
         off_m = np.linalg.norm(frame["tool"] - frame["target"])
@@ -79,7 +97,8 @@ def session(
 def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) -> None:
     """From any free start the tool comes to its target."""
     cell = replace(cell_of(name), rate_hz=250)
-    random, hands = np.random.default_rng(seed), taught.hands.reshape(-1, 2, 3)
+    random = np.random.default_rng(seed)
+    hands = taught.hands.reshape(-1, 2, 3)
     late = []
     for number, start in enumerate(free_postures(cell, MANY, seed)):
         ran = session(cell, taught, start, hands[random.integers(len(hands))])
@@ -87,7 +106,9 @@ def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) 
         is_reported = last["flags"] & Flag.STUCK or last["reason"] == Reason.BLOCKED
         if ran.there_s is None:
             late.append(number)
-            assert is_reported or last["flags"] & Flag.SEPARATION, f"start {number}: not there, and nothing said"
+            assert is_reported or last["flags"] & Flag.SEPARATION, (
+                f"start {number}: not there, and nothing said"
+            )
     assert len(late) <= MANY // 50, late
 
 
@@ -98,7 +119,8 @@ STUCK = 5
 @pytest.fixture(scope="module")
 def stuck(taught: Skill) -> tuple[Settings, Vector, Vector]:
     cell = replace(cell_of("wam"), rate_hz=250)
-    random, hands = np.random.default_rng(100), taught.hands.reshape(-1, 2, 3)
+    random = np.random.default_rng(100)
+    hands = taught.hands.reshape(-1, 2, 3)
     drawn = [hands[random.integers(len(hands))] for _ in range(STUCK + 1)]
     return cell, free_postures(cell, STUCK + 1, 1)[STUCK], drawn[STUCK]
 
@@ -113,7 +135,9 @@ def test_stuck_tool_is_reported_and_led_out(
     flagged = int(np.flatnonzero(frames["flags"] & Flag.STUCK)[0])
     off_m = np.linalg.norm(frames["tool"] - frames["target"], axis=1)
     before = flagged - round(1.0 / cell.period_s)
-    assert off_m[before] - off_m[flagged] < 0.1 * off_m[before]  # within a second of no real progress
+    assert (
+        off_m[before] - off_m[flagged] < 0.1 * off_m[before]
+    )  # within a second of no real progress
     assert ran.there_s is not None
     assert 2 <= len(ran.ways[0]) <= WAY
     assert (frames["mode"][frames["reason"] == Reason.BLOCKED] == Mode.HOLD).all()
@@ -134,15 +158,24 @@ def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Ve
     assert not last["joint_velocities"].any()
 
 
-def test_way_from_elsewhere_is_ignored(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
+def test_way_from_elsewhere_is_ignored(
+    taught: Skill, stuck: tuple[Settings, Vector, Vector]
+) -> None:
     """A way out that begins elsewhere is not followed."""
     cell, start, hands = stuck
     state = start_state(cell, taught)
     state["joints"][0] = start
-    controller, far = Controller(cell, taught, state, urdf=URDF), json.dumps([(start + 0.5).tolist(), start.tolist()])
+    controller = Controller(cell, taught, state, urdf=URDF)
+    far = json.dumps([(start + 0.5).tolist(), start.tolist()])
     for k in range(1, 2000):
         controller.step(
-            Tick(k, (*(seen(hands, k) if k % 5 == 1 else ()), *([order("way", far)] if k % 100 == 0 else ())))
+            Tick(
+                k,
+                (
+                    *(seen(hands, k) if k % 5 == 1 else ()),
+                    *([order("way", far)] if k % 100 == 0 else ()),
+                ),
+            )
         )
         assert not controller.state["way_count"]
 
@@ -150,8 +183,10 @@ def test_way_from_elsewhere_is_ignored(taught: Skill, stuck: tuple[Settings, Vec
 @pytest.mark.parametrize("seed", range(3))
 def test_arm_in_the_table_leaves_it_first(skill: Skill, seed: int) -> None:
     """An arm that stands in the table is not ready until it is out."""
-    cell, random = replace(ASSUMED, arm=replace(ASSUMED.arm, source="state")), np.random.default_rng(seed)
-    separation, kinematics = Separation(cell, URDF), Arm(cell, URDF)
+    cell = replace(ASSUMED, arm=replace(ASSUMED.arm, source="state"))
+    random = np.random.default_rng(seed)
+    separation = Separation(cell, URDF)
+    kinematics = Arm(cell, URDF)
     while True:
         q = random.uniform(cell.joints.lower, cell.joints.upper)
         depth, _, thing = separation.intrusion(q)

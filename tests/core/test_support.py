@@ -34,7 +34,9 @@ def errors() -> LocalErrors:
         lambda_mean=1.0,
     )
     inputs = np.concatenate([np.zeros((20, 2)), np.ones((20, 2))])
-    errors_m = np.concatenate([np.tile([0.02, 0.0, 0.0], (20, 1)), np.tile([0.0, 0.05, 0.0], (20, 1))])
+    errors_m = np.concatenate(
+        [np.tile([0.02, 0.0, 0.0], (20, 1)), np.tile([0.0, 0.05, 0.0], (20, 1))]
+    )
     return LocalErrors.of(primitive, inputs, errors_m, FAR_STD_M)
 
 
@@ -43,8 +45,12 @@ def test_covariance_is_scatter_of_near_errors(errors: LocalErrors) -> None:
     least = LEAST_STD_M**2 * np.eye(3)
     near, other, far = errors.covariances(np.array([[0.0, 0.0], [1.0, 1.0], [6.0, -6.0]])) - least
     prior = 0.1 / 20.1 * FAR_STD_M**2
-    np.testing.assert_allclose(near, np.diag([0.02**2, 0.0, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9)
-    np.testing.assert_allclose(other, np.diag([0.0, 0.05**2, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(
+        near, np.diag([0.02**2, 0.0, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        other, np.diag([0.0, 0.05**2, 0.0]) * 20 / 20.1 + prior * np.eye(3), atol=1e-9
+    )
     np.testing.assert_allclose(far, FAR_STD_M**2 * np.eye(3), atol=1e-9)
     away = np.linspace(0.0, 3.0, 30)[:, None] * [1.0, -1.0]
     grows = np.trace(errors.covariances(away), axis1=1, axis2=2)
@@ -56,16 +62,24 @@ def test_error_probability_follows_levels() -> None:
     covariance.
     """
     ratios = np.array(NORMAL_RATIOS)
-    at_levels = [error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios]
+    at_levels = [
+        error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios
+    ]
     np.testing.assert_allclose(at_levels, 1.0 - np.array(LEVELS), atol=1e-6)
     stds = np.geomspace(0.005, 3.0, 60)
     probabilities = [error_probability(std**2 * np.eye(3), 0.0, ratios) for std in stds]
     assert (np.diff(probabilities) >= 0.0).all()
     assert probabilities[0] < 1e-4
     assert probabilities[-1] > 0.99
-    drawn = np.linalg.norm(0.05 * np.random.default_rng(2).normal(size=(20_000, 3)), axis=1) > UNSURE_M
-    assert error_probability(0.05**2 * np.eye(3), 0.0, ratios) == pytest.approx(drawn.mean(), abs=0.02)
-    assert error_probability(0.05**2 * np.eye(3), 0.0075, ratios) == error_probability(0.005 * np.eye(3), 0.0, ratios)
+    drawn = (
+        np.linalg.norm(0.05 * np.random.default_rng(2).normal(size=(20_000, 3)), axis=1) > UNSURE_M
+    )
+    assert error_probability(0.05**2 * np.eye(3), 0.0, ratios) == pytest.approx(
+        drawn.mean(), abs=0.02
+    )
+    assert error_probability(0.05**2 * np.eye(3), 0.0075, ratios) == error_probability(
+        0.005 * np.eye(3), 0.0, ratios
+    )
     assert error_probability(np.zeros((3, 3)), 0.0, ratios) == 0.0
 
 
@@ -83,7 +97,8 @@ def test_unshown_places_are_uncertain() -> None:
     count = len(certain.names)
     scatters = np.tile(np.diag([0.02, 0.03, 0.01]), (count, 1, 1))
     model = segmented(unknown=Unknown(FAR_STD_M, scatters))
-    at_last, last = certain.hands[-1:], certain.names[-1:]
+    at_last = certain.hands[-1:]
+    last = certain.names[-1:]
 
     def covariance(one: SegmentedKMP, hands: np.ndarray) -> np.ndarray:
         belief = np.zeros(64)
@@ -95,21 +110,30 @@ def test_unshown_places_are_uncertain() -> None:
     added = covariance(model, at_last) - covariance(certain, at_last)
     assert np.diag(added) == pytest.approx([0.02, 0.03, 0.01], rel=0.2)
     assert np.abs(covariance(taught, at_last) - covariance(certain, at_last)).max() < 2e-3
-    few = segmented(unknown=Unknown(FAR_STD_M, 0.0 * scatters), errors=certain.errors[certain.errors[:, 2] < 0.5])
+    few = segmented(
+        unknown=Unknown(FAR_STD_M, 0.0 * scatters),
+        errors=certain.errors[certain.errors[:, 2] < 0.5],
+    )
     alone = segmented(errors=few.errors, unknown=None)
-    assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), "no errors of this segment"
+    assert np.trace(covariance(few, at_last)) > 5 * np.trace(covariance(alone, at_last)), (
+        "no errors of this segment"
+    )
 
 
 def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], list[bool], float]:
     """Error probabilities and flags of hands (2, 3) that rest, and the last unprimed belief in the
     first segment."""
     settings = Settings()
-    segment, state = SkillStage(settings, skill), start_state(settings, skill)
+    segment = SkillStage(settings, skill)
+    state = start_state(settings, skill)
     frame = blank(frame_layout(len(settings.joints.names)))
-    state["hands"][:, 0], state["hand_stillness"] = hands, 1.0
-    probabilities, unsure = [], []
+    state["hands"][:, 0] = hands
+    state["hand_stillness"] = 1.0
+    probabilities = []
+    unsure = []
     for tick in range(1, ticks + 1):
-        state["tick"], state["hand_ticks"] = tick, tick
+        state["tick"] = tick
+        state["hand_ticks"] = tick
         segment.step(state, frame)
         probabilities.append(float(frame["error_probability"]))
         unsure.append(bool(state["unsure"]))
@@ -121,8 +145,11 @@ def test_possible_other_segment_is_unsure() -> None:
     shipped = shipped_skill()
     regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
     model = segmented()
-    begin, places = model.hands[0].reshape(2, 3), model.nominal.at.copy()
-    places[2, :6] = model.hands[0]  # the hands return to where they began, and the tool is elsewhere then
+    begin = model.hands[0].reshape(2, 3)
+    places = model.nominal.at.copy()
+    places[2, :6] = model.hands[
+        0
+    ]  # the hands return to where they began, and the tool is elsewhere then
     places[2, 6:] = places[0, 6:] + (0.0, 0.3, 0.0)
     task = model.task._replace(corners=np.tile(np.arange(len(places))[:, None], 2))
     variant = replace(model, task=task, nominal=model.nominal._replace(at=places))

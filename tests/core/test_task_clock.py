@@ -32,14 +32,18 @@ from thirdhand_sim.lab.people.left_out import judged, left_out, predicted_rounds
 
 RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
 WAITS = RUNS._replace(waits=True)
-HOME, AWAY = np.array(RUNS.begin), np.array(RUNS.begin) + 0.5
+HOME = np.array(RUNS.begin)
+AWAY = np.array(RUNS.begin) + 0.5
 OWN = HOME + 0.3  # begin of a person whose hands start elsewhere than those of the demonstrations
 PERIOD_S = 0.01
 
 
-def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S) -> np.ndarray:
+def along(
+    clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S
+) -> np.ndarray:
     """The clock (T, CLOCK_SIZE) while the hands move or rest for these times at these positions."""
-    state, out = np.zeros(CLOCK_SIZE), []
+    state = np.zeros(CLOCK_SIZE)
+    out = []
     for activity, lasts_s, hands in parts:
         for _ in range(round(lasts_s / period_s)):
             moves = activity == "move"
@@ -57,14 +61,42 @@ def along(clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: flo
         (RUNS, [("move", 20.0, AWAY)], 5.1),  # it ends with the longest demonstration
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # it returns by itself
-        (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),  # a hesitation
-        (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),  # not where demonstrations begin
-        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)], 0.0),  # where this person began
+        (
+            RUNS,
+            [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)],
+            2.1,
+        ),  # a hesitation
+        (
+            RUNS,
+            [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)],
+            5.1,
+        ),  # not where demonstrations begin
+        (
+            RUNS,
+            [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)],
+            0.0,
+        ),  # where this person began
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, AWAY + 0.2)], 1.4),
-        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)], 1.4),  # a pause before leaving
-        (RUNS, [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)], 2.4),  # first seen in motion
-        (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),  # the task was over
-        (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),  # too short a rest
+        (
+            RUNS,
+            [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)],
+            1.4,
+        ),  # a pause before leaving
+        (
+            RUNS,
+            [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)],
+            2.4,
+        ),  # first seen in motion
+        (
+            RUNS,
+            [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)],
+            0.9,
+        ),  # the task was over
+        (
+            RUNS,
+            [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)],
+            5.1,
+        ),  # too short a rest
     ],
 )
 def test_clock_counts_from_first_motion(
@@ -77,9 +109,14 @@ def test_clock_counts_from_first_motion(
 @pytest.mark.parametrize("clock", [RUNS, WAITS])
 def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
     """Its rate and change are its derivatives."""
-    series = along(clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3)
+    series = along(
+        clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3
+    )
     assert np.abs(np.diff(series[:, CLOCK_S]) / 1e-3 - series[1:, CLOCK_RATE]).max() < 1e-9
-    assert np.quantile(np.abs(np.diff(series[:, CLOCK_RATE]) / 1e-3 - series[:-1, CLOCK_CHANGE]), 0.99) < 0.1
+    assert (
+        np.quantile(np.abs(np.diff(series[:, CLOCK_RATE]) / 1e-3 - series[:-1, CLOCK_CHANGE]), 0.99)
+        < 0.1
+    )
     assert series[:, REST_LEFT_S].min() >= 0.0
 
 
@@ -87,8 +124,11 @@ def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
 def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
     """A clock is learned as it counts live, at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
-    speeds, stillness = np.where(times > 1.0, 0.3, 0.0), np.where(times > 1.0, 0.0, 1.0)
-    expected_s = counted(np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None])
+    speeds = np.where(times > 1.0, 0.3, 0.0)
+    stillness = np.where(times > 1.0, 0.0, 1.0)
+    expected_s = counted(
+        np.tile(AWAY, (len(times), 1)), speeds, stillness, 1.0 / rate_hz, RUNS.numbers[None]
+    )
     live = along(RUNS, ("rest", 1.0, AWAY), ("move", 3.0, AWAY), period_s=0.002)[:, CLOCK_S]
     assert np.abs(np.interp(times, np.arange(len(live)) * 0.002, live) - expected_s).max() < 0.05
 
@@ -96,17 +136,23 @@ def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
 def test_task_begins_again_once_in_a_rest() -> None:
     """The task begins again once in each rest where it begins."""
     rows = RUNS.rows(np.stack([HOME, AWAY]))
-    state, begun = np.zeros(CLOCK_SIZE), []
-    for speed, hands, segment in [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300:
+    state = np.zeros(CLOCK_SIZE)
+    begun = []
+    for speed, hands, segment in (
+        [(0.3, AWAY, 1)] * 50 + [(0.0, HOME, 1)] * 300 + [(0.0, AWAY, 1)] * 300
+    ):
         begun.append(count(hands, speed, 0.0, PERIOD_S, segment, rows, state))
     assert np.flatnonzero(begun).tolist() == pytest.approx([50 + RUNS.home_s / PERIOD_S], abs=1)
-    for speed, hands in [(0.3, AWAY)] * 50 + [(0.0, AWAY)] * 300:  # a segment begins anew, but not the task
+    for speed, hands in [(0.3, AWAY)] * 50 + [
+        (0.0, AWAY)
+    ] * 300:  # a segment begins anew, but not the task
         assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
     assert state[CLOCK_S] == 0.0
 
 
 def test_own_begin_is_kept_through_segments() -> None:
-    rows, state = RUNS.rows(np.stack([HOME, HOME + 1.0])), np.zeros(CLOCK_SIZE)
+    rows = RUNS.rows(np.stack([HOME, HOME + 1.0]))
+    state = np.zeros(CLOCK_SIZE)
     begun = [
         count(hands, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)
         for speed, hands, segment, ticks in [
@@ -165,7 +211,9 @@ def test_learn_takes_a_clock_for_a_timetable(
     assert 1000.0 * np.linalg.norm(late.position - demonstrations[0].tool[-1, :3]) < error_mm
     assert np.linalg.norm(late.position - at(skill, 3.0).position) > 0.2
     behind, moving, ahead = (at(skill, 4.8 + step_s) for step_s in (-0.02, 0.0, 0.02))
-    np.testing.assert_allclose(moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3)
+    np.testing.assert_allclose(
+        moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,7 +232,9 @@ def test_every_round_is_predicted_as_the_first(kind: str) -> None:
 
 def test_each_segment_restarts_the_clock() -> None:
     """A clock starts anew in each segment with the next motion."""
-    rows, state, seconds = np.tile(RUNS.numbers, (2, 1)), np.zeros(CLOCK_SIZE), []
+    rows = np.tile(RUNS.numbers, (2, 1))
+    state = np.zeros(CLOCK_SIZE)
+    seconds = []
     for speed, segment in [(0.3, 0)] * 200 + [(0.0, 1)] * 100 + [(0.3, 1)] * 100:
         count(AWAY, speed, float(speed == 0.0), PERIOD_S, segment, rows, state)
         seconds.append(state[CLOCK_S])

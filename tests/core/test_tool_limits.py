@@ -21,14 +21,16 @@ PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 def test_limit_uses_all_that_is_planned(name: str) -> None:
     """At the tool's limit, the named joint uses all of its planned speed."""
     settings = cell_of(name)
-    arm, random = Arm(settings, robot_description(settings)), np.random.default_rng(0)
+    arm = Arm(settings, robot_description(settings))
+    random = np.random.default_rng(0)
     never_binding = {"max_speed": 100.0, "max_acceleration": 1000.0, "fault_speed": 200.0}
     quick = changed(settings, tool=never_binding)
     for _ in range(20):
         q = np.array(settings.arm.posture) + random.uniform(-0.2, 0.2, len(settings.joints.names))
         u = random.normal(size=3)
         u /= np.linalg.norm(u)
-        directed, least = tool_limits(arm, quick, q[None], u[None]), tool_limits(arm, quick, q[None])
+        directed = tool_limits(arm, quick, q[None], u[None])
+        least = tool_limits(arm, quick, q[None])
         pose = arm.at(q)
         for order, (kind, value, joint) in enumerate(
             (
@@ -40,7 +42,8 @@ def test_limit_uses_all_that_is_planned(name: str) -> None:
             weights = limits / limits.mean()
             jacobian = pose.tasks[:3] * weights
             moved = weights * (
-                jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + pose.damping * np.eye(3), value * u)
+                jacobian.T
+                @ np.linalg.solve(jacobian @ jacobian.T + pose.damping * np.eye(3), value * u)
             )
             shares = np.abs(moved) / limits
             assert shares.max() == pytest.approx(PLANNED_LIMIT_SHARES[order], rel=0.01)
@@ -60,8 +63,11 @@ def test_frame_meets_its_binding_limit() -> None:
     frames["setpoint_acceleration"][2] = (-settings.tool.acceleration, 0.0, 0.0)
     frames["setpoint_velocity"][3] = (settings.tool.engaging_speed, 0.0, 0.0)
     frames["flags"][3] = Flag.ENGAGING
-    frames["joint_velocities"][4, 2] = 0.99 * PLANNED_LIMIT_SHARES[1] ** 2 * settings.joints.velocity[2]
-    frames["joint_velocities"][5, 2], frames["mode"][5] = settings.joints.velocity[2], Mode.HOLD
+    frames["joint_velocities"][4, 2] = (
+        0.99 * PLANNED_LIMIT_SHARES[1] ** 2 * settings.joints.velocity[2]
+    )
+    frames["joint_velocities"][5, 2] = settings.joints.velocity[2]
+    frames["mode"][5] = Mode.HOLD
     assert {name: np.flatnonzero(met).tolist() for name, met in binding(settings, frames)} == {
         "speed of wam/shoulder_yaw_joint": [0],
         "[tool] max_speed": [1],

@@ -39,7 +39,8 @@ def compiled():
     }
 
 def since(before):
-    return {name: count - before[name] for name, count in compiled().items() if count != before[name]}
+    counts = compiled()
+    return {name: counts[name] - before[name] for name in counts if counts[name] != before[name]}
 
 def compiled_by(skill):
     so_far = compiled()
@@ -70,7 +71,11 @@ assert since(before) == {}, since(before)
 
 def done_in_a_process(script: str, *arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", COUNTED + script, *arguments], capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, "-c", COUNTED + script, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -84,5 +89,6 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
 def test_other_kind_of_skill_compiles_nothing() -> None:
     """A skill of another kind than the shipped one compiles nothing anew."""
     done_in_a_process(
-        OF_ANOTHER_KIND, *(str(RECORDINGS / name) for name in ("soldering.npz", "experiments/as-paper.npz"))
+        OF_ANOTHER_KIND,
+        *(str(RECORDINGS / name) for name in ("soldering.npz", "experiments/as-paper.npz")),
     )

@@ -18,7 +18,8 @@ EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
 
 
 def numbers(size: int) -> st.SearchStrategy[Vector]:
-    usual, any_finite = st.floats(-3, 3), st.floats(allow_nan=False, allow_infinity=False)
+    usual = st.floats(-3, 3)
+    any_finite = st.floats(allow_nan=False, allow_infinity=False)
     return st.tuples(*[st.one_of(usual, any_finite)] * size).map(np.array)
 
 
@@ -26,7 +27,8 @@ def numbers(size: int) -> st.SearchStrategy[Vector]:
 @given(numbers(3), numbers(3), numbers(3))
 def test_clamped_target_is_reachable(p: Vector, v: Vector, a: Vector) -> None:
     """A clamped target is in the reachable region and leads no further out."""
-    v, a = v.clip(-1e6, 1e6), a.clip(-1e6, 1e6)
+    v = v.clip(-1e6, 1e6)
+    a = a.clip(-1e6, 1e6)
     position, velocity, acceleration, clamped = clamp(p, v, a, box=EVERYWHERE, reach=REACH)
     from_shoulder = position - REACH.centre
     distance = float(np.linalg.norm(from_shoulder))
@@ -59,7 +61,8 @@ def test_clamping_keeps_motion_along_the_boundary() -> None:
 def test_target_stays_at_a_side_of_the_box() -> None:
     """A target outside the box stays at its side and moves along it."""
     box = np.array([[0.3, -0.4, 0.1], [0.7, 0.4, 0.5]])
-    target, velocity = np.array([0.5, 0.6, 0.3]), np.array([0.1, 0.2, 0.3])
+    target = np.array([0.5, 0.6, 0.3])
+    velocity = np.array([0.1, 0.2, 0.3])
     position, moving, _, clamped = clamp(target, velocity, velocity, box=box, reach=REACH)
     assert clamped
     assert position.tolist() == [0.5, 0.4, 0.3]

@@ -19,7 +19,10 @@ from thirdhand.daemon.skill_worker import SkillWorker
 @pytest.fixture(scope="session")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A listening session and one connected to it."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as near, open_session(connect=endpoints(near)) as far:
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as near,
+        open_session(connect=endpoints(near)) as far,
+    ):
         yield near, far
 
 
@@ -62,6 +65,8 @@ def taught_cell(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Cell]:
     """A cell with three places taught, for requests that change nothing."""
-    with contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path_factory.mktemp("cell"))) as cell:
+    with contextlib.closing(
+        Cell(*sessions, skill, skill_worker, tmp_path_factory.mktemp("cell"))
+    ) as cell:
         cell.client.add(PLACES)
         yield cell

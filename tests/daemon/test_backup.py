@@ -30,19 +30,26 @@ def run_in(root: Path, command: str) -> None:
     """Run a command of the page with this folder in the place of the root of the file system."""
     done = subprocess.run(
         command.replace("sudo ", "").replace("-C /", f"-C {root}"),
-        shell=True, cwd=root, capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+        shell=True,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_cell_is_restored_from_its_backup_by_the_commands_of_the_page(tmp_path: Path) -> None:
-    backup, restore = commands("Back up"), commands("Restore")
+    backup = commands("Back up")
+    restore = commands("Restore")
     assert len(backup) + len(restore) <= 4
     assert [line.split()[1:3] for line in restore if "systemctl" in line] == [
         ["systemctl", "stop"],
         ["systemctl", "start"],
     ]
-    home, config = tmp_path / "var/lib/thirdhand", tmp_path / "etc/thirdhand/bench.toml"
+    home = tmp_path / "var/lib/thirdhand"
+    config = tmp_path / "etc/thirdhand/bench.toml"
     saved = SavedViaPoints(Settings(files=Files(state=str(home / ".local/state/thirdhand"))))
     skill = adapted(skill_in(RECORDINGS / "soldering.npz"), Scene().via_points(), tolerance=0.04)
     with saved.replacing(skill):
@@ -67,5 +74,7 @@ def test_a_cell_is_restored_from_its_backup_by_the_commands_of_the_page(tmp_path
     folder.mkdir()
     shutil.copytree(home / ".local/state/thirdhand", folder / "state")
     with serving(folder, "--joints", "assumed") as daemon:
-        assert Client(daemon.session).status().places == tuple(point.name for point in Scene().via_points())
+        assert Client(daemon.session).status().places == tuple(
+            point.name for point in Scene().via_points()
+        )
         assert "via-points of an earlier run are in force (3)" in daemon.log.read_text()

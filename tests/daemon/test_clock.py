@@ -52,12 +52,15 @@ class FakeClock:
         self.now += round(seconds * 1e9) + self.oversleep_ns
 
     def deadlines(self, *, rate_hz: int = 500, spin_ns: int = 0) -> Deadlines:
-        return Deadlines(rate_hz, spin_ns=spin_ns, now_ns=self.now_ns, wall_ns=self.wall_ns, sleep=self.sleep)
+        return Deadlines(
+            rate_hz, spin_ns=spin_ns, now_ns=self.now_ns, wall_ns=self.wall_ns, sleep=self.sleep
+        )
 
 
 def test_deadlines_stay_in_phase_however_late_each_wake_is() -> None:
     clock = FakeClock(oversleep_ns=300_000)
-    start, deadlines = clock.now, clock.deadlines()
+    start = clock.now
+    deadlines = clock.deadlines()
     for tick in range(1000):
         index, late_ns = deadlines.wait()
         assert index == tick
@@ -121,7 +124,9 @@ def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None
     before = deadlines.stamp_ns
     deadlines.wait()
     assert deadlines.stamp_ns - before == 98 * PERIOD_NS
-    assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000  # the deadline's time, not that of waking
+    assert (
+        deadlines.stamp_ns == WALL_NS + clock.now - 300_000
+    )  # the deadline's time, not that of waking
 
 
 def test_stamps_follow_a_system_clock_that_is_set_ahead_at_once() -> None:
@@ -182,14 +187,18 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
     reports = []
     for k in range(100):
         clock.now += 100_000_000
-        clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000  # slewed by 500 parts in a million
+        clock.set_by_ns += (
+            round(set_by_s * 1e9) * (k == 50) + 50_000
+        )  # slewed by 500 parts in a million
         reports.append(system.set_by())
     assert [(k, text) for k, text in enumerate(reports) if text] == [(50, words)]
 
 
 def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -> None:
-    clock, prepared = FakeClock(), []
-    start, deadlines = clock.now, clock.deadlines()
+    clock = FakeClock()
+    prepared = []
+    start = clock.now
+    deadlines = clock.deadlines()
 
     def prepare() -> None:
         prepared.append(clock.now - start)
@@ -206,7 +215,9 @@ def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -
     assert len(prepared) == 1
 
 
-def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(clock_module, "NO_TICK_S", 60.0)
     clock = FakeClock()
     deadlines = clock.deadlines()

@@ -32,7 +32,9 @@ with connect(sys.argv[1]) as cell:
 
 def switch(daemon: Daemon) -> subprocess.Popen[str]:
     """A pressed clutch in a process of its own, released by a line on its input."""
-    return subprocess.Popen([sys.executable, "-c", SWITCH, daemon.endpoint], stdin=subprocess.PIPE, text=True, cwd=ROOT)
+    return subprocess.Popen(
+        [sys.executable, "-c", SWITCH, daemon.endpoint], stdin=subprocess.PIPE, text=True, cwd=ROOT
+    )
 
 
 def is_held(status: dict[str, Any]) -> bool:
@@ -44,16 +46,24 @@ def is_following(status: dict[str, Any]) -> bool:
 
 
 @pytest.mark.timeout(120)
-def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silence(tmp_path: Path) -> None:
+def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silence(
+    tmp_path: Path,
+) -> None:
     records = tmp_path / "records"
     with (
-        serving(tmp_path, "--joints", "assumed", "--record", str(records), network=CLUTCHED) as daemon,
+        serving(
+            tmp_path, "--joints", "assumed", "--record", str(records), network=CLUTCHED
+        ) as daemon,
         Tracker(daemon.session),
     ):
         status = daemon.until(is_held)
         assert status["because"] == "the clutch has not been heard yet"
         daemon.session.put("thirdhand/clutch", b"\0\1\0\0\7")
-        daemon.until(lambda s: s["because"].endswith("what arrives on clutch is malformed: a bool of 7; 0 or 1 needed"))
+        daemon.until(
+            lambda s: s["because"].endswith(
+                "what arrives on clutch is malformed: a bool of 7; 0 or 1 needed"
+            )
+        )
 
         pressed = switch(daemon)
         daemon.until(is_following)
@@ -66,20 +76,34 @@ def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silenc
             daemon.until(is_following)
             killed.kill()
         status = daemon.until(is_held)
-        assert status["because"].startswith("the clutch was last heard as pressed, and then not for 300 ms")
+        assert status["because"].startswith(
+            "the clutch was last heard as pressed, and then not for 300 ms"
+        )
         assert daemon.end() == 0
 
     (path,) = records.glob("*.mcap")
     whole = tmp_path / "whole.mcap"
     assert replay(path, output=whole).exact
     steps = [step for step in Recording.open(whole).steps() if step.frame is not None]
-    heard = [cdr.decode_bool(payload) for step in steps for kind, payload in step.events if kind == "clutch"]
+    heard = [
+        cdr.decode_bool(payload)
+        for step in steps
+        for kind, payload in step.events
+        if kind == "clutch"
+    ]
     assert heard.count(False) == 1
-    newest, until = False, -1  # as a reader of the recording has it: the last message, and when it becomes stale
+    # as a reader of the recording has it: the last message, and when it becomes stale
+    newest = False
+    until = -1
     for step in steps:
-        for value in (cdr.decode_bool(payload) for kind, payload in step.events if kind == "clutch"):
-            newest, until = value, step.tick + 150
+        for value in (
+            cdr.decode_bool(payload) for kind, payload in step.events if kind == "clutch"
+        ):
+            newest = value
+            until = step.tick + 150
         is_pressed = newest and step.tick < until
         expected = {Reason.NONE, Reason.NO_HANDS} if is_pressed else {Reason.CLUTCH}
-        assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, step.tick  # by the operator at the end
+        assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, (
+            step.tick
+        )  # by the operator at the end
         assert (step.frame["mode"] == Mode.FOLLOW) <= is_pressed, step.tick

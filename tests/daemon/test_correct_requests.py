@@ -27,9 +27,15 @@ def taught(skill: Skill) -> Skill:
 def held(cell: Cell, taught: Skill) -> Cell:
     """A cell whose arm holds, with the hands halfway to the handover, and was led away."""
     cell.client.add(PLACES)
-    state, hands = cell.state, taught.model.hands
-    state["tick"], state["arm_tick"], state["held_tick"], state["guided_tick"] = 1000, 1000, 900, 990
-    state["operator_hold"], state["held"], state["held_segment"] = 1, HELD_SEEN, 0
+    state = cell.state
+    hands = taught.model.hands
+    state["tick"] = 1000
+    state["arm_tick"] = 1000
+    state["held_tick"] = 900
+    state["guided_tick"] = 990
+    state["operator_hold"] = 1
+    state["held"] = HELD_SEEN
+    state["held_segment"] = 0
     state["held_hands"] = (0.5 * (hands[0] + hands[1])).reshape(2, 3)
     state["measured"] = cell.settings.arm.posture
     state["measured"][0] += 0.2
@@ -49,9 +55,17 @@ def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> N
         ({"arm_tick": 500}, ADD, "the arm's joints are not measured now"),
         ({"measured_velocities": 0.3}, ADD, "the arm moves at 0.30 rad/s; 0.05 rad/s accepted"),
         ({"held_segment": -1}, ADD, "the segment of the task was not known"),
-        ({}, ADD | {"tool": right}, "the tool is 0 mm from where the skill has it for these hands; 5 mm or more"),
+        (
+            {},
+            ADD | {"tool": right},
+            "the tool is 0 mm from where the skill has it for these hands; 5 mm or more",
+        ),
         ({"held_hands": 0.3}, ADD, "the distance of a hand from its paths is "),
-        ({}, ADD | {"tool": [0.5, 0.0, 2.0]}, "$.tool: [0.5, 0.0, 2.0] outside the skill's workspace"),
+        (
+            {},
+            ADD | {"tool": [0.5, 0.0, 2.0]},
+            "$.tool: [0.5, 0.0, 2.0] outside the skill's workspace",
+        ),
         ({}, ADD | {"tool": [0.6, 0.0, -0.02]}, "$.tool: [0.6, 0.0, -0.02]"),
         (
             {},
@@ -76,21 +90,31 @@ def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> N
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("field", "value"), [("operator_hold", 0), ("held_tick", 950), ("mode", Mode.FOLLOW)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("operator_hold", 0), ("held_tick", 950), ("mode", Mode.FOLLOW)]
+)
 def test_a_correction_is_made_in_its_own_hold_alone(
     held: Cell, monkeypatch: pytest.MonkeyPatch, field: str, value: int
 ) -> None:
     """The hold ends while the correction is computed, and another one may have begun."""
     monkeypatch.setattr(held.requests, "_keep", lambda file: held.state.__setitem__(field, value))
-    assert held.refusal("correct", ADD).startswith("the hold ended while this was computed; nothing was changed")
+    assert held.refusal("correct", ADD).startswith(
+        "the hold ended while this was computed; nothing was changed"
+    )
 
 
 @pytest.mark.timeout(300)
 def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> None:
     first = held.client.correct()
     assert first.correction is not None
-    assert (first.correction.name, first.correction.segment) == ("correction-1", ("start", "handover"))
-    assert held.kinds()[-2:] == ["skill", "segment"]  # the segment of the hold, whatever the hand did that led
+    assert (first.correction.name, first.correction.segment) == (
+        "correction-1",
+        ("start", "handover"),
+    )
+    assert held.kinds()[-2:] == [
+        "skill",
+        "segment",
+    ]  # the segment of the hold, whatever the hand did that led
     first_places = held.client.places()
     held.state["measured"][0] += 0.1
     second = held.client.correct()

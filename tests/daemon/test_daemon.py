@@ -34,7 +34,13 @@ from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings, robot_description
 
 HANDOVER = requests.ViaPoint(
-    "handover", (0.62, -0.28, 0.30), RIGHT, (0.54, -0.28, 0.38), std=0.001, radius=0.03, follow="left"
+    "handover",
+    (0.62, -0.28, 0.30),
+    RIGHT,
+    (0.54, -0.28, 0.38),
+    std=0.001,
+    radius=0.03,
+    follow="left",
 )
 
 
@@ -91,9 +97,13 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
 
 def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Path) -> None:
     """They are recorded in their order, and replayed identically."""
-    records, period_ns, bursts = tmp_path / "records", 20_000_000, (3, 1, 3, 2, 3, 30, 3)
+    records = tmp_path / "records"
+    period_ns = 20_000_000
+    bursts = (3, 1, 3, 2, 3, 30, 3)
     sent: list[list[int]] = []
-    with serving(tmp_path, "--joints", "assumed", "--rate", "50", "--record", str(records)) as daemon:
+    with serving(
+        tmp_path, "--joints", "assumed", "--rate", "50", "--record", str(records)
+    ) as daemon:
         with Tracker(daemon.session):
             daemon.until(following)
         daemon.until(lambda s: s["mode"] == "hold")
@@ -129,13 +139,20 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         assert daemon.end() == 0
         assert "earlier run" not in daemon.log.read_text()
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        (log_line,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
+        (log_line,) = (
+            line for line in daemon.log.read_text().splitlines() if "earlier run" in line
+        )
         (file,) = (tmp_path / "state").rglob("places-*.json")
-        assert f"via-points of an earlier run are in force (1): handover. They are saved in {file}; " in log_line
+        assert (
+            f"via-points of an earlier run are in force (1): handover. They are saved in {file}; "
+            in log_line
+        )
         assert "`thirdhand via-points remove NAME` removes one" in log_line
         assert daemon.client.status().places == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
-        assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [("handover", 0.03, "left")]
+        assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [
+            ("handover", 0.03, "left")
+        ]
         daemon.client.ask("via_points", {"op": "clear"})
         daemon.process.kill()
     with serving(tmp_path, "--joints", "assumed") as daemon:
@@ -149,11 +166,16 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
         assert daemon.end() == 0
 
 
-def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(shared_daemon: Any) -> None:
+def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(
+    shared_daemon: Any,
+) -> None:
     shared_daemon.client.ask("hold")
     replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
     assert sum(reply.ok is not None for reply in replies) == 1
-    assert shared_daemon.until(lambda s: s["reason"] in ("operator", "arm_not_ready"))["mode"] == "hold"
+    assert (
+        shared_daemon.until(lambda s: s["reason"] in ("operator", "arm_not_ready"))["mode"]
+        == "hold"
+    )
     shared_daemon.client.ask("resume")
 
 
@@ -166,12 +188,28 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert "resume in force since tick" in told("resume", *connect).stdout
     reset = told("reset", *connect)
     assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
-    place = ("--left", ".62", "-.28", ".3", "--right", ".98", ".32", ".06", "--tool", ".62", "-.28", ".3")
+    place = (
+        "--left",
+        ".62",
+        "-.28",
+        ".3",
+        "--right",
+        ".98",
+        ".32",
+        ".06",
+        "--tool",
+        ".62",
+        "-.28",
+        ".3",
+    )
     added = succeeded("via-points", "add", "my place", *place, *connect)
     assert "my place" in added.stdout
     assert "replaced" not in added.stdout
     repeated = told("via-points", "add", "my place", *place, *connect)
-    assert (repeated.returncode, repeated.stdout.endswith("replaced, because a via-point had the same name: my place\n")) == (
+    assert (
+        repeated.returncode,
+        repeated.stdout.endswith("replaced, because a via-point had the same name: my place\n"),
+    ) == (
         0,
         True,
     )
@@ -191,10 +229,15 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
         patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
     error_text = capsys.readouterr().err
-    assert re.search(r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z", error_text)
+    assert re.search(
+        r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z",
+        error_text,
+    )
     shared_daemon.client.ask("hold")
     with Tracker(shared_daemon.session):
-        status = shared_daemon.until(lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50)
+        status = shared_daemon.until(
+            lambda s: s["hand_age_ms"] and max(s["hand_age_ms"].values()) < 50
+        )
         assert main(add) == 0
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
@@ -210,9 +253,12 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
 
 
 def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
-    settings, urdf = Settings(), robot_description(Settings())
-    controller, joints = Controller(settings, skill, urdf=urdf), settings.arm.posture
-    tool, expected_m = MeasuredArm(settings, urdf), Arm(settings, urdf).at(np.array(joints)).position
+    settings = Settings()
+    urdf = robot_description(Settings())
+    controller = Controller(settings, skill, urdf=urdf)
+    joints = settings.arm.posture
+    tool = MeasuredArm(settings, urdf)
+    expected_m = Arm(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
     assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))
@@ -226,13 +272,25 @@ def test_a_daemon_that_cannot_listen_says_so(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = thirdhand("serve", "--listen", endpoint, "--joints", "assumed", env=os.environ | {"HOME": str(tmp_path)})
+        done = thirdhand(
+            "serve",
+            "--listen",
+            endpoint,
+            "--joints",
+            "assumed",
+            env=os.environ | {"HOME": str(tmp_path)},
+        )
     assert done.returncode == 1
     assert "cannot listen on tcp/127.0.0.1" in done.stderr
 
 
 def test_the_client_on_the_page_of_the_wire_works(shared_daemon: Any) -> None:
-    code = (ROOT / "docs" / "wire.md").read_text().split("<!-- client -->\n```python\n")[1].split("```")[0]
+    code = (
+        (ROOT / "docs" / "wire.md")
+        .read_text()
+        .split("<!-- client -->\n```python\n")[1]
+        .split("```")[0]
+    )
     code = code.replace("tcp/127.0.0.1:7447", shared_daemon.endpoint)
     done = python(code)
     assert done.returncode == 0, done.stderr

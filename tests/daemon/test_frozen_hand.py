@@ -35,9 +35,14 @@ def measured(seconds: float, rate_hz: float, at: tuple[float, ...] = LEFT, seed:
 
 @pytest.mark.parametrize("unit_m", [1.0, 1e-3])
 @pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
-def test_each_loss_of_a_tracked_hand_is_noticed_after_half_a_second(rate_hz: float, unit_m: float) -> None:
+def test_each_loss_of_a_tracked_hand_is_noticed_after_half_a_second(
+    rate_hz: float, unit_m: float
+) -> None:
     lost = round(2.0 * rate_hz)
-    for default in (None, (0.25, -0.25, 0.1)):  # the last pose again and again, or one of the tracker's own
+    for default in (
+        None,
+        (0.25, -0.25, 0.1),
+    ):  # the last pose again and again, or one of the tracker's own
         tracked = measured(3.0, rate_hz)
         pieces = [tracked, np.tile(tracked[-1] if default is None else default, (lost, 1))]
         pieces += [measured(3.0, rate_hz, (0.8, -0.1, 0.2), 1)]
@@ -61,10 +66,14 @@ def program(rate_hz: float, *, begins_at_rest: bool) -> Iterator[Vector]:
 @pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
 def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
     for begins_at_rest in (True, False):
-        assert not len(refused(np.concatenate([*program(rate_hz, begins_at_rest=begins_at_rest)]), rate_hz))
+        assert not len(
+            refused(np.concatenate([*program(rate_hz, begins_at_rest=begins_at_rest)]), rate_hz)
+        )
     assert not len(refused(np.tile(LEFT, (1000, 1)), rate_hz))
     share = np.linspace(0.0, 1.0, round(3 * rate_hz))
-    along = 0.4 * (10 * share**3 - 15 * share**4 + 6 * share**5)  # with the least jerk, and no rest before
+    along = 0.4 * (
+        10 * share**3 - 15 * share**4 + 6 * share**5
+    )  # with the least jerk, and no rest before
     stop = np.concatenate([along[1:], np.full(round(2 * rate_hz), along[-1])])
     assert not len(refused(np.outer(stop, (1.0, 0.5, 0.0)), rate_hz))
 
@@ -90,13 +99,17 @@ def test_noise_is_never_frozen() -> None:
 @pytest.mark.thorough
 def test_the_arm_holds_for_a_lost_hand_and_says_why(tmp_path: Path) -> None:
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session) as tracker:
-        random, end_s = np.random.default_rng(0), time.monotonic() + 3.0
+        random = np.random.default_rng(0)
+        end_s = time.monotonic() + 3.0
         while time.monotonic() < end_s:
             tracker.left = tuple((LEFT + 3e-4 * random.standard_normal(3)).tolist())
             time.sleep(0.004)
         daemon.until(lambda status: status["mode"] == "follow")
         held = daemon.until(lambda status: status["reason"] == "stale_hand", timeout_s=3.0)
-        assert "what arrives is rejected as frozen: the pose of a hand was the same, bit for bit" in held["because"]
+        assert (
+            "what arrives is rejected as frozen: the pose of a hand was the same, bit for bit"
+            in held["because"]
+        )
         assert held["remedy"].startswith("bring the hand into the tracker's view")
         tracker.left = (LEFT[0], LEFT[1] + 0.001, LEFT[2])
         daemon.until(lambda status: status["mode"] == "follow")

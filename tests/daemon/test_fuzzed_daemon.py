@@ -17,7 +17,8 @@ from thirdhand.contract import cdr
 from thirdhand.contract.records import Mode
 from thirdhand.settings.config import Settings
 
-SECONDS, INTERVAL_S = 5.0, 0.01
+SECONDS = 5.0
+INTERVAL_S = 0.01
 INPUTS = ("hands/left", "hands/right", "joints/state")
 
 
@@ -32,13 +33,16 @@ def test_a_daemon_under_spoilt_bytes_keeps_every_bound(tmp_path: Path) -> None:
     with serving(tmp_path, "--record", str(tmp_path / "recorded")) as daemon:
         publishers = {key: daemon.session.declare_publisher(f"thirdhand/{key}") for key in INPUTS}
         commands = daemon.session.declare_subscriber("thirdhand/joints/command", follow)
-        asked, began = [], time.monotonic()
+        asked = []
+        began = time.monotonic()
         while (t := time.monotonic() - began) < SECONDS:
             for key, payload in traffic.at(t, time.time_ns()):
                 if key in publishers:
                     publishers[key].put(payload)
                 else:
-                    asked.append(daemon.session.get(f"thirdhand/{key}", payload=payload, timeout=5.0))
+                    asked.append(
+                        daemon.session.get(f"thirdhand/{key}", payload=payload, timeout=5.0)
+                    )
             time.sleep(INTERVAL_S)
         answers = [reply.ok is not None for replies in asked[:-5] for reply in replies]
         status = daemon.client.status()

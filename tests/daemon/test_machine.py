@@ -11,14 +11,19 @@ from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import Source
 from thirdhand.daemon.machine import Machine
 
-FOLLOWS, SILENT = (Mode.FOLLOW, Reason.NONE), (Mode.FAULT, Reason.ARM_SILENT)
+FOLLOWS = (Mode.FOLLOW, Reason.NONE)
+SILENT = (Mode.FAULT, Reason.ARM_SILENT)
 
 
 class Watched:
     """A machine of which 500 ticks a second are told, each tenth of one."""
 
     def __init__(self, folder: Path) -> None:
-        self._pressure, self._now_s, self._tick, self._missed, self._waited_s = folder / "cpu", 0.0, 0, 0, 5.0
+        self._pressure = folder / "cpu"
+        self._now_s = 0.0
+        self._tick = 0
+        self._missed = 0
+        self._waited_s = 5.0
         self.machine = Machine(self._pressure)
 
     def goes_on(
@@ -31,11 +36,17 @@ class Watched:
         outcome: tuple[Mode, Reason] = FOLLOWS,
     ) -> None:
         for _ in range(round(10 * seconds)):
-            self._now_s, self._tick, self._missed = self._now_s + 0.1, self._tick + 50, self._missed + missed
+            self._now_s = self._now_s + 0.1
+            self._tick = self._tick + 50
+            self._missed = self._missed + missed
             self._waited_s += 0.1 * waiting
             waited_us = round(1e6 * self._waited_s)
-            self._pressure.write_text(f"some avg10=1.00 avg60=0.00 avg300=0.00 total={waited_us}\nfull total=0\n")
-            self.machine.update(self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=outcome)
+            self._pressure.write_text(
+                f"some avg10=1.00 avg60=0.00 avg300=0.00 total={waited_us}\nfull total=0\n"
+            )
+            self.machine.update(
+                self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=outcome
+            )
 
 
 def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
@@ -53,12 +64,20 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
 def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
     evidence = Evidence(busy="the loop was up to 45 ms late")
     for reason in Reason:
-        blamed = explained(reason, evidence).why.startswith("this machine was too busy, the loop was up to 45 ms late; ")
+        blamed = explained(reason, evidence).why.startswith(
+            "this machine was too busy, the loop was up to 45 ms late; "
+        )
         assert blamed == (reason in (Reason.STALE_HAND, Reason.ARM_ERROR, Reason.ARM_SILENT))
-        assert blamed == ("see what else runs on this machine" in explained(reason, evidence).what_to_do)
+        assert blamed == (
+            "see what else runs on this machine" in explained(reason, evidence).what_to_do
+        )
     refused = Source(rate_hz=100.0, cause="wrong_frame", refused="frame 'camera'")
-    assert "busy" not in explained(Reason.STALE_HAND, evidence._replace(sources={"left": refused})).why
+    assert (
+        "busy" not in explained(Reason.STALE_HAND, evidence._replace(sources={"left": refused})).why
+    )
     stale = Source(rate_hz=60.0, age_ms=130.0)
     for left, is_blamed in ((stale, True), (Source(rate_hz=60.0, age_ms=9.0, fresh=True), False)):
         sources = {"left": left, "right": stale}
-        assert ("busy" in explained(Reason.STALE_HAND, evidence._replace(sources=sources)).why) == is_blamed
+        assert (
+            "busy" in explained(Reason.STALE_HAND, evidence._replace(sources=sources)).why
+        ) == is_blamed

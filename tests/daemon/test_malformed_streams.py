@@ -11,8 +11,12 @@ from thirdhand.cli.diagnosis import findings
 from thirdhand.contract import channels
 from thirdhand.contract.requests import Status
 
-EVERY_INPUT = f'{LISTENING}\n[hands]\nclutch = "key"\ngripper = "key"\n[recording]\nalso = ["camera"]\n'
-HEARD = [channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded]
+EVERY_INPUT = (
+    f'{LISTENING}\n[hands]\nclutch = "key"\ngripper = "key"\n[recording]\nalso = ["camera"]\n'
+)
+HEARD = [
+    channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded
+]
 SOURCES = {"hands/left": "left hand", "hands/right": "right hand", "joints/state": "arm"}
 
 
@@ -34,6 +38,8 @@ def test_malformed_messages_of_every_stream_are_counted_and_named(tmp_path: Path
         for key, stream in status.streams.items():
             assert f"what arrives on {key} is malformed: {stream.refused}" in status.because
         report = findings(before, status, own_ns=status.time_ns, own_version=status.version)
-        assert {finding.what for finding in report if "rejected as malformed: " in finding.found} - {"mode"} == named
+        assert {
+            finding.what for finding in report if "rejected as malformed: " in finding.found
+        } - {"mode"} == named
     log = daemon.log.read_text(encoding="utf-8")
     assert all(f"{name}: rejected as malformed: " in log for name in named)

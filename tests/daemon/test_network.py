@@ -20,7 +20,15 @@ from support.many_cells import ROS2_DOMAIN
 from support.paths import RECORDINGS, ROOT
 from support.ros2_nodes import header, port, typed
 from support.wam import JOINT_NAMES
-from thirdhand.client import Client, Publisher, Tracker, UnreachableError, cells, endpoints, open_session
+from thirdhand.client import (
+    Client,
+    Publisher,
+    Tracker,
+    UnreachableError,
+    cells,
+    endpoints,
+    open_session,
+)
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, channels, requests
 from thirdhand.contract.messages import PoseStamped
@@ -46,7 +54,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
             str(tmp_path_factory.mktemp("lab")),
             endpoint,
         ]
-        process = subprocess.Popen([*command, *NAMES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            [*command, *NAMES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         assert process.stdin is not None
         assert process.stdout is not None
         try:
@@ -58,8 +68,17 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
             process.communicate()
 
 
-def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
-    play = ["play", str(RECORDINGS / "demonstration-6.mcap"), "--speed", "50", "--connect", lab.endpoint]
+def test_play_succeeds_only_where_the_daemon_counts_the_hands(
+    lab: Lab, capsys: pytest.CaptureFixture[str]
+) -> None:
+    play = [
+        "play",
+        str(RECORDINGS / "demonstration-6.mcap"),
+        "--speed",
+        "50",
+        "--connect",
+        lab.endpoint,
+    ]
     assert main([*play, "--cell", NAMES[1]]) == 0
     assert "of the left hand, " in (output := capsys.readouterr().err)
     assert "the daemon's loop received" in output
@@ -83,7 +102,9 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(lab: Lab, capsys: 
 @contextlib.contextmanager
 def _answering(lab: Lab, key: str, answer: bytes) -> Iterator[None]:
     """Something that answers on a key as a storage does, as long as the context lasts."""
-    queryable = lab.session.declare_queryable(key, lambda query: query.reply(key, answer), complete=True)
+    queryable = lab.session.declare_queryable(
+        key, lambda query: query.reply(key, answer), complete=True
+    )
     yield
     queryable.undeclare()
 
@@ -99,21 +120,31 @@ def ros(lab: Lab) -> Iterator[dict[str, Any]]:
 
 
 def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, Any]) -> None:
-    cell, modes = NAMES[4], list[Any]()
-    commands, statuses = list[Any](), list[Any]()
+    cell = NAMES[4]
+    modes = list[Any]()
+    commands = list[Any]()
+    statuses = list[Any]()
     topics = {f"/{cell}/joints/command": ("sensor_msgs/msg/JointState", commands.append)}
     topics |= {f"/{cell}/status": ("std_msgs/msg/String", statuses.append)}
-    listening = [ROS2Subscriber(topic, callback=take, **typed(kind), **ros) for topic, (kind, take) in topics.items()]
+    listening = [
+        ROS2Subscriber(topic, callback=take, **typed(kind), **ros)
+        for topic, (kind, take) in topics.items()
+    ]
     pose = typed("geometry_msgs/msg/PoseStamped")
     hands = [ROS2Publisher(f"/{cell}/hands/{side}", **pose, **ros) for side in ("left", "right")]
     store = hands[0].session_mgr.store.types
-    place, point, turn = (store[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Point", "Quaternion"))
+    place, point, turn = (
+        store[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Point", "Quaternion")
+    )
 
     def follows() -> bool:
         base_header = header(store, "base")
         for hand, (x, y, z) in zip(hands, (LEFT, RIGHT), strict=True):
             hand.publish(
-                header=base_header, pose=place(position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0))
+                header=base_header,
+                pose=place(
+                    position=point(x=x, y=y, z=z), orientation=turn(x=0.0, y=0.0, z=0.0, w=1.0)
+                ),
             )
         modes[:] = [json.loads(status.data)["mode"] for status in statuses]
         return "follow" in modes
@@ -128,7 +159,9 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
     assert final_status.rejected.keys() <= {"repeated", "older", "ahead"}
 
 
-def test_a_daemon_that_ends_is_gone_from_every_list(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_daemon_that_ends_is_gone_from_every_list(
+    lab: Lab, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The last test here: all of them end."""
     lab.daemons.kill()
     lab.daemons.wait()
@@ -159,12 +192,22 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
     with open_session(connect=[lab.endpoint], zenoh_config=file) as session:
         assert list(session.info.routers_zid())
         assert endpoints(session) == ()
-        publisher, came = Publisher(session, "cell", "hands/left"), []
-        with lab.session.declare_subscriber("cell/hands/left", lambda sample: came.append(str(sample.key_expr))):
-            until(lambda: publisher.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0)))) or came)
+        publisher = Publisher(session, "cell", "hands/left")
+        came = []
+        with lab.session.declare_subscriber(
+            "cell/hands/left", lambda sample: came.append(str(sample.key_expr))
+        ):
+            until(
+                lambda: (
+                    publisher.put(cdr.encode_pose(PoseStamped(1, "", LEFT, (0.0, 0.0, 0.0, 1.0))))
+                    or came
+                )
+            )
     assert set(came) == {"cell/hands/left"}  # and not elsewhere
     with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1"):
         open_session(otherwise=[lab.endpoint], zenoh_config=file, timeout_s=0.3)
-    with open_session(listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}) as listening:
+    with open_session(
+        listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}
+    ) as listening:
         assert endpoints(listening)[0].startswith("tcp/127.0.0.1:")
         assert not list(listening.info.routers_zid())

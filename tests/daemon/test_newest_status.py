@@ -29,13 +29,18 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def shown(status: dict[str, Any], request: str, reply: dict[str, Any]) -> bool:
     """Whether a status shows what a request did."""
     if request in ("hold", "resume", "reset"):
-        return status["tick"] >= reply["tick"] and (status["reason"] == "operator") == (request == "hold")
+        return status["tick"] >= reply["tick"] and (status["reason"] == "operator") == (
+            request == "hold"
+        )
     if request == "segment":
         return bool(status["segment"]) and status["segment"][0] == "glass"
     return status["places"] == [point["name"] for point in reply["points"]]
 
 
-PLACES = [{"name": p.name, "left": p.left, "right": p.right, "tool": p.tool, "std": 0.01} for p in Scene().via_points()]
+PLACES = [
+    {"name": p.name, "left": p.left, "right": p.right, "tool": p.tool, "std": 0.01}
+    for p in Scene().via_points()
+]
 REQUESTS: list[tuple[str, dict[str, Any]]] = [
     ("hold", {}),
     ("resume", {}),
@@ -75,10 +80,14 @@ def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -
                 end = time.monotonic() + 5.0
                 while len(published) < before + 3 and time.monotonic() < end:
                     time.sleep(0.01)
-                assert all(message["tick"] >= reply["tick"] for message in published[before:]), request
+                assert all(message["tick"] >= reply["tick"] for message in published[before:]), (
+                    request
+                )
                 status = published[before]
                 if request != "segment":  # which the hands tell anew
-                    assert all(shown(message, request, reply) for message in published[before:]), request
+                    assert all(shown(message, request, reply) for message in published[before:]), (
+                        request
+                    )
             assert shown(status, request, reply), (request, status)
             time.sleep(0.013 * round_ % 0.1)  # at every phase of the published ones
     subscriber.undeclare()

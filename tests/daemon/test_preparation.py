@@ -20,7 +20,9 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import visits
 
 PLACES = Scene().via_points()
-TURNED = msgspec.structs.replace(PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03)
+TURNED = msgspec.structs.replace(
+    PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03
+)
 TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
 
 
@@ -29,7 +31,8 @@ def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[
     client = daemon.client
     first = PLACES[0]
     yield "add", lambda: client.add(PLACES)
-    hands.left, hands.right = first.left, first.right
+    hands.left = first.left
+    hands.right = first.right
     yield "segment", lambda: client.set_segment(first.name)
     daemon.until(lambda status: status["mode"] == "follow", 60.0)
     yield "hold", client.hold
@@ -46,10 +49,14 @@ def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[
 
 def look_for_a_way_out() -> None:
     """Compute what the skill worker computes for an arm that is stuck."""
-    skill, settings = shipped_skill(), Settings()
+    skill = shipped_skill()
+    settings = Settings()
     with contextlib.closing(SkillWorker()) as worker:
-        posture, hands = np.array(settings.arm.posture), skill.hands[0].reshape(2, 3)
-        worker.compute(way_out_of, settings, posture, skill.tool_positions[0], skill.orientation, hands)
+        posture = np.array(settings.arm.posture)
+        hands = skill.hands[0].reshape(2, 3)
+        worker.compute(
+            way_out_of, settings, posture, skill.tool_positions[0], skill.orientation, hands
+        )
 
 
 def commands_in(folder: Path) -> Iterator[str]:
@@ -70,7 +77,9 @@ def commands_in(folder: Path) -> Iterator[str]:
 
 @pytest.mark.timeout(1500)
 @pytest.mark.thorough
-def test_after_the_preparation_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_the_preparation_nothing_is_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cache = tmp_path / "cache"
     late: dict[str, set[str]] = {}
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))

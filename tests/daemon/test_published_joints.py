@@ -39,7 +39,8 @@ def state(*names: str, velocity: tuple[float, ...] | None = None, **others: floa
 @contextlib.contextmanager
 def published(daemon: Daemon, messages: Callable[[int], list[JointState]]) -> Iterator[None]:
     """Within it messages are published every 4 ms, given how often that was."""
-    publisher, ended = daemon.session.declare_publisher("thirdhand/joints/state"), threading.Event()
+    publisher = daemon.session.declare_publisher("thirdhand/joints/state")
+    ended = threading.Event()
 
     def publish() -> None:
         k = 0
@@ -60,12 +61,20 @@ def published(daemon: Daemon, messages: Callable[[int], list[JointState]]) -> It
 
 CASES: dict[str, Callable[[int], list[JointState]]] = {
     "positions only": lambda k: [state(*JOINTS)],
-    "fewer velocities than joints": lambda k: [state(*JOINTS, velocity=(0.0,) * 7, left_finger=0.1, right_finger=NAN)],
-    "a gripper between": lambda k: [state(left_finger=0.1) for _ in range(4)] + [state(*JOINTS[::-1])] * (k % 5 == 0),
-    "a humanoid": lambda k: [
-        state(*JOINTS, **{f"humanoid/left_hand_ring_finger_distal_joint_{i}": 0.0 for i in range(65)})
+    "fewer velocities than joints": lambda k: [
+        state(*JOINTS, velocity=(0.0,) * 7, left_finger=0.1, right_finger=NAN)
     ],
-    "two publishers": lambda k: [state(*JOINTS[:4])] * (k % 2) + [state(finger=1.0), state(*JOINTS[4:], finger=1.0)],
+    "a gripper between": lambda k: (
+        [state(left_finger=0.1) for _ in range(4)] + [state(*JOINTS[::-1])] * (k % 5 == 0)
+    ),
+    "a humanoid": lambda k: [
+        state(
+            *JOINTS, **{f"humanoid/left_hand_ring_finger_distal_joint_{i}": 0.0 for i in range(65)}
+        )
+    ],
+    "two publishers": lambda k: (
+        [state(*JOINTS[:4])] * (k % 2) + [state(finger=1.0), state(*JOINTS[4:], finger=1.0)]
+    ),
     "a joint each": lambda k: [state(name) for name in JOINTS],
     "every joint twice": lambda k: [state(name) for name in (*JOINTS[:3], *JOINTS[:3], *JOINTS)],
 }

@@ -71,7 +71,13 @@ def sample(x: float) -> bytes:
     return cdr.encode_pose(PoseStamped(next(numbers), BASE, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
 
-PAIRS = [(named, named), (named, nameless), (nameless, named), (named, ros2_node), (ros2_node, nameless)]
+PAIRS = [
+    (named, named),
+    (named, nameless),
+    (nameless, named),
+    (named, ros2_node),
+    (ros2_node, nameless),
+]
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS)
@@ -82,7 +88,8 @@ def test_second_publisher_is_refused(
 ) -> None:
     """However near its samples are, and however they are stamped."""
     streams, arrivals, session = cell
-    put, put_other = first(session), second(session)
+    put = first(session)
+    put_other = second(session)
     until(lambda: put(sample(0.4)) or list(streams.receive()))  # it is connected
     put(sample(0.45))
     until(lambda: 0.45 in [event.value.position[0] for event in streams.receive()])
@@ -97,7 +104,10 @@ def test_second_publisher_is_refused(
     assert received_by(streams, arrivals, put, sample(0.5)) == [0.5]
 
     # Once the first one is silent, the second one is heard.
-    until(lambda: received_by(streams, arrivals, put_other, sample(0.7)) == [0.7], within_s=20 * TAKEOVER_S)
+    until(
+        lambda: received_by(streams, arrivals, put_other, sample(0.7)) == [0.7],
+        within_s=20 * TAKEOVER_S,
+    )
     assert received_by(streams, arrivals, put, sample(0.5)) == []
 
 

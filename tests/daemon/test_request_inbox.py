@@ -23,7 +23,9 @@ from thirdhand.settings.config import Settings
 LED, NOT_LED = (Event("joints/guided", cdr.encode_bool(led), led) for led in (True, False))
 BY_HAND = "by hand"
 RARELY = st.sampled_from((*6 * (False,), True))
-ORDERS = st.tuples(st.sampled_from(("hold", "resume")), st.sampled_from(("", "a", "b", "a", "b")), RARELY)
+ORDERS = st.tuples(
+    st.sampled_from(("hold", "resume")), st.sampled_from(("", "a", "b", "a", "b")), RARELY
+)
 TICKS = st.lists(st.tuples(st.lists(ORDERS, max_size=2), RARELY, RARELY), min_size=15, max_size=30)
 
 
@@ -117,10 +119,14 @@ def test_a_request_that_no_tick_completed_changes_no_name(opened: Callable[[], C
     assert "somebody else holds the arm too" in cell.ask("resume", "bob")
 
 
-def test_the_name_beyond_the_last_is_refused_and_its_hold_obeyed(opened: Callable[[], Cell]) -> None:
+def test_the_name_beyond_the_last_is_refused_and_its_hold_obeyed(
+    opened: Callable[[], Cell],
+) -> None:
     cell = opened()
     assert not any(cell.ask("hold", by) for by in ("", *map(str, range(MAX_HOLDERS)), "0"))
-    assert "'64' given, but 64 others hold the arm; it holds until a resume without" in cell.ask("hold", "64")
+    assert "'64' given, but 64 others hold the arm; it holds until a resume without" in cell.ask(
+        "hold", "64"
+    )
     assert cell.steps[-1][0].inbox[-1].kind == "hold"
     assert "'64' does not hold the arm" in cell.ask("resume", "64")
     assert not cell.ask("resume")
@@ -142,7 +148,9 @@ def test_no_resume_ends_the_hold_of_one_who_leads_the_arm(opened: Callable[[], C
     assert cell.frames[-1]["mode"] == Mode.FOLLOW
 
 
-def test_a_resume_does_not_end_a_hold_that_was_received_after_it(opened: Callable[[], Cell]) -> None:
+def test_a_resume_does_not_end_a_hold_that_was_received_after_it(
+    opened: Callable[[], Cell],
+) -> None:
     cell = opened()
     cell.ask("hold")
     resume = cell.inbox.order("resume", holds=cell.inbox.holds_received)

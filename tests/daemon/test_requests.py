@@ -41,7 +41,12 @@ FAR_LEFT = Reach(centre=(0.0, 1.5, 0.346))
 
 def point(**change: Any) -> dict[str, Any]:
     """A place as a client writes it; None leaves a field out."""
-    whole = {"name": "a", "left": HANDOVER.left, "right": HANDOVER.right, "tool": HANDOVER.tool} | change
+    whole = {
+        "name": "a",
+        "left": HANDOVER.left,
+        "right": HANDOVER.right,
+        "tool": HANDOVER.tool,
+    } | change
     return {name: value for name, value in whole.items() if value is not None}
 
 
@@ -58,12 +63,20 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     assert cell.client.places() == points
 
     moved = cell.client.ask(
-        "via_points", add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3]))
+        "via_points",
+        add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3])),
     )
-    assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [0.5, 0.1, 0.3]
+    assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [
+        0.5,
+        0.1,
+        0.3,
+    ]
     assert len(moved["points"]) == 3
 
-    assert [taught.name for taught in cell.client.remove("glass").points or ()] == ["handover", "soldering"]
+    assert [taught.name for taught in cell.client.remove("glass").points or ()] == [
+        "handover",
+        "soldering",
+    ]
     assert cell.client.clear().points == ()
     assert cell.kinds() == ["skill"] * 4
     assert cell.taken[0].value.via_points == PLACES
@@ -102,7 +115,9 @@ def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
     assert cell.names() == []
 
 
-def test_places_in_force_whose_file_cannot_be_replaced_are_reported(cell: Cell, skill: Skill) -> None:
+def test_places_in_force_whose_file_cannot_be_replaced_are_reported(
+    cell: Cell, skill: Skill
+) -> None:
     SavedViaPoints(cell.settings).path(skill).mkdir(parents=True)
     (warning,) = cell.client.add(PLACES).warnings
     assert warning.startswith("the via-points end at a restart: they cannot be saved (")
@@ -116,19 +131,32 @@ NOT_EMPTY: list[tuple[Any, str]] = [
 REFUSED: dict[str, list[tuple[Any, str]]] = {
     "via_points": [
         (add(point(left=[1.0, 2.0])), "$.points[0].left: 2 numbers, 3 needed"),
-        (add(point(left=[0.1, 0.2, 10.5])), "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted"),
+        (
+            add(point(left=[0.1, 0.2, 10.5])),
+            "$.points[0].left[2]: 10.5 given; -10 to 10 m accepted",
+        ),
         (add(point(right=None)), "$.points[0]: field `right` is missing"),
         (add(point(name="")), "$.points[0].name: '' given; 1 to 64 letters"),
         (add(point(std=0.0)), "$.points[0].std: 0.0 given; a number from 1e-05 to 1 accepted"),
         (add(point(radius=0.3)), "$.points[0].radius: 0.3 given; a number from 0 to 0.2 accepted"),
         (add(point(follow="both")), "$.points[0].follow: 'both' given; left, none, right accepted"),
-        (add(point(), point(name="b"), point()), "$.points[2].name: 'a' given twice, names once each needed"),
-        (add(point(tool=[3.0, 0.0, 0.0])), "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, ("),
+        (
+            add(point(), point(name="b"), point()),
+            "$.points[2].name: 'a' given twice, names once each needed",
+        ),
+        (
+            add(point(tool=[3.0, 0.0, 0.0])),
+            "$.points[0].tool: [3.0, 0.0, 0.0] outside the skill's workspace, (",
+        ),
         (
             add(point(tool=[0.2, 0.0, 0.3])),
-            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach by 0.145 m: 0.35 to 0.88 m from the",
+            "$.points[0].tool: [0.2, 0.0, 0.3] out of the arm's reach by 0.145 m: 0.35 to 0.88 m "
+            "from the",
         ),
-        (add(point(tool=[0.6, 0.0, 0.01])), "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m"),
+        (
+            add(point(tool=[0.6, 0.0, 0.01])),
+            "$.points[0].tool: [0.6, 0.0, 0.01] out of the arm's reach by 0.010 m",
+        ),
         (add(), "$.points: none given, 1 to 100 needed"),
         (add(*(point(name=f"p{i}") for i in range(101))), "$.points: 101 given, 1 to 100 needed"),
         (add(point(), tolerance=-1.0), "$.tolerance: -1.0 given; a number from 0 to 10 accepted"),
@@ -146,12 +174,18 @@ REFUSED: dict[str, list[tuple[Any, str]]] = {
         (b" " * 262_145, "a request of 262145 bytes, at most 262144 accepted"),
     ],
     "skill": [
-        ({"name": "nothing"}, "$.name: no skill 'nothing' in the skill folder; its skills: soldering"),
+        (
+            {"name": "nothing"},
+            "$.name: no skill 'nothing' in the skill folder; its skills: soldering",
+        ),
         *(({"name": name}, "$.name: ") for name in (".npz", "a/b", "", "x" * 129)),
         ({"name": 3}, "$.name: 3 given; 1 to 64 letters"),
         ({}, "$: field `name` is missing"),
     ],
-    "resume": [*NOT_EMPTY, ({"by": 5}, "$.by: 5 given; a name of up to 64 letters, digits, spaces and . _ - accepted")],
+    "resume": [
+        *NOT_EMPTY,
+        ({"by": 5}, "$.by: 5 given; a name of up to 64 letters, digits, spaces and . _ - accepted"),
+    ],
     "reset": [*NOT_EMPTY, ({"now": True}, "$: unknown field 'now'; known are none")],
 }
 
@@ -168,7 +202,16 @@ def test_a_request_is_refused_whole_and_with_a_reason(
 
 
 @pytest.mark.parametrize(
-    "payload", [None, b"hold!", {"now": True}, {"by": 5}, b'{"by": "a", "by": "b"}', b" " * 262_145, b"[" * 100_000]
+    "payload",
+    [
+        None,
+        b"hold!",
+        {"now": True},
+        {"by": 5},
+        b'{"by": "a", "by": "b"}',
+        b" " * 262_145,
+        b"[" * 100_000,
+    ],
 )
 def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) -> None:
     reply = taught_cell.reply("hold", payload)
@@ -198,7 +241,10 @@ def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to
 
 @pytest.mark.parametrize(
     ("state", "message"),
-    [("running", "did not take the request: it is starting, ending or stalled"), ("fails", "failed in the tick")],
+    [
+        ("running", "did not take the request: it is starting, ending or stalled"),
+        ("fails", "failed in the tick"),
+    ],
 )
 def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
     cell: Cell, monkeypatch: pytest.MonkeyPatch, state: str, message: str
@@ -218,15 +264,39 @@ def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
 @pytest.mark.parametrize(
     "name",
     [
-        *("../secret", "..", "/etc/passwd", "sub/inside", "a\0b", "link", "loop", "pipe", ".hidden", "x" * 200),
-        *("{folder}/../secret", "{folder}/soldering", "soldering.npz/../../secret", "~/secret", "secret\n", ""),
+        *(
+            "../secret",
+            "..",
+            "/etc/passwd",
+            "sub/inside",
+            "a\0b",
+            "link",
+            "loop",
+            "pipe",
+            ".hidden",
+            "x" * 200,
+        ),
+        *(
+            "{folder}/../secret",
+            "{folder}/soldering",
+            "soldering.npz/../../secret",
+            "~/secret",
+            "secret\n",
+            "",
+        ),
     ],
 )
-def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_path: Path, name: str) -> None:
+def test_a_skill_is_loaded_from_its_folder_only(
+    cell: Cell, skill: Skill, tmp_path: Path, name: str
+) -> None:
     """What lies elsewhere is not loaded, however it is named; nor is told where it is."""
     outside = tmp_path / "elsewhere"
     outside.mkdir()
-    for path in (outside / "secret.npz", cell.folder.parent / "secret.npz", cell.folder / ".hidden.npz"):
+    for path in (
+        outside / "secret.npz",
+        cell.folder.parent / "secret.npz",
+        cell.folder / ".hidden.npz",
+    ):
         path.write_bytes(skill.file)
     (cell.folder / "sub").mkdir()
     (cell.folder / "sub" / "inside.npz").write_bytes(skill.file)
@@ -244,19 +314,39 @@ def test_a_skill_is_loaded_from_its_folder_only(cell: Cell, skill: Skill, tmp_pa
 def test_the_segment_of_the_task_is_told_by_client_and_command(
     cell: Cell, sessions: tuple[zenoh.Session, zenoh.Session], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "There are: start, handover, glass, soldering" in cell.refusal("segment", {"name": "elsewhere"})
+    assert "There are: start, handover, glass, soldering" in cell.refusal(
+        "segment", {"name": "elsewhere"}
+    )
     reply = cell.client.set_segment("glass")
     assert (reply.mode, reply.reason, cell.kinds()[-1]) == ("hold", "no_hands", "segment")
-    command = ["segment", "soldering", "--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
-    for mode, reason, text in ((Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"), (Mode.FOLLOW, Reason.NONE, "follow")):
-        cell.mode, cell.reason = mode, reason
+    command = [
+        "segment",
+        "soldering",
+        "--connect",
+        *endpoints(sessions[0]),
+        "--cell",
+        cell.settings.cell,
+    ]
+    for mode, reason, text in (
+        (Mode.HOLD, Reason.NO_HANDS, "hold (no_hands)"),
+        (Mode.FOLLOW, Reason.NONE, "follow"),
+    ):
+        cell.mode = mode
+        cell.reason = reason
         assert main(command) == 0
-        assert re.search(rf"^at soldering since tick \d+: {re.escape(text)}$", capsys.readouterr().out, re.MULTILINE)
+        assert re.search(
+            rf"^at soldering since tick \d+: {re.escape(text)}$",
+            capsys.readouterr().out,
+            re.MULTILINE,
+        )
     assert cell.kinds()[-3:] == ["segment"] * 3
 
 
 def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a_warning(
-    sessions: tuple[zenoh.Session, zenoh.Session], skill: StoredSkill, skill_worker: SkillWorker, tmp_path: Path
+    sessions: tuple[zenoh.Session, zenoh.Session],
+    skill: StoredSkill,
+    skill_worker: SkillWorker,
+    tmp_path: Path,
 ) -> None:
     positions = skill.tool_positions
     half = Reach(min_x=float(np.quantile(positions[:, 0], 0.4)))  # 40 % are nearer to the base
@@ -265,7 +355,8 @@ def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a
         folder.mkdir()
         number = int(np.count_nonzero(beyond_m(Settings(reach=reach), positions)))
         sentence = (
-            f"{number} of {len(positions)} places of the tool in skill 'soldering' are out of the arm's reach, the"
+            f"{number} of {len(positions)} places of the tool in skill 'soldering' are out of the "
+            "arm's reach, the"
         )
         with contextlib.closing(Cell(*sessions, skill, skill_worker, folder, reach)) as cell:
             if is_refused:
@@ -283,7 +374,10 @@ def test_a_skill_out_of_reach_is_not_served(
 ) -> None:
     (tmp_path / "soldering.npz").write_bytes(skill.file)
     settings = Settings(files=Files(state=str(tmp_path)), reach=reach)
-    with pytest.raises(SkillError, match=r"places of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: "):
+    with pytest.raises(
+        SkillError,
+        match=r"places of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: ",
+    ):
         load_skill(tmp_path / "soldering.npz", settings)
     served = load_skill(tmp_path / "soldering.npz", Settings(files=Files(state=str(tmp_path))))
     assert served.digest == skill.digest
@@ -304,9 +398,13 @@ def test_a_skill_with_a_residual_risk_is_served_only_if_somebody_accepted_it(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    refusal = "not served: nobody has accepted its residual risk: the gate holds 3.0 % of hands swapped. Who takes"
+    refusal = (
+        "not served: nobody has accepted its residual risk: the gate holds 3.0 % of hands swapped. "
+        "Who takes"
+    )
     for accepted_by in ("", "Ada"):
-        risky, folder = with_residual_risk(skill, accepted_by), tmp_path / f"by {accepted_by}"
+        risky = with_residual_risk(skill, accepted_by)
+        folder = tmp_path / f"by {accepted_by}"
         folder.mkdir()
         (folder / "risky.npz").write_bytes(risky.file)
         settings = Settings(files=Files(state=str(folder)))
@@ -334,10 +432,16 @@ class SlowWorkshop(SkillWorker):
 
     def __init__(self) -> None:
         super().__init__()
-        self.begun, self.let = threading.Event(), threading.Event()
+        self.begun = threading.Event()
+        self.let = threading.Event()
 
     def adapt(
-        self, skill: Skill, places: Sequence[requests.ViaPoint], *, tolerance: float, timeout_s: float = 0.0
+        self,
+        skill: Skill,
+        places: Sequence[requests.ViaPoint],
+        *,
+        tolerance: float,
+        timeout_s: float = 0.0,
     ) -> Skill:
         self.begun.set()
         assert self.let.wait(20)
@@ -353,7 +457,8 @@ def slow() -> Iterator[SlowWorkshop]:
 
 @pytest.mark.parametrize("suffix", ORDERS)
 def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suffix: str) -> None:
-    first, second = cell.client.ask(suffix), cell.client.ask(suffix, {})
+    first = cell.client.ask(suffix)
+    second = cell.client.ask(suffix, {})
     assert 0 < first["tick"] < second["tick"]
     assert cell.kinds() == [suffix, suffix]
 
@@ -370,7 +475,9 @@ def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(cell: Cell) ->
     assert cell.kinds() == ["hold", "hold", "resume", "hold", "resume"]
 
 
-def test_hold_is_answered_while_a_slow_request_runs(opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop) -> None:
+def test_hold_is_answered_while_a_slow_request_runs(
+    opened: Callable[[SkillWorker], Cell], slow: SlowWorkshop
+) -> None:
     cell = opened(slow)
     with ThreadPoolExecutor(1) as pool:
         teaching = pool.submit(cell.client.add, PLACES)

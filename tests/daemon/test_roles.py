@@ -27,7 +27,15 @@ from thirdhand.daemon.single_instance import NETWORK_BOUNDS
 
 CELL = "bench"
 NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
-INPUTS = ("hands/left", "hands/right", "joints/state", "joints/guided", "gripper/state", "tool/pose", *NOT_DEMONSTRATED)
+INPUTS = (
+    "hands/left",
+    "hands/right",
+    "joints/state",
+    "joints/guided",
+    "gripper/state",
+    "tool/pose",
+    *NOT_DEMONSTRATED,
+)
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 DOMAIN = 3  # of ROS 2
@@ -65,11 +73,17 @@ class Guarded:
         self._declared = [self.session.declare_subscriber(key, self._take) for key in keys(INPUTS)]
         self._publishers = [self.session.declare_publisher(key) for key in keys(OUTPUTS)]
         session_id = str(self.session.zid())
-        topics = ros2.tokens(DOMAIN, CELL, session_id, [ros2.of_channel(CELL, channel) for channel in TOPICS]).values()
+        topics = ros2.tokens(
+            DOMAIN, CELL, session_id, [ros2.of_channel(CELL, channel) for channel in TOPICS]
+        ).values()
         self._tokens = [
-            self.session.liveliness().declare_token(token) for token in (channels.presence(CELL, session_id), *topics)
+            self.session.liveliness().declare_token(token)
+            for token in (channels.presence(CELL, session_id), *topics)
         ]
-        self._answering = [self.session.declare_queryable(channels.key(CELL, key), self._answer) for key in REQUESTS]
+        self._answering = [
+            self.session.declare_queryable(channels.key(CELL, key), self._answer)
+            for key in REQUESTS
+        ]
 
     def _take(self, sample: zenoh.Sample) -> None:
         if bytes(sample.payload) != b"from the bench":
@@ -116,7 +130,9 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
 
         def hear(sample: zenoh.Sample) -> None:  # its own words it hears too
             got.update([str(sample.key_expr)] if bytes(sample.payload) == b"out" else [])
-            passed_on.update([str(sample.key_expr)] if bytes(sample.payload) == b"from the bench" else [])
+            passed_on.update(
+                [str(sample.key_expr)] if bytes(sample.payload) == b"from the bench" else []
+            )
 
         def observe(sample: zenoh.Sample) -> None:
             forged.extend([str(sample.key_expr)] if bytes(sample.payload) != b"out" else [])
@@ -124,7 +140,9 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         streams = keys((*INPUTS, *OUTPUTS))
         heard = [session.declare_subscriber(key, hear) for key in (*full.values(), *streams, "**")]
         false_token = session.liveliness().declare_token(channels.presence(CELL, "f00"))
-        false_answers = [session.declare_queryable(full[key], lambda query: query.drop()) for key in REQUESTS]
+        false_answers = [
+            session.declare_queryable(full[key], lambda query: query.drop()) for key in REQUESTS
+        ]
         observed = [observer.declare_subscriber(key, observe) for key in keys(OUTPUTS)]
         until(lambda: Client(operator, CELL, timeout_s=1.0).ask("status") == {})
         end = time.monotonic() + PATIENCE_S
@@ -148,7 +166,9 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
     assert guarded.taken == keys(role.publishes)
     assert got == (keys(OUTPUTS) if role.hears else set())
     assert passed_on == (
-        {channels.key(CELL, key) for key in INPUTS if key not in NOT_DEMONSTRATED} if role.hears_inputs else set()
+        {channels.key(CELL, key) for key in INPUTS if key not in NOT_DEMONSTRATED}
+        if role.hears_inputs
+        else set()
     )
     assert forged == []
     assert answered == (len(REQUESTS) if role.asks else 1)  # the status is for all
@@ -162,7 +182,9 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
     with contextlib.ExitStack() as closing:
         closing.callback(daemon.close)
         sessions = {
-            name: closing.enter_context(open_session(connect=[daemon.endpoint], certificate=secrets / name))
+            name: closing.enter_context(
+                open_session(connect=[daemon.endpoint], certificate=secrets / name)
+            )
             for name in ("tracker", "tracker-2", "operator", "operator-2")
         }
         got: dict[str, set[str]] = {name: set() for name in sessions}
@@ -187,13 +209,18 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
             daemon.publish()
             time.sleep(0.05)
         daemon.asked.clear()
-        asked = [sessions["operator-2"].get(full[key], payload=b"{}", timeout=PATIENCE_S) for key in REQUESTS]
+        asked = [
+            sessions["operator-2"].get(full[key], payload=b"{}", timeout=PATIENCE_S)
+            for key in REQUESTS
+        ]
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
     tracked = {full[key] for key in ROLES["tracker"].publishes}
     assert {key for key, names in senders.items() if b"tracker" in names} == tracked
-    assert {key for key, names in senders.items() if names & {b"tracker-2", b"operator", b"operator-2"}} == set()
+    assert {
+        key for key, names in senders.items() if names & {b"tracker-2", b"operator", b"operator-2"}
+    } == set()
     assert got["tracker-2"] == got["operator-2"] == set()
     assert got["operator"] == {full[key] for key in OUTPUTS}
 
@@ -203,7 +230,9 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
     access = access_control(CELL, names("tracker"))["access_control"]
     assert all(subject["cert_common_names"] for subject in access["subjects"])
     assert "tracker" not in [subject["id"] for subject in access["subjects"]]
-    assert {name for policy in access["policies"] for name in policy["subjects"]} == {s["id"] for s in access["subjects"]}
+    assert {name for policy in access["policies"] for name in policy["subjects"]} == {
+        s["id"] for s in access["subjects"]
+    }
 
 
 @pytest.mark.thorough
@@ -218,9 +247,14 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
         (
             "daemon",
             other / "operator",
-            "the certificate of the daemon .* is not from the authority in .*other/secrets/operator",
+            "the certificate of the daemon .* is not from the authority in "
+            ".*other/secrets/operator",
         ),
-        ("daemon", certificates / "operator-8", "refuses the certificate in .*operator-8, which has expired by the clock there"),
+        (
+            "daemon",
+            certificates / "operator-8",
+            "refuses the certificate in .*operator-8, which has expired by the clock there",
+        ),
         (
             "daemon",
             certificates / "operator-9",
@@ -231,18 +265,25 @@ def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: 
         with open_session(listen=["tls/127.0.0.1:0"], certificate=certificates / daemon) as session:
             for timeout_s in (0.3, None):  # with None, other errors are waited for
                 with pytest.raises(CertificateError, match=words):
-                    open_session(connect=endpoints(session), certificate=client or "", timeout_s=timeout_s)
+                    open_session(
+                        connect=endpoints(session), certificate=client or "", timeout_s=timeout_s
+                    )
             (secured,) = endpoints(session)
             plain = secured.replace("tls/", "tcp/")
             with pytest.raises(
-                CertificateError, match=f"{plain} accepts TLS only: {secured}, and a certificate, needed"
+                CertificateError,
+                match=f"{plain} accepts TLS only: {secured}, and a certificate, needed",
             ):
                 open_session(connect=[plain], certificate=client or "", timeout_s=0.3)
     with (
         open_session(listen=["tls/127.0.0.2:0"], certificate=certificates / "daemon") as session,
-        pytest.raises(CertificateError, match=r"the certificate of the daemon .* is not for this address"),
+        pytest.raises(
+            CertificateError, match=r"the certificate of the daemon .* is not for this address"
+        ),
     ):
-        open_session(connect=endpoints(session), certificate=certificates / "operator", timeout_s=0.3)
+        open_session(
+            connect=endpoints(session), certificate=certificates / "operator", timeout_s=0.3
+        )
 
 
 def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
@@ -258,7 +299,9 @@ def test_a_daemon_and_its_commands_by_certificates(
     secrets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = f'[network]\nlisten = ["tls/127.0.0.1:0"]\ncertificate = "{secrets}/daemon"\n'
-    with launched(tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config) as service:
+    with launched(
+        tmp_path, "--joints", "assumed", "--record", str(tmp_path / "records"), network=config
+    ) as service:
         connect = ("--connect", service.endpoint)
         assert service.endpoint.startswith("tls/127.0.0.1:")
         monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(secrets / "operator"))
@@ -275,7 +318,10 @@ def test_a_daemon_and_its_commands_by_certificates(
             client = Client(operating)
             client.ask("resume")
             until(lambda: client.status().mode == "follow")
-            operating.put("thirdhand/hands/left", cdr.encode_pose(PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))))
+            operating.put(
+                "thirdhand/hands/left",
+                cdr.encode_pose(PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))),
+            )
         assert service.stop() == 0
     written = [path for path in (tmp_path / "records").rglob("*") if path.is_file()]
     assert written

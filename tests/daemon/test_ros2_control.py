@@ -20,8 +20,11 @@ from support.wam import JOINT_NAMES
 from thirdhand.client import endpoints
 from thirdhand.settings.config import Settings
 
-DOMAIN, RATE_HZ = 11, 250
-FORWARD, TRAJECTORY, STATES = "/arm/forward/commands", "/arm/jtc/joint_trajectory", "/arm/joint_states"
+DOMAIN = 11
+RATE_HZ = 250
+FORWARD = "/arm/forward/commands"
+TRAJECTORY = "/arm/jtc/joint_trajectory"
+STATES = "/arm/joint_states"
 CONFIGURATION = f"""
 rate_hz = {RATE_HZ}
 [network]
@@ -42,11 +45,14 @@ state = "{{state}}"
 
 @pytest.mark.parametrize("ends", ["stop", "failure"])
 @pytest.mark.one_case
-def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.Session, ends: str) -> None:
+def test_controllers_follow_and_are_left_at_rest(
+    tmp_path: Path, router: zenoh.Session, ends: str
+) -> None:
     """Stopped while it moves, and with a loop that fails for good while it moves."""
     (endpoint,) = endpoints(router)
     (tmp_path / "driven.toml").write_text(CONFIGURATION.format(router=endpoint, state=tmp_path))
-    positions, ways = list[Any](), list[Any]()
+    positions = list[Any]()
+    ways = list[Any]()
     topics = {FORWARD: ("std_msgs/msg/Float64MultiArray", positions.append)}
     topics |= {TRAJECTORY: ("trajectory_msgs/msg/JointTrajectory", ways.append)}
     heard = [
@@ -60,9 +66,12 @@ def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.S
         q = positions[-1].data if positions else np.array(Settings().arm.posture)[::-1]
         none = np.empty(0)
         states.publish(
-            header=header(states.session_mgr.store.types), name=list(reversed(JOINT_NAMES)),
-            position=np.array(q), velocity=none, effort=none,
-        )  # fmt: skip
+            header=header(states.session_mgr.store.types),
+            name=list(reversed(JOINT_NAMES)),
+            position=np.array(q),
+            velocity=none,
+            effort=none,
+        )
         return True
 
     arguments = ("--config", str(tmp_path / "driven.toml"))
@@ -74,7 +83,8 @@ def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.S
         def moves() -> bool:
             as_the_arm()
             away = 0.06 * np.sin(3.0 * time.monotonic())
-            hands.left, hands.right = (0.92 + away, -0.3, 0.08), (0.92 + away, 0.3, 0.08)
+            hands.left = (0.92 + away, -0.3, 0.08)
+            hands.right = (0.92 + away, 0.3, 0.08)
             return len(ways) > 10 and np.abs(ways[-1].points[0].velocities).max() > 0.05
 
         until(moves, "the arm never moved")
@@ -89,6 +99,8 @@ def test_controllers_follow_and_are_left_at_rest(tmp_path: Path, router: zenoh.S
     time.sleep(0.2)
     np.testing.assert_allclose(positions[-1].data, ways[-1].points[0].positions)
     steps = np.abs(np.diff([message.data for message in positions[-40:]], axis=0))
-    assert steps.max() < 3 * 1.6 / RATE_HZ  # without a jump; a busy machine loses one message or two
+    assert (
+        steps.max() < 3 * 1.6 / RATE_HZ
+    )  # without a jump; a busy machine loses one message or two
     for node in (*heard, states):
         node.close()

@@ -73,12 +73,16 @@ class Wrists:
     def _publish(self) -> None:
         types = self.node.session_mgr.store.types
         names = ("Vector3", "Quaternion", "Transform", "TransformStamped")
-        vector, quaternion, transform, stamped = (types[f"geometry_msgs/msg/{name}"] for name in names)
+        vector, quaternion, transform, stamped = (
+            types[f"geometry_msgs/msg/{name}"] for name in names
+        )
         while not self._end.wait(0.01):
             now_ns = time.time_ns()
             for _ in range(self.times):
                 self.session.put(KEY, cdr.encode_transforms(now_ns, OTHERS))
-            self.session.put(KEY, cdr.encode_transforms(now_ns, [*OTHERS[:24], of_left(), *OTHERS[24:]]))
+            self.session.put(
+                KEY, cdr.encode_transforms(now_ns, [*OTHERS[:24], of_left(), *OTHERS[24:]])
+            )
             pose = transform(vector(*(1000.0 * value for value in RIGHT)), quaternion(*STRAIGHT))
             self.node.publish(transforms=[stamped(header(types, "mocap"), "right_wrist", pose)])
 
@@ -114,18 +118,28 @@ MALFORMED = (
 
 
 @pytest.mark.thorough
-def test_frames_are_hands_amid_many_others_and_bad_ones_are_refused(tmp_path: Path, router: zenoh.Session) -> None:
+def test_frames_are_hands_amid_many_others_and_bad_ones_are_refused(
+    tmp_path: Path, router: zenoh.Session
+) -> None:
     (endpoint,) = endpoints(router)
     (tmp_path / "tf.toml").write_text(CELL.format(router=endpoint, state=tmp_path))
     serve = ("--config", str(tmp_path / "tf.toml"), "--record", str(tmp_path / "records"))
     with serving(tmp_path, *serve) as daemon, Wrists(endpoint) as wrists:
 
         def is_followed(now: dict[str, Any]) -> bool:
-            return bool(now["mode"] == "follow" and all(now["sources"][side]["fresh"] for side in ("left", "right")))
+            return bool(
+                now["mode"] == "follow"
+                and all(now["sources"][side]["fresh"] for side in ("left", "right"))
+            )
 
         status = daemon.until(is_followed, 30)
-        np.testing.assert_allclose([status["hands_m"][side] for side in ("left", "right")], [LEFT, RIGHT], atol=0.005)
-        assert [status["sources"][side]["frame"] for side in ("left", "right")] == ["world", "mocap"]
+        np.testing.assert_allclose(
+            [status["hands_m"][side] for side in ("left", "right")], [LEFT, RIGHT], atol=0.005
+        )
+        assert [status["sources"][side]["frame"] for side in ("left", "right")] == [
+            "world",
+            "mocap",
+        ]
         assert status["sources"]["left"]["clock_ms"] < 1000
         assert_refused(daemon, wrists.session)
         wrists.times = 10  # 1000 messages a second of 48 frames
@@ -143,11 +157,15 @@ def assert_refused(daemon: Daemon, session: zenoh.Session) -> None:
     for cause, message in bad().items():
         assert cause not in daemon.client.ask("status")["sources"]["left"]["rejected"]
         session.put(KEY, message)
-        status = daemon.until(lambda now, cause=cause: now["sources"]["left"]["rejected"].get(cause))  # type: ignore[misc]
+        status = daemon.until(
+            lambda now, cause=cause: now["sources"]["left"]["rejected"].get(cause)
+        )  # type: ignore[misc]
         assert status["mode"] == "follow", cause
     for count, message in enumerate(MALFORMED, start=2):
         session.put(KEY, message)
-        daemon.until(lambda now, count=count: now["sources"]["left"]["rejected"]["malformed"] == count)  # type: ignore[misc]
+        daemon.until(
+            lambda now, count=count: now["sources"]["left"]["rejected"]["malformed"] == count
+        )  # type: ignore[misc]
     assert not daemon.client.ask("status")["sources"]["right"]["rejected"].keys() & bad().keys()
 
 
@@ -155,7 +173,8 @@ def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
     """Behind certificates: a tracker publishes them, and a recorder hears them."""
     settings = parse(CELL.format(router="tcp/127.0.0.1:1", state=tmp_path), origin="tf.toml")
     topics = [*ros2.of_settings(settings.ros2)]
-    right, tool = Transform("/mocap", "/right_wrist", (1.0, 2.0, 3.0), STRAIGHT), (0.4, 0.0, 0.2)
+    right = Transform("/mocap", "/right_wrist", (1.0, 2.0, 3.0), STRAIGHT)
+    tool = (0.4, 0.0, 0.2)
     frames = [of_left(), right, Transform("base", "iron", tool, STRAIGHT)]
     sessions = guarded(tmp_path, settings.cell, DOMAIN, topics, "recorder", "tracker", "observer")
     with (
@@ -171,7 +190,9 @@ def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
             return not captured.missing and len(captured.malformed) == 3
 
         until(is_complete, "the frames were not heard")
-        poses = {key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES}
+        poses = {
+            key: channels.POSE.decode(captured.samples[key][-1].payload) for key in ros2.FRAMES
+        }
         assert [(pose.stamp_ns, pose.frame_id, pose.position) for pose in poses.values()] == [
             (1, "world", of_left().translation),
             (1, "mocap", (1.0, 2.0, 3.0)),

@@ -49,7 +49,10 @@ POSTURE = np.array(Settings().arm.posture) + 0.05
 def key(topic: str) -> str:
     """The Zenoh key of a topic that the settings name."""
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml").ros2
-    return ros2.key(DOMAIN, next(candidate for candidate in ros2.of_settings(settings) if candidate.name == topic))
+    return ros2.key(
+        DOMAIN,
+        next(candidate for candidate in ros2.of_settings(settings) if candidate.name == topic),
+    )
 
 
 class LikeRmw:
@@ -68,7 +71,9 @@ class LikeRmw:
 
 
 @pytest.mark.thorough
-def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path, router: zenoh.Session) -> None:
+def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(
+    tmp_path: Path, router: zenoh.Session
+) -> None:
     (endpoint,) = endpoints(router)
     (tmp_path / "viewed.toml").write_text(CONFIGURATION.format(router=endpoint, state=tmp_path))
     latched = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
@@ -85,10 +90,17 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
             joints = daemon.session.declare_publisher("thirdhand/joints/state")
 
             def as_the_arm() -> bool:
-                joints.put(cdr.encode_joints(JointState(time.time_ns(), JOINT_NAMES, tuple(POSTURE), (0.0,) * 7)))
+                joints.put(
+                    cdr.encode_joints(
+                        JointState(time.time_ns(), JOINT_NAMES, tuple(POSTURE), (0.0,) * 7)
+                    )
+                )
                 return True
 
-            until(lambda: as_the_arm() and daemon.client.ask("status")["reason"] == "no_hands", "no arm")
+            until(
+                lambda: as_the_arm() and daemon.client.ask("status")["reason"] == "no_hands",
+                "no arm",
+            )
             listening = [  # after all that is latched was published
                 listen("/robot_description", "std_msgs/msg/String", qos=latched),
                 listen("/tf_static", "tf2_msgs/msg/TFMessage", qos=latched),
@@ -96,28 +108,42 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
                 listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
             ]
             late = {topic: LikeRmw(node, topic) for topic in early}
-            until(lambda: as_the_arm() and heard["/diagnostics"] and len(heard["/tf"]) > 5, "nothing was said")
-            until(lambda: all(subscriber.told for subscriber in (*early.values(), *late.values())), "what is latched was not told")
-            began, count = time.monotonic(), len(heard["/tf"])
+            until(
+                lambda: as_the_arm() and heard["/diagnostics"] and len(heard["/tf"]) > 5,
+                "nothing was said",
+            )
+            until(
+                lambda: all(subscriber.told for subscriber in (*early.values(), *late.values())),
+                "what is latched was not told",
+            )
+            began = time.monotonic()
+            count = len(heard["/tf"])
             until(lambda: as_the_arm() and len(heard["/tf"]) >= count + 10, "frames ended")
             assert time.monotonic() - began > 0.5  # ten a second: the loop shares the interpreter
-            held, frames = heard["/diagnostics"][-1].status[0], heard["/tf"][-1].transforms
+            held = heard["/diagnostics"][-1].status[0]
+            frames = heard["/tf"][-1].transforms
             with Tracker(daemon.session) as hands:
 
                 def is_at_fault() -> bool:  # as the arm does not follow
                     away = 0.06 * np.sin(3.0 * time.monotonic())
-                    hands.left, hands.right = (0.92 + away, -0.3, 0.08), (0.92 + away, 0.3, 0.08)
+                    hands.left = (0.92 + away, -0.3, 0.08)
+                    hands.right = (0.92 + away, 0.3, 0.08)
                     return bool(as_the_arm() and heard["/diagnostics"][-1].status[0].level == 2)
 
                 until(is_at_fault, "no fault was told")
             assert heard["/robot_description"][0].data == robot_description(Settings())
             assert [
-                TYPES.deserialize_cdr(raw, "std_msgs/msg/String").data for raw in late["/robot_description"].told
+                TYPES.deserialize_cdr(raw, "std_msgs/msg/String").data
+                for raw in late["/robot_description"].told
             ] == [robot_description(Settings())]
             assert all(subscriber.told == late[topic].told for topic, subscriber in early.items())
             for subscriber in listening:
                 subscriber.close()
-    assert (held.level, held.name, held.message[:15]) == (1, "thirdhand: thirdhand", "hold (no_hands)")
+    assert (held.level, held.name, held.message[:15]) == (
+        1,
+        "thirdhand: thirdhand",
+        "hold (no_hands)",
+    )
     assert heard["/diagnostics"][-1].status[0].message.startswith("fault (arm_")
     values = {pair.key: pair.value for pair in held.values}
     assert (values["mode"], values["reason"]) == ("hold", "no_hands")
@@ -131,16 +157,30 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(tmp_path: Path,
 
 def as_told(one: Any) -> Transform:
     """A `TransformStamped`."""
-    position, q = one.transform.translation, one.transform.rotation
-    return Transform(one.header.frame_id, one.child_frame_id, (position.x, position.y, position.z), (q.x, q.y, q.z, q.w))
+    position = one.transform.translation
+    q = one.transform.rotation
+    return Transform(
+        one.header.frame_id,
+        one.child_frame_id,
+        (position.x, position.y, position.z),
+        (q.x, q.y, q.z, q.w),
+    )
 
 
 def placed(transforms: list[Transform], frame: str, root: str = "base") -> np.ndarray:
     """Where a frame is in frame `base`, as a 4 x 4 matrix, along the parents."""
-    placement, above = pin.SE3.Identity(), {transform.child: transform for transform in transforms}
+    placement = pin.SE3.Identity()
+    above = {transform.child: transform for transform in transforms}
     while frame != root:
         transform = above[frame]
-        placement, frame = pin.SE3(pin.Quaternion(np.array(transform.rotation)).matrix(), np.array(transform.translation)) * placement, transform.parent
+        placement = (
+            pin.SE3(
+                pin.Quaternion(np.array(transform.rotation)).matrix(),
+                np.array(transform.translation),
+            )
+            * placement
+        )
+        frame = transform.parent
     return np.array(placement.homogeneous)
 
 
@@ -164,8 +204,11 @@ def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: 
         domain = Ros2Domain(daemon, settings, topics, failed=failures.append)
         with contextlib.closing(domain):
             admitted, unseen = (
-                [LikeRmw(session, topic) for topic in ("/robot_description", "/tf_static")] for session in (observer, tracker)
+                [LikeRmw(session, topic) for topic in ("/robot_description", "/tf_static")]
+                for session in (observer, tracker)
             )
-            until(lambda: all(subscriber.told for subscriber in admitted), "an observer was not told")
+            until(
+                lambda: all(subscriber.told for subscriber in admitted), "an observer was not told"
+            )
             assert not any(subscriber.told for subscriber in unseen)
         assert failures == []

@@ -49,7 +49,11 @@ def files_in(folder: Path) -> dict[Path, bytes]:
 
 
 def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
-    saved: SavedViaPoints, settings: Settings, skill: Skill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    saved: SavedViaPoints,
+    settings: Settings,
+    skill: Skill,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
     taught = adapted(skill, POINTS, tolerance=0.03)
@@ -85,7 +89,9 @@ def test_via_points_that_this_skill_cannot_go_through_are_set_aside(
     assert [file.suffix for file in saved.path(skill).parent.iterdir()] == [".damaged"]
 
 
-def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(saved: SavedViaPoints, skill: Skill) -> None:
+def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(
+    saved: SavedViaPoints, skill: Skill
+) -> None:
     random = Random(1)
     keep(saved, adapted(skill, POINTS, tolerance=0.03))
     whole = saved.path(skill).read_bytes()
@@ -103,11 +109,18 @@ def another_arm(folder: Path, change: tuple[str, str]) -> Settings:
     assert change[0] in text
     urdf.write_text(text.replace(*change))
     shipped = Settings()
-    joints = {name: list(getattr(shipped.joints, name)) for name in ("lower", "upper", "acceleration", "jerk")}
+    joints = {
+        name: list(getattr(shipped.joints, name))
+        for name in ("lower", "upper", "acceleration", "jerk")
+    }
     values = {
         "cell": "lab/bench2",
         "files": {"state": str(folder)},
-        "arm": {"urdf": str(urdf), "plate": shipped.arm.plate, "posture": list(shipped.arm.posture)},
+        "arm": {
+            "urdf": str(urdf),
+            "plate": shipped.arm.plate,
+            "posture": list(shipped.arm.posture),
+        },
         "joints": joints,
     }
     return converted(values, origin="another arm")
@@ -130,7 +143,8 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
 ) -> None:
     """Whatever the change leaves in reach is in force; and all once the arm is as it was."""
     keep(saved, adapted(skill, POINTS, tolerance=0.03))
-    tools, settings = np.array([point.tool for point in POINTS]), Settings(cell="lab/bench2")
+    tools = np.array([point.tool for point in POINTS])
+    settings = Settings(cell="lab/bench2")
     for min_x in (0.0, *(np.sort(tools[:, 0])[[0, 1, 2]] + 0.01)):
         reach = msgspec.structs.replace(settings.reach, min_x=float(min_x))
         changed = msgspec.structs.replace(settings, files=Files(state=str(tmp_path)), reach=reach)
@@ -151,7 +165,9 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
             assert added.tolerance == 0.03
             assert stat.S_IMODE(aside.stat().st_mode) == 0o600
         caplog.clear()
-    assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3  # none replaced another
+    assert (
+        len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3
+    )  # none replaced another
     assert saved.read(skill) == (POINTS, 0.03)
 
 
@@ -163,7 +179,9 @@ def settings(tmp_path: Path) -> Settings:
     return Settings(cell="lab/bench2", files=Files(state=str(tmp_path)))
 
 
-def test_it_is_kept_for_its_skill_and_for_a_while(settings: Settings, skill: Skill, tmp_path: Path) -> None:
+def test_it_is_kept_for_its_skill_and_for_a_while(
+    settings: Settings, skill: Skill, tmp_path: Path
+) -> None:
     saved = SavedSegment(settings)
     assert saved.read(skill) == ""
     saved.keep(skill, ("handover", "glass"), 0.9)
@@ -206,7 +224,9 @@ REASONS: dict[str | bytes, tuple[str, ...]] = {
     "a folder": ("Is a directory; a file needed, and that is a folder",),
     "a pipe": ("it is not a file",),
     "a huge file": (f"it has {1 << 40} bytes, at most {MAX_STATE_BYTES} accepted",),
-    "a link to itself": ("Too many levels of symbolic links; a link that leads to a file or folder needed",),
+    "a link to itself": (
+        "Too many levels of symbolic links; a link that leads to a file or folder needed",
+    ),
 }
 
 
@@ -215,7 +235,8 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
     how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = state_folder(settings)
-    saved_points, segment = SavedViaPoints(settings), folder / "segment.json"
+    saved_points = SavedViaPoints(settings)
+    segment = folder / "segment.json"
     for path in (segment, saved_points.path(skill)):
         damage(path, how)
     assert SavedSegment(settings).read(skill) == ""
@@ -233,9 +254,12 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
     assert SavedSegment(settings).read(skill) == "handover"
 
 
-def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path: Path, skill: Skill) -> None:
+def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(
+    tmp_path: Path, skill: Skill
+) -> None:
     settings = Settings(files=Files(state=str(tmp_path / "state")))
-    folder, points = state_folder(settings), SavedViaPoints(settings).path(skill)
+    folder = state_folder(settings)
+    points = SavedViaPoints(settings).path(skill)
     for path in (folder / "segment.json", points, folder / "daemon.lock"):
         damage(path, DEEP)
     with serving(tmp_path, "--joints", "assumed") as daemon:
@@ -245,16 +269,30 @@ def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(tmp_path
         assert f"{points} cannot be used" in log
         assert daemon.client.status().segment == ()
         assert daemon.client.set_segment("glass").mode == "hold"
-        assert daemon.until(lambda now: (folder / "segment.json").exists() and now["segment"])["segment_belief"] == 1.0
+        assert (
+            daemon.until(lambda now: (folder / "segment.json").exists() and now["segment"])[
+                "segment_belief"
+            ]
+            == 1.0
+        )
     with serving(tmp_path, "--joints", "assumed") as daemon:
         assert "cannot be used" not in daemon.log.read_text()
         assert daemon.until(lambda now: bool(now["segment"]))["segment"] == ["glass", "soldering"]
         second_log = daemon.log.read_text()
-        assert second_log.count("the task continues at via-point glass, which an earlier run had reached") == 1
+        assert (
+            second_log.count(
+                "the task continues at via-point glass, which an earlier run had reached"
+            )
+            == 1
+        )
         assert daemon.end() == 0
-        assert daemon.log.read_text().endswith(" ended: the daemon of cell thirdhand; it recorded nothing\n")
+        assert daemon.log.read_text().endswith(
+            " ended: the daemon of cell thirdhand; it recorded nothing\n"
+        )
 
 
-def test_an_arm_that_was_calibrated_keeps_its_own(saved: SavedViaPoints, skill: Skill, tmp_path: Path) -> None:
+def test_an_arm_that_was_calibrated_keeps_its_own(
+    saved: SavedViaPoints, skill: Skill, tmp_path: Path
+) -> None:
     keep(saved, adapted(skill, POINTS, tolerance=0.03))
     assert SavedViaPoints(another_arm(tmp_path, ("0.55", "0.5503"))).read(skill) == (POINTS, 0.03)

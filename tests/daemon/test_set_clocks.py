@@ -36,7 +36,9 @@ class Commands:
 
 def follows(daemon: Daemon, tick: int) -> None:
     """Wait until the arm follows, some ticks after this one."""
-    status = daemon.until(lambda now: now["mode"] == "follow" and now["tick"] > tick + RATE_HZ, 60.0)
+    status = daemon.until(
+        lambda now: now["mode"] == "follow" and now["tick"] > tick + RATE_HZ, 60.0
+    )
     assert not any("fault" in line for line in daemon.log.read_text().splitlines()), status
 
 
@@ -49,12 +51,21 @@ def assert_replays(folder: Path) -> None:
 
 
 @pytest.mark.skipif(not LIBRARY, reason="needs libfaketime: on Debian, apt install libfaketime")
-def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    offset, records = tmp_path / "offset", tmp_path / "records"
+def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offset = tmp_path / "offset"
+    records = tmp_path / "records"
     offset.write_text("+0")
     (tmp_path / "sitecustomize.py").write_text(SLEEP)
-    faked = {"LD_PRELOAD": LIBRARY, "FAKETIME_TIMESTAMP_FILE": str(offset), "PYTHONPATH": str(tmp_path)}
-    for name, value in (faked | {"FAKETIME_CACHE_DURATION": "1", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}).items():
+    faked = {
+        "LD_PRELOAD": LIBRARY,
+        "FAKETIME_TIMESTAMP_FILE": str(offset),
+        "PYTHONPATH": str(tmp_path),
+    }
+    for name, value in (
+        faked | {"FAKETIME_CACHE_DURATION": "1", "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+    ).items():
         monkeypatch.setenv(name, value)
     arguments = ("--joints", "assumed", "--rate", str(RATE_HZ), "--record", str(records))
     with serving(tmp_path, *arguments) as daemon:
@@ -67,10 +78,17 @@ def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(tmp_path: Path, monk
                 offset.write_text(f"{after_s:+.3f}")
                 how = "ahead" if after_s > before_s else "back"
                 words = f"the system clock was set: {how} by {abs(after_s - before_s):.1f}"
-                until(lambda words=words: words in daemon.log.read_text(), f"not in the log: {words}", within_s=60.0)
+                until(
+                    lambda words=words: words in daemon.log.read_text(),
+                    f"not in the log: {words}",
+                    within_s=60.0,
+                )
                 follows(daemon, tick)
             words = "hand's stamps are 3650 days behind the daemon's clock"
-            until(lambda: words in told("status", "--connect", daemon.endpoint).stdout, f"not in the status: {words}")
+            until(
+                lambda: words in told("status", "--connect", daemon.endpoint).stdout,
+                f"not in the status: {words}",
+            )
             stamps = tuple(commands.stamps)
         assert daemon.end() == 0
     assert len(stamps) > RATE_HZ * len(OFFSETS_S)

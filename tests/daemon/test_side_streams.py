@@ -14,7 +14,9 @@ from thirdhand.daemon.cell_streams import Arrivals
 from thirdhand.daemon.side_streams import WAITING_IMAGES, SideStream
 
 
-def test_images_are_passed_on_in_order_and_the_rest_is_counted(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_images_are_passed_on_in_order_and_the_rest_is_counted(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+) -> None:
     near, far = sessions
     came: list[tuple[str, bytes]] = []
     arrivals = {key: Arrivals() for key in ("camera/front", "camera/side")}
@@ -26,8 +28,16 @@ def test_images_are_passed_on_in_order_and_the_rest_is_counted(sessions: tuple[z
         SideStream(near, key, functools.partial(pass_on, key), counted, waiting=WAITING_IMAGES)
         for key, counted in arrivals.items()
     ]
-    sent = [("camera/front", grey(10)), ("camera/front", b"nonsense"), ("camera/front", b"nonsense")]
-    sent += [("camera/front", grey(20)), ("camera/side", grey(30, kind="PNG")), ("camera/other", grey(40))]
+    sent = [
+        ("camera/front", grey(10)),
+        ("camera/front", b"nonsense"),
+        ("camera/front", b"nonsense"),
+    ]
+    sent += [
+        ("camera/front", grey(20)),
+        ("camera/side", grey(30, kind="PNG")),
+        ("camera/other", grey(40)),
+    ]
 
     def are_passed_on() -> bool:
         if not came:

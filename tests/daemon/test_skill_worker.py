@@ -44,10 +44,14 @@ def is_there(pid: int) -> bool:
 
 def assert_same_bits(one: Skill, other: Skill) -> None:
     random = np.random.default_rng(0)
-    hands, velocities, accelerations = (random.normal((0.8, 0.0, 0.2), 0.1, (2, 3)) for _ in range(3))
+    hands, velocities, accelerations = (
+        random.normal((0.8, 0.0, 0.2), 0.1, (2, 3)) for _ in range(3)
+    )
     assert one.digest == other.digest
     assert one.file == other.file
-    predicted, expected = (bits(skill.predict(hands, velocities, accelerations)) for skill in (one, other))
+    predicted, expected = (
+        bits(skill.predict(hands, velocities, accelerations)) for skill in (one, other)
+    )
     assert predicted == expected
 
 
@@ -86,11 +90,15 @@ def test_errors_come_back_with_their_words_and_do_not_end_the_process(
     assert process_of(skill_worker) == started
 
 
-def test_a_killed_process_is_replaced_at_the_next_request(skill_worker: SkillWorker, skill: Skill) -> None:
+def test_a_killed_process_is_replaced_at_the_next_request(
+    skill_worker: SkillWorker, skill: Skill
+) -> None:
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     os.kill(started, signal.SIGKILL)
-    os.waitid(os.P_PID, started, os.WEXITED | os.WNOWAIT)  # until it is dead; the skill worker finds that out itself
+    os.waitid(
+        os.P_PID, started, os.WEXITED | os.WNOWAIT
+    )  # until it is dead; the skill worker finds that out itself
     assert_same_bits(skill_worker.load(SOLDERING), skill)
     assert process_of(skill_worker) != started
     assert not is_there(started)
@@ -109,7 +117,9 @@ def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Ski
         remote.model.primitive.inputs[0, 0] = 1.0
 
 
-def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(
+    skill: Skill, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("thirdhand.daemon.skill_worker.HUNG_S", 0.5)
     worker = SkillWorker()
     try:
@@ -129,7 +139,9 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(skill: Skill, m
         worker.close()
 
 
-def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(skill_worker: SkillWorker) -> None:
+def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(
+    skill_worker: SkillWorker,
+) -> None:
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 
         def late(left_s: float) -> None:

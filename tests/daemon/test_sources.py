@@ -29,11 +29,15 @@ S = 1_000_000_000
 POSTURE = Settings().arm.posture
 
 
-def pose(stamp_ns: int, position: tuple[float, ...] = LEFT, turn: Any = STRAIGHT, frame: str = "base") -> PoseStamped:
+def pose(
+    stamp_ns: int, position: tuple[float, ...] = LEFT, turn: Any = STRAIGHT, frame: str = "base"
+) -> PoseStamped:
     return PoseStamped(stamp_ns, frame, position, turn)  # type: ignore[arg-type]
 
 
-def joints(stamp_ns: int, position: tuple[float, ...] = POSTURE, names: tuple[str, ...] = JOINT_NAMES) -> JointState:
+def joints(
+    stamp_ns: int, position: tuple[float, ...] = POSTURE, names: tuple[str, ...] = JOINT_NAMES
+) -> JointState:
     return JointState(stamp_ns, names, position, (0.0,) * len(position))
 
 
@@ -53,7 +57,12 @@ class Cell:
         self.frame: Frame = blank(frame_layout(7))
         self.log: list[str] = []
 
-    def tell(self, *messages: tuple[str, PoseStamped | JointState], late_ns: int = 0, at_ns: int | None = None) -> None:
+    def tell(
+        self,
+        *messages: tuple[str, PoseStamped | JointState],
+        late_ns: int = 0,
+        at_ns: int | None = None,
+    ) -> None:
         """One tick, in whose inbox messages are by source; they arrive at a time, or so much later
         than their stamps.
         """
@@ -69,7 +78,14 @@ class Cell:
         sources = dict(self.sources.update(self.controller, state, now_s))
         self.log += self.sources.news(sources, now_s)
         none = Percentiles()
-        more = {"rate_hz": 500.0, "missed": 0, "realtime": True, "memory_locked": True, "scribe": {}, "endpoints": ()}
+        more = {
+            "rate_hz": 500.0,
+            "missed": 0,
+            "realtime": True,
+            "memory_locked": True,
+            "scribe": {},
+            "endpoints": (),
+        }
         cell = CellStatus(self.frame, self.controller, state, sources, self.settings, failure)
         return cell.status(**more, version="", lateness_us=none, work_us=none, latency_ms=none)
 
@@ -77,9 +93,24 @@ class Cell:
 @pytest.mark.parametrize(
     ("source", "message", "cause", "words"),
     [
-        ("left", pose(2, frame="camera"), Cause.WRONG_FRAME, "frame 'camera'; 'base' or none accepted"),
-        ("left", pose(2, (980.0, -320.0, 60.0)), Cause.OUT_OF_RANGE, "at (980, -320, 60), which looks like mm;"),
-        ("left", pose(2, turn=(0.0, 0.0, 0.0, 0.0)), Cause.NOT_A_ROTATION, "of norm 0; norm 1 needed"),
+        (
+            "left",
+            pose(2, frame="camera"),
+            Cause.WRONG_FRAME,
+            "frame 'camera'; 'base' or none accepted",
+        ),
+        (
+            "left",
+            pose(2, (980.0, -320.0, 60.0)),
+            Cause.OUT_OF_RANGE,
+            "at (980, -320, 60), which looks like mm;",
+        ),
+        (
+            "left",
+            pose(2, turn=(0.0, 0.0, 0.0, 0.0)),
+            Cause.NOT_A_ROTATION,
+            "of norm 0; norm 1 needed",
+        ),
         (
             "right",
             pose(2, (math.nan, 0.0, 0.0)),
@@ -87,10 +118,30 @@ class Cell:
             "at (nan, 0, 0) in the tracker's frame, orientation (0, 0, 0, 1); finite",
         ),
         ("right", pose(S, RIGHT), Cause.REPEATED, "stamp 1.000 s again"),
-        ("right", pose(3 * S, RIGHT), Cause.AHEAD, "stamped 2 s after the newest accepted one: its clock stepped"),
-        ("right", pose(S // 2, RIGHT), Cause.OLDER, "stamped 500 ms before the newest accepted one"),
-        ("left", pose(S + 1, (0.5, 0.0, 0.3)), Cause.JUMPED, "at (0.5, 0, 0.3) in the tracker's frame"),
-        ("arm", joints(2, (90.0,) * 7), Cause.OUT_OF_RANGE, "base_yaw_joint at 90 rad, which looks like degrees; -2.8"),
+        (
+            "right",
+            pose(3 * S, RIGHT),
+            Cause.AHEAD,
+            "stamped 2 s after the newest accepted one: its clock stepped",
+        ),
+        (
+            "right",
+            pose(S // 2, RIGHT),
+            Cause.OLDER,
+            "stamped 500 ms before the newest accepted one",
+        ),
+        (
+            "left",
+            pose(S + 1, (0.5, 0.0, 0.3)),
+            Cause.JUMPED,
+            "at (0.5, 0, 0.3) in the tracker's frame",
+        ),
+        (
+            "arm",
+            joints(2, (90.0,) * 7),
+            Cause.OUT_OF_RANGE,
+            "base_yaw_joint at 90 rad, which looks like degrees; -2.8",
+        ),
         ("arm", joints(2, (0.0, 0.0), ("a", "b")), Cause.INCOMPLETE, "missing among 2, a, b"),
         (
             "arm",
@@ -106,36 +157,49 @@ class Cell:
         ),
     ],
 )
-def test_what_is_rejected_is_said_in_words(skill: Skill, source: str, message: Any, cause: Cause, words: str) -> None:
+def test_what_is_rejected_is_said_in_words(
+    skill: Skill, source: str, message: Any, cause: Cause, words: str
+) -> None:
     cell = Cell(skill)
     cell.tell(*resting_hands(S))
     cell.tell((source, message))
     refused = cell.controller.intake.refused[source, cause]
     assert refused[:2] == (cause, message)
     cell.tell(*resting_hands(2 * S))
-    assert words in explained(cause, evidence(refused, cell.settings, cell.sources.arrivals[KEY_OF_SOURCE[source]])).why
+    assert (
+        words
+        in explained(
+            cause, evidence(refused, cell.settings, cell.sources.arrivals[KEY_OF_SOURCE[source]])
+        ).why
+    )
 
 
 @pytest.mark.parametrize("rate_hz", [3, 5, 8])
 @pytest.mark.one_case
 def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: int) -> None:
-    cell, told_of = Cell(skill), set()
+    cell = Cell(skill)
+    told_of = set()
     for k in range(2500):
         cell.tell(("arm", joints(k + 1)), *resting_hands(k + 1) * (k % (500 // rate_hz) == 0))
         status = cell.status(k / 500)
         if k > 1000 and status.reason == "stale_hand":
             told_of.add(status.because)
             for side in ("left", "right"):
-                assert re.search(rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", status.because)
+                assert re.search(
+                    rf"the {side} hand arrives at \d\.\d Hz, 10 Hz at least needed", status.because
+                )
             assert (
                 status.remedy
-                == "publish hands more often, or raise [hands] stale_ms; or [hands] stale_max_ms if they come in bursts"
+                == "publish hands more often, or raise [hands] stale_ms; or [hands] stale_max_ms "
+                "if they come in bursts"
             )
     assert told_of
 
 
 @pytest.mark.parametrize("named_twice", JOINT_NAMES)
-def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(skill: Skill, named_twice: str) -> None:
+def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(
+    skill: Skill, named_twice: str
+) -> None:
     """With two positions it is nowhere: the arm would seem to have left its command."""
     cell = Cell(skill)
     for k in range(1, 100):
@@ -143,7 +207,10 @@ def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(skill: Skill,
         cell.tell(("arm", state), *resting_hands(k))
         status = cell.status(k / 500)
     assert (status.mode, status.reason) == ("hold", "arm_not_ready")
-    assert f"['{named_twice}'] named more than once among 8; one position each needed" in status.because
+    assert (
+        f"['{named_twice}'] named more than once among 8; one position each needed"
+        in status.because
+    )
     part = joints(1, POSTURE[:3], (*JOINT_NAMES[:2], JOINT_NAMES[1]))
     with pytest.raises(WireError, match="named more than once among 3"):
         JointStates(JOINT_NAMES, 0.1).take(part, 0.0)
@@ -153,7 +220,8 @@ class Clock:
     """Samples of the right hand at 100 Hz, each with its stamp and its delay [ns]."""
 
     def __init__(self, skill: Skill) -> None:
-        self.cell, self.now_ns = Cell(skill), 100 * S
+        self.cell = Cell(skill)
+        self.now_ns = 100 * S
 
     def tell(self, stamp_ns: int) -> None:
         self.cell.tell(("right", pose(stamp_ns, RIGHT)), late_ns=self.now_ns - stamp_ns)
@@ -164,20 +232,27 @@ class Clock:
 
 
 @pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # of the publisher's clock from the daemon's
-def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Skill, apart_s: int) -> None:
-    held, stepped = Clock(skill), Clock(skill)
+def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(
+    skill: Skill, apart_s: int
+) -> None:
+    held = Clock(skill)
+    stepped = Clock(skill)
     for clock in (held, stepped):
         for _ in range(50):
             clock.tell(clock.now_ns + apart_s * S - 5_000_000)
-    for k in range(300):  # a network that delivers nothing for 3 s, then one old sample, then the newest
+    for k in range(
+        300
+    ):  # a network that delivers nothing for 3 s, then one old sample, then the newest
         held.cell.tell()
         held.now_ns += 2_000_000 if k else 2 * S
     held.tell(held.now_ns + apart_s * S - 2 * S)
     held.tell(held.now_ns + apart_s * S - 8_000_000)
     stepped.tell(stepped.now_ns + apart_s * S + 2 * S)
-    told_held, told_stepped = held.cell.status(1.0), stepped.cell.status(1.0)
+    told_held = held.cell.status(1.0)
+    told_stepped = stepped.cell.status(1.0)
     assert (told_held.rejected, told_stepped.rejected) == ({"ahead": 1}, {"ahead": 1})
-    delayed, ahead = told_held.sources["right"], told_stepped.sources["right"]
+    delayed = told_held.sources["right"]
+    ahead = told_stepped.sources["right"]
     assert delayed.refused.endswith("which arrived 1.99 s late (its clock is right)")
     assert "find what holds them up: the network" in delayed.advice
     assert ahead.refused.endswith("after the newest accepted one: its clock stepped ahead")
@@ -186,18 +261,25 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(skill: Ski
 
 
 @pytest.mark.parametrize("set_back_s", [0.3, 3600, 10 * 365 * 86_400])
-def test_a_clock_that_was_set_back_is_told_from_a_second_source(skill: Skill, set_back_s: float) -> None:
-    set_back, second = Clock(skill), Clock(skill)
+def test_a_clock_that_was_set_back_is_told_from_a_second_source(
+    skill: Skill, set_back_s: float
+) -> None:
+    set_back = Clock(skill)
+    second = Clock(skill)
     for clock in (set_back, second):
         for _ in range(50):
             clock.tell(clock.now_ns)
     for k in range(6):
         set_back.tell(set_back.now_ns - round(set_back_s * S))
         second.tell(second.now_ns - round(set_back_s * S) * (k % 2))
-    told_back, told_second = (clock.cell.status(1.0).sources["right"] for clock in (set_back, second))
+    told_back, told_second = (
+        clock.cell.status(1.0).sources["right"] for clock in (set_back, second)
+    )
     assert (told_back.cause, told_second.cause) == ("older", "older")
     assert told_back.refused.endswith(" before the newest accepted one: its clock was set back")
-    assert told_back.advice.startswith("correct the publisher's clock; samples are accepted again after")
+    assert told_back.advice.startswith(
+        "correct the publisher's clock; samples are accepted again after"
+    )
     assert told_second.refused.endswith(" before the newest accepted one")
     assert "stop a second tracker or driver of this key" in told_second.advice
     for _ in range(30):
@@ -211,7 +293,10 @@ def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(ski
         cell.tell(("left", pose(k + 1, frame="camera")))
         cell.status(100 + k / 10)
     assert [line.split(":")[0] for line in cell.log] == ["left hand"]
-    assert "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: find [hands]" in cell.log[0]
+    assert (
+        "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: find [hands]"
+        in cell.log[0]
+    )
     cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse("a header of another kind")
     cell.status(103.0)
     assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
@@ -242,7 +327,11 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
     for k in range(200):
-        cell.tell(("right", pose(k + 1, RIGHT)), ("left", pose(k + 1, frame="camera")), ("arm", joints(k + 1)))
+        cell.tell(
+            ("right", pose(k + 1, RIGHT)),
+            ("left", pose(k + 1, frame="camera")),
+            ("arm", joints(k + 1)),
+        )
         if k % 50 == 0:
             status = cell.status(k / 500)
     status = cell.status(0.4)
@@ -251,7 +340,9 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
         "the left hand has not been seen yet, as what arrives is rejected as wrong_frame: "
         "frame 'camera'; 'base', 'optitrack' or none accepted"
     )
-    assert status.remedy.startswith("find [hands] frame and base_from_tracker by thirdhand calibrate, also after the")
+    assert status.remedy.startswith(
+        "find [hands] frame and base_from_tracker by thirdhand calibrate, also after the"
+    )
     assert status.frames == ("base", "optitrack", "")
     assert status.sources["right"].rate_hz == pytest.approx(500, rel=0.05)
     assert (status.sources["right"].fresh, status.sources["left"].fresh) == (True, False)
@@ -263,7 +354,9 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
     assert not status.sources["right"].fresh
 
 
-@pytest.mark.parametrize(("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")])
+@pytest.mark.parametrize(
+    ("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")]
+)
 def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
     skill: Skill, unit: str, reported: str
 ) -> None:
@@ -278,13 +371,19 @@ def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
         cell.status(k / 500)
     status = cell.status(0.2)
     assert status.mode == "hold"
-    assert f"look like {reported}," in status.because or f"which looks like {reported}; " in status.because
+    assert (
+        f"look like {reported}," in status.because
+        or f"which looks like {reported}; " in status.because
+    )
     assert {source.unit for name, source in status.sources.items() if name != "arm"} == {reported}
 
 
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
-def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(skill: Skill, batch_ticks: int) -> None:
-    cell, period_ns = Cell(skill), S // 500
+def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(
+    skill: Skill, batch_ticks: int
+) -> None:
+    cell = Cell(skill)
+    period_ns = S // 500
     waiting: list[tuple[str, PoseStamped]] = []
     status = cell.status(0.0)
     for k in range(5 * batch_ticks):
@@ -307,18 +406,30 @@ def test_an_arm_that_is_not_ready_says_why(skill: Skill) -> None:
     cell.tell()
     assert cell.status(0.0).because == "no joint states arrived yet"
     cell.tell(("arm", joints(1, (0.0, 0.0), ("a", "b"))))
-    assert "what arrives from the arm is rejected as incomplete: joints ['wam/" in cell.status(0.1).because
+    assert (
+        "what arrives from the arm is rejected as incomplete: joints ['wam/"
+        in cell.status(0.1).because
+    )
     cell.tell(("arm", joints(2)))
     status = cell.status(0.2)
     assert status.because == "the arm has not rested in one posture for long enough"
-    assert status.remedy == "wait: the service begins by itself once the arm has rested within its limits for 0.1 s"
+    assert (
+        status.remedy
+        == "wait: the service begins by itself once the arm has rested within its limits for 0.1 s"
+    )
     outside = (2.7, *POSTURE[1:])
     for k in range(120):
         cell.tell(("arm", joints(10 + k, outside)))
-    assert cell.status(0.5).because == "wam/base_yaw_joint at 2.700 rad is outside -2.6 to 2.6, and is moved back"
+    assert (
+        cell.status(0.5).because
+        == "wam/base_yaw_joint at 2.700 rad is outside -2.6 to 2.6, and is moved back"
+    )
     for _ in range(60):
         cell.tell()
-    assert (cell.status(0.7).reason, cell.status(0.8).because) == ("arm_silent", "no joint states for 120 ms")
+    assert (cell.status(0.7).reason, cell.status(0.8).because) == (
+        "arm_silent",
+        "no joint states for 120 ms",
+    )
 
 
 def test_clocks_are_told_apart_from_latency(skill: Skill) -> None:
@@ -337,6 +448,8 @@ def test_an_arm_that_reports_too_seldom_is_told_how_often(skill: Skill, rate_hz:
         cell.tell(*[("arm", joints(k + 1))] * (k % (500 // rate_hz) == 0))
         status = cell.status(k / 500)
         if k > 1000:
-            assert re.fullmatch(r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", status.because)
+            assert re.fullmatch(
+                r"joint states arrive at \d\.\d Hz, 10 Hz at least needed", status.because
+            )
             assert status.remedy == "publish joints/state more often, or raise [arm] silent_ms"
     assert status.reason == "arm_not_ready"

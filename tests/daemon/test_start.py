@@ -27,7 +27,8 @@ from thirdhand.settings.network import Network
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
     """A cell whose daemon has begun to start, and where it listens."""
-    network, files = Network(listen=("tcp/127.0.0.1:0",)), Files(state=str(tmp_path))
+    network = Network(listen=("tcp/127.0.0.1:0",))
+    files = Files(state=str(tmp_path))
     with starting(Settings(cell="lab/bench", network=network, files=files)) as start:
         yield start, endpoints(start.session)[0]
 
@@ -40,7 +41,10 @@ def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
         client = Client(session, "lab/bench")
         for channel in CHANNELS:
             if channel.queryable:
-                with pytest.raises(StartingError, match=r"cell lab/bench is starting: importing, \d+ modules so far"):
+                with pytest.raises(
+                    StartingError,
+                    match=r"cell lab/bench is starting: importing, \d+ modules so far",
+                ):
                     client.ask(channel.key)
         (cell,) = cells(session)
         assert (cell.name, cell.status) == ("lab/bench", None)
@@ -57,7 +61,9 @@ def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
         assert not isinstance(ended.value, StartingError)
 
 
-def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(started: tuple[Startup, str]) -> None:
+def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(
+    started: tuple[Startup, str],
+) -> None:
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:
         client = Client(session, "lab/bench")
@@ -81,23 +87,33 @@ def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(s
 
 
 @pytest.mark.thorough
-def test_a_service_that_gets_no_further_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_gets_no_further_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(launch, "START_STALL_S", 16.0)
-    before = "import time\nfrom thirdhand.daemon import daemon\ndaemon.warm_up = lambda *_, **__: time.sleep(600)"
+    before = (
+        "import time\nfrom thirdhand.daemon import daemon\ndaemon.warm_up = lambda *_, **__: "
+        "time.sleep(600)"
+    )
     reports: list[str] = []
     stuck = r"no progress for 16 s.*last report: loading compiled functions, \d+ of \d+ functions"
-    with pytest.raises(LaunchError, match=stuck), serving(tmp_path, before=before, say=reports.append):
+    with (
+        pytest.raises(LaunchError, match=stuck),
+        serving(tmp_path, before=before, say=reports.append),
+    ):
         raise AssertionError("it was ready")
     assert reports[0].startswith("  starting: importing")
 
 
 @pytest.mark.parametrize(
-    "command", ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"]
+    "command",
+    ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"],
 )
 def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
     arguments = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = (
-        f"import sys\nfrom thirdhand.command_line import main\ncode = main({arguments})\nassert 'numpy' not in sys.modules\n"
+        f"import sys\nfrom thirdhand.command_line import main\ncode = main({arguments})\nassert "
+        "'numpy' not in sys.modules\n"
     )
     done = python(f"{code}sys.exit(code)")
     assert done.returncode == 1

@@ -28,7 +28,9 @@ from thirdhand.recordings.replay import replay
 
 def children(pid: int) -> list[int]:
     """The processes that a process has started and that are still there."""
-    done = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False
+    )
     return [int(line) for line in done.stdout.split()]
 
 
@@ -51,7 +53,12 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 
     with (
         serving(
-            tmp_path, "--joints", "assumed", "--record", str(records), before=SABOTAGE.format(folder=str(tmp_path))
+            tmp_path,
+            "--joints",
+            "assumed",
+            "--record",
+            str(records),
+            before=SABOTAGE.format(folder=str(tmp_path)),
         ) as daemon,
         Tracker(daemon.session),
     ):
@@ -83,10 +90,14 @@ def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Pat
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
     """One that has no folder for its lock, and is served all the same."""
     (tmp_path / "state").write_text("a file where a folder is needed")
-    with serving(tmp_path, "--joints", "assumed", before=SABOTAGE.format(folder=str(tmp_path))) as daemon:
+    with serving(
+        tmp_path, "--joints", "assumed", before=SABOTAGE.format(folder=str(tmp_path))
+    ) as daemon:
         started = children(daemon.process.pid)
         daemon.until(lambda status: status["tick"] > 0)
-        assert "a second daemon of this cell is only detected through Zenoh" in daemon.log.read_text()
+        assert (
+            "a second daemon of this cell is only detected through Zenoh" in daemon.log.read_text()
+        )
         fail(tmp_path, "step")
         assert daemon.process.wait(20) == 1
         assert "step is sabotaged" in daemon.log.read_text()
@@ -108,7 +119,9 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
     assert victim.read_text() == "untouched"
 
 
-@pytest.mark.parametrize("signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]])
+@pytest.mark.parametrize(
+    "signals", [[signal.SIGHUP], [signal.SIGINT] * 5, [signal.SIGTERM, signal.SIGHUP]]
+)
 @pytest.mark.one_case
 def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: list[int]) -> None:
     """`resume` is asked all the while: nobody cancels the stop of a daemon that ends."""
@@ -140,7 +153,9 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
         assert "did not come to rest" not in log  # the time-out of the stop
     (recording,) = records.glob("*.mcap")
     last = log.splitlines()[-1]
-    assert last.endswith(f" ended: the daemon of cell thirdhand; its newest recording is {recording}")
+    assert last.endswith(
+        f" ended: the daemon of cell thirdhand; its newest recording is {recording}"
+    )
     assert "operator" not in log  # its own stop is nobody's hold, which `resume` would end
     result = replay(recording)
     assert result.exact, result.text()
@@ -152,7 +167,9 @@ def test_a_daemon_that_was_paused_counts_what_it_missed_and_goes_on(tmp_path: Pa
         daemon.process.send_signal(signal.SIGSTOP)
         time.sleep(1.0)
         daemon.process.send_signal(signal.SIGCONT)
-        after = daemon.until(lambda now: now["tick"] > before["tick"] + 400 and now["mode"] == "follow")
+        after = daemon.until(
+            lambda now: now["tick"] > before["tick"] + 400 and now["mode"] == "follow"
+        )
         assert after["missed"] - before["missed"] >= 400
         assert after["tick"] - before["tick"] > after["missed"] - before["missed"]
 
@@ -162,7 +179,15 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     free once its daemon has ended or was killed: test_taught_places_survive_a_restart.
     """
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        arguments = ("serve", "--joints", "assumed", "--listen", "tcp/127.0.0.1:0", "--connect", daemon.endpoint)
+        arguments = (
+            "serve",
+            "--joints",
+            "assumed",
+            "--listen",
+            "tcp/127.0.0.1:0",
+            "--connect",
+            daemon.endpoint,
+        )
         refused = thirdhand(*arguments, env=os.environ | {"HOME": str(tmp_path / "home")})
         assert refused.returncode == 1
         assert "cell thirdhand is already served" in refused.stderr
@@ -178,29 +203,39 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert stat.S_IMODE(lock.parent.stat().st_mode) == 0o700
         other = tmp_path / "other"
         other.mkdir()
-        with serving(other, "--joints", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"):
+        with serving(
+            other, "--joints", "assumed", "--connect", daemon.endpoint, "--cell", "bench/2"
+        ):
             assert daemon.client.status().cell == "thirdhand"
         assert daemon.end() == 0
 
 
-def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(tmp_path: Path) -> None:
+def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(
+    tmp_path: Path,
+) -> None:
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
 
         def skill_worker() -> int:
-            names = {pid: Path(f"/proc/{pid}/comm").read_text().strip() for pid in children(daemon.process.pid)}
+            names = {
+                pid: Path(f"/proc/{pid}/comm").read_text().strip()
+                for pid in children(daemon.process.pid)
+            }
             assert len(names) == 3  # with the process that forks them
             assert set(names.values()) >= {"scribe", "skill worker"}
             return next(pid for pid, name in names.items() if name == "skill worker")
 
-        taught, tick = teach(daemon, 3), daemon.client.status().tick
+        taught = teach(daemon, 3)
+        tick = daemon.client.status().tick
         # It also computes the limits of the tool, and is killed while it does nothing else.
         daemon.until(lambda status: status["tick"] > tick and status["tool_limits"])
         first = skill_worker()
         os.kill(first, signal.SIGSTOP)
         killing = threading.Timer(0.3, os.kill, [first, signal.SIGKILL])
         killing.start()
-        with pytest.raises(RefusedError, match="ended while it worked; nothing was changed, try again"):
+        with pytest.raises(
+            RefusedError, match="ended while it worked; nothing was changed, try again"
+        ):
             teach(daemon, 5)
         killing.join()
         assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
@@ -208,7 +243,8 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
             teach(daemon, 5)
         assert len(teach(daemon, 5)) == 5
 
-        busy, started = skill_worker(), children(daemon.process.pid)
+        busy = skill_worker()
+        started = children(daemon.process.pid)
         assert busy != first
         daemon.until(lambda status: status["tick"] > 600)
         os.kill(busy, signal.SIGSTOP)  # it hears of nothing
@@ -224,21 +260,34 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(t
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     """The via-points in force once these are taught."""
     place = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
-    points = [{"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)]
-    points_in_force: list[dict[str, Any]] = daemon.client.ask("via_points", {"op": "add", "points": points})["points"]
+    points = [
+        {"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)
+    ]
+    points_in_force: list[dict[str, Any]] = daemon.client.ask(
+        "via_points", {"op": "add", "points": points}
+    )["points"]
     return points_in_force
 
 
-@pytest.mark.parametrize("streams", ["> /dev/full", "2> /dev/full", "> >(true)", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    "streams", ["> /dev/full", "2> /dev/full", "> >(true)", ">&-", "2>&-", "<&- >&- 2>&-"]
+)
 @pytest.mark.one_case
-def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path: Path, streams: str) -> None:
+def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(
+    tmp_path: Path, streams: str
+) -> None:
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = (
-        f"exec {sys.executable} -m thirdhand serve --joints assumed --config {tmp_path}/cell.toml --listen {endpoint}"
+        f"exec {sys.executable} -m thirdhand serve --joints assumed --config {tmp_path}/cell.toml "
+        f"--listen {endpoint}"
     )
     running = subprocess.Popen(
-        ["bash", "-c", f"{command} {streams}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ["bash", "-c", f"{command} {streams}"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
     try:
         with open_session(connect=[endpoint], timeout_s=60.0) as session:
@@ -250,7 +299,10 @@ def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(tmp_path
         assert running.returncode == 0, output
         assert "Traceback" not in output
         if streams == "> /dev/full":
-            assert f"listening on {endpoint} as cell thirdhand (standard output: No space left on device" in output
+            assert (
+                f"listening on {endpoint} as cell thirdhand (standard output: No space left on "
+                "device" in output
+            )
     finally:
         running.kill()
         running.wait()
@@ -264,13 +316,17 @@ def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
     )
     parent = (
         "import socket, sys, threading, time\nfrom thirdhand.process import child\nstarted = []\n"
-        "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', socket.SOCK_STREAM)))\n"
+        "thread = threading.Thread(target=lambda: started.append(child.start('busy', 'busy', "
+        "socket.SOCK_STREAM)))\n"
         "thread.start()\nthread.join()\nassert started[0].has_begun(60)\n"
         "print(started[0].pid, flush=True)\ntime.sleep(60)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     running = subprocess.Popen(
-        [sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
+        [sys.executable, "-c", parent],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
     )
     assert running.stdout is not None
     busy = int(running.stdout.readline())

@@ -45,7 +45,8 @@ class Manager:
 
     def heard(self, seconds: float, until: str = "\n") -> list[str]:
         """The assignments that arrive within this time, or until one of them arrives."""
-        assignments, end = list[str](), time.monotonic() + seconds
+        assignments = list[str]()
+        end = time.monotonic() + seconds
         while until not in assignments and (left := end - time.monotonic()) > 0:
             self.socket.settimeout(left)
             try:
@@ -66,7 +67,9 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 
 
 @pytest.mark.thorough
-def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(manager: Manager, tmp_path: Path) -> None:
+def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
+    manager: Manager, tmp_path: Path
+) -> None:
     mark = tmp_path / "mark"
     arguments = ("--joints", "assumed")
     before = STANDS_STILL.format(mark=str(mark))
@@ -113,7 +116,9 @@ own_answers.DEAF_AFTER_S, own_answers.ASK_EVERY_S = 1.5, 0.3
 
 
 @pytest.mark.thorough
-def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(manager: Manager, tmp_path: Path) -> None:
+def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(
+    manager: Manager, tmp_path: Path
+) -> None:
     mark = tmp_path / "mark"
     with serving(tmp_path, "--joints", "assumed", before=DEAF.format(mark=str(mark))) as daemon:
         for _ in range(10):  # more than two of its own requests
@@ -124,13 +129,21 @@ def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(man
         mark.unlink()
         assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
         assert daemon.end() == 0
-        assert daemon.log.read_text().count("the daemon has not answered on its own endpoint tcp/127.0.0.1:") == 1
+        assert (
+            daemon.log.read_text().count(
+                "the daemon has not answered on its own endpoint tcp/127.0.0.1:"
+            )
+            == 1
+        )
 
 
 def engaged_by_resume(daemon: Daemon) -> None:
     """Check that the arm holds, with both hands in sight, until an operator's resume."""
-    daemon.until(lambda now: len(now["hand_age_ms"]) == 2 and max(now["hand_age_ms"].values()) < 100)
-    client, end = Client(daemon.session), time.monotonic() + 1.0
+    daemon.until(
+        lambda now: len(now["hand_age_ms"]) == 2 and max(now["hand_age_ms"].values()) < 100
+    )
+    client = Client(daemon.session)
+    end = time.monotonic() + 1.0
     while time.monotonic() < end:
         now = client.status()
         assert (now.mode, now.reason) == ("hold", "operator")
@@ -153,30 +166,41 @@ def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
         "thirdhand.cli.serve.serve",
     ]
     assert options["ExecStart"].hold
-    assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")  # it does not see the check's exit code
+    assert "RestartPreventExitStatus" not in UNIT.read_text(
+        encoding="utf-8"
+    )  # it does not see the check's exit code
     assert {str(parsed.config) for parsed in options.values()} == {"/etc/thirdhand/%i.toml"}
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+@pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed"
+)
 def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     program = tmp_path / "thirdhand"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
     unit = tmp_path / UNIT.name
     text = UNIT.read_text(encoding="utf-8").replace(commands()["ExecStart"][0], str(program))
-    for spoilt in ("", "WatchdogSec=soon\n"):  # the second one is refused, so the tool reads the file
+    for spoilt in (
+        "",
+        "WatchdogSec=soon\n",
+    ):  # the second one is refused, so the tool reads the file
         unit.write_text(text.replace("[Install]", f"{spoilt}[Install]"))
         done = subprocess.run(
             ["systemd-analyze", "verify", str(tmp_path / "thirdhand@bench.service")],
-            capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
         assert bool(done.returncode or done.stderr) == bool(spoilt), done.stderr
 
 
 def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
     manager: Manager, tmp_path: Path
 ) -> None:
-    disk, filled = tmp_path / "disk", tmp_path / "disk" / "filled"
+    disk = tmp_path / "disk"
+    filled = tmp_path / "disk" / "filled"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
     if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
@@ -189,11 +213,20 @@ def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
                 pass
         with serving(tmp_path, "--joints", "assumed", "--record", str(disk / "records")) as daemon:
             checked = told(
-                "serve", "--check", "--config", str(tmp_path / "cell.toml"), "--record", str(disk / "records")
+                "serve",
+                "--check",
+                "--config",
+                str(tmp_path / "cell.toml"),
+                "--record",
+                str(disk / "records"),
             )
-            assert (checked.returncode, "wrong  disk" in checked.stdout) == (1, True), checked.stdout
+            assert (checked.returncode, "wrong  disk" in checked.stdout) == (1, True), (
+                checked.stdout
+            )
             assert manager.heard(30, "READY=1")[-1] == "READY=1"
-            with pytest.raises(RefusedError, match=r"cannot save via-points in .*: No space left on device"):
+            with pytest.raises(
+                RefusedError, match=r"cannot save via-points in .*: No space left on device"
+            ):
                 Client(daemon.session).add(Scene().via_points())
             assert Client(daemon.session).status().places == ()
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"

@@ -28,7 +28,10 @@ from thirdhand.process.priority import AHEAD_NICE
 
 pytestmark = pytest.mark.timed
 FEW_DESCRIPTORS = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (600, 600))"
-SOON_S, USUAL_S, LONGEST_GAP_S, AT_ONCE_S = 1.0, 0.050, 0.020, 0.010
+SOON_S = 1.0
+USUAL_S = 0.050
+LONGEST_GAP_S = 0.020
+AT_ONCE_S = 0.010
 
 IDLE_CONNECTIONS = """
 import resource, socket
@@ -132,9 +135,18 @@ with open_session(connect=[f"tcp/127.0.0.1:{near.getsockname()[1]}"]) as session
 @contextlib.contextmanager
 def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
     """Another process that attacks until the context ends; what it said when it was in place."""
-    code = f"import sys, time\nendpoint, *arguments = sys.argv[1:]\nfrom thirdhand.client import open_session\n{script}"
+    code = (
+        "import sys, time\nendpoint, *arguments = sys.argv[1:]\nfrom thirdhand.client import "
+        f"open_session\n{script}"
+    )
     attacker = subprocess.Popen(
-        [sys.executable, "-c", f"{code}\nprint('done', flush=True)\ntime.sleep(60)", daemon.endpoint, *arguments],
+        [
+            sys.executable,
+            "-c",
+            f"{code}\nprint('done', flush=True)\ntime.sleep(60)",
+            daemon.endpoint,
+            *arguments,
+        ],
         stdout=subprocess.PIPE,
         text=True,
         cwd=ROOT,
@@ -150,7 +162,8 @@ def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
 
 def holds_s(daemon: Daemon, during_s: float = 1.5) -> list[float]:
     """How long holds took to be in force, the longest last; the status goes on meanwhile."""
-    took, end = [], time.monotonic() + during_s
+    took = []
+    end = time.monotonic() + during_s
     first = daemon.client.status().tick
     while (begin := time.monotonic()) < end:
         daemon.client.ask("hold")
@@ -162,7 +175,11 @@ def holds_s(daemon: Daemon, during_s: float = 1.5) -> list[float]:
 
 def peak_mib(pid: int) -> float:
     """The most memory that a process has had."""
-    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmHWM"))
+    (line,) = (
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    )
     return int(line.split()[1]) / 1024
 
 
@@ -170,14 +187,19 @@ def is_welcome(daemon: Daemon, within_s: float = 30.0) -> bool:
     """Whether a new client is served."""
     end = time.monotonic() + within_s
     while time.monotonic() < end:
-        with contextlib.suppress(UnreachableError), open_session(connect=[daemon.endpoint], timeout_s=2.0) as session:
+        with (
+            contextlib.suppress(UnreachableError),
+            open_session(connect=[daemon.endpoint], timeout_s=2.0) as session,
+        ):
             return bool(Client(session, timeout_s=2.0).status())
     return False
 
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with serving(tmp_path_factory.mktemp("attacked"), "--joints", "assumed", before=FEW_DESCRIPTORS) as daemon:
+    with serving(
+        tmp_path_factory.mktemp("attacked"), "--joints", "assumed", before=FEW_DESCRIPTORS
+    ) as daemon:
         yield daemon
         log = daemon.log.read_text()
         assert daemon.client.status().mode != "fault", log
@@ -194,7 +216,8 @@ with open_session(connect=[endpoint]) as session:
     begin, sent = time.monotonic(), 0
     while True:
         for hand in hands:
-            hand.put(cdr.encode_pose(PoseStamped(time.time_ns(), "base", (0.98, 0.3, 0.06), (0.0, 0.0, 0.0, 1.0))))
+            pose = PoseStamped(time.time_ns(), "base", (0.98, 0.3, 0.06), (0.0, 0.0, 0.0, 1.0))
+                        hand.put(cdr.encode_pose(pose))
         sent += 1
         time.sleep(max(0.0, begin + sent / 5000 - time.monotonic()))
 """
@@ -203,7 +226,8 @@ BUSY = "while True: pass"
 
 @pytest.mark.parametrize("kind", ["list", "add", "status", "resume", "hold", "nonsense"])
 def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kind: str) -> None:
-    begin, before = time.monotonic(), len(daemon.log.read_text().splitlines())
+    begin = time.monotonic()
+    before = len(daemon.log.read_text().splitlines())
     with attack(FLOOD, daemon, kind) as report:
         assert report == "begun"
         assert holds_s(daemon)[-1] < SOON_S
@@ -281,7 +305,9 @@ def put(thread: int, nice: int) -> None:
 
 def test_requests_beyond_the_bound_are_refused_at_once(daemon: Daemon) -> None:
     add = b'{"op": "add", "points": [{"name": "a", "left": [0.62, -0.28, 0.3], "right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3]}]}'  # noqa: E501
-    asked = [daemon.session.get("thirdhand/via_points", payload=add, timeout=60.0) for _ in range(40)]
+    asked = [
+        daemon.session.get("thirdhand/via_points", payload=add, timeout=60.0) for _ in range(40)
+    ]
     answers = [reply for replies in asked for reply in replies]
     refused = [reply.err.payload.to_string() for reply in answers if reply.err is not None]
     assert len(answers) == 40
@@ -319,7 +345,9 @@ def test_commands_come_on_while_a_large_message_is_sent(daemon: Daemon) -> None:
     """As another process hears them, with and without such a message in turn."""
     heard: list[float] = []
     daemon.until(lambda status: status["tick"] > 0)
-    listening = daemon.session.declare_subscriber("thirdhand/joints/command", lambda _: heard.append(time.monotonic()))
+    listening = daemon.session.declare_subscriber(
+        "thirdhand/joints/command", lambda _: heard.append(time.monotonic())
+    )
     with attack(ONE_LARGE_MESSAGE, daemon) as report:
         times = [float(stamp_s) for stamp_s in report.split()]
     listening.undeclare()  # type: ignore[no-untyped-call]

@@ -22,12 +22,17 @@ def test_an_arm_that_is_stuck_says_so_and_comes_out(tmp_path: Path) -> None:
         serving(tmp_path, "--config", str(config), "--joints", "assumed") as daemon,
         Tracker(daemon.session) as hands,
     ):
-        hands.left, hands.right = (0.986, -0.354, 0.075), (0.78, 0.06, 0.11)
-        stuck = daemon.until(lambda status: "stuck" in status["flags"] or status["reason"] == "blocked", 30.0)
+        hands.left = (0.986, -0.354, 0.075)
+        hands.right = (0.78, 0.06, 0.11)
+        stuck = daemon.until(
+            lambda status: "stuck" in status["flags"] or status["reason"] == "blocked", 30.0
+        )
         assert "from its target" in stuck["because"], stuck
         assert stuck["remedy"]
         leaving = daemon.until(lambda status: "on its way out" in status["because"], 30.0)
         assert (leaving["mode"], leaving["reason"]) == ("hold", "blocked")
-        following = daemon.until(lambda status: status["mode"] == "follow" and not status["because"], 30.0)
+        following = daemon.until(
+            lambda status: status["mode"] == "follow" and not status["because"], 30.0
+        )
         assert not following["flags"] or "stuck" not in following["flags"]
     assert "a way out of" in daemon.log.read_text()

@@ -18,7 +18,11 @@ from thirdhand.recordings.mcap_reader import Messages, full_name
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.workbench.report.columns import read
-from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.demonstration_reader import (
+    hand_samples,
+    read_demonstration,
+    write_demonstration,
+)
 
 TAKE = circling(0)._replace(gripper=np.full(600, 0.5))
 BAD: dict[str, Callable[[bytes], bytes]] = {
@@ -31,7 +35,9 @@ BAD: dict[str, Callable[[bytes], bytes]] = {
 
 def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = range(10, 11)) -> Path:
     """A copy of a recording in which some messages of a topic, by their indices, are bad."""
-    path, messages, count = source.with_name("spoiled.mcap"), Messages(source), 0
+    path = source.with_name("spoiled.mcap")
+    messages = Messages(source)
+    count = 0
     next(iter(messages))
     with McapFile(path, joints=7) as file:
         for name, data in messages.attachments.items():
@@ -49,17 +55,22 @@ def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = rang
 @pytest.mark.parametrize("kind", BAD)
 @pytest.mark.parametrize("key", [*TAKE_KEYS.values(), "gripper/state"])
 def test_a_bad_message_is_lost_and_counted(kind: str, key: str, tmp_path: Path) -> None:
-    topic, remarks = f"/thirdhand/{key}", list[str]()
+    topic = f"/thirdhand/{key}"
+    remarks = list[str]()
     write_demonstration(tmp_path / "take.mcap", TAKE)
     path = spoiled(tmp_path / "take.mcap", topic, kind, range(100, 300, 100))
     take = read_demonstration(path, say=remarks.append)
     assert len(take.stamps_ns) == 600 - 2 * (key == "tool/pose")
-    np.testing.assert_allclose(take.left, TAKE.left[np.isin(TAKE.stamps_ns, take.stamps_ns)], atol=0.01)
+    np.testing.assert_allclose(
+        take.left, TAKE.left[np.isin(TAKE.stamps_ns, take.stamps_ns)], atol=0.01
+    )
     assert f"{path}: {topic}: 2 of 600 messages are not readable: " in "\n".join(remarks)
     if key == "hands/left":
         assert len(hand_samples(path, say=remarks.append)) == 1198
         assert remarks[-1].startswith(f"{path}: 2 of 1200 poses are not readable: {topic}: ")
-        with pytest.raises(RecordingError, match="hands/left: 600 of 600 messages are not readable: "):
+        with pytest.raises(
+            RecordingError, match="hands/left: 600 of 600 messages are not readable: "
+        ):
             read_demonstration(spoiled(tmp_path / "take.mcap", topic, kind, range(600)))
 
 

@@ -22,7 +22,11 @@ from thirdhand.recordings.steps import Step
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.cli.view import convert
 from thirdhand.workbench.report.report import reported
-from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration, write_demonstration
+from thirdhand.workbench.takes.demonstration_reader import (
+    hand_samples,
+    read_demonstration,
+    write_demonstration,
+)
 
 COUNT = 600
 
@@ -44,7 +48,8 @@ def frames(whole: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[int, 
 
 def records(data: bytes) -> list[tuple[int, int, int]]:
     """Opcode, first byte and end of every record."""
-    spans, offset = [], 8
+    spans = []
+    offset = 8
     while offset < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, offset)
         spans.append((opcode, offset, offset + 9 + length))
@@ -82,7 +87,11 @@ def test_what_follows_a_damaged_chunk_is_read(
     assert all(encode(step.frame) == frames[step.tick] for step in steps if step.frame is not None)
     missing = sorted(set(range(COUNT)) - set(read_ticks))
     assert missing == (list(range(missing[0], missing[-1] + 1)) if missing else [])
-    assert missing or at in (1, 17, 28)  # what is wrong there, only the checksum over all data knows
+    assert missing or at in (
+        1,
+        17,
+        28,
+    )  # what is wrong there, only the checksum over all data knows
     assert len(missing) <= 60
     if missing and missing[-1] < COUNT - 1:
         (behind,) = (step for step in steps if step.damage)
@@ -93,7 +102,11 @@ def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
     random = np.random.default_rng(3)
     refused: list[str] = []
     starts = [start for _, start, _ in records(whole)]
-    for offset in [*random.integers(8, len(whole), 40).tolist(), *(start + 3 for start in starts[:60:4]), len(whole) - 4]:
+    for offset in [
+        *random.integers(8, len(whole), 40).tolist(),
+        *(start + 3 for start in starts[:60:4]),
+        len(whole) - 4,
+    ]:
         try:
             recording, steps = read(tmp_path / "a.mcap", flipped(whole, offset, 0x10))
         except RecordingError as error:
@@ -107,13 +120,20 @@ def test_every_byte_counts(tmp_path: Path, whole: bytes) -> None:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "zstd of another size", "lz4"])
-def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path, whole: bytes, compression: str) -> None:
+def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(
+    tmp_path: Path, whole: bytes, compression: str
+) -> None:
     size = 100 << 20
     zeros = bytes(size)
     packed = lz4.frame.compress(zeros) if compression == "lz4" else zstandard.compress(zeros)
     told_size = size if compression == "zstd" else 1000
     name = compression[:4].encode()
-    body = struct.pack("<QQQII", 0, 1 << 63, told_size, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    body = (
+        struct.pack("<QQQII", 0, 1 << 63, told_size, 0, len(name))
+        + name
+        + struct.pack("<Q", len(packed))
+        + packed
+    )
     begin, _ = chunks(whole)[0]
     bomb = struct.pack("<BQ", Opcode.CHUNK, len(body)) + body
     recording, steps = read(tmp_path / "a.mcap", whole[:begin] + bomb + whole[begin:])
@@ -126,32 +146,42 @@ def test_a_recording_whose_skill_is_damaged_says_so(tmp_path: Path, whole: bytes
     for offset in (whole.index(b"skill.npz") + 300, whole.index(b"arm.urdf") + 300):
         path.write_bytes(flipped(whole, offset))
         for use in (replay, lambda path: convert(path, tmp_path / "a.rrd")):
-            with pytest.raises(RecordingError, match=r"lacks its (skill|arm); .*an attachment's checksum is wrong"):
+            with pytest.raises(
+                RecordingError, match=r"lacks its (skill|arm); .*an attachment's checksum is wrong"
+            ):
                 use(path)
         columns = reported(path).columns
         assert columns.ticks.tolist() == list(range(COUNT))
         assert any("an attachment's checksum is wrong" in gap for gap in columns.gaps)
     path.write_bytes(flipped(whole, whole.index(b"settings.json") + 300))
-    with pytest.raises(RecordingError, match=r"lacks its settings: .*an attachment's checksum is wrong"):
+    with pytest.raises(
+        RecordingError, match=r"lacks its settings: .*an attachment's checksum is wrong"
+    ):
         Recording.open(path)
 
 
 def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_demonstration(
-        path, Demonstration(np.arange(3000) * 10_000_000, *np.random.default_rng(1).random((3, 3000, 7)))
+        path,
+        Demonstration(np.arange(3000) * 10_000_000, *np.random.default_rng(1).random((3, 3000, 7))),
     )
     start, end = chunks(path.read_bytes())[0]
     path.write_bytes(flipped(path.read_bytes(), (start + end) // 2))
-    with pytest.raises(RecordingError, match=r"damage at byte .* no poses can be read; nothing is learned"):
+    with pytest.raises(
+        RecordingError, match=r"damage at byte .* no poses can be read; nothing is learned"
+    ):
         read_demonstration(path)
     with pytest.raises(RecordingError, match="is damaged"):
         list(hand_samples(path))
 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut", "lost"])
-def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path: Path, whole: bytes, kind: str) -> None:
-    path, remarks = tmp_path / "a.mcap", list[str]()
+def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(
+    tmp_path: Path, whole: bytes, kind: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    remarks = list[str]()
     start, end = chunks(whole)[5]
     if kind == "lost":
         with Recorder(path, settings=CELL, skill=SKILL) as recorder:
@@ -160,7 +190,9 @@ def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path:
                     lost = 5 * (tick.index == 15)
                     recorder.write(tick, frame, time_ns=at_ns(tick.index), timing=timing, lost=lost)
     else:
-        path.write_bytes(flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2])
+        path.write_bytes(
+            flipped(whole, start + 100) if kind == "damaged" else whole[: (start + end) // 2]
+        )
     tick_count = convert(path, tmp_path / "a.rrd", say=remarks.append)
     recording = Recording.open(path)
     steps = [step for step in recording.steps() if step.frame is not None]
@@ -177,5 +209,9 @@ def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(tmp_path:
     if kind != "lost":  # the same words; nothing here replays, for its frames are made up
         faults = [str(fault) for fault in recording.faults]
         assert all(any(fault in line for line in remarks) for fault in faults)
-    logged = [row["TextLog:text"][0] for row in drawn(tmp_path / "a.rrd")["/log"] if row.get("TextLog:text")]
+    logged = [
+        row["TextLog:text"][0]
+        for row in drawn(tmp_path / "a.rrd")["/log"]
+        if row.get("TextLog:text")
+    ]
     assert set(remarks[:-1]) <= set(logged)

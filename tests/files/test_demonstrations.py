@@ -22,11 +22,14 @@ from thirdhand.workbench.takes.demonstration_reader import read_demonstration, w
 
 def _swaying(count: int) -> np.ndarray:
     """Poses (3, T, 7) of hands and tool that move and turn as people do, 100 a second."""
-    random, t = np.random.default_rng(1), 0.01 * np.arange(count)
+    random = np.random.default_rng(1)
+    t = 0.01 * np.arange(count)
     phases = random.uniform(0.0, 6.0, (3, 6, 1))
     waves = np.sin(3.0 * t + phases)
     turns = Rotation.from_rotvec((0.3 * waves[:, 3:]).transpose(0, 2, 1).reshape(-1, 3)).as_quat()
-    return np.concatenate([0.2 * waves[:, :3].transpose(0, 2, 1), turns.reshape(3, count, 4)], axis=2)
+    return np.concatenate(
+        [0.2 * waves[:, :3].transpose(0, 2, 1), turns.reshape(3, count, 4)], axis=2
+    )
 
 
 def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -44,21 +47,35 @@ def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path:
 
 def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Path) -> None:
     """Hands of a tracker in millimetres that is turned by 90 degrees, beside a tool in `base`."""
-    stamps, path = START_NS + np.arange(50) * 10_000_000, tmp_path / "a.mcap"
+    stamps = START_NS + np.arange(50) * 10_000_000
+    path = tmp_path / "a.mcap"
     left, right, tool = _swaying(50)
     quarter = Rotation.from_euler("z", 90, degrees=True)
     tracker_poses = []
     for poses in (left, right):
         turned = quarter.inv() * Rotation.from_quat(poses[:, 3:])
-        tracker_poses.append(np.hstack([1000 * quarter.inv().apply(poses[:, :3] - [0.1, 0, 0]), turned.as_quat()]))
-    streams = {"/x/hands/left": tracker_poses[0], "/x/hands/right": tracker_poses[1], "/x/tool/pose": tool}
+        tracker_poses.append(
+            np.hstack([1000 * quarter.inv().apply(poses[:, :3] - [0.1, 0, 0]), turned.as_quat()])
+        )
+    streams = {
+        "/x/hands/left": tracker_poses[0],
+        "/x/hands/right": tracker_poses[1],
+        "/x/tool/pose": tool,
+    }
     _streams(path, {name: (stamps, poses) for name, poses in streams.items()}, frame="mocap")
-    mocap = TrackerSettings(unit="mm", base_from_tracker=(0.1, 0.0, 0.0, *quarter.as_quat().tolist()))
+    mocap = TrackerSettings(
+        unit="mm", base_from_tracker=(0.1, 0.0, 0.0, *quarter.as_quat().tolist())
+    )
     remarks: list[str] = []
-    read = read_demonstration(path, settings=Settings(trackers={"mocap": mocap}), say=remarks.append)
+    read = read_demonstration(
+        path, settings=Settings(trackers={"mocap": mocap}), say=remarks.append
+    )
     for name, poses in (("left", left), ("right", right), ("tool", tool)):
         np.testing.assert_allclose(getattr(read, name)[:, :3], poses[:, :3], atol=1e-9)
-    mapped = "hands/left, hands/right transformed to frame base by [trackers.mocap] unit and base_from_tracker"
+    mapped = (
+        "hands/left, hands/right transformed to frame base by [trackers.mocap] unit and "
+        "base_from_tracker"
+    )
     assert mapped in remarks[0]
     with pytest.raises(RecordingError, match="hands/left is in frame 'mocap'"):
         read_demonstration(path)
@@ -70,20 +87,27 @@ def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Pat
 
 def test_a_gripper_comes_back_with_its_demonstration_at_the_tools_stamps(tmp_path: Path) -> None:
     stamps = START_NS + np.arange(50) * 10_000_000
-    poses, closure = _swaying(50), np.linspace(0.0, 1.0, 50)
+    poses = _swaying(50)
+    closure = np.linspace(0.0, 1.0, 50)
     write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses, gripper=closure))
     np.testing.assert_array_equal(read_demonstration(tmp_path / "a.mcap").gripper, closure)
     with pytest.raises(ValueError, match=r"gripper/state: shape \(7,\) given"):
         write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, *poses, gripper=closure[:7]))
 
 
-def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, frame: str = "base") -> None:
+def _streams(
+    path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, frame: str = "base"
+) -> None:
     """Writes poses as any ROS 2 recorder would: each topic at its own stamps."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
-        pose = writer.register_schema(channels.POSE.type, "ros2msg", schema(channels.POSE.type).encode())
-        other = writer.register_channel("/chatter", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        pose = writer.register_schema(
+            channels.POSE.type, "ros2msg", schema(channels.POSE.type).encode()
+        )
+        other = writer.register_channel(
+            "/chatter", "json", writer.register_schema("x", "jsonschema", b"{}")
+        )
         writer.add_message(other, 0, b"{}", 0)
         for topic, (stamps, poses) in streams.items():
             channel = writer.register_channel(topic, "cdr", pose)
@@ -92,7 +116,9 @@ def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, f
                 writer.add_message(
                     channel,
                     stamp + 5,
-                    cdr.encode_pose(messages.PoseStamped(stamp, frame_id, tuple(row[:3]), tuple(row[3:]))),
+                    cdr.encode_pose(
+                        messages.PoseStamped(stamp, frame_id, tuple(row[:3]), tuple(row[3:]))
+                    ),
                     stamp,
                 )
         writer.finish()
@@ -100,16 +126,15 @@ def _streams(path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, f
 
 def _line(stamps: np.ndarray, slope: float) -> np.ndarray:
     poses = np.zeros((len(stamps), 7))
-    poses[:, 0], poses[:, 6] = slope * stamps / 1e9, np.where(np.arange(len(stamps)) % 2, -1.0, 1.0)
+    poses[:, 0] = slope * stamps / 1e9
+    poses[:, 6] = np.where(np.arange(len(stamps)) % 2, -1.0, 1.0)
     return poses
 
 
 def test_streams_with_stamps_of_their_own_are_brought_to_those_of_the_tool(tmp_path: Path) -> None:
-    left, right, tool = (
-        np.arange(0, 1000, 7) * 1_000_000,
-        np.arange(30, 900, 11) * 1_000_000,
-        np.arange(0, 1000, 5) * 1_000_000,
-    )
+    left = np.arange(0, 1000, 7) * 1_000_000
+    right = np.arange(30, 900, 11) * 1_000_000
+    tool = np.arange(0, 1000, 5) * 1_000_000
     _streams(
         tmp_path / "a.mcap",
         {
@@ -129,14 +154,21 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
     stamps = np.arange(5) * 1_000_000
     good = (stamps, _line(stamps, 1))
     _streams(tmp_path / "a.mcap", {"/x/tool/pose": good})
-    with pytest.raises(RecordingError, match=r"ending in hands/left .* topics: /chatter \(x in json\), /x/tool/pose"):
+    with pytest.raises(
+        RecordingError,
+        match=r"ending in hands/left .* topics: /chatter \(x in json\), /x/tool/pose",
+    ):
         read_demonstration(tmp_path / "a.mcap")
     _streams(tmp_path / "a.mcap", {"/x/hands/left": good, "/y/hands/left": good})
-    with pytest.raises(RecordingError, match=r"two streams of hands/left: /x/hands/left and /y/hands/left"):
+    with pytest.raises(
+        RecordingError, match=r"two streams of hands/left: /x/hands/left and /y/hands/left"
+    ):
         read_demonstration(tmp_path / "a.mcap")
     all_three = {"/x/hands/left": good, "/x/hands/right": good, "/x/tool/pose": good}
     _streams(tmp_path / "a.mcap", all_three, frame="tracker")
-    with pytest.raises(RecordingError, match=r"hands/left is in frame 'tracker': 'base' needed, or"):
+    with pytest.raises(
+        RecordingError, match=r"hands/left is in frame 'tracker': 'base' needed, or"
+    ):
         read_demonstration(tmp_path / "a.mcap")
     late = (stamps + 10**12, good[1])
     _streams(tmp_path / "a.mcap", all_three | {"/x/tool/pose": late})
@@ -144,10 +176,16 @@ def test_a_demonstration_that_lacks_something_says_what(tmp_path: Path) -> None:
         read_demonstration(tmp_path / "a.mcap")
     still = (stamps * 0, good[1])
     _streams(tmp_path / "a.mcap", all_three | {"/x/tool/pose": still})
-    with pytest.raises(RecordingError, match="5 poses on tool/pose with 1 different stamps, 2 needed"):
+    with pytest.raises(
+        RecordingError, match="5 poses on tool/pose with 1 different stamps, 2 needed"
+    ):
         read_demonstration(tmp_path / "a.mcap")
     with pytest.raises(ValueError, match=r"hands/right: shape \(4, 7\) given"):
-        write_demonstration(tmp_path / "b.mcap", Demonstration(stamps, good[1], good[1][:4], good[1]))
+        write_demonstration(
+            tmp_path / "b.mcap", Demonstration(stamps, good[1], good[1][:4], good[1])
+        )
     for wrong, words in ((stamps * 1e-9, "float64 from 0 on"), (stamps - 1, "int64 from -1 on")):
-        with pytest.raises(ValueError, match=rf"stamps_ns: {words} given, integers \[ns\] from 0 on needed"):
+        with pytest.raises(
+            ValueError, match=rf"stamps_ns: {words} given, integers \[ns\] from 0 on needed"
+        ):
             write_demonstration(tmp_path / "b.mcap", Demonstration(wrong, *[good[1]] * 3))

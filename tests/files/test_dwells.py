@@ -35,26 +35,34 @@ def listed(taken: Demonstration, path: Path) -> Summary:
 def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
     taken: Demonstration, tmp_path: Path
 ) -> None:
-    vise = msgspec.structs.replace(taken.places[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none")
+    vise = msgspec.structs.replace(
+        taken.places[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
+    )
     listing = listed(taken._replace(places=(*taken.places, vise)), tmp_path / "a.mcap")
     least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
     (remark,) = listing.remarks
     assert remark == (
-        f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} mm, 100 mm needed"
+        f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} "
+        "mm, 100 mm needed"
     )
     assert remark in table(listing)
 
 
 def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstration) -> None:
-    middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))  # on the way to the glass, as fast as it goes
+    middle = int(
+        np.argmax(np.abs(np.gradient(taken.tool[:, 1])))
+    )  # on the way to the glass, as fast as it goes
     period_ns = round(1e9 * taken.period_s)
     lasts = round(0.8 / taken.period_s)
-    rows = np.concatenate([np.arange(middle), np.full(lasts, middle), np.arange(middle, len(taken.stamps_ns))])
+    rows = np.concatenate(
+        [np.arange(middle), np.full(lasts, middle), np.arange(middle, len(taken.stamps_ns))]
+    )
     rested = taken._replace(
         stamps_ns=taken.stamps_ns[0] + period_ns * np.arange(len(rows)),
         **{side: getattr(taken, side)[rows] for side in ("left", "right", "tool")},
     )
-    begin_s, end_s = middle * taken.period_s, (middle + lasts) * taken.period_s
+    begin_s = middle * taken.period_s
+    end_s = (middle + lasts) * taken.period_s
     assert any(abs(a - begin_s) < 0.2 and abs(b - end_s) < 0.2 for a, b in dwells(rested))
     assert remarks_on_places(taken) == []
     (remark,) = remarks_on_places(rested)
@@ -63,10 +71,14 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
 
 
 @pytest.mark.parametrize("end", ["begins", "ends"])
-def test_a_take_that_begins_or_ends_in_motion_is_warned_of(end: str, taken: Demonstration, tmp_path: Path) -> None:
+def test_a_take_that_begins_or_ends_in_motion_is_warned_of(
+    end: str, taken: Demonstration, tmp_path: Path
+) -> None:
     index = int(np.argmax(np.linalg.norm(np.gradient(taken.right[:, :3], axis=0), axis=1)))
     rows = slice(index, None) if end == "begins" else slice(None, index)
-    cut = Demonstration._make(part[rows] if isinstance(part, np.ndarray) else part for part in taken)
+    cut = Demonstration._make(
+        part[rows] if isinstance(part, np.ndarray) else part for part in taken
+    )
     (remark,) = [line for line in listed(cut, tmp_path / "a.mcap").remarks if "in motion" in line]
     assert remark.startswith(f"it {end} in motion: ")
     assert "right 0." in remark

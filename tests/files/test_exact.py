@@ -52,23 +52,28 @@ for name in sys.argv[1:]:
 
 def corrected() -> tuple[Skill, Demonstration]:
     """The shipped skill with a via-point of its own name, which pulls the tool, and a take."""
-    skill, (_, take) = skill_in(RECORDINGS / "soldering.npz"), learned("cyclic")
+    skill = skill_in(RECORDINGS / "soldering.npz")
+    _, take = learned("cyclic")
     middle = skill.hands.mean(axis=0)
     tool = skill.tool_positions.mean(axis=0) + np.array([0.02, 0.0, 0.03])
-    pull = ViaPoint("correction-1", *(tuple(part.tolist()) for part in (middle[:3], middle[3:], tool)))
+    pull = ViaPoint(
+        "correction-1", *(tuple(part.tolist()) for part in (middle[:3], middle[3:], tool))
+    )
     return adapted(skill, (*Scene().via_points(), pull), tolerance=0.05), take
 
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Recordings of hands with noise, unseen for a while, with a hold; one for each kind."""
-    folder, out = tmp_path_factory.mktemp("sessions"), [RECORDINGS / "golden.mcap"]
+    folder = tmp_path_factory.mktemp("sessions")
+    out = [RECORDINGS / "golden.mcap"]
     settings = msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ)
     for number, kind in enumerate((*KINDS, "corrected")):
         skill, take = corrected() if kind == "corrected" else learned(kind)
         random = np.random.default_rng(number)
         left, right = (
-            hand + random.normal(0.0, [0.001] * 3 + [0.01] * 4, hand.shape) for hand in (take.left, take.right)
+            hand + random.normal(0.0, [0.001] * 3 + [0.01] * 4, hand.shape)
+            for hand in (take.left, take.right)
         )
         received = hand_events(take._replace(left=left, right=right), range(2))
         unseen = slice(len(received) // 2, len(received) // 2 + RATE_HZ)
@@ -77,18 +82,28 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         received[len(received) // 4 + 50].append(order("resume"))
         out.append(folder / f"{number}.mcap")
         controller = Controller(settings, skill, urdf=robot_description(settings))
-        with Recorder(out[-1], settings=settings, skill=skill.file, state=start_state(settings, skill)) as recorder:
+        with Recorder(
+            out[-1], settings=settings, skill=skill.file, state=start_state(settings, skill)
+        ) as recorder:
             for index, inbox in enumerate(received):
                 tick = Tick(index, tuple(inbox))
-                recorder.write(tick, controller.step(tick), time_ns=10**18 + index * round(settings.period_s * 1e9))
+                recorder.write(
+                    tick,
+                    controller.step(tick),
+                    time_ns=10**18 + index * round(settings.period_s * 1e9),
+                )
     return out
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.thorough
 @pytest.mark.parametrize("processor", PROCESSORS)
-def test_sessions_with_each_kind_of_skill_replay_bit_for_bit(sessions: list[Path], processor: str) -> None:
+def test_sessions_with_each_kind_of_skill_replay_bit_for_bit(
+    sessions: list[Path], processor: str
+) -> None:
     command = [sys.executable, "-c", REPLAYED, *map(str, sessions)]
     environment = os.environ | PROCESSORS[processor]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=580, check=False, env=environment, cwd=ROOT)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=580, check=False, env=environment, cwd=ROOT
+    )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr

@@ -73,22 +73,36 @@ def compressed(stamp_ns: int, row: list[float]) -> bytes:
     [("ros1", "geometry_msgs/PoseStamped", of_ros_1), ("cdr", POSE.type, compressed)],
 )
 def test_messages_of_ros_1_and_compressed_ones_are_read_from_mcap(
-    encoding: str, kind: str, encoded: Callable[[int, list[float]], bytes], take: Demonstration, tmp_path: Path
+    encoding: str,
+    kind: str,
+    encoded: Callable[[int, list[float]], bytes],
+    take: Demonstration,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile=encoding)
-        pose = writer.register_schema(kind, "ros1msg" if encoding == "ros1" else "ros2msg", schema(POSE.type).encode())
-        for side, topic in (("left", "/a/hands/left"), ("right", "/a/hands/right"), ("tool", "/a/tool/pose")):
+        pose = writer.register_schema(
+            kind, "ros1msg" if encoding == "ros1" else "ros2msg", schema(POSE.type).encode()
+        )
+        for side, topic in (
+            ("left", "/a/hands/left"),
+            ("right", "/a/hands/right"),
+            ("tool", "/a/tool/pose"),
+        ):
             channel = writer.register_channel(topic, encoding, pose)
-            for stamp, row in zip(take.stamps_ns.tolist(), getattr(take, side).tolist(), strict=True):
+            for stamp, row in zip(
+                take.stamps_ns.tolist(), getattr(take, side).tolist(), strict=True
+            ):
                 writer.add_message(channel, stamp + 1000, encoded(stamp + 1000, row), stamp + 1000)
         writer.finish()
     same(read_demonstration(path), take)
 
 
-def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotation: str = "Quaternion") -> Path:
+def motive(
+    path: Path, take: Demonstration, *, unit: str = "Millimeters", rotation: str = "Quaternion"
+) -> Path:
     """A take as Motive exports it: rotation and position of each body, and a marker of each."""
     types, names, kinds, axes = [["", label] for label in ("Type", "Name", "", "")]
     axes[:] = ["Frame", "Time (Seconds)"]
@@ -104,7 +118,18 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
     numbers = np.hstack([np.arange(len(take.tool))[:, None], take.seconds[:, None], *columns])
     with path.open("w", newline="", encoding="utf-8") as stream:
         out = csv.writer(stream)
-        out.writerow(["Format Version", "1.23", "Take Name", "a", "Rotation Type", rotation, "Length Units", unit])
+        out.writerow(
+            [
+                "Format Version",
+                "1.23",
+                "Take Name",
+                "a",
+                "Rotation Type",
+                rotation,
+                "Length Units",
+                unit,
+            ]
+        )
         out.writerow([])
         out.writerows([types, names, ["", "ID"], kinds, axes])
         for row in numbers.tolist():
@@ -113,15 +138,20 @@ def motive(path: Path, take: Demonstration, *, unit: str = "Millimeters", rotati
     return path
 
 
-def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstration, tmp_path: Path) -> None:
-    path, remarks = motive(tmp_path / "a.csv", take), list[str]()
+def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(
+    take: Demonstration, tmp_path: Path
+) -> None:
+    path = motive(tmp_path / "a.csv", take)
+    remarks = list[str]()
     got = read_demonstration(path, settings=CAPTURE, say=remarks.append)
     assert got.begins == (200,)
     left_in = np.r_[0:200, 260 : len(take.tool)]
     same(got, take._replace(**{side: getattr(take, side)[left_in] for side in NAMES}))
     assert "left is LeftHand; right is RightHand; tool is Tool" in " ".join(remarks)
     assert "hands/left 3.98 to 5.20 s: not seen" in " ".join(remarks)
-    with pytest.raises(RecordingError, match=r"frame 'motion capture': 'base' needed, or a configuration"):
+    with pytest.raises(
+        RecordingError, match=r"frame 'motion capture': 'base' needed, or a configuration"
+    ):
         read_demonstration(path)
     for wrong, words in (
         ({"unit": "Feet"}, "Length Units 'Feet'"),
@@ -135,19 +165,33 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(take: Demonstr
     ("spoil", "words"),
     [
         (lambda rows: rows[:0], "holds no frame, 2 needed: export"),
-        (lambda rows: [[row[0], "inf", *row[2:]] for row in rows], "frame 1 of 20 is at inf s, up to 1e.09 s needed"),
+        (
+            lambda rows: [[row[0], "inf", *row[2:]] for row in rows],
+            "frame 1 of 20 is at inf s, up to 1e.09 s needed",
+        ),
         (lambda rows: [[row[0], "nan", *row[2:]] for row in rows], "frame 1 of 20 is at nan s"),
-        (lambda rows: rows[::-1], "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed"),
-        (lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows], "mm; the unit in the file"),
+        (
+            lambda rows: rows[::-1],
+            "frame 2 of 20 is at .* s, and the one before at .* s; times that grow needed",
+        ),
+        (
+            lambda rows: [[*row[:2], *(f"{x}e3" for x in row[2:])] for row in rows],
+            "mm; the unit in the file",
+        ),
     ],
 )
 def test_frames_of_motive_that_are_none_are_refused_with_what_to_do(
-    spoil: Callable[[list[list[str]]], list[list[str]]], words: str, take: Demonstration, tmp_path: Path
+    spoil: Callable[[list[list[str]]], list[list[str]]],
+    words: str,
+    take: Demonstration,
+    tmp_path: Path,
 ) -> None:
     path = motive(tmp_path / "a.csv", take)
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
     head = next(i for i, row in enumerate(rows) if row[0] == "Frame") + 1
-    path.write_text("\n".join(map(",".join, [*rows[:head], *spoil(rows[head : head + 20])])), encoding="utf-8")
+    path.write_text(
+        "\n".join(map(",".join, [*rows[:head], *spoil(rows[head : head + 20])])), encoding="utf-8"
+    )
     with pytest.raises(RecordingError, match=words):
         read_demonstration(path, settings=CAPTURE)
 
@@ -167,11 +211,15 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
     assert (got.begins, len(got.tool)) == ((), len(take.tool))
     np.testing.assert_allclose(got.hands, take.hands, atol=0.01)
     np.testing.assert_allclose(got.tool[:, 3:], np.tile([0.0, 0.0, 0.0, 1.0], (len(take.tool), 1)))
-    one_handed = read_demonstration(tmp_path / "a.c3d", settings=CAPTURE, topics={"left": PoseTopic("RightHand")})
+    one_handed = read_demonstration(
+        tmp_path / "a.c3d", settings=CAPTURE, topics={"left": PoseTopic("RightHand")}
+    )
     assert one_handed.conducts == "right"
 
 
-def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(take: Demonstration, tmp_path: Path) -> None:
+def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(
+    take: Demonstration, tmp_path: Path
+) -> None:
     for labels, words in (
         (list(NAMES.values()), "was cut: it holds .* of .* frames"),
         (["RightHand"] * 3, "RightHand 2"),
@@ -197,7 +245,9 @@ def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_pa
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n")
-    shape = '<link name="a"><collision><geometry><mesh filename="a.stl"/></geometry></collision></link>'
+    shape = (
+        '<link name="a"><collision><geometry><mesh filename="a.stl"/></geometry></collision></link>'
+    )
     (tmp_path / "b.urdf").write_text(f"<robot>{shape}</robot>")
     read: Callable[[], object] = {
         ".npz": lambda: skill_in(path),
@@ -209,7 +259,8 @@ def test_pointers_of_git_lfs_are_named_whatever_they_stand_for(name: str, tmp_pa
         ".mp4": lambda: run("hands", "--camera", str(path)),
     }.get(path.suffix, lambda: read_demonstration(path.parent if "/" in name else path))
     with pytest.raises(
-        ExplainedError, match="it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches"
+        ExplainedError,
+        match="it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches",
     ):
         read()
 
@@ -228,9 +279,17 @@ def lerobot(path: Path) -> None:
     ("name", "made", "words"),
     [
         ("set", lerobot, r"set is a data set of LeRobot, .*docs/arrays\.md"),
-        ("a.csv", lambda path: path.write_text("t,x\n0,1\n"), r"is not a CSV file as Motive exports it .*docs/arrays"),
+        (
+            "a.csv",
+            lambda path: path.write_text("t,x\n0,1\n"),
+            r"is not a CSV file as Motive exports it .*docs/arrays",
+        ),
         ("a.c3d", lambda path: path.write_bytes(b"nothing"), "is not a C3D file that can be read"),
-        ("a.mcap.zst", lambda path: path.write_bytes(b"x"), "is not read: decompress it first, or give the folder"),
+        (
+            "a.mcap.zst",
+            lambda path: path.write_bytes(b"x"),
+            "is not read: decompress it first, or give the folder",
+        ),
         (
             "a.parquet",
             lambda path: path.write_bytes(b"x"),
@@ -247,11 +306,14 @@ def test_what_is_not_read_is_refused_with_what_to_do(
 
 
 def test_the_lines_of_the_page_make_a_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "arrays.md").read_text(encoding="utf-8"), re.S)
+    (block,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "arrays.md").read_text(encoding="utf-8"), re.S
+    )
     assert len(block.split("\n\n")[1].splitlines()) + len(block.split("\n\n")[2].splitlines()) <= 10
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {}
     exec(block, namespace)
-    variables, got = SimpleNamespace(**namespace), read_demonstration(tmp_path / "take-1.mcap")
+    variables = SimpleNamespace(**namespace)
+    got = read_demonstration(tmp_path / "take-1.mcap")
     np.testing.assert_array_equal(got.left, variables.left)
     np.testing.assert_array_equal(got.stamps_ns, variables.take.stamps_ns)

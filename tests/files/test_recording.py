@@ -41,17 +41,27 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
         assert (step.state is None) == (tick.index % 100 != 99)
         assert (step.time_ns, step.lost, step.skill) == (at_ns(tick.index), 0, None)
     assert {kind for step in steps for kind, _ in step.events} == set(EVENT_NUMBERS)
-    assert list(recording.notes("status"))[:2] == [("status", "tick 0", at_ns(0)), ("status", "tick 50", at_ns(50))]
+    assert list(recording.notes("status"))[:2] == [
+        ("status", "tick 0", at_ns(0)),
+        ("status", "tick 50", at_ns(50)),
+    ]
 
 
-def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_and_skill(tmp_path: Path) -> None:
+def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_and_skill(
+    tmp_path: Path,
+) -> None:
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):
             recorder.write(tick, frame, time_ns=at_ns(tick.index))
         for count, skill in ((4, b"other"), (2, b"other"), (1, SKILL)):
             (tick, frame, _), *_ = ticks(1, first=20 + count)
             recorder.write(
-                tick, frame, time_ns=at_ns(tick.index), state=state_after(tick.index), skill=skill, lost=count
+                tick,
+                frame,
+                time_ns=at_ns(tick.index),
+                state=state_after(tick.index),
+                skill=skill,
+                lost=count,
             )
     steps = list(Recording.open(tmp_path / "a.mcap").steps())
     assert [(step.tick, step.lost, step.skill) for step in steps[10:]] == [
@@ -71,7 +81,10 @@ def test_a_cut_recording_is_read_up_to_the_cut_and_says_so(tmp_path: Path, share
     assert recording.truncated
     steps = list(recording.steps())[1:]
     assert share * 600 * 0.5 < len(steps) < 600
-    assert all(encode(step.frame) == encode(frame) for step, (_, frame, _) in zip(steps, written, strict=False))
+    assert all(
+        encode(step.frame) == encode(frame)
+        for step, (_, frame, _) in zip(steps, written, strict=False)
+    )
 
 
 def test_what_was_flushed_survives_when_nothing_is_closed(tmp_path: Path) -> None:
@@ -87,7 +100,9 @@ def test_what_was_flushed_survives_when_nothing_is_closed(tmp_path: Path) -> Non
 def test_errors_name_the_file_what_is_wrong_and_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=re.escape(f"no recording {tmp_path}/a.mcap.")):
         Recording.open(tmp_path / "a.mcap")
-    write_demonstration(tmp_path / "demo.mcap", Demonstration(np.arange(3) * 10, *np.ones((3, 3, 7))))
+    write_demonstration(
+        tmp_path / "demo.mcap", Demonstration(np.arange(3) * 10, *np.ones((3, 3, 7)))
+    )
     (tmp_path / "notes.mcap").write_text("not an MCAP file at all", encoding="utf-8")
     with pytest.raises(RecordingError, match=r"Its folder has: demo.mcap, notes.mcap\."):
         Recording.open(tmp_path / "a.mcap")
@@ -134,7 +149,11 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
     topics = {topic for topic, _ in decoded}
     assert {"/tf", "/robot_description"} < topics
     now_and_then = {"skill_in_force", "requests", "log", "objects", "gripper/command"}
-    always = [channel.key for channel in channels.CHANNELS if channel.recorded and channel.key not in now_and_then]
+    always = [
+        channel.key
+        for channel in channels.CHANNELS
+        if channel.recorded and channel.key not in now_and_then
+    ]
     assert {channels.topic("hall/bench-1", key) for key in always} == topics
     frames = [message for topic, message in decoded if topic == "/hall/bench-1/frame"]
     assert list(frames[-1].joints) == written[-1][1]["joints"].tolist()
@@ -146,6 +165,10 @@ def test_ros_2_tools_read_every_message_of_a_recording(tmp_path: Path) -> None:
         ]
     assert len(read) == len(decoded)
     assert (
-        next(message.position.tolist() for topic, message in reversed(read) if topic.endswith("joints/command"))
+        next(
+            message.position.tolist()
+            for topic, message in reversed(read)
+            if topic.endswith("joints/command")
+        )
         == written[-1][1]["joints"].tolist()
     )

@@ -37,7 +37,9 @@ def made(kind: str, **fields: Any) -> Any:
 
 
 def header(stamp_ns: int, frame: str) -> Any:
-    stamp = made("builtin_interfaces/msg/Time", sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))
+    stamp = made(
+        "builtin_interfaces/msg/Time", sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9)
+    )
     return made("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
@@ -52,7 +54,11 @@ def stamped(stamp_ns: int, frame: str, *at: float) -> Any:
 
 
 def array(stamp_ns: int, frame: str, *places: tuple[float, float, float]) -> Any:
-    return made("geometry_msgs/msg/PoseArray", header=header(stamp_ns, frame), poses=[pose(*place) for place in places])
+    return made(
+        "geometry_msgs/msg/PoseArray",
+        header=header(stamp_ns, frame),
+        poses=[pose(*place) for place in places],
+    )
 
 
 def tree(stamp_ns: int, frame: str, **places: tuple[float, float, float]) -> Any:
@@ -75,12 +81,16 @@ def tree(stamp_ns: int, frame: str, **places: tuple[float, float, float]) -> Any
     return made("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
-def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+def bag(
+    path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = StoragePlugin.SQLITE3
+) -> Path:
     """A bag with one message of each topic at each of STAMPS, in the order of time."""
     with Writer(path, version=9, storage_plugin=plugin) as writer:
         connections = {}
         for topic, messages in topics.items():
-            connections[topic] = writer.add_connection(topic, messages[0].__msgtype__, typestore=STORE)
+            connections[topic] = writer.add_connection(
+                topic, messages[0].__msgtype__, typestore=STORE
+            )
         for i, stamp_ns in enumerate(STAMPS.tolist()):
             for topic, messages in topics.items():
                 data = STORE.serialize_cdr(messages[i], messages[i].__msgtype__)
@@ -90,24 +100,41 @@ def bag(path: Path, topics: dict[str, list[Any]], *, plugin: StoragePlugin = Sto
 
 def moving(make: Any, *arguments: Any) -> list[Any]:
     """A message for each of STAMPS, made of its stamp and how far the way has gone."""
-    return [make(stamp, *arguments, distance_m) for stamp, distance_m in zip(STAMPS.tolist(), WAY.tolist(), strict=True)]
+    return [
+        make(stamp, *arguments, distance_m)
+        for stamp, distance_m in zip(STAMPS.tolist(), WAY.tolist(), strict=True)
+    ]
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
-def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Path, plugin: StoragePlugin) -> None:
+def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(
+    tmp_path: Path, plugin: StoragePlugin
+) -> None:
     hands = moving(lambda stamp, way: array(stamp, "base", (way, 0.3, 0.0), (way, -0.3, 0.0)))
-    frames = moving(lambda stamp, way: tree(stamp, "base", elbow=(0.0, 0.0, 1.0), glass=(0.5, way, 0.2)))
+    frames = moving(
+        lambda stamp, way: tree(stamp, "base", elbow=(0.0, 0.0, 1.0), glass=(0.5, way, 0.2))
+    )
     folder = bag(tmp_path / "bag", {"/mocap/hands": hands, "/tf": frames}, plugin=plugin)
-    sources = {name: PoseTopic.parsed(text) for name, text in
-               (("left", "mocap/hands:1"), ("right", "/mocap/hands:0"), ("tool", "/tf:glass"))}  # fmt: skip
+    sources = {
+        name: PoseTopic.parsed(text)
+        for name, text in (
+            ("left", "mocap/hands:1"),
+            ("right", "/mocap/hands:0"),
+            ("tool", "/tf:glass"),
+        )
+    }
     (file,) = [path for path in folder.iterdir() if path.suffix != ".yaml"]
     for path in (folder, file):
         got = read_demonstration(path, topics=sources)
         np.testing.assert_array_equal(got.stamps_ns, STAMPS)
         np.testing.assert_allclose(got.left[:, :2], np.column_stack([WAY, np.full(len(WAY), -0.3)]))
-        np.testing.assert_allclose(got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)]))
+        np.testing.assert_allclose(
+            got.tool[:, :3], np.column_stack([np.full(len(WAY), 0.5), WAY, np.full(40, 0.2)])
+        )
     if plugin is StoragePlugin.SQLITE3:
-        with contextlib.closing(sqlite3.connect(file)) as recorder:  # one that was killed, before its metadata
+        with contextlib.closing(
+            sqlite3.connect(file)
+        ) as recorder:  # one that was killed, before its metadata
             recorder.execute("PRAGMA journal_mode = WAL")
             recorder.execute("DELETE FROM messages WHERE timestamp > ?", (int(STAMPS[20]),))
             recorder.commit()
@@ -119,14 +146,18 @@ def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(tmp_path: Pat
         path = file
     for selection, words in (
         ({"left": PoseTopic("/mocap/hands")}, r"--left /mocap/hands: an index needed, one of 0, 1"),
-        ({**sources, "tool": PoseTopic("/tf", "iron")}, r"--tool /tf:iron: a child frame needed, one of elbow, glass"),
+        (
+            {**sources, "tool": PoseTopic("/tf", "iron")},
+            r"--tool /tf:iron: a child frame needed, one of elbow, glass",
+        ),
         (
             {"left": PoseTopic("/nowhere")},
             r"--left /nowhere: no topic there; its topics: .*topics with poses: /mocap",
         ),
         (
             {},
-            r"hands/left .*: /mocap/hands \(geometry_msgs/msg/PoseArray\), .* read: .*; --left TOPIC",
+            r"hands/left .*: /mocap/hands \(geometry_msgs/msg/PoseArray\), .* read: .*; --left "
+            r"TOPIC",
         ),
     ):
         with pytest.raises(RecordingError, match=words):
@@ -148,7 +179,11 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
 @pytest.mark.parametrize("read", [read_demonstration, hand_samples])
 @pytest.mark.parametrize(
     ("kind", "encoding"),
-    [("geometry_msgs/msg/Pose", "cdr"), ("geometry_msgs/msg/PointStamped", "cdr"), (POSE.type, "json")],
+    [
+        ("geometry_msgs/msg/Pose", "cdr"),
+        ("geometry_msgs/msg/PointStamped", "cdr"),
+        (POSE.type, "json"),
+    ],
 )
 def test_hands_of_a_type_that_is_not_read_are_refused_with_it_and_with_the_types_accepted(
     kind: str, encoding: str, read: Callable[[Path], object], tmp_path: Path
@@ -169,34 +204,55 @@ def test_hands_of_a_type_that_is_not_read_are_refused_with_it_and_with_the_types
 
 def test_odometry_of_a_tracker_is_read_as_poses(tmp_path: Path) -> None:
     tool = moving(stamped, "base", 0.5, 0.0)
-    got = read_demonstration(bag(tmp_path / "bag", {"/left_hand": moving(odometry, "base", 0.3, 0.0), "/tool": tool}))
-    np.testing.assert_allclose(got.left[:, :3], np.column_stack([np.full(40, 0.3), np.zeros(40), WAY]))
+    got = read_demonstration(
+        bag(tmp_path / "bag", {"/left_hand": moving(odometry, "base", 0.3, 0.0), "/tool": tool})
+    )
+    np.testing.assert_allclose(
+        got.left[:, :3], np.column_stack([np.full(40, 0.3), np.zeros(40), WAY])
+    )
 
 
 def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:
     """Of a motion capture in millimetres, y up, the arm's base 1 m before its origin."""
     y_up = Rotation.from_euler("x", 90, degrees=True)
-    frames = moving(lambda stamp, way: tree(stamp, "mocap", LeftWrist=(way, 0.0, -300.0), RightWrist=(900.0, 1.0, 0.0)))
+    frames = moving(
+        lambda stamp, way: tree(
+            stamp, "mocap", LeftWrist=(way, 0.0, -300.0), RightWrist=(900.0, 1.0, 0.0)
+        )
+    )
     elbows = moving(lambda stamp, way: tree(stamp, "mocap", LeftElbow=(way, 0.0, 0.0)))
     tool = moving(lambda stamp, way: stamped(stamp, "base", 0.5, way, 0.2))
     path = bag(tmp_path / "bag", {"/tf": frames, "/tf_elbows": elbows, "/arm/tcp": tool})
-    hands = HandSettings(frame="mocap", unit="mm", base_from_tracker=(1.0, 0.0, 0.0, *y_up.as_quat().tolist()))
+    hands = HandSettings(
+        frame="mocap", unit="mm", base_from_tracker=(1.0, 0.0, 0.0, *y_up.as_quat().tolist())
+    )
     remarks: list[str] = []
     got = read_demonstration(path, settings=Settings(hands=hands), say=remarks.append)
-    expected_m = y_up.apply(np.column_stack([WAY, np.zeros(40), np.full(40, -300.0)])) / 1000 + [1.0, 0.0, 0.0]
+    expected_m = y_up.apply(np.column_stack([WAY, np.zeros(40), np.full(40, -300.0)])) / 1000 + [
+        1.0,
+        0.0,
+        0.0,
+    ]
     np.testing.assert_allclose(got.left[:, :3], expected_m, atol=1e-12)
     np.testing.assert_allclose(got.left[:, 3:], np.tile(y_up.as_quat(), (40, 1)), atol=1e-12)
     np.testing.assert_allclose(got.tool[:, 1], WAY)
     assert "left is /tf:LeftWrist; right is /tf:RightWrist; tool is /arm/tcp" in remarks[0]
     assert "hands/left, hands/right transformed to frame base" in remarks[0]
-    with pytest.raises(RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"):
+    with pytest.raises(
+        RecordingError, match=r"hands/left is in frame 'mocap': 'base' needed, or a configuration"
+    ):
         read_demonstration(path)
     with pytest.raises(RecordingError, match=r"tool.*; /arm/tcp, /hand/gripper could be it"):
-        read_demonstration(bag(tmp_path / "two", {"/tf": frames, "/arm/tcp": tool, "/hand/gripper": tool}))
+        read_demonstration(
+            bag(tmp_path / "two", {"/tf": frames, "/arm/tcp": tool, "/hand/gripper": tool})
+        )
 
 
-def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count(tmp_path: Path) -> None:
-    settings, begin_ns = Settings(), STAMPS[0]
+def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count(
+    tmp_path: Path,
+) -> None:
+    settings = Settings()
+    begin_ns = STAMPS[0]
     joints = np.array(settings.arm.posture) + np.outer(WAY, np.ones(7))
 
     def state(stamp: int, way: float) -> Any:
@@ -224,15 +280,22 @@ def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count
     np.testing.assert_allclose(got.left[:, 2], WAY)
     assert np.ptp(got.tool[:, :3], axis=0).max() > 0.05
     assert np.abs(got.tool[0, :3] - [0.45, 0.0, 0.3]).max() < 0.5
-    foreign = [dataclasses.replace(message, name=["a", *message.name[1:]]) for message in topics["/joint_states"]]
-    with pytest.raises(RecordingError, match=r"no topic ending in tool/pose .* or joints/state of the arm's joints"):
+    foreign = [
+        dataclasses.replace(message, name=["a", *message.name[1:]])
+        for message in topics["/joint_states"]
+    ]
+    with pytest.raises(
+        RecordingError, match=r"no topic ending in tool/pose .* or joints/state of the arm's joints"
+    ):
         read_demonstration(bag(tmp_path / "foreign", {**topics, "/joint_states": foreign}))
 
 
 def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     (tmp_path / "a.db3").write_bytes(b"nothing")
     for path in (tmp_path, tmp_path / "a.db3", tmp_path / "b.bag"):
-        with pytest.raises(RecordingError, match=r"is not a bag that can be read: |there is no file .*bag"):
+        with pytest.raises(
+            RecordingError, match=r"is not a bag that can be read: |there is no file .*bag"
+        ):
             read_demonstration(path)
 
 
@@ -241,9 +304,14 @@ def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None
     remarks: list[str] = []
     got = read_demonstration(RECORDINGS / "golden.mcap", say=remarks.append)
     assert re.search(
-        r"tool is computed from .*joints/state by the arm's URDF; \d+ of \d+ poses are invalid or farther", remarks[0]
+        r"tool is computed from .*joints/state by the arm's URDF; \d+ of \d+ poses are invalid or "
+        r"farther",
+        remarks[0],
     )
-    assert any(re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line) for line in remarks)
+    assert any(
+        re.search(r"left out, \d\.\d of 20\.0 s: hands/left 6\.48 to 6\.99 s: not seen", line)
+        for line in remarks
+    )
     assert got.seconds[got.begins[0]] - got.seconds[got.begins[0] - 1] == pytest.approx(0.51)
     assert len(got.stamps_ns) > 1800
     assert np.abs(got.tool[:, :3]).max() < 1.0

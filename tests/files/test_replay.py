@@ -36,10 +36,14 @@ GOLDEN = RECORDINGS / "golden.mcap"
 def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked_for() -> None:
     two = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
     done = thirdhand("replay", str(GOLDEN), timeout=110, env=os.environ | two)
-    assert (done.returncode, done.stdout) == (0, "10000 ticks, 10000 frames identical\n"), done.stderr
+    assert (done.returncode, done.stdout) == (0, "10000 ticks, 10000 frames identical\n"), (
+        done.stderr
+    )
 
 
-def test_a_replay_names_the_stages_whose_constants_are_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_names_the_stages_whose_constants_are_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording = Recording.open(GOLDEN)
     names = {f"constants of {stage}" for stage in STAGES}
     assert names | {"features", "libc", "kernel"} <= recording.metadata.keys()
@@ -90,7 +94,10 @@ def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
         def keep(tick: Tick, frame: Frame) -> None:
             recorder.write(
-                tick, frame, time_ns=tick.index * 2_000_000, state=controller.state if tick.index % 250 == 0 else None
+                tick,
+                frame,
+                time_ns=tick.index * 2_000_000,
+                state=controller.state if tick.index % 250 == 0 else None,
             )
 
         run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:1000], [keep])
@@ -101,8 +108,12 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
     recording = Recording.open(recorded)
     steps = list(recording.steps())
     path = tmp_path / "changed.mcap"
-    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
-        for tick, step in zip(list(ticks_of(HandScript(Scene(), seed=4)))[:1000], steps[1:], strict=True):
+    with Recorder(
+        path, settings=recording.settings, skill=recording.skill, state=steps[0].state
+    ) as recorder:
+        for tick, step in zip(
+            list(ticks_of(HandScript(Scene(), seed=4)))[:1000], steps[1:], strict=True
+        ):
             frame = step.frame.copy()
             if step.tick == 600:
                 frame["joints"][2] += 1e-9
@@ -122,7 +133,9 @@ def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Pa
     steps = list(recording.steps())
     taken = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
     path = tmp_path / "gap.mcap"
-    with Recorder(path, settings=recording.settings, skill=recording.skill, state=steps[0].state) as recorder:
+    with Recorder(
+        path, settings=recording.settings, skill=recording.skill, state=steps[0].state
+    ) as recorder:
         for tick, step in zip(taken, steps[1:], strict=True):
             if not 400 <= tick.index < 500:
                 recorder.write(
@@ -138,8 +151,8 @@ def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Pa
     assert len(result.missing) == 1
     assert result.ticks == result.identical == 899
     assert (
-        "gap after tick 399, before tick 500: 100 ticks not recorded; the replay continues after tick 500"
-        in result.text()
+        "gap after tick 399, before tick 500: 100 ticks not recorded; the replay continues after "
+        "tick 500" in result.text()
     )
 
 
@@ -162,7 +175,9 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
     assert [file.name for file in tmp_path.iterdir()] == ["damaged.mcap"]
 
 
-def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
+def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(
+    recorded: Path, tmp_path: Path
+) -> None:
     data = recorded.read_bytes()
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[: len(data) * 2 // 3])
@@ -200,24 +215,37 @@ def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
     assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
     assert replay(output).exact
     sparse, whole, were = (
-        [step.frame for step in Recording.open(path).steps(whole=False)][1:] for path in (checked, output, recorded)
+        [step.frame for step in Recording.open(path).steps(whole=False)][1:]
+        for path in (checked, output, recorded)
     )
     assert [frame.tobytes() for frame in whole] == [frame.tobytes() for frame in were]
     assert [tick for tick, frame in enumerate(sparse) if frame is not None] == [0, 500]
-    assert_refused(1, "a file other than the recording", "replay", str(output), "--output", str(output))
+    assert_refused(
+        1, "a file other than the recording", "replay", str(output), "--output", str(output)
+    )
     assert replay(output).exact
 
 
-def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(checked: Path, tmp_path: Path) -> None:
+def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(
+    checked: Path, tmp_path: Path
+) -> None:
     recording = Recording.open(checked)
-    steps, path = list(recording.steps(whole=False)), tmp_path / "changed.mcap"
+    steps = list(recording.steps(whole=False))
+    path = tmp_path / "changed.mcap"
     table = np.array([*recording.checksums.values()], "<u4")
     table[601] ^= 1
     with Recorder(
-        path, settings=recording.settings, skill=recording.skill, state=steps[0].state, checksums=table.tobytes()
+        path,
+        settings=recording.settings,
+        skill=recording.skill,
+        state=steps[0].state,
+        checksums=table.tobytes(),
     ) as recorder:
         for tick, step in zip(ticks(recording), steps[1:], strict=True):
             recorder.write(tick, step.frame, time_ns=step.time_ns)
     result = replay(path)
     assert (result.ticks, result.identical, result.exact) == (1000, 999, False)
-    assert "first difference at tick 601: its checksum\nlargest differences: none in the frames" in result.text()
+    assert (
+        "first difference at tick 601: its checksum\nlargest differences: none in the frames"
+        in result.text()
+    )

@@ -54,15 +54,24 @@ class Shares(NamedTuple):
 def tracked(take: Demonstration, noise_m: float, seed: int) -> Demonstration:
     """The take with a tracker's white noise on hands and tool."""
     random = np.random.default_rng(seed)
-    noise = [np.pad(noise_m * random.normal(size=(len(take.tool), 3)), ((0, 0), (0, 4))) for _ in NAMES]
-    left, right, tool = (getattr(take, name) + stream_noise for name, stream_noise in zip(NAMES, noise, strict=True))
+    noise = [
+        np.pad(noise_m * random.normal(size=(len(take.tool), 3)), ((0, 0), (0, 4))) for _ in NAMES
+    ]
+    left, right, tool = (
+        getattr(take, name) + stream_noise for name, stream_noise in zip(NAMES, noise, strict=True)
+    )
     return take._replace(left=left, right=right, tool=tool)
 
 
 def clean_takes() -> list[Demonstration]:
     """Takes at 25 to 240 Hz: of hands that circle, by a script, and of modelled people."""
-    simulated = [tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed) for seed, hz in ((1, 30), (2, 240))]
-    shipped = [f"demonstration-{i}" for i in (1,)] + [f"people/demonstration-{i}" for i in (3, 6, 9)]
+    simulated = [
+        tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed)
+        for seed, hz in ((1, 30), (2, 240))
+    ]
+    shipped = [f"demonstration-{i}" for i in (1,)] + [
+        f"people/demonstration-{i}" for i in (3, 6, 9)
+    ]
     return [
         circling(1, apart_m=0.03),
         *simulated,
@@ -77,7 +86,9 @@ def checked(streams: Streams) -> Iterator[tuple[str, np.ndarray]]:
         for name in NAMES
     ]
     for group in (tracks[:2], tracks[2:]):
-        for track, result in zip(group, track_check.checked(group, SETTINGS, longest_s=0.5), strict=True):
+        for track, result in zip(
+            group, track_check.checked(group, SETTINGS, longest_s=0.5), strict=True
+        ):
             yield track.source, np.isin(track.stamps_ns, result.track.stamps_ns)
 
 
@@ -93,9 +104,12 @@ def spoilt(take: Demonstration, spoil: Spoil, seed: int) -> tuple[Streams, str]:
 
 
 def is_bad(take: Demonstration, streams: Streams, name: str) -> np.ndarray:
-    stream, base = streams[name], spoiled.START_NS + take.stamps_ns - take.stamps_ns[0]
+    stream = streams[name]
+    base = spoiled.START_NS + take.stamps_ns - take.stamps_ns[0]
     truth = getattr(take, name)[np.searchsorted(base, stream.stamps_ns), :3]
-    return ~(np.linalg.norm(stream.poses[:, :3] - truth, axis=1) <= OFF_M) | ~np.isfinite(stream.poses).all(axis=1)
+    return ~(np.linalg.norm(stream.poses[:, :3] - truth, axis=1) <= OFF_M) | ~np.isfinite(
+        stream.poses
+    ).all(axis=1)
 
 
 Case = tuple[Demonstration, Streams]
@@ -106,10 +120,12 @@ def shares(cases: list[Case], clean: list[Demonstration]) -> Shares:
     for take, streams in cases:
         for name, retained in checked(streams):
             wrong = is_bad(take, streams, name)
-            missed, bad = missed + int((wrong & retained).sum()), bad + int(wrong.sum())
+            missed = missed + int((wrong & retained).sum())
+            bad = bad + int(wrong.sum())
     for take in clean:
         for _, retained in checked(streams_of(take)):
-            removed, good = removed + int((~retained).sum()), good + len(retained)
+            removed = removed + int((~retained).sum())
+            good = good + len(retained)
     return Shares(missed / max(bad, 1), removed / good)
 
 
@@ -129,7 +145,10 @@ def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
         retained = dict(checked(streams))
         wrong = is_bad(take, streams, name)
         hits.append(not retained[name][wrong].any())
-        assert not hits[-1] or all(retained[stream_name][~is_bad(take, streams, stream_name)].all() for stream_name in NAMES)
+        assert not hits[-1] or all(
+            retained[stream_name][~is_bad(take, streams, stream_name)].all()
+            for stream_name in NAMES
+        )
     assert np.mean(hits) >= 0.9
 
 
@@ -144,7 +163,8 @@ def test_each_constant_matters_and_none_is_better_halved_or_doubled(
         for number, take in enumerate(clean)
         for seed in range(SEEDS)
     ]
-    whole, cache = getattr(track_check, INTAKE), {}
+    whole = getattr(track_check, INTAKE)
+    cache = {}
 
     def remembered(tracks: list[Track], settings: Settings) -> object:
         key = tuple((track.stamps_ns.tobytes(), track.poses.tobytes()) for track in tracks)
@@ -154,7 +174,9 @@ def test_each_constant_matters_and_none_is_better_halved_or_doubled(
 
     monkeypatch.setattr(track_check, INTAKE, remembered)
     now = shares(cases, clean)
-    lines, idle, better = [f"as it is: {now}"], [], []
+    lines = [f"as it is: {now}"]
+    idle = []
+    better = []
     for module, names in ((track_check, CHECK), (track_offsets, OFFSETS)):
         for name in names:
             value = getattr(module, name)
@@ -166,7 +188,11 @@ def test_each_constant_matters_and_none_is_better_halved_or_doubled(
                 lines.append(f"{module.__name__}.{name} = {other:g}: {others[-1]}")
             if all(np.abs(np.subtract(candidate, now)).max() < 2e-4 for candidate in others):
                 idle.append(name)
-            better += [name for candidate in others if candidate.removed <= now.removed and candidate.missed < now.missed - 0.01]
+            better += [
+                name
+                for candidate in others
+                if candidate.removed <= now.removed and candidate.missed < now.missed - 0.01
+            ]
     print("\n".join(lines))
     assert (idle, better) == ([], [])
     assert now.missed < 0.02

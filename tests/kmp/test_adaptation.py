@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kmp import KMP, Gaussians, ViaPointMissed, named_arrays
-from support.primitives import database, kernel, properties, representations, same_bits, seeds, skill, via
+from support.primitives import (
+    database,
+    kernel,
+    properties,
+    representations,
+    same_bits,
+    seeds,
+    skill,
+    via,
+)
 
 
 def test_near_point_is_replaced_and_far_one_inserted():
@@ -16,7 +25,9 @@ def test_near_point_is_replaced_and_far_one_inserted():
     adapted = primitive.adapt(inputs, via(0, 2)[1], tolerance=0.1)
     assert list(adapted.inner.changes.replaced) == [7]
     assert len(adapted.inputs) == 31
-    np.testing.assert_array_equal(adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs]))
+    np.testing.assert_array_equal(
+        adapted.inputs, np.concatenate([np.delete(primitive.inputs, 7, axis=0), inputs])
+    )
     np.testing.assert_array_equal(adapted.via_inputs, inputs)
     assert adapted.base is primitive
     assert primitive.base is primitive
@@ -25,7 +36,9 @@ def test_near_point_is_replaced_and_far_one_inserted():
 
 def test_tolerance_is_exclusive_and_takes_nearest():
     """A distance equal to the tolerance does not replace."""
-    primitive = KMP.fit([[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1)
+    primitive = KMP.fit(
+        [[0.0], [1.0]], Gaussians([[0.0], [1.0]], np.ones((2, 1, 1))), kernel=kernel, lambda_mean=1
+    )
     point = Gaussians([[5.0]], [[[1e-6]]])
     assert len(primitive.adapt([[0.25]], point, tolerance=0.25).inner.changes.replaced) == 0
     assert list(primitive.adapt([[0.25]], point, tolerance=0.26).inner.changes.replaced) == [0]
@@ -50,7 +63,8 @@ def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     assert np.array_equal(together.inner.changes.replaced, shuffled.inner.changes.replaced)
     np.testing.assert_allclose(shuffled.mean(queries), together.mean(queries), atol=1e-8)
-    covariance, expected = shuffled.predict(queries).covariance, together.predict(queries).covariance
+    covariance = shuffled.predict(queries).covariance
+    expected = together.predict(queries).covariance
     np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-7)
     assert same_bits(singly, together, queries)
     assert primitive.adapt(*via(0, 0), tolerance=1) is together.base is primitive
@@ -60,12 +74,15 @@ def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
 @given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
 def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance):
     """Adapting is fitting the changed database."""
-    adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(*via(seed, 4, std=0.01), tolerance=tolerance)
+    adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(
+        *via(seed, 4, std=0.01), tolerance=tolerance
+    )
     lambdas = {"lambda_mean": 2.0, "lambda_covariance": lambda_covariance}
     fitted = KMP.fit(adapted.inputs, adapted.reference, kernel=kernel, **lambdas)
     queries = np.random.default_rng(seed + 1).normal(size=(3, 4))
     np.testing.assert_allclose(adapted.mean(queries), fitted.mean(queries), atol=1e-7)
-    covariance, expected = adapted.predict(queries).covariance, fitted.predict(queries).covariance
+    covariance = adapted.predict(queries).covariance
+    expected = fitted.predict(queries).covariance
     of_base = len(adapted.base.inputs) / len(fitted.inputs)  # N stays the base's
     np.testing.assert_allclose(covariance, expected * of_base, rtol=1e-6, atol=1e-7)
 
@@ -74,16 +91,26 @@ def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance
 def test_teaching_elsewhere_keeps_covariance(representation):
     """A via-point elsewhere does not change the covariance here."""
     inputs, reference = database()
-    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
+    primitive = KMP.fit(
+        inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation
+    )
     points = Gaussians.of(np.zeros((80, 3)), deviation=0.01)
     elsewhere = 40.0 + 3 * np.random.default_rng(0).normal(size=(80, 4))
     adapted = primitive.adapt(elsewhere, points, tolerance=0.1)
     assert len(adapted.inputs) == 110
     queries = np.concatenate([inputs[:5], np.full((1, 4), -50.0)])
     before = primitive.predict(queries).covariance
-    for variant in (adapted, named_arrays.from_arrays(named_arrays.to_arrays(adapted)), adapted.refitted(reference)):
-        np.testing.assert_allclose(variant.predict(queries).covariance, before, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(variant.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9)
+    for variant in (
+        adapted,
+        named_arrays.from_arrays(named_arrays.to_arrays(adapted)),
+        adapted.refitted(reference),
+    ):
+        np.testing.assert_allclose(
+            variant.predict(queries).covariance, before, rtol=1e-6, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            variant.predict(queries[:1]).covariance, before[:1], rtol=1e-6, atol=1e-9
+        )
 
 
 def test_missed_via_point_is_named():

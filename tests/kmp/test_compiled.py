@@ -44,7 +44,8 @@ from kmp.compiled import compiled
 def operations(a, b, m, out):
     for k in range(len(a)):
         x, y = a[k], b[k]
-        out[k] = math.exp(-x * x) + math.sqrt(x * x + y * y) * math.sin(x) - math.atan2(y, x) * math.cos(y)
+        out[k] = math.exp(-x * x) + math.sqrt(x * x + y * y) * math.sin(x)
+        out[k] -= math.atan2(y, x) * math.cos(y)
         out[k] += x**3 * math.log(1.0 + abs(y)) + abs(x) ** 1.7 + math.acos(abs(x) / (1.0 + abs(x)))
     for i in range(len(m)):
         for j in range(len(m)):
@@ -57,7 +58,8 @@ out = np.zeros(1000)
 compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
 s = random.normal(size=(37, 3))
-query = KMP.fit(s, Gaussians(s, [np.eye(3)] * 37), kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
+reference = Gaussians(s, [np.eye(3)] * 37)
+    query = KMP.fit(s, reference, kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
 from kmp.loops.query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))
@@ -68,10 +70,14 @@ print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex
 @pytest.mark.thorough
 def test_bits_are_those_of_a_plain_cpu():
     """Not rounded: the golden session, whose states are, is replayed so at length."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")
+    }
     command = [sys.executable, "-c", OPERATIONS]
     native, generic = (
-        subprocess.run(command, env=environment | more, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            command, env=environment | more, cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
         for more in ({}, {"NUMBA_CPU_NAME": "generic"})
     )
     assert len(native) > 1000
@@ -81,7 +87,8 @@ def test_bits_are_those_of_a_plain_cpu():
 FIRST = """
 import numpy as np
 from kmp import KMP, GaussianKernel, Gaussians
-skill = KMP.fit([[0.0], [1.0]], Gaussians.of([[0.0], [1.0]], deviation=0.1), kernel=GaussianKernel(1.0), lambda_mean=1)
+reference = Gaussians.of([[0.0], [1.0]], deviation=0.1)
+skill = KMP.fit([[0.0], [1.0]], reference, kernel=GaussianKernel(1.0), lambda_mean=1)
 print(skill.mean([[0.5]]), skill.jacobian([0.5]))
 """
 
@@ -91,17 +98,21 @@ def test_first_compilation_is_announced_once(tmp_path):
     command = [sys.executable, "-c", FIRST]
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
-        subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True) for _ in range(2)
+        subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True)
+        for _ in range(2)
     )
     assert first.stderr.splitlines() == [
-        "kmp compiles its loops for this machine: some seconds, once; later runs load them from its cache."
+        "kmp compiles its loops for this machine: some seconds, once; later runs load them from "
+        "its cache."
     ]
     assert (second.stdout, second.stderr) == (first.stdout, "")
 
 
 def test_exponentials_are_exact_to_one_unit():
     """Exponentials are right to a unit in the last place."""
-    values = np.concatenate([np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]])
+    values = np.concatenate(
+        [np.linspace(0, 3, 100_000), np.geomspace(1e-300, 1400, 100_000), [0.0, 1417.0, np.inf]]
+    )
     result = values.copy()
     exponentials(result, 0.5, np.empty_like(values))
     expected = np.exp(np.longdouble(-0.5) * values).astype(np.float64)
@@ -109,7 +120,9 @@ def test_exponentials_are_exact_to_one_unit():
     assert result[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
-LISTENS = r"from numba.core import (dispatcher, )?event"  # to compilations, of which a start reports
+LISTENS = (
+    r"from numba.core import (dispatcher, )?event"  # to compilations, of which a start reports
+)
 
 
 def test_nothing_is_compiled_otherwise():

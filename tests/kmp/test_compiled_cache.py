@@ -18,7 +18,8 @@ MODULES = {
     "numbers.py": "STEP = 1.0\n",
     "inner.py": "from kmp.compiled import compiled\nfrom steps.numbers import (\n    STEP,\n)\n\n"
     "@compiled\ndef inner(x):\n    return x + STEP\n",
-    "outer.py": "from kmp.compiled import compiled\nfrom steps import inner as below\n\nmore = below.inner\n\n"
+    "outer.py": "from kmp.compiled import compiled\nfrom steps import inner as below\n\nmore = "
+    "below.inner\n\n"
     "@compiled\ndef outer(x):\n    return 10.0 * more(x)\n",
     "apart.py": "",
     "length.py": """
@@ -63,7 +64,8 @@ class Checkout:
     """A package with a compiled function that calls one of another module, and a cache."""
 
     def __init__(self, folder: Path, cache: Path) -> None:
-        self.folder, self.cache = folder / "steps", cache
+        self.folder = folder / "steps"
+        self.cache = cache
         self.folder.mkdir(parents=True)
         for name, text in MODULES.items():
             (self.folder / name).write_text(text)
@@ -71,7 +73,10 @@ class Checkout:
     def change(self, name: str, before: str, after: str) -> None:
         """Replace a text in a module."""
         path = self.folder / name
-        path.write_text(path.read_text().replace(before, after) + "# of another length, as bytecode is trusted by it\n")
+        path.write_text(
+            path.read_text().replace(before, after)
+            + "# of another length, as bytecode is trusted by it\n"
+        )
 
     def result(self) -> list[float]:
         """The outer function's result for 1, and the number of functions compiled for it."""
@@ -133,10 +138,16 @@ def test_same_sources_elsewhere_are_served(checkout: Checkout, tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("module", "before", "after", "returned"),
-    [("inner.py", "x + STEP", "x - STEP", 0.0), ("numbers.py", "1.0", "2.0", 30.0), ("outer.py", "10.0", "5.0", 10.0)],
+    [
+        ("inner.py", "x + STEP", "x - STEP", 0.0),
+        ("numbers.py", "1.0", "2.0", 30.0),
+        ("outer.py", "10.0", "5.0", 10.0),
+    ],
     ids=["what it calls", "a constant of what it calls", "itself"],
 )
-def test_change_compiles_anew(checkout: Checkout, module: str, before: str, after: str, returned: float) -> None:
+def test_change_compiles_anew(
+    checkout: Checkout, module: str, before: str, after: str, returned: float
+) -> None:
     """A function is compiled anew after a change of what it calls."""
     assert checkout.result() == [20.0, 2]
     checkout.change(module, before, after)

@@ -41,13 +41,16 @@ def test_constraints_are_obeyed():
     assert violation(confined) < 1e-9
     assert violation(confined, SIDE) < 1e-9
     for queries in (T, T[9:10]):
-        np.testing.assert_allclose(skill.predict(queries).covariance, base().predict(queries).covariance, atol=1e-12)
+        np.testing.assert_allclose(
+            skill.predict(queries).covariance, base().predict(queries).covariance, atol=1e-12
+        )
 
 
 def test_mean_has_least_cost():
     """The mean has the least cost among those that satisfy the constraints."""
     few = LinearConstraints(WHERE[::5], np.tile([0.0, 1.0], (9, 1)), np.full(9, -0.2))
-    t, path = T[::4], PATH[::4]
+    t = T[::4]
+    path = PATH[::4]
     reference = Gaussians(path, np.tile(0.05 * np.eye(2), (len(t), 1, 1)))
     skill = KMP.fit(t, reference, kernel=GaussianKernel(5.0), lambda_mean=1.0).constrained(few)
     points = np.concatenate([t, few.inputs + 1e-9])
@@ -60,9 +63,15 @@ def test_mean_has_least_cost():
     def slope(w):
         return k[: len(t)].T @ (k[: len(t)] @ w - path[:, 1]) / 0.05 + k @ w
 
-    obeyed = {"type": "ineq", "fun": lambda w: (k @ w)[len(t) :] + 0.2, "jac": lambda w: k[len(t) :]}
+    obeyed = {
+        "type": "ineq",
+        "fun": lambda w: (k @ w)[len(t) :] + 0.2,
+        "jac": lambda w: k[len(t) :],
+    }
     start = np.zeros(len(points))
-    optimum = minimize(cost, start, jac=slope, constraints=[obeyed], method="SLSQP", options={"maxiter": 500})
+    optimum = minimize(
+        cost, start, jac=slope, constraints=[obeyed], method="SLSQP", options={"maxiter": 500}
+    )
     np.testing.assert_allclose(skill.mean(points)[:, 1], k @ optimum.x, atol=2e-3)
     found_by_us = np.linalg.solve(k, skill.mean(points)[:, 1])
     assert cost(found_by_us) <= cost(optimum.x) * (1 + 1e-3)
@@ -70,7 +79,9 @@ def test_mean_has_least_cost():
 
 def test_speed_and_rates_can_be_limited():
     """A speed can be limited and rates among the outputs too."""
-    slow = LinearConstraints(WHERE, np.tile([-1.0, 0.0], (41, 1)), np.full(41, -1.5), np.ones((41, 1)))
+    slow = LinearConstraints(
+        WHERE, np.tile([-1.0, 0.0], (41, 1)), np.full(41, -1.5), np.ones((41, 1))
+    )
     skill = base().constrained(slow)
     assert base().jacobians(WHERE)[:, 0, 0].max() > 2.9
     assert skill.jacobians(WHERE)[:, 0, 0].max() < 1.5 + 1e-9
@@ -98,7 +109,9 @@ def test_via_points_and_constraints_in_any_order():
 def test_low_rank_is_solved_anew():
     """A low-rank primitive is solved densely for constraints."""
     via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
-    dense, low = (base(representation).adapt(*via, tolerance=0) for representation in ("dense", "low_rank"))
+    dense, low = (
+        base(representation).adapt(*via, tolerance=0) for representation in ("dense", "low_rank")
+    )
     assert low.representation == "low_rank"
     constrained = low.constrained(LOW)
     assert violation(constrained) < 1e-9
@@ -112,11 +125,26 @@ CONTRADICTION = LinearConstraints([[1.0], [1.0]], [[0, 1], [0, -1]], [0.5, 0.5])
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: base().constrained(CONTRADICTION), r"The constraints cannot be met together: \d is missed by"),
-        (lambda: many().constrained(LOW), "low rank primitive of 6002 numbers given, at most 6000 or the dense"),
-        (lambda: base().constrained(LinearConstraints([[1.0]], [[1.0]], [0.0])), "1 outputs given, 2 needed"),
-        (lambda: base().constrained(LinearConstraints([[1.0, 2.0]], [[1.0, 0]], [0.0])), "2 inputs given, 1 needed"),
-        (lambda: LinearConstraints([[1.0]], [[0.0, 0.0]], [0.0]), r"normals\[0\] is 0, and must have a direction"),
+        (
+            lambda: base().constrained(CONTRADICTION),
+            r"The constraints cannot be met together: \d is missed by",
+        ),
+        (
+            lambda: many().constrained(LOW),
+            "low rank primitive of 6002 numbers given, at most 6000 or the dense",
+        ),
+        (
+            lambda: base().constrained(LinearConstraints([[1.0]], [[1.0]], [0.0])),
+            "1 outputs given, 2 needed",
+        ),
+        (
+            lambda: base().constrained(LinearConstraints([[1.0, 2.0]], [[1.0, 0]], [0.0])),
+            "2 inputs given, 1 needed",
+        ),
+        (
+            lambda: LinearConstraints([[1.0]], [[0.0, 0.0]], [0.0]),
+            r"normals\[0\] is 0, and must have a direction",
+        ),
     ],
 )
 def test_impossible_constraints_are_refused(call, says):

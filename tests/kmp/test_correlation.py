@@ -43,13 +43,17 @@ def test_neutral_correlation_changes_nothing(representation):
 
 def test_covariances_are_those_of_equation_11():
     """The covariances are those of equation 11."""
-    correlation = Correlation(basis().centres, 0.3, np.random.default_rng(0).uniform(0.5, 2, size=(5, 2)))
+    correlation = Correlation(
+        basis().centres, 0.3, np.random.default_rng(0).uniform(0.5, 2, size=(5, 2))
+    )
     primitive = letter()
     covariances = correlation.applied(primitive).base.reference.covariance
     for n in (0, 20, 59):
         phi = np.exp(-0.5 * (T[n] - correlation.centres[:, 0]) ** 2 / 0.3**2)
         factor = np.diag(phi / phi.sum() @ correlation.theta)
-        np.testing.assert_allclose(covariances[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9)
+        np.testing.assert_allclose(
+            covariances[n], factor.T @ primitive.base.reference.covariance[n] @ factor, rtol=1e-9
+        )
 
 
 def test_negative_factor_flips_signs():
@@ -57,7 +61,9 @@ def test_negative_factor_flips_signs():
     primitive = letter()
     before = primitive.base.reference.covariance
     for factor in (-2.0, -0.05, -0.02, 0.0, 0.02, 0.05, 2.0):
-        covariances = Correlation([[1.0]], 1.0, [[1.0, factor]]).applied(primitive).base.reference.covariance
+        covariances = (
+            Correlation([[1.0]], 1.0, [[1.0, factor]]).applied(primitive).base.reference.covariance
+        )
         assert np.linalg.eigvalsh(covariances).min() > 1e-3 * 0.05**2 * before.max()
         deviation = np.sqrt(covariances[:, 1, 1] / before[:, 1, 1])
         np.testing.assert_allclose(deviation, max(abs(factor), 0.05), rtol=1e-12)
@@ -69,7 +75,16 @@ def test_negative_factor_flips_signs():
 def test_rewards_grow_and_via_point_is_met(seed):
     """Rewards grow and the via-point is still met."""
     primitive = letter()
-    result = improve(primitive, roughness, T, correlation=basis(), exploration=0.3, updates=15, rollouts=8, seed=seed)
+    result = improve(
+        primitive,
+        roughness,
+        T,
+        correlation=basis(),
+        exploration=0.3,
+        updates=15,
+        rollouts=8,
+        seed=seed,
+    )
     assert result.rewards[-1] > 1.03 * result.rewards[0]
     assert roughness(result.primitive.mean(T)) >= result.rewards.max()
     np.testing.assert_allclose(result.primitive.mean([[1.0]]), [[1.4, -1.2]], atol=1e-3)

@@ -12,14 +12,17 @@ from kmp.criteria.cross_validation import (
 )
 
 RANDOM = np.random.default_rng(0)
-POINTS, TARGETS = RANDOM.normal(size=(20, 2)), RANDOM.normal(size=(20, 3))
+POINTS = RANDOM.normal(size=(20, 2))
+TARGETS = RANDOM.normal(size=(20, 3))
 GROUP = RANDOM.integers(0, 4, 20)
 KERNEL = np.exp(-0.5 * ((POINTS[:, None] - POINTS) ** 2).sum(axis=2))
 RATIOS = np.array([0.01, 0.3])
 
 
 def test_residuals_are_those_without_the_group():
-    assert squared_distances(POINTS) == pytest.approx(((POINTS[:, None] - POINTS) ** 2).sum(axis=2), abs=1e-12)
+    assert squared_distances(POINTS) == pytest.approx(
+        ((POINTS[:, None] - POINTS) ** 2).sum(axis=2), abs=1e-12
+    )
     shifted = {number: TARGETS - number for number in range(4)}
     by_ratio = held_out_residuals(KERNEL, RATIOS, GROUP, shifted.__getitem__)
     for ratio, residuals in zip(RATIOS, by_ratio, strict=True):
@@ -27,7 +30,9 @@ def test_residuals_are_those_without_the_group():
             training = number != GROUP
             mine = ~training
             noisy = KERNEL[np.ix_(training, training)] + ratio * np.eye(training.sum())
-            mean = KERNEL[np.ix_(mine, training)] @ np.linalg.solve(noisy, shifted[number][training])
+            mean = KERNEL[np.ix_(mine, training)] @ np.linalg.solve(
+                noisy, shifted[number][training]
+            )
             np.testing.assert_allclose(residuals[mine], shifted[number][mine] - mean, atol=1e-9)
 
 

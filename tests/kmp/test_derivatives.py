@@ -38,24 +38,33 @@ def taught(one, deviation=1e-4):
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernel_of_derivatives(name):
     """The kernel of derivatives is the derivative of the kernel."""
-    kernel, h = KERNELS[name], 1e-5
+    kernel = KERNELS[name]
+    h = 1e-5
     i = 4 if name in {"one length", "a length an input"} else 1
     a, u, b, v = (0.5 * RANDOM.normal(size=(n, i)) for n in (5, 5, 4, 4))
-    u[1], v[2] = 0, 0
+    u[1] = 0
+    v[2] = 0
     c = kernel.channels
 
     def at(t, r):
         return kernel(a + t * u, b + r * v).reshape(5, c, 4, c)
 
-    once_a, once_b = (at(h, 0) - at(-h, 0)) / (2 * h), (at(0, h) - at(0, -h)) / (2 * h)
+    once_a = (at(h, 0) - at(-h, 0)) / (2 * h)
+    once_b = (at(0, h) - at(0, -h)) / (2 * h)
     twice = (at(h, h) - at(h, -h) - at(-h, h) + at(-h, -h)) / (4 * h * h)
-    is_a, is_b = u.any(axis=1)[:, None, None, None], v.any(axis=1)[None, None, :, None]
-    expected = np.where(is_a & is_b, twice, np.where(is_a, once_a, np.where(is_b, once_b, at(0, 0))))
-    first, other = Functionals(a, u), Functionals(b, v)
+    is_a = u.any(axis=1)[:, None, None, None]
+    is_b = v.any(axis=1)[None, None, :, None]
+    expected = np.where(
+        is_a & is_b, twice, np.where(is_a, once_a, np.where(is_b, once_b, at(0, 0)))
+    )
+    first = Functionals(a, u)
+    other = Functionals(b, v)
     gram = between(kernel, first, other)
     np.testing.assert_allclose(gram.reshape(5, c, 4, c), expected, atol=3e-5)
     np.testing.assert_allclose(between(kernel, other, first), gram.T, atol=1e-12)
-    np.testing.assert_allclose(variances(kernel, first).ravel(), np.diagonal(between(kernel, first, first)), rtol=1e-9)
+    np.testing.assert_allclose(
+        variances(kernel, first).ravel(), np.diagonal(between(kernel, first, first)), rtol=1e-9
+    )
     whole = Functionals.concatenated([first, other])
     assert np.linalg.eigvalsh(between(kernel, whole, whole))[0] > -1e-9
 
@@ -85,16 +94,21 @@ def test_mean_and_covariance_are_naive_ones(representation):
     np.testing.assert_allclose(prediction.mean, mean, atol=1e-8)
     np.testing.assert_allclose(prediction.covariance, covariance, rtol=1e-5, atol=1e-8)
     for query, expected in zip(queries, covariance, strict=True):
-        np.testing.assert_allclose(primitive.predict(query[None]).covariance[0], expected, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(
+            primitive.predict(query[None]).covariance[0], expected, rtol=1e-5, atol=1e-8
+        )
         moving = primitive.predict_motion(query, np.ones(4), np.zeros(4))
         np.testing.assert_allclose(moving.covariance, expected, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_velocity_is_taught_and_replaces_no_point(representation):
-    v, desired = np.array([[0.3, -0.2, 0.1, 0.4]]), Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
+    v = np.array([[0.3, -0.2, 0.1, 0.4]])
+    desired = Gaussians.of([[0.1, 0.2, -0.3]], deviation=1e-4)
     primitive = base(representation).adapt(PLACE, desired, tolerance=9.0, directions=v)
-    np.testing.assert_allclose(primitive.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, desired.mean[0], atol=1e-5)
+    np.testing.assert_allclose(
+        primitive.predict_motion(PLACE[0], v[0], np.zeros(4)).velocity, desired.mean[0], atol=1e-5
+    )
     assert len(primitive.inputs) == 61  # no reference point gave way
 
 
@@ -107,8 +121,10 @@ def test_derivative_over_time_is_met(kernel):
     reference = Gaussians(mean, np.tile(np.diag([1e-3, 1e-2]), (50, 1, 1)))
     primitive = KMP.fit(t, reference, kernel=KERNELS[kernel], lambda_mean=1.0)
     desired = Gaussians.of([[5.0, 2.0]], deviation=1e-4)
-    adapted, h = primitive.adapt([[0.6]], desired, tolerance=0, directions=[[1.0]]), 1e-5
-    ahead, behind = adapted.mean([[0.6 + h]]), adapted.mean([[0.6 - h]])
+    adapted = primitive.adapt([[0.6]], desired, tolerance=0, directions=[[1.0]])
+    h = 1e-5
+    ahead = adapted.mean([[0.6 + h]])
+    behind = adapted.mean([[0.6 - h]])
     np.testing.assert_allclose((ahead - behind) / (2 * h), desired.mean, atol=1e-3)
     np.testing.assert_allclose(adapted.jacobian([0.6])[:, 0], [5.0, 2.0], atol=1e-3)
     bend = (adapted.jacobian([0.9 + h]) - adapted.jacobian([0.9 - h]))[:, 0] / (2 * h)

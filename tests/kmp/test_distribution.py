@@ -24,7 +24,8 @@ import kmp
 from kmp.compiled import AVAILABLE
 from kmp import KMP, GaussianKernel, Gaussians
 s = np.linspace(0, 2, 40)[:, None] * [1.0, -0.5]
-one = KMP.fit(s, Gaussians(np.sin(s), np.tile(1e-3 * np.eye(2), (40, 1, 1))), kernel=GaussianKernel(2.0), lambda_mean=1)
+reference = Gaussians(np.sin(s), np.tile(1e-3 * np.eye(2), (40, 1, 1)))
+one = KMP.fit(s, reference, kernel=GaussianKernel(2.0), lambda_mean=1)
 one = one.adapt_jacobian(s[5:6], [np.eye(2)], deviation=0.1)
 found = one.predict_motion([0.3, 0.2], [1.0, 0.5], [0.0, 0.1])
 print(json.dumps([kmp.__file__, AVAILABLE, *(np.asarray(part).tolist() for part in found)]))
@@ -35,8 +36,23 @@ print(json.dumps([kmp.__file__, AVAILABLE, *(np.asarray(part).tolist() for part 
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     shutil.copytree(ROOT / "kmp", folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
-    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(folder), str(folder / "source")]
+    options = [
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--quiet",
+        "--disable-pip-version-check",
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        *options,
+        "--wheel-dir",
+        str(folder),
+        str(folder / "source"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
     [path] = folder.glob("kernelized_movement_primitives-*.whl")
@@ -46,9 +62,17 @@ def wheel(tmp_path_factory):
 def test_it_holds_this_tree_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
-        metadata = archive.read(next(name for name in archive.namelist() if name.endswith("/METADATA"))).decode()
-    assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "kmp").rglob("*.py")} | {"kmp/py.typed"}
-    needed = {line.removeprefix("Requires-Dist: ") for line in metadata.splitlines() if line.startswith("Requires-D")}
+        metadata = archive.read(
+            next(name for name in archive.namelist() if name.endswith("/METADATA"))
+        ).decode()
+    assert held == {str(path.relative_to(ROOT)) for path in (ROOT / "kmp").rglob("*.py")} | {
+        "kmp/py.typed"
+    }
+    needed = {
+        line.removeprefix("Requires-Dist: ")
+        for line in metadata.splitlines()
+        if line.startswith("Requires-D")
+    }
     assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scipy>=1.14"}
     for name, extra in (("scikit-learn", "mixture"), ("numba", "fast"), ("matplotlib", "plot")):
         assert any(line.startswith(name) and f"extra == '{extra}'" in line for line in needed)
@@ -57,7 +81,10 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
 
 def test_requirements_agree_with_project():
     """Its requirements are those of the project."""
-    whole, alone = (tomllib.loads((ROOT / path).read_text()) for path in ("pyproject.toml", "kmp/pyproject.toml"))
+    whole, alone = (
+        tomllib.loads((ROOT / path).read_text())
+        for path in ("pyproject.toml", "kmp/pyproject.toml")
+    )
     extras, theirs = (project["project"]["optional-dependencies"] for project in (alone, whole))
     assert {*alone["project"]["dependencies"], *extras["fast"]} <= set(theirs["cell"])
     assert set(extras["plot"]) <= set(theirs["learn"])
@@ -70,7 +97,9 @@ def test_predicts_the_same_without_numba(wheel, tmp_path):
         archive.extractall(tmp_path)
     code = WITHOUT_NUMBA.format(site=str(tmp_path), libraries=sysconfig.get_path("purelib"))
     command = [sys.executable, "-I", "-S", "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     where, compiled, *printed = json.loads(done.stdout)
     assert where.startswith(str(tmp_path))

@@ -29,7 +29,9 @@ def test_errors_are_a_few_units_in_last_place(ours, theirs, arguments):
         assert ours(*row) == pytest.approx(theirs(*row), rel=4 * 2.0**-52, abs=0.0)
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(tanh, math.tanh), (acos, math.acos)], ids=["tanh", "acos"])
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [(tanh, math.tanh), (acos, math.acos)], ids=["tanh", "acos"]
+)
 def test_their_errors_are_below_1e_15(ours, theirs):
     for x in np.linspace(-1.0, 1.0, 501).tolist():
         assert ours(x) == pytest.approx(theirs(x), rel=0.0, abs=1e-15)
@@ -39,7 +41,11 @@ def test_values_at_ends():
     """Their ends are those of the functions."""
     assert (exp(0.0), exp(-math.inf), exp(math.inf), log(1.0)) == (1.0, 0.0, math.inf, 0.0)
     assert math.isnan(exp(math.nan))
-    assert [atan2(y, x) for y, x in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0))] == [0.0, math.pi / 2, math.pi]
+    assert [atan2(y, x) for y, x in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0))] == [
+        0.0,
+        math.pi / 2,
+        math.pi,
+    ]
     for quarter in range(-8, 9):
         angle = quarter * math.pi / 2
         assert sin_cos(angle) == pytest.approx((math.sin(angle), math.cos(angle)), abs=1e-14)

@@ -40,5 +40,7 @@ def test_works_in_pipelines_and_searches():
     """It is found in pipelines and searches."""
     pipeline = make_pipeline(StandardScaler(), KMPRegressor(ell=1.0))
     assert cross_val_score(pipeline, X, Y[:, 0], cv=3).min() > 0.9
-    search = GridSearchCV(KMPRegressor(), {"ell": [0.001, 0.5], "noise": [0.05, 0.2]}, cv=3).fit(X, Y[:, 0])
+    search = GridSearchCV(KMPRegressor(), {"ell": [0.001, 0.5], "noise": [0.05, 0.2]}, cv=3).fit(
+        X, Y[:, 0]
+    )
     assert search.best_params_["ell"] == 0.5

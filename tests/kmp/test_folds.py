@@ -17,10 +17,19 @@ def fold(dimensions, outputs, rates=False):
         return np.hstack([path, 2 * np.cos(2 * s @ ways) * ways]) if rates else path
 
     mean = shown(inputs)
-    roots = 0.1 * random.normal(size=(60, mean.shape[1], mean.shape[1])) + 0.2 * np.eye(mean.shape[1])
+    roots = 0.1 * random.normal(size=(60, mean.shape[1], mean.shape[1])) + 0.2 * np.eye(
+        mean.shape[1]
+    )
     prior = np.full(mean.shape[1], 0.3)
     prior[outputs:] = 0
-    return Fold(inputs, Gaussians(mean, roots @ roots.transpose(0, 2, 1)), prior, held, shown(held) + 0.1, 0.0)
+    return Fold(
+        inputs,
+        Gaussians(mean, roots @ roots.transpose(0, 2, 1)),
+        prior,
+        held,
+        shown(held) + 0.1,
+        0.0,
+    )
 
 
 CASES = [
@@ -34,15 +43,21 @@ CASES = [
 
 @pytest.mark.parametrize(("held", "kernel"), CASES, ids=[str(i) for i in range(len(CASES))])
 def test_errors_and_likelihoods_are_those_of_a_fit(held, kernel):
-    outputs, penalties = held.held_outputs.shape[1] // kernel.channels, [1e-2, 0.3, 10.0]
+    outputs = held.held_outputs.shape[1] // kernel.channels
+    penalties = [1e-2, 0.3, 10.0]
     rmses = held.rmses(kernel, penalties, outputs)
     likelihoods = held.negative_log_likelihoods(kernel, 0.3, penalties, outputs)
     for penalty, rmse, likelihood in zip(penalties, rmses, likelihoods, strict=True):
-        miss = (held.fitted(kernel, penalty, None).mean(held.held_inputs) - held.held_outputs)[:, :outputs]
+        miss = (held.fitted(kernel, penalty, None).mean(held.held_inputs) - held.held_outputs)[
+            :, :outputs
+        ]
         assert rmse == pytest.approx(np.sqrt((miss**2).sum(axis=1).mean()), rel=1e-7)
         prediction = held.fitted(kernel, 0.3, penalty).predict(held.held_inputs)
-        residual, log_densities = (held.held_outputs - prediction.mean)[:, :outputs], []
-        for r, covariance in zip(residual, prediction.covariance[:, :outputs, :outputs], strict=True):
+        residual = (held.held_outputs - prediction.mean)[:, :outputs]
+        log_densities = []
+        for r, covariance in zip(
+            residual, prediction.covariance[:, :outputs, :outputs], strict=True
+        ):
             log_det = np.linalg.slogdet(2 * np.pi * covariance)[1]
             log_densities.append(-0.5 * (log_det + r @ np.linalg.solve(covariance, r)))
         assert likelihood == pytest.approx(-np.mean(log_densities), rel=1e-6)

@@ -18,7 +18,9 @@ seeds = st.integers(0, 2**32 - 1)
 def some(count, outputs, seed):
     random = np.random.default_rng(seed)
     root = random.normal(size=(count, outputs, outputs))
-    return Gaussians(random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs))
+    return Gaussians(
+        random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs)
+    )
 
 
 def test_the_package_exports_what_it_names():
@@ -45,12 +47,18 @@ def test_the_arrays_are_read_only_copies():
 @pytest.mark.parametrize(
     ("second", "says"),
     [
-        ([[1, 0.5], [0.25, 1]], r"covariance\[1\] is not symmetric: .* by up to 0\.25\. Give \(C \+ C\^T\) / 2"),
+        (
+            [[1, 0.5], [0.25, 1]],
+            r"covariance\[1\] is not symmetric: .* by up to 0\.25\. Give \(C \+ C\^T\) / 2",
+        ),
         (
             np.diag([1, -0.5]),
             r"covariance\[1\] is not positive definite: .* is -0\.5, .* Add a small variance",
         ),
-        (np.zeros((2, 2)), r"covariance\[1\] is not positive definite: its smallest eigenvalue is 0,"),
+        (
+            np.zeros((2, 2)),
+            r"covariance\[1\] is not positive definite: its smallest eigenvalue is 0,",
+        ),
     ],
 )
 def test_invalid_covariance_is_refused(second, says):
@@ -63,7 +71,8 @@ def test_invalid_covariance_is_refused(second, says):
 @given(seeds)
 def test_affine_map_and_inverse_cancel(seed):
     """An affine map and its inverse cancel."""
-    value, random = some(4, 3, seed), np.random.default_rng(seed)
+    value = some(4, 3, seed)
+    random = np.random.default_rng(seed)
     rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
     offset = random.normal(size=3)
     back = value.affine(rotation, offset).affine(rotation.T, -rotation.T @ offset)
@@ -75,7 +84,9 @@ def test_affine_map_and_inverse_cancel(seed):
 @given(seeds)
 def test_product_is_commutative_and_surer(seed):
     """A product does not depend on the order, and has less variance than its factors."""
-    a, b, c = some(3, 2, seed), some(3, 2, seed + 1), some(3, 2, seed + 2)
+    a = some(3, 2, seed)
+    b = some(3, 2, seed + 1)
+    c = some(3, 2, seed + 2)
     product = a.product(b, c)
     other = c.product(a).product(b)
     np.testing.assert_allclose(product.mean, other.mean, rtol=1e-7, atol=1e-9)

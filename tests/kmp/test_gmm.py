@@ -33,7 +33,9 @@ def demonstrations(seed=0):
 def test_em_finds_two_clusters():
     """EM finds two clusters."""
     random = np.random.default_rng(0)
-    samples = np.concatenate([random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))])
+    samples = np.concatenate(
+        [random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))]
+    )
     model = GaussianMixture.fit(samples, components=2, seed=0)
     left, right = np.argsort(model.means[:, 0])
     np.testing.assert_allclose(model.means[[left, right]], [[0, 0], [5, 1]], atol=0.1)
@@ -45,8 +47,12 @@ def test_the_same_seed_gives_the_same_bits():
     a, b = (GaussianMixture.fit(demonstrations(), components=5, seed=3) for _ in range(2))
     assert np.array_equal(a.means, b.means)
     assert np.array_equal(a.covariances, b.covariances)
-    assert np.array_equal(a.sample_inputs(9, dimensions=1, seed=4), b.sample_inputs(9, dimensions=1, seed=4))
-    assert not np.array_equal(a.sample_inputs(9, dimensions=1, seed=4), a.sample_inputs(9, dimensions=1, seed=5))
+    assert np.array_equal(
+        a.sample_inputs(9, dimensions=1, seed=4), b.sample_inputs(9, dimensions=1, seed=4)
+    )
+    assert not np.array_equal(
+        a.sample_inputs(9, dimensions=1, seed=4), a.sample_inputs(9, dimensions=1, seed=5)
+    )
 
 
 @properties
@@ -58,7 +64,8 @@ def test_regression_has_conditional_moments(seed):
     components = list(zip(mix.weights, mix.means, mix.covariances, strict=True))
     share = np.array([w * multivariate_normal(m[:2], c[:2, :2]).pdf(s) for w, m, c in components])
     share /= share.sum()
-    first, second = np.zeros(2), np.zeros((2, 2))
+    first = np.zeros(2)
+    second = np.zeros((2, 2))
     for h, m, c in zip(share, mix.means, mix.covariances, strict=True):
         gain = c[2:, :2] @ np.linalg.inv(c[:2, :2])
         mean = m[2:] + gain @ (s - m[:2])
@@ -66,7 +73,9 @@ def test_regression_has_conditional_moments(seed):
         second += h * (c[2:, 2:] - gain @ c[:2, 2:] + np.outer(mean, mean))
     reference = mix.regress(s[None])
     np.testing.assert_allclose(reference.mean[0], first, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(reference.covariance[0], second - np.outer(first, first), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        reference.covariance[0], second - np.outer(first, first), rtol=1e-6, atol=1e-8
+    )
 
 
 def test_regression_far_away_is_finite():
@@ -82,7 +91,10 @@ def test_sampled_inputs_have_marginal_moments():
     drawn = mix.sample_inputs(40_000, dimensions=2, seed=0)
     mean = mix.weights @ mix.means[:, :2]
     spread = mix.means[:, :2] - mean
-    covariance = np.einsum("k,kij->ij", mix.weights, mix.covariances[:, :2, :2]) + (mix.weights * spread.T) @ spread
+    covariance = (
+        np.einsum("k,kij->ij", mix.weights, mix.covariances[:, :2, :2])
+        + (mix.weights * spread.T) @ spread
+    )
     assert drawn.shape == (40_000, 2)
     np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.05)
     np.testing.assert_allclose(np.cov(drawn.T), covariance, rtol=0.05, atol=0.05)
@@ -91,10 +103,22 @@ def test_sampled_inputs_have_marginal_moments():
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: GaussianMixture.fit([[0.0, 1.0]], components=5, seed=0), "1 samples given for 5 components: give at"),
-        (lambda: mixture(0).regress(np.zeros((1, 4))), "4 input dimensions given; this mixture of 4 .* takes 1 to 3"),
-        (lambda: GaussianMixture([0.5, 0.4], np.zeros((2, 1)), np.ones((2, 1, 1))), "numbers of sum 1, none below 0"),
-        (lambda: GaussianMixture([1.0], np.zeros((2, 1)), np.ones((2, 1, 1))), r"means: shape \(2, 1\) given, \(1, I"),
+        (
+            lambda: GaussianMixture.fit([[0.0, 1.0]], components=5, seed=0),
+            "1 samples given for 5 components: give at",
+        ),
+        (
+            lambda: mixture(0).regress(np.zeros((1, 4))),
+            "4 input dimensions given; this mixture of 4 .* takes 1 to 3",
+        ),
+        (
+            lambda: GaussianMixture([0.5, 0.4], np.zeros((2, 1)), np.ones((2, 1, 1))),
+            "numbers of sum 1, none below 0",
+        ),
+        (
+            lambda: GaussianMixture([1.0], np.zeros((2, 1)), np.ones((2, 1, 1))),
+            r"means: shape \(2, 1\) given, \(1, I",
+        ),
     ],
 )
 def test_impossible_mixtures_are_refused(call, says):

@@ -6,7 +6,11 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, VelocityKernel
 from support.primitives import naive
 
-KERNELS = {"gaussian": GaussianKernel(0.5), "periodic": PeriodicKernel(0.5, 2.5), "velocity": VelocityKernel(2.0)}
+KERNELS = {
+    "gaussian": GaussianKernel(0.5),
+    "periodic": PeriodicKernel(0.5, 2.5),
+    "velocity": VelocityKernel(2.0),
+}
 T = np.linspace(0, 2, 40)[:, None]
 QUERIES = np.concatenate([T[::8] + 0.01, [[5.0]]])
 
@@ -20,11 +24,16 @@ def fitted(kernel="gaussian", representation="dense", adapted=False):
     if not adapted:
         return primitive
     return primitive.adapt(
-        [[0.5], [1.51]], Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))), tolerance=0.02
+        [[0.5], [1.51]],
+        Gaussians(mean[[10, 29]] + 0.1, np.tile(0.5 * np.eye(2), (2, 1, 1))),
+        tolerance=0.02,
     )
 
 
-@pytest.fixture(params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)], ids=str)
+@pytest.fixture(
+    params=[(k, r, a) for k in KERNELS for r in ("dense", "low_rank") for a in (False, True)],
+    ids=str,
+)
 def skill(request):
     return fitted(*request.param)
 
@@ -33,18 +42,26 @@ def test_joint_covariance_is_the_naive_one(skill):
     """The joint covariance is that of the naive solution."""
     _, covariance = naive(skill, QUERIES)
     within = 1e-9 if skill.representation == "dense" else 1e-6
-    np.testing.assert_allclose(skill.predict_joint(QUERIES).covariance[0], covariance.reshape(12, 12), atol=within)
+    np.testing.assert_allclose(
+        skill.predict_joint(QUERIES).covariance[0], covariance.reshape(12, 12), atol=within
+    )
 
 
 def test_trajectories_have_mean_and_covariance():
     """Trajectories have the mean and the joint covariance and follow from the seed."""
     skill = fitted()
-    drawn, joint = skill.sample(QUERIES, 20_000, seed=3), skill.predict_joint(QUERIES)
+    drawn = skill.sample(QUERIES, 20_000, seed=3)
+    joint = skill.predict_joint(QUERIES)
     assert drawn.shape == (20_000, 6, 2)
-    flat, scale = drawn.reshape(20_000, -1), np.sqrt(np.diagonal(joint.covariance[0]))
+    flat = drawn.reshape(20_000, -1)
+    scale = np.sqrt(np.diagonal(joint.covariance[0]))
     np.testing.assert_allclose((flat.mean(axis=0) - joint.mean[0]) / scale, 0, atol=0.04)
-    np.testing.assert_allclose((np.cov(flat.T) - joint.covariance[0]) / np.outer(scale, scale), 0, atol=0.05)
-    np.testing.assert_array_equal(skill.sample(QUERIES, 2, seed=3), skill.sample(QUERIES, 2, seed=3))
+    np.testing.assert_allclose(
+        (np.cov(flat.T) - joint.covariance[0]) / np.outer(scale, scale), 0, atol=0.05
+    )
+    np.testing.assert_array_equal(
+        skill.sample(QUERIES, 2, seed=3), skill.sample(QUERIES, 2, seed=3)
+    )
     assert not np.array_equal(skill.sample(QUERIES, 2, seed=3), skill.sample(QUERIES, 2, seed=4))
 
 
@@ -61,10 +78,15 @@ def test_a_rhythmic_skill_has_no_seam(representation):
     mean = np.hstack([np.sin(phase), np.cos(2 * phase)])
     reference = Gaussians.of(mean, deviation=0.01)
     kernel = PeriodicKernel(1.0, 2 * np.pi)
-    primitive = KMP.fit(phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation)
-    via = primitive.adapt([[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06)
+    primitive = KMP.fit(
+        phase, reference, kernel=kernel, lambda_mean=1.0, representation=representation
+    )
+    via = primitive.adapt(
+        [[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06
+    )
     assert list(via.inner.changes.replaced) == [0]  # the nearest round the circle
-    a, b = np.zeros((1, 1)), np.full((1, 1), 2 * np.pi)
+    a = np.zeros((1, 1))
+    b = np.full((1, 1), 2 * np.pi)
     for skill in (primitive, via):
         assert np.array_equal(skill.mean(a), skill.mean(b))
         assert np.array_equal(skill.predict(a).covariance, skill.predict(b).covariance)

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kmp import KMP, GaussianKernel, Gaussians, PeriodicKernel, RankReached, VelocityKernel, named_arrays
+from kmp import (
+    KMP,
+    GaussianKernel,
+    Gaussians,
+    PeriodicKernel,
+    RankReached,
+    VelocityKernel,
+    named_arrays,
+)
 
 properties = settings(max_examples=10, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -19,7 +27,9 @@ def tube(seed, count):
     """Hands that move along a path, with scatter, and a tool that goes with them."""
     random = np.random.default_rng(seed)
     t = random.uniform(size=count)
-    path = np.stack([0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1)
+    path = np.stack(
+        [0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1
+    )
     inputs = path + 0.02 * random.normal(size=path.shape)
     tool = np.stack([np.sin(3 * t), 0.5 * np.cos(4 * t), t - t**2], axis=1) * 0.5
     root = STD * random.normal(size=(count, 3, 3))
@@ -47,14 +57,20 @@ def points(seed, count, std=1e-4, spread=0.05):
 def agree(dense, low, queries, within=1e-6):
     np.testing.assert_allclose(low.mean(queries), dense.mean(queries), atol=within)
     np.testing.assert_allclose(low.mean(queries[:1]), dense.mean(queries[:1]), atol=within)
-    a, b = dense.predict(queries), low.predict(queries)
+    a = dense.predict(queries)
+    b = low.predict(queries)
     scale = np.abs(a.covariance).max()
     np.testing.assert_allclose(b.covariance, a.covariance, atol=1e-5 * scale)
-    np.testing.assert_allclose(low.predict(queries[:1]).covariance[0], b.covariance[0], atol=1e-9 * scale)
+    np.testing.assert_allclose(
+        low.predict(queries[:1]).covariance[0], b.covariance[0], atol=1e-9 * scale
+    )
     assert np.array_equal(b.mean, low.mean(queries))
-    query, v = queries[0], np.ones(queries.shape[1])
+    query = queries[0]
+    v = np.ones(queries.shape[1])
     np.testing.assert_allclose(low.jacobian(query), dense.jacobian(query), atol=100 * within)
-    np.testing.assert_allclose(low.curvature(query, v), dense.curvature(query, v), atol=1e4 * within)
+    np.testing.assert_allclose(
+        low.curvature(query, v), dense.curvature(query, v), atol=1e4 * within
+    )
 
 
 @properties
@@ -69,12 +85,19 @@ def test_equals_dense_within_data(seed, lambda_covariance):
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
 @properties
-@given(seeds, st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 0.05, 1.0]), st.sampled_from([None, 5.0]))
+@given(
+    seeds,
+    st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.05, 1.0]),
+    st.sampled_from([None, 5.0]),
+)
 def test_adapted_equals_dense_adapted(seed, tolerance, spread, lambda_covariance):
     """An adapted low-rank primitive equals the adapted dense one."""
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     inputs, desired = points(seed, 3, std=1e-3, spread=spread)
-    dense, low = (primitive.adapt(inputs, desired, tolerance=tolerance) for primitive in (dense, low))
+    dense, low = (
+        primitive.adapt(inputs, desired, tolerance=tolerance) for primitive in (dense, low)
+    )
     assert np.array_equal(dense.inputs, low.inputs)
     assert np.array_equal(dense.reference.mean, low.reference.mean)
     agree(dense, low, np.concatenate([dense.inputs[:20], inputs]), within=5e-6)
@@ -87,13 +110,20 @@ def test_hidden_covariance_is_refused(variance, representation):
     inputs, reference = tube(0, 600)
     options = {"kernel": kernel, "representation": representation}
     hidden = Gaussians(reference.mean, np.tile(variance * np.eye(3), (600, 1, 1)))
-    with pytest.raises(ValueError, match=r"lost in rounding: .* 1e-11 needed|not positive definite to working"):
+    with pytest.raises(
+        ValueError, match=r"lost in rounding: .* 1e-11 needed|not positive definite to working"
+    ):
         KMP.fit(inputs, hidden, lambda_mean=1.0, **options)
     if representation == "low_rank":
-        with pytest.raises(ValueError, match=r"at point 0 would be lost .* a lambda_mean of at least"):
+        with pytest.raises(
+            ValueError, match=r"at point 0 would be lost .* a lambda_mean of at least"
+        ):
             KMP.fit(inputs, hidden, lambda_mean=1.0, lambda_covariance=1e9, **options)
-    primitive, point = KMP.fit(inputs, reference, lambda_mean=1.0, **options), hidden[:1]
-    with pytest.raises(ValueError, match=r"at point 600 would be lost in rounding: .* a lambda_\w+ of at least"):
+    primitive = KMP.fit(inputs, reference, lambda_mean=1.0, **options)
+    point = hidden[:1]
+    with pytest.raises(
+        ValueError, match=r"at point 600 would be lost in rounding: .* a lambda_\w+ of at least"
+    ):
         primitive.adapt(inputs[:1] + 0.1, point, tolerance=0.0)
     with pytest.raises(ValueError, match=r"at point 599 would be lost in rounding"):
         primitive.adapt(inputs[:1], point, tolerance=0.001)
@@ -105,7 +135,8 @@ def test_hidden_covariance_is_refused(variance, representation):
 
 def correlated(seed, count, outputs, spread):
     """A path over time with its rates, and correlations: deviations of 10 mm to 10 mm / spread."""
-    random, t = np.random.default_rng(seed), np.linspace(0, 2, count)[:, None]
+    random = np.random.default_rng(seed)
+    t = np.linspace(0, 2, count)[:, None]
     half = np.arange(2, 2 + outputs // 2)
     mean = np.hstack([np.sin(half * t), half * np.cos(half * t)])
     turn = np.linalg.qr(random.normal(size=(count, outputs, outputs)))[0]
@@ -114,7 +145,9 @@ def correlated(seed, count, outputs, spread):
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are surer than the data is smooth
-@pytest.mark.parametrize("one", [GaussianKernel(8.0), PeriodicKernel(2.0, 3.0), VelocityKernel(8.0)], ids=repr)
+@pytest.mark.parametrize(
+    "one", [GaussianKernel(8.0), PeriodicKernel(2.0, 3.0), VelocityKernel(8.0)], ids=repr
+)
 @pytest.mark.parametrize("outputs", [2, 4, 6])
 @pytest.mark.parametrize("spread", [1.0, 30.0, 300.0])
 def test_correlated_outputs_with_any_kernel(one, outputs, spread):
@@ -124,17 +157,24 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
     backward = Gaussians(reference.mean[::-1], reference.covariance[::-1])
     reordered, _ = of_both(t[::-1], backward, kernel=one, lambda_mean=10.0)
     via = t[50:51] + 0.004, Gaussians(reference.mean[50:51] + 0.01, reference.covariance[70:71])
-    for a, b, c in ((dense, low, reordered), (primitive.adapt(*via, tolerance=0.02) for primitive in (dense, low, reordered))):
+    for a, b, c in (
+        (dense, low, reordered),
+        (primitive.adapt(*via, tolerance=0.02) for primitive in (dense, low, reordered)),
+    ):
         error = np.linalg.norm(b.mean(t) - a.mean(t), axis=1).max()
         # The same points in another order differ by what rounding does to the dense solution.
         rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
         assert error < max(1e-5, 2.0 * rounding)
         assert error <= b.error_bound_at_points
         scale = np.abs(a.predict(t).covariance).max()
-        np.testing.assert_allclose(b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale)
+        np.testing.assert_allclose(
+            b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale
+        )
 
 
-@pytest.mark.parametrize("one", [GaussianKernel(8.0), PeriodicKernel(8.0, 2.0), VelocityKernel(8.0)], ids=repr)
+@pytest.mark.parametrize(
+    "one", [GaussianKernel(8.0), PeriodicKernel(8.0, 2.0), VelocityKernel(8.0)], ids=repr
+)
 def test_rank_decides_over_time(one):
     """Over time, the rank decides on the representation, not the number of points alone."""
     t, reference = correlated(0, 240, 4, 3.0)
@@ -165,7 +205,9 @@ def test_reached_rank_is_reported_with_error_bound(rank):
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
     says = rf"rank: {rank} features leave up to .* 4e-12 is required: .* Raise the rank"
     with pytest.warns(RankReached, match=says) as caught:
-        low = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank)
+        low = KMP.fit(
+            inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank
+        )
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
     assert 1e-6 < error < low.error_bound_at_points
     assert f"{low.error_bound_at_points:.2g} [unit" in str(caught[0].message)
@@ -178,21 +220,33 @@ def test_the_error_bound_holds(seed, left, adapted):
     dense, low = both(seed, rank_tolerance=left)
     if adapted:
         inputs, desired = points(seed, 1)
-        dense, low = (primitive.adapt(inputs, desired, tolerance=0.02) for primitive in (dense, low))
+        dense, low = (
+            primitive.adapt(inputs, desired, tolerance=0.02) for primitive in (dense, low)
+        )
     data = dense.inputs[:300]
-    assert np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= low.error_bound_at_points
-    elsewhere = np.concatenate([dense.inputs, 0.5 * np.random.default_rng(seed).normal(size=(500, 6))])
-    assert np.linalg.norm(low.mean(elsewhere) - dense.mean(elsewhere), axis=1).max() <= low.error_bound
+    assert (
+        np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= low.error_bound_at_points
+    )
+    elsewhere = np.concatenate(
+        [dense.inputs, 0.5 * np.random.default_rng(seed).normal(size=(500, 6))]
+    )
+    assert (
+        np.linalg.norm(low.mean(elsewhere) - dense.mean(elsewhere), axis=1).max() <= low.error_bound
+    )
     assert dense.error_bound == dense.error_bound_at_points == 0
 
 
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # the rate wanted is another than the neighbours'
+@pytest.mark.filterwarnings(
+    "ignore::kmp.ViaPointMissed"
+)  # the rate wanted is another than the neighbours'
 @pytest.mark.parametrize("ell", [2.0, 8.0, 200.0])
 @pytest.mark.parametrize("count", [12, 60])
 def test_derivatives_are_features_too(count, ell):
     """Derivatives of values and rates are features too."""
     t = np.linspace(0, 2, count)[:, None]
-    along = np.where(np.arange(count) % 3 == 0, 1.0, 0.0)[:, None]  # of value and rate: rate and acceleration
+    along = np.where(np.arange(count) % 3 == 0, 1.0, 0.0)[
+        :, None
+    ]  # of value and rate: rate and acceleration
     values = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t)])
     mean = np.where(along > 0, values[:, 1:], values[:, :2])
     reference = Gaussians(mean, np.tile(np.diag([1e-4, 1e-2]), (count, 1, 1)))

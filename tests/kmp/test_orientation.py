@@ -24,7 +24,8 @@ def same(a, b, atol=1e-9):
 @given(seeds)
 def test_log_is_half_the_rotation_vector(seed):
     """Exp undoes log and log is half the rotation vector."""
-    q, a = drawn(seed % 2**31), drawn((seed + 1) % 2**31, 1)[0]
+    q = drawn(seed % 2**31)
+    a = drawn((seed + 1) % 2**31, 1)[0]
     zeta = orientation.log(q, a)
     np.testing.assert_allclose(orientation.exp(zeta, a), q, atol=1e-12)
     angle = 2 * np.linalg.norm(zeta, axis=1)
@@ -43,11 +44,18 @@ def test_small_angles_lose_no_digits(angle):
 @given(seeds, st.sampled_from([1e-7, 1e-3, 1.0]))
 def test_rotation_per_zeta_is_the_derivative(seed, size):
     """Rotations per zeta agree with finite differences."""
-    random, h = np.random.default_rng(seed), 1e-6
-    zeta, change, a = size * random.normal(size=3), random.normal(size=3), np.array([0, 0, 0, 1.0])
-    ahead, behind = (Rotation.from_quat(orientation.exp((zeta + t * change)[None], a)[0]) for t in (h, -h))
+    random = np.random.default_rng(seed)
+    h = 1e-6
+    zeta = size * random.normal(size=3)
+    change = random.normal(size=3)
+    a = np.array([0, 0, 0, 1.0])
+    ahead, behind = (
+        Rotation.from_quat(orientation.exp((zeta + t * change)[None], a)[0]) for t in (h, -h)
+    )
     omega = (ahead * behind.inv()).as_rotvec() / (2 * h)
-    np.testing.assert_allclose(orientation.rotation_per_zeta(zeta) @ change, omega, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        orientation.rotation_per_zeta(zeta) @ change, omega, rtol=1e-6, atol=1e-7
+    )
 
 
 def test_signs_are_continuous():
@@ -58,7 +66,9 @@ def test_signs_are_continuous():
     aligned = orientation.continuous(flipped)
     assert ((aligned[1:] * aligned[:-1]).sum(axis=1) > 0.9).all()
     same(aligned, q)
-    assert np.linalg.norm(np.diff(orientation.log(aligned, aligned[25]), axis=0), axis=1).max() < 0.1
+    assert (
+        np.linalg.norm(np.diff(orientation.log(aligned, aligned[25]), axis=0), axis=1).max() < 0.1
+    )
 
 
 def path(t):
@@ -68,7 +78,9 @@ def path(t):
 
 def skill(velocity):
     t = np.linspace(0, 1.5, 120)
-    q = orientation.continuous(path(t).as_quat() * np.where(np.arange(120) % 3 == 0, -1, 1)[:, None])
+    q = orientation.continuous(
+        path(t).as_quat() * np.where(np.arange(120) % 3 == 0, -1, 1)[:, None]
+    )
     auxiliary = q[60]
     zeta = orientation.log(q, auxiliary)
     mean = np.hstack([zeta, np.gradient(zeta, t, axis=0, edge_order=2)]) if velocity else zeta
@@ -81,7 +93,9 @@ def skill(velocity):
 @pytest.mark.parametrize("velocity", [False, True])
 def test_skill_has_orientation_and_angular_velocity(velocity):
     """A skill reproduces orientations and their angular velocity."""
-    primitive, t, h = skill(velocity), np.linspace(0.1, 1.4, 20), 1e-5
+    primitive = skill(velocity)
+    t = np.linspace(0.1, 1.4, 20)
+    h = 1e-5
     q = primitive.mean(t[:, None])
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
     same(q, path(t).as_quat(), atol=1e-4)
@@ -104,7 +118,8 @@ def test_via_points_of_either_sign_are_met():
 
 def test_via_point_may_fix_angular_velocity():
     """A via-point can fix the angular velocity or leave it free."""
-    primitive, omega = skill(velocity=True), np.array([[0.5, -0.3, 0.8]])
+    primitive = skill(velocity=True)
+    omega = np.array([[0.5, -0.3, 0.8]])
     desired = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
     free = primitive.adapt([[0.7]], desired, 1e-8 * np.eye(3), tolerance=0.02)
     same(free.mean([[0.7]]), desired)
@@ -126,8 +141,12 @@ def test_covariance_is_of_world_rotations():
     q, covariance = model.predict([[0.7], [0.9]])
     same(q, model.mean([[0.7], [0.9]]))
     zeta = model.primitive.predict([[0.7], [0.9]])
-    draws = np.random.default_rng(0).multivariate_normal(zeta.mean[0], 1e-6 * zeta.covariance[0], size=20_000)
-    turns = (Rotation.from_quat(orientation.exp(draws, model.auxiliary)) * Rotation.from_quat(q[0]).inv()).as_rotvec()
+    draws = np.random.default_rng(0).multivariate_normal(
+        zeta.mean[0], 1e-6 * zeta.covariance[0], size=20_000
+    )
+    turns = (
+        Rotation.from_quat(orientation.exp(draws, model.auxiliary)) * Rotation.from_quat(q[0]).inv()
+    ).as_rotvec()
     scale = np.abs(covariance[0]).max()
     np.testing.assert_allclose(np.cov(turns.T) / 1e-6, covariance[0], atol=0.03 * scale)
 
@@ -137,8 +156,14 @@ def test_impossible_orientations_are_refused():
     model = skill(velocity=False)
     q = drawn(0, 1)
     for call, says in (
-        (lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]), r"quaternions\[0\] has norm 2, and must have 1"),
-        (lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]), r"quaternions\[0\] is .* give -q"),
+        (
+            lambda: orientation.log([[0, 0, 0, 2.0]], [0, 0, 0, 1]),
+            r"quaternions\[0\] has norm 2, and must have 1",
+        ),
+        (
+            lambda: orientation.log([[0, 0, 0, -1.0]], [0, 0, 0, 1]),
+            r"quaternions\[0\] is .* give -q",
+        ),
         (
             lambda: model.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
             "the skill has no rates; fit it with a VelocityKernel",
@@ -146,6 +171,8 @@ def test_impossible_orientations_are_refused():
     ):
         with pytest.raises(ValueError, match=says):
             call()
-    flat = KMP.fit([[0.0]], Gaussians([[0.0]], [[[1.0]]]), kernel=GaussianKernel(1.0), lambda_mean=1)
+    flat = KMP.fit(
+        [[0.0]], Gaussians([[0.0]], [[[1.0]]]), kernel=GaussianKernel(1.0), lambda_mean=1
+    )
     with pytest.raises(ValueError, match="primitive: 1 outputs given, 3 needed for an orientation"):
         OrientationKMP(flat, [0, 0, 0, 1])

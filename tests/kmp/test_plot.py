@@ -12,7 +12,9 @@ pytest.importorskip("matplotlib", reason="pip install 'kmp[plot]'")
 from matplotlib import pyplot as plt
 
 T = np.linspace(0, 2, 40)[:, None]
-REFERENCE = Gaussians(np.hstack([np.sin(T), np.cos(T)]), np.tile([[4e-4, 2e-4], [2e-4, 9e-4]], (40, 1, 1)))
+REFERENCE = Gaussians(
+    np.hstack([np.sin(T), np.cos(T)]), np.tile([[4e-4, 2e-4], [2e-4, 9e-4]], (40, 1, 1))
+)
 PLAIN = KMP.fit(T, REFERENCE, kernel=GaussianKernel(4.0), lambda_mean=1.0)
 VIA = Gaussians([[0.8, 0.5]], [np.diag([1e-4, 4e-4])])
 ADAPTED = PLAIN.adapt([[1.0]], VIA, tolerance=0.03)
@@ -37,8 +39,12 @@ def test_plot_over_input():
     queries = np.linspace(0, 2, 200)[:, None]
     prediction = PLAIN.predict(queries)
     for i, panel in enumerate(axes):
-        np.testing.assert_array_equal(drawn(panel, "mean").get_xydata(), np.hstack([queries, prediction.mean[:, i, None]]))
-        np.testing.assert_array_equal(drawn(panel, "reference").get_xydata(), np.hstack([T, REFERENCE.mean[:, i, None]]))
+        np.testing.assert_array_equal(
+            drawn(panel, "mean").get_xydata(), np.hstack([queries, prediction.mean[:, i, None]])
+        )
+        np.testing.assert_array_equal(
+            drawn(panel, "reference").get_xydata(), np.hstack([T, REFERENCE.mean[:, i, None]])
+        )
         for times, label in ((1, "1 deviation"), (2, "2 deviations")):
             [path] = drawn(panel, label).get_paths()
             far = times * np.sqrt(prediction.covariance[:, i, i])
@@ -56,7 +62,9 @@ def test_via_points_replace_references():
         [bars] = [bars for bars in panel.containers if bars.get_label() == "via-point"]
         points, _, [lines] = bars
         np.testing.assert_array_equal(points.get_xydata(), [[1.0, (0.8, 0.5)[i]]])
-        np.testing.assert_allclose(lines.get_segments()[0][:, 1], (0.8, 0.5)[i] + np.array([-2, 2]) * (0.01, 0.02)[i])
+        np.testing.assert_allclose(
+            lines.get_segments()[0][:, 1], (0.8, 0.5)[i] + np.array([-2, 2]) * (0.01, 0.02)[i]
+        )
         assert len(drawn(panel, "reference").get_xdata()) == 39 - (len(T) - len(ADAPTED.inputs))
         assert not (np.abs(drawn(panel, "reference").get_xdata() - 1.0) < 0.02).any()
 
@@ -71,13 +79,18 @@ def test_region_in_a_plane():
     for times, label in ((1, "1 deviation"), (2, "2 deviations")):
         rings = drawn(axes, label).get_path().to_polygons(closed_only=False)
         assert len(rings) == len(T)
-        for ring, mean, covariance in zip(rings, prediction.mean, prediction.covariance, strict=True):
+        for ring, mean, covariance in zip(
+            rings, prediction.mean, prediction.covariance, strict=True
+        ):
             offsets = ring[:, ::-1] - mean
             squares = np.einsum("no,op,np->n", offsets, np.linalg.inv(covariance), offsets)
             np.testing.assert_allclose(squares, times**2, rtol=1e-6)
             turned = ring - ring.mean(axis=0)
             assert (
-                np.cross(np.pad(turned[:-1], ((0, 0), (0, 1))), np.pad(turned[1:], ((0, 0), (0, 1))))[:, 2].min() >= 0
+                np.cross(
+                    np.pad(turned[:-1], ((0, 0), (0, 1))), np.pad(turned[1:], ((0, 0), (0, 1)))
+                )[:, 2].min()
+                >= 0
             )
     axes.figure.canvas.draw()
     assert axes.get_aspect() == 1.0

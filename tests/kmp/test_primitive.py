@@ -8,7 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kmp import KMP, GaussianKernel, Gaussians, named_arrays
-from support.primitives import database, kernel, naive, properties, representations, same_bits, seeds, skill, via
+from support.primitives import (
+    database,
+    kernel,
+    naive,
+    properties,
+    representations,
+    same_bits,
+    seeds,
+    skill,
+    via,
+)
 
 
 @properties
@@ -36,7 +46,9 @@ def test_batches_equal_single_queries():
     primitive = skill()
     prediction = primitive.predict(queries)
     for n in (0, 255, 256, 511, 512, 599):
-        np.testing.assert_allclose(prediction.covariance[n], primitive.predict(queries[n : n + 1]).covariance[0], rtol=1e-9)
+        np.testing.assert_allclose(
+            prediction.covariance[n], primitive.predict(queries[n : n + 1]).covariance[0], rtol=1e-9
+        )
 
 
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
@@ -47,7 +59,9 @@ def test_covariance_is_positive_definite(seed, spread, representation):
     random = np.random.default_rng(seed)
     inputs = spread * random.normal(size=(20, 2))
     exact = Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1)))
-    primitive = KMP.fit(inputs, exact, kernel=kernel, lambda_mean=1.0, representation=representation)
+    primitive = KMP.fit(
+        inputs, exact, kernel=kernel, lambda_mean=1.0, representation=representation
+    )
     adapted = primitive.adapt(inputs[:3] + 0.01, exact[:3], tolerance=0.1)
     for variant in (primitive, adapted):
         for prediction in (variant.predict(inputs), *(variant.predict(s[None]) for s in inputs)):
@@ -61,14 +75,21 @@ def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
     """A covariance that rounding would hide is refused and the remedy works."""
     inputs, reference = database()
     sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
-    primitive = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance)
+    primitive = KMP.fit(
+        inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=lambda_covariance
+    )
     assert primitive.predict(inputs).covariance.shape == (30, 3, 3)
     points = via(0, 1, std=1e-8)
-    says = rf"point 30 .* lambda Sigma is {1e-16 * lambda_covariance:.3g} .* lambda_covariance of at least 1e\+05"
+    says = (
+        rf"point 30 .* lambda Sigma is {1e-16 * lambda_covariance:.3g} .* lambda_covariance of at "
+        r"least 1e\+05"
+    )
     with pytest.raises(ValueError, match=says):
         primitive.adapt(*points, tolerance=0)
     remedied = KMP.fit(inputs, sure, kernel=kernel, lambda_mean=1.0, lambda_covariance=1e5)
-    np.testing.assert_allclose(remedied.adapt(*points, tolerance=0).mean(points[0]), points[1].mean, atol=1e-6)
+    np.testing.assert_allclose(
+        remedied.adapt(*points, tolerance=0).mean(points[0]), points[1].mean, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
@@ -111,7 +132,9 @@ def test_other_units_change_nothing(seed, c, representation):
             lambda_mean=2.0 / f**2,
             representation=representation,
         )
-        .base.adapt(f * points, Gaussians(f * desired.mean, f**2 * desired.covariance), tolerance=0.1 * f)
+        .base.adapt(
+            f * points, Gaussians(f * desired.mean, f**2 * desired.covariance), tolerance=0.1 * f
+        )
         .predict(f * queries)
         for f in (1.0, c)
     )
@@ -124,8 +147,12 @@ def test_other_units_change_nothing(seed, c, representation):
 def test_uncertainty_has_two_parts(seed, representation):
     """The uncertainty is the demonstrations' variability plus the distance from them."""
     inputs, reference = database(seed)
-    primitive = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation)
-    queries = np.concatenate([inputs[:3], np.random.default_rng(seed).normal(size=(3, 4)), np.full((1, 4), 50.0)])
+    primitive = KMP.fit(
+        inputs, reference, kernel=kernel, lambda_mean=2.0, representation=representation
+    )
+    queries = np.concatenate(
+        [inputs[:3], np.random.default_rng(seed).normal(size=(3, 4)), np.full((1, 4), 50.0)]
+    )
     parts = primitive.uncertainty(queries)
     total = primitive.predict(queries).covariance
     np.testing.assert_allclose(parts.variability + parts.distance, total, rtol=1e-6, atol=1e-7)
@@ -140,12 +167,16 @@ def test_uncertainty_has_two_parts(seed, representation):
 @pytest.mark.parametrize("points", [0, 1])
 def test_threads_may_share_a_primitive(representation, points):
     primitive, fresh = (
-        skill(count=60, representation=representation).adapt(*via(0, points), tolerance=0.1) for _ in range(2)
+        skill(count=60, representation=representation).adapt(*via(0, points), tolerance=0.1)
+        for _ in range(2)
     )
     queries = np.random.default_rng(2).normal(size=(64, 1, 4))
     with ThreadPoolExecutor(4) as pool:
         predictions = list(pool.map(primitive.predict, queries))
-    assert all(np.array_equal(p.covariance, fresh.predict(q).covariance) for p, q in zip(predictions, queries, strict=True))
+    assert all(
+        np.array_equal(p.covariance, fresh.predict(q).covariance)
+        for p, q in zip(predictions, queries, strict=True)
+    )
 
 
 INPUTS, REFERENCE = database(count=3)
@@ -161,12 +192,30 @@ def fit(inputs=INPUTS, reference=REFERENCE):
     ("call", "says"),
     [
         (lambda: fit(INPUTS[:2]), "3 normals over 3 outputs given for 2 inputs; 2 over 3 needed"),
-        (lambda: fit([[1.0], [1.0]], TWINS), "not positive definite to working precision at point 1, with lambda 1"),
-        (lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1), r"inputs: shape \(1, 2\) given, \(V, 4\) needed"),
-        (lambda: fit().adapt(*via(0, 1, outputs=2), tolerance=1), "1 normals over 2 outputs given for 1 inputs"),
-        (lambda: named_arrays.from_arrays({"ell": np.array(1.0)}), "arrays lack base_inputs, base_mean, .* Needed are"),
-        (lambda: named_arrays.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}), r"weights: shape \(2, 3\) given"),
-        (lambda: named_arrays.from_arrays(ARRAYS | {"replaced": np.array([99])}), r"replaced: \[99\] given, ascending"),
+        (
+            lambda: fit([[1.0], [1.0]], TWINS),
+            "not positive definite to working precision at point 1, with lambda 1",
+        ),
+        (
+            lambda: fit().adapt(*via(0, 1, inputs=2), tolerance=1),
+            r"inputs: shape \(1, 2\) given, \(V, 4\) needed",
+        ),
+        (
+            lambda: fit().adapt(*via(0, 1, outputs=2), tolerance=1),
+            "1 normals over 2 outputs given for 1 inputs",
+        ),
+        (
+            lambda: named_arrays.from_arrays({"ell": np.array(1.0)}),
+            "arrays lack base_inputs, base_mean, .* Needed are",
+        ),
+        (
+            lambda: named_arrays.from_arrays(ARRAYS | {"weights": np.ones((2, 3))}),
+            r"weights: shape \(2, 3\) given",
+        ),
+        (
+            lambda: named_arrays.from_arrays(ARRAYS | {"replaced": np.array([99])}),
+            r"replaced: \[99\] given, ascending",
+        ),
     ],
 )
 def test_impossible_calls_are_refused(call, says):
@@ -179,7 +228,9 @@ def test_impossible_calls_are_refused(call, says):
 
 
 wide = np.longdouble
-extended = pytest.mark.skipif(np.finfo(wide).eps > 1e-18, reason="this machine has no extended precision")
+extended = pytest.mark.skipif(
+    np.finfo(wide).eps > 1e-18, reason="this machine has no extended precision"
+)
 
 
 def solved(matrix, right):
@@ -210,7 +261,8 @@ def blocks(kernel, a, b):
 
 def exact(primitive, queries):
     """Equations (8), (9) and the covariance of IJRR 2019 as they stand, in extended precision."""
-    s, kernel = primitive.inputs.astype(wide), primitive.kernel
+    s = primitive.inputs.astype(wide)
+    kernel = primitive.kernel
     n, o = primitive.reference.mean.shape
     unit = np.eye(o, dtype=wide)
     k = np.kron(blocks(kernel, s, s), unit)
@@ -219,7 +271,9 @@ def exact(primitive, queries):
     sigma[np.arange(n), :, np.arange(n)] = primitive.reference.covariance
     sigma = sigma.reshape(n * o, n * o)
     right = (primitive.reference.mean - primitive.prior_mean).astype(wide).ravel()
-    mean = (rows @ solved(k + wide(primitive.lambda_mean) * sigma, right)).reshape(-1, o) + primitive.prior_mean
+    mean = (rows @ solved(k + wide(primitive.lambda_mean) * sigma, right)).reshape(
+        -1, o
+    ) + primitive.prior_mean
     gain = solved(k + wide(primitive.lambda_covariance) * sigma, rows.T)
     covariances = [unit - rows[i : i + o] @ gain[:, i : i + o] for i in range(0, len(rows), o)]
     return mean, np.array(covariances) * n / wide(primitive.lambda_covariance)
@@ -228,7 +282,9 @@ def exact(primitive, queries):
 def hands(seed=0, count=70):
     random = np.random.default_rng(seed)
     t = np.linspace(0, 1, count)
-    path = np.stack([0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1)
+    path = np.stack(
+        [0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1
+    )
     root = 0.02 * random.normal(size=(count, 3, 3))
     tool = np.stack([np.sin(3 * t), np.cos(4 * t), t - t**2], axis=1) * 0.5
     inputs = path + 0.01 * random.normal(size=path.shape)
@@ -263,10 +319,20 @@ def check(primitive, queries):
     mean, covariance = exact(primitive, queries)
     together = primitive.predict(queries)
     singly = [primitive.predict(query[None]) for query in queries]
-    for predicted_mean in (together.mean, np.concatenate([prediction.mean for prediction in singly])):
-        assert np.linalg.norm((predicted_mean - mean).astype(float)) <= 1e-9 * np.linalg.norm(mean.astype(float))
-    for predicted_covariance in (together.covariance, np.concatenate([prediction.covariance for prediction in singly])):
-        assert np.linalg.norm((predicted_covariance - covariance).astype(float)) <= 1e-9 * np.linalg.norm(covariance.astype(float))
+    for predicted_mean in (
+        together.mean,
+        np.concatenate([prediction.mean for prediction in singly]),
+    ):
+        assert np.linalg.norm((predicted_mean - mean).astype(float)) <= 1e-9 * np.linalg.norm(
+            mean.astype(float)
+        )
+    for predicted_covariance in (
+        together.covariance,
+        np.concatenate([prediction.covariance for prediction in singly]),
+    ):
+        assert np.linalg.norm(
+            (predicted_covariance - covariance).astype(float)
+        ) <= 1e-9 * np.linalg.norm(covariance.astype(float))
     near = slice(0, -3)  # and where the covariance is small, in its own right
     error = np.linalg.norm((together.covariance - covariance)[near].astype(float))
     assert error <= 1e-9 * np.linalg.norm(covariance[near].astype(float))

@@ -11,7 +11,12 @@ from support.primitives import KERNELS, curve
 def primitive(kernel, representation, changed):
     inputs, reference = curve(KERNELS[kernel])
     prior = [0.3, 0.2, 0, 0][: reference.outputs]
-    options = {"lambda_mean": 1.0, "lambda_covariance": 3.0, "prior_mean": prior, "representation": representation}
+    options = {
+        "lambda_mean": 1.0,
+        "lambda_covariance": 3.0,
+        "prior_mean": prior,
+        "representation": representation,
+    }
     model = KMP.fit(inputs, reference, kernel=KERNELS[kernel], **options)
     if changed != "fitted":
         via = Gaussians.of(reference.mean[20:22] + 0.05, deviation=0.03)
@@ -25,7 +30,9 @@ def primitive(kernel, representation, changed):
 CHANGES = ("fitted", "adapted", "with a Jacobian")
 
 
-@pytest.fixture(params=[(k, r, c) for k in KERNELS for r in ("dense", "low_rank") for c in CHANGES], ids=str)
+@pytest.fixture(
+    params=[(k, r, c) for k in KERNELS for r in ("dense", "low_rank") for c in CHANGES], ids=str
+)
 def skill(request):
     return primitive(*request.param)
 
@@ -41,7 +48,8 @@ def test_one_call_equals_the_others(skill, monkeypatch):
     """One call gives the results of the separate calls, bit for bit."""
     monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as where Numba is not installed
     s, v, a = moving(skill)
-    prediction, batch = skill.predict_motion(s, v, a), skill.predict(s[None])
+    prediction = skill.predict_motion(s, v, a)
+    batch = skill.predict(s[None])
     assert np.array_equal(prediction.mean, skill.mean(s[None])[0])
     assert np.array_equal(prediction.mean, batch.mean[0])
     assert np.array_equal(prediction.covariance, batch.covariance[0])
@@ -57,18 +65,22 @@ def test_one_call_equals_the_others(skill, monkeypatch):
 def test_compiled_loops_equal_plain_ones(skill):
     """Compiled loops give the same but for rounding."""
     motion = moving(skill)
-    prediction, plain = skill.predict_motion(*motion), skill.inner.query.motion(*motion, covariance=True)
+    prediction = skill.predict_motion(*motion)
+    plain = skill.inner.query.motion(*motion, covariance=True)
     assert (skill.inner.compiled_query is None) == (skill.kernel.channels == 2 or not AVAILABLE)
     for name in plain._fields[:3] + plain._fields[4:]:
         size = np.abs(getattr(plain, name)).max()
-        np.testing.assert_allclose(getattr(prediction, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(prediction, name), getattr(plain, name), rtol=0, atol=1e-11 * size, err_msg=name
+        )
     np.testing.assert_allclose(prediction.covariance, plain.covariance, rtol=0, atol=1e-9)
     np.linalg.cholesky(prediction.covariance)
 
 
 def test_jacobian_and_curvature_are_derivatives(skill):
     """The Jacobian and the curvature agree with finite differences."""
-    (s, v, _), h = moving(skill), 1e-5
+    s, v, _ = moving(skill)
+    h = 1e-5
     steps = h * np.eye(len(s))
     numeric = (skill.mean(s + steps) - skill.mean(s - steps)).T / (2 * h)
     np.testing.assert_allclose(skill.jacobian(s), numeric, rtol=1e-5, atol=1e-5)
@@ -78,8 +90,13 @@ def test_jacobian_and_curvature_are_derivatives(skill):
 
 def test_motion_is_the_derivative_along_path(skill):
     """Velocity and acceleration agree with finite differences along the motion."""
-    (s, v, a), h = moving(skill), 1e-4
+    s, v, a = moving(skill)
+    h = 1e-4
     behind, center, ahead = skill.mean([s + t * v + t * t / 2 * a for t in (-h, 0, h)])
     prediction = skill.predict_motion(s, v, a)
-    np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(prediction.acceleration, (ahead - 2 * center + behind) / h**2, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        prediction.velocity, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        prediction.acceleration, (ahead - 2 * center + behind) / h**2, rtol=1e-3, atol=1e-3
+    )

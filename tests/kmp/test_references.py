@@ -19,12 +19,16 @@ from support.shown_skills import off, two_hands
 def some(seed, count=6, outputs=2):
     random = np.random.default_rng(seed)
     root = random.normal(size=(count, outputs, outputs))
-    return Gaussians(random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs))
+    return Gaussians(
+        random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs)
+    )
 
 
 def test_superposition_is_a_product():
     """Superposition is the product of the covariances over their priorities."""
-    a, b, g = some(0), some(1), [0.3, 0.7]
+    a = some(0)
+    b = some(1)
+    g = [0.3, 0.7]
     superposition = superposed([a, b], g)
     product = Gaussians(a.mean, a.covariance / g[0]).product(Gaussians(b.mean, b.covariance / g[1]))
     np.testing.assert_allclose(superposition.mean, product.mean, rtol=1e-9)
@@ -37,9 +41,12 @@ def reaching(random, start, goal, t):
 
 
 def learned(velocity=False):
-    random, t = np.random.default_rng(0), np.linspace(0, 1, 60)
+    random = np.random.default_rng(0)
+    t = np.linspace(0, 1, 60)
     ends = np.array([[0, 0], [1, 0]])
-    paths = [reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + ends), t) for _ in range(6)]
+    paths = [
+        reaching(random, *(random.uniform(-0.3, 0.3, size=(2, 2)) + ends), t) for _ in range(6)
+    ]
     frames = [CoordinateFrame.start_and_goal(path) for path in paths]
     if velocity:
         frames = [[frame.with_velocity() for frame in pair] for pair in frames]
@@ -60,7 +67,9 @@ def learned(velocity=False):
 def test_frames_carry_skill_to_new_places():
     """Start and goal frames carry the skill to new places."""
     skill, t = learned()
-    start, goal = np.array([-0.6, 0.5]), np.array([1.5, -0.6])  # none of them demonstrated
+    # none of them demonstrated
+    start = np.array([-0.6, 0.5])
+    goal = np.array([1.5, -0.6])
     path = skill.placed([CoordinateFrame.at(start), CoordinateFrame.at(goal)]).mean(t)
     np.testing.assert_allclose(path[0], start, atol=0.02)
     np.testing.assert_allclose(path[-1], goal, atol=0.02)
@@ -70,7 +79,9 @@ def test_via_points_are_met_in_other_frames():
     """Via-points in world coordinates are met in moved frames."""
     skill, t = learned()
     desired = Gaussians.of([[0.4, 0.9]], deviation=1e-4)
-    placed = skill.placed([CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])])
+    placed = skill.placed(
+        [CoordinateFrame([[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2]), CoordinateFrame.at([1.5, -0.6])]
+    )
     adapted = placed.adapt([[0.5]], desired, tolerance=0.01)
     np.testing.assert_allclose(adapted.mean([[0.5]]), desired.mean, atol=1e-3)
     np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
@@ -87,20 +98,33 @@ def test_turned_frames_turn_predictions():
     skill, t = learned(velocity=True)
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     straight = skill.predict(t)
-    turned = skill.placed([CoordinateFrame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]).predict(t)
+    turned = skill.placed(
+        [CoordinateFrame(turn, turn @ f.offset[:2]).with_velocity() for f in skill.frames]
+    ).predict(t)
     block_turn = np.kron(np.eye(2), turn)
     np.testing.assert_allclose(turned.mean, straight.mean @ block_turn.T, atol=1e-7)
-    np.testing.assert_allclose(turned.covariance, block_turn @ straight.covariance @ block_turn.T, atol=1e-7)
+    np.testing.assert_allclose(
+        turned.covariance, block_turn @ straight.covariance @ block_turn.T, atol=1e-7
+    )
 
 
 def test_frames_that_do_not_fit_are_refused():
     origin = CoordinateFrame.at([0.0, 0.0])
     with pytest.raises(ValueError, match="must have an inverse"):
         CoordinateFrame(np.zeros((2, 2)), np.zeros(2))
-    takes, t = [(np.zeros((9, 1)), np.zeros((9, 2)))] * 2, np.zeros((9, 1))
-    with pytest.raises(ValueError, match=r"frames: \[1, 2\] given for 2 demonstrations, as many for each needed"):
+    takes = [(np.zeros((9, 1)), np.zeros((9, 2)))] * 2
+    t = np.zeros((9, 1))
+    with pytest.raises(
+        ValueError, match=r"frames: \[1, 2\] given for 2 demonstrations, as many for each needed"
+    ):
         LocalKMP.learn(
-            takes, [[origin], [origin, origin]], t, kernel=GaussianKernel(1.0), lambda_mean=1, components=1, seed=0
+            takes,
+            [[origin], [origin, origin]],
+            t,
+            kernel=GaussianKernel(1.0),
+            lambda_mean=1,
+            components=1,
+            seed=0,
         )
 
 
@@ -112,15 +136,21 @@ SEEDS = range(4)
 
 def within(normals, wanted):
     """The share of outputs within two deviations."""
-    return np.mean(np.abs(normals.mean - wanted) < 2 * np.sqrt(np.diagonal(normals.covariance, axis1=1, axis2=2)))
+    return np.mean(
+        np.abs(normals.mean - wanted)
+        < 2 * np.sqrt(np.diagonal(normals.covariance, axis1=1, axis2=2))
+    )
 
 
 def judged(offset):
     """Errors and shares (S, 2) at a demonstration that was left out: the process, the mixture."""
-    errors, shares = [], []
+    errors = []
+    shares = []
     for seed in SEEDS:
         *takes, (hands, tool) = two_hands(seed, offset=offset)
-        mixture = GaussianMixture.fit(np.vstack([np.hstack(take) for take in takes]), components=10, seed=seed)
+        mixture = GaussianMixture.fit(
+            np.vstack([np.hstack(take) for take in takes]), components=10, seed=seed
+        )
         predictions = gaussian_process_reference(takes, hands, count=200), mixture.regress(hands)
         errors.append([off(prediction.mean, tool) for prediction in predictions])
         shares.append([within(prediction, tool) for prediction in predictions])
@@ -137,11 +167,14 @@ def test_process_knows_common_offsets():
 
 def test_common_offsets_are_correlated():
     """Outputs that are off together are correlated."""
-    random, t = np.random.default_rng(0), np.linspace(0, 1, 50)[:, None]
+    random = np.random.default_rng(0)
+    t = np.linspace(0, 1, 50)[:, None]
     takes = []
     for _ in range(6):
         shift = 0.2 * random.normal(size=2)
-        takes.append((t, np.sin(3 * t) + [shift[0], shift[0], shift[1]] + 0.02 * random.normal(size=(50, 3))))
+        takes.append(
+            (t, np.sin(3 * t) + [shift[0], shift[0], shift[1]] + 0.02 * random.normal(size=(50, 3)))
+        )
     reference = gaussian_process_reference(takes, t[::10], count=90)
     deviation = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))
     correlation = reference.covariance / deviation[:, :, None] / deviation[:, None, :]

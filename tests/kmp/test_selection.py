@@ -13,7 +13,9 @@ from support.shown_skills import driven_by_hands, off, over_time, two_hands
 
 
 def chosen(demonstrations=None, **options):
-    return kmp.learn(demonstrations or driven_by_hands(), **{"components": 6, "seed": 0, "count": 60} | options)
+    return kmp.learn(
+        demonstrations or driven_by_hands(), **{"components": 6, "seed": 0, "count": 60} | options
+    )
 
 
 def unseen_rmse(learned):
@@ -24,7 +26,10 @@ def unseen_rmse(learned):
 
 def is_of(score, primitive):
     """Whether the score is of a primitive's parameters."""
-    return np.array_equal(score.ell, primitive.kernel.ell) and score.lambda_mean == primitive.lambda_mean
+    return (
+        np.array_equal(score.ell, primitive.kernel.ell)
+        and score.lambda_mean == primitive.lambda_mean
+    )
 
 
 def test_choice_is_as_good_as_best_tried():
@@ -47,15 +52,21 @@ def test_choice_is_as_good_as_best_tried():
     lines = learned.report(3).splitlines()
     assert len(lines) == 6
     assert lines[-1].startswith("chosen: GaussianKernel(ell=[")
-    assert lines[-1].endswith(f"matters up to {learned.reach[0]:.3g} {learned.reach[1]:.3g} from it")
+    assert lines[-1].endswith(
+        f"matters up to {learned.reach[0]:.3g} {learned.reach[1]:.3g} from it"
+    )
 
 
 def test_reach_is_where_a_tenth_moves():
     """The reach is how far the mean moves by a tenth."""
     t = np.linspace(0, 2, 100)[:, None]
-    primitive = KMP.fit(t, Gaussians.of(np.sin(3 * t), deviation=0.02), kernel=GaussianKernel(8.0), lambda_mean=0.1)
+    primitive = KMP.fit(
+        t, Gaussians.of(np.sin(3 * t), deviation=0.02), kernel=GaussianKernel(8.0), lambda_mean=0.1
+    )
     [reach] = primitive.via_point_reach([1.0])
-    moved = primitive.adapt([[1.0]], Gaussians.of(primitive.mean([[1.0]]) + 1, deviation=0), tolerance=0.0)
+    moved = primitive.adapt(
+        [[1.0]], Gaussians.of(primitive.mean([[1.0]]) + 1, deviation=0), tolerance=0.0
+    )
     along = np.linspace(0, 2, 401)[:, None]
     change = np.abs(moved.mean(along) - primitive.mean(along))[:, 0]
     assert np.abs(along[change > 0.1, 0] - 1).max() == pytest.approx(reach, abs=0.02)
@@ -71,9 +82,16 @@ def test_reach_is_where_a_tenth_moves():
 def test_the_choice_follows_the_units(criterion, ells, ell_within, lambda_within):
     c = 100.0
     choice = chosen(criterion=criterion)
-    other = chosen([(c * s, c * xi) for s, xi in driven_by_hands()], regularization=1e-6 * c**2, criterion=criterion)
-    before, after = choice.primitive, other.primitive
-    np.testing.assert_allclose(c**2 * after.kernel.ell[:ells], before.kernel.ell[:ells], rtol=ell_within)
+    other = chosen(
+        [(c * s, c * xi) for s, xi in driven_by_hands()],
+        regularization=1e-6 * c**2,
+        criterion=criterion,
+    )
+    before = choice.primitive
+    after = other.primitive
+    np.testing.assert_allclose(
+        c**2 * after.kernel.ell[:ells], before.kernel.ell[:ells], rtol=ell_within
+    )
     np.testing.assert_allclose(c**2 * after.lambda_mean, before.lambda_mean, rtol=lambda_within)
     for large, small in zip(other.scores[:1], choice.scores[:1], strict=True):
         np.testing.assert_allclose(large.rmse, c * small.rmse, rtol=1e-3)
@@ -99,7 +117,9 @@ def test_reference_over_time_is_even(velocity):
     np.testing.assert_allclose(learned.primitive.inputs[:, 0], np.linspace(0, 2, 60))
     np.testing.assert_allclose(learned.reach, learned.primitive.via_point_reach([1.0]), rtol=0.2)
     t = np.array([[0.5], [1.5]])
-    np.testing.assert_allclose(learned.primitive.mean(t)[:, :2], np.hstack([np.sin(3 * t), np.cos(2 * t)]), atol=0.08)
+    np.testing.assert_allclose(
+        learned.primitive.mean(t)[:, :2], np.hstack([np.sin(3 * t), np.cos(2 * t)]), atol=0.08
+    )
 
 
 def test_impossible_choices_are_refused():
@@ -110,7 +130,9 @@ def test_impossible_choices_are_refused():
         chosen(takes)
     with pytest.raises(ValueError, match="demonstrations: none given"):
         kmp.learn([], components=1, seed=0)
-    with pytest.raises(ValueError, match=r"demonstrations\[1\] outputs: shape \(80, 3\) given, \(80, 2\) needed"):
+    with pytest.raises(
+        ValueError, match=r"demonstrations\[1\] outputs: shape \(80, 3\) given, \(80, 2\) needed"
+    ):
         chosen([*takes, (np.zeros((80, 2)), np.zeros((80, 3)))])
     for scale, begin, words in (
         (1e9, 1.76e18, "give seconds"),
@@ -129,7 +151,10 @@ def test_impossible_choices_are_refused():
 def test_shown_points_where_they_predict_better():
     """With many inputs, demonstrated samples become reference points where they predict better."""
     *takes, (hands, tool) = two_hands(0, demonstrations=6)
-    learned = {points: chosen(takes, points=points, components=10, count=120) for points in ("auto", "shown", "drawn")}
+    learned = {
+        points: chosen(takes, points=points, components=10, count=120)
+        for points in ("auto", "shown", "drawn")
+    }
     misses = {points: off(choice.primitive.mean(hands), tool) for points, choice in learned.items()}
     assert misses["shown"] < 0.8 * misses["drawn"]
     rmses = {points: choice.scores[0].rmse for points, choice in learned.items()}
@@ -167,16 +192,23 @@ CASES = [
 
 @pytest.mark.parametrize(("points", "kernel"), CASES, ids=["ard", "one ell", "time", "velocity"])
 def test_the_gradient_is_the_differences(points, kernel):
-    prior, ell = np.zeros(points.reference.outputs), np.atleast_1d(kernel.ell)
+    prior = np.zeros(points.reference.outputs)
+    ell = np.atleast_1d(kernel.ell)
 
     def value(logs):
         scaled = np.exp(logs[:-1]) if np.ndim(kernel.ell) else float(np.exp(logs[0]))
-        of = GaussianKernel(scaled) if isinstance(kernel, GaussianKernel) else VelocityKernel(scaled)
+        of = (
+            GaussianKernel(scaled) if isinstance(kernel, GaussianKernel) else VelocityKernel(scaled)
+        )
         return negative_log_likelihood(points, prior, of, float(np.exp(logs[-1])))[0]
 
-    log_point, step = np.log([*ell, 0.7]), 1e-5
+    log_point = np.log([*ell, 0.7])
+    step = 1e-5
     gradient = negative_log_likelihood(points, prior, kernel, 0.7)[1]
-    differences = [(value(log_point + step * e) - value(log_point - step * e)) / (2 * step) for e in np.eye(len(log_point))]
+    differences = [
+        (value(log_point + step * e) - value(log_point - step * e)) / (2 * step)
+        for e in np.eye(len(log_point))
+    ]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-6)
 
 
@@ -188,7 +220,8 @@ def test_likelihood_is_that_of_scipy():
     for n, covariance in enumerate(points.reference.covariance):
         total[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += 0.7 * covariance
     densities = [
-        multivariate_normal(cov=s * total).logpdf(points.reference.mean.ravel()) for s in (signal, 0.9 * signal)
+        multivariate_normal(cov=s * total).logpdf(points.reference.mean.ravel())
+        for s in (signal, 0.9 * signal)
     ]
     assert value == pytest.approx(-densities[0], rel=1e-9)
     assert densities[1] < densities[0]
@@ -197,9 +230,13 @@ def test_likelihood_is_that_of_scipy():
 def test_likelihood_finds_irrelevant_input():
     """An uninformative input is detected, and the prediction improves without it."""
     options = {"components": 16, "seed": 0, "count": 80, "criterion": "likelihood"}
-    separate, shared = (kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one"))
+    separate, shared = (
+        kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one")
+    )
     variances = np.var(np.concatenate([s for s, _ in driven_by_hands()]), axis=0)
-    relevance, alike = (np.asarray(learned.primitive.kernel.ell) * variances for learned in (separate, shared))
+    relevance, alike = (
+        np.asarray(learned.primitive.kernel.ell) * variances for learned in (separate, shared)
+    )
     assert relevance[1] < 0.1 * relevance[0]
     assert alike[1] == pytest.approx(alike[0], rel=0.3)
     assert unseen_rmse(separate) < 0.9 * unseen_rmse(shared)
@@ -207,7 +244,8 @@ def test_likelihood_finds_irrelevant_input():
 
 @pytest.mark.parametrize("velocity", [False, True])
 def test_one_demonstration_is_enough(velocity):
-    takes, options = over_time(velocity), {"components": 8, "seed": 0, "count": 60, "velocity": velocity}
+    takes = over_time(velocity)
+    options = {"components": 8, "seed": 0, "count": 60, "velocity": velocity}
     learned = kmp.learn(takes[:1], criterion="likelihood", **options)
     assert isinstance(learned.primitive.kernel, VelocityKernel if velocity else GaussianKernel)
     miss = learned.primitive.mean(takes[0][0]) - takes[0][1]

@@ -20,13 +20,19 @@ def test_foreign_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):
         kmp.load(tmp_path / "text")
     np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(ValueError, match=r"other\.npz: not an \.npz file that `kmp\.save` wrote, or damaged: save"):
+    with pytest.raises(
+        ValueError, match=r"other\.npz: not an \.npz file that `kmp\.save` wrote, or damaged: save"
+    ):
         kmp.load(tmp_path / "other.npz")
     np.savez(tmp_path / "object.npz", a=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match=r"object\.npz: not an \.npz file"):
         kmp.load(tmp_path / "object.npz")
-    (tmp_path / "pointer.npz").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284\n")
-    with pytest.raises(ValueError, match=r"pointer\.npz: a pointer of Git LFS .*; `git lfs pull` fetches that"):
+    (tmp_path / "pointer.npz").write_bytes(
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284\n"
+    )
+    with pytest.raises(
+        ValueError, match=r"pointer\.npz: a pointer of Git LFS .*; `git lfs pull` fetches that"
+    ):
         kmp.load(tmp_path / "pointer.npz")
     half = {"kmp_format": np.array(1)}
     np.savez(tmp_path / "half.npz", **half, checksum=np.array(checksum(half)))
@@ -44,7 +50,9 @@ def test_cut_file_is_refused(tmp_path):
     data = saved(tmp_path).read_bytes()
     for size in (0, 3, 100, len(data) // 2, len(data) - 1):
         part.write_bytes(data[:size])
-        with pytest.raises(ValueError, match=r"part\.npz: not an \.npz file that `kmp\.save` wrote"):
+        with pytest.raises(
+            ValueError, match=r"part\.npz: not an \.npz file that `kmp\.save` wrote"
+        ):
             kmp.load(part)
     part.write_bytes(data[:300] + bytes(8) + data[308:])
     with pytest.raises(ValueError, match=r"part\.npz: not an \.npz file"):

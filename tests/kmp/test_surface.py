@@ -11,7 +11,9 @@ import kmp
 from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
 from support.paths import ROOT
 
-pytestmark = pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # points of other deviations are near
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::kmp.ViaPointMissed"
+)  # points of other deviations are near
 
 T = np.linspace(0, 2, 80)[:, None]
 VALUES = np.hstack([np.sin(3 * T), np.cos(2 * T)])
@@ -20,7 +22,9 @@ RATES = np.hstack([3 * np.cos(3 * T), -2 * np.sin(2 * T)])
 
 def fitted(representation="dense", **options):
     options = {"kernel": GaussianKernel(8.0), "lambda_mean": 0.1} | options
-    return KMP.fit(T, Gaussians.of(VALUES, deviation=0.05), representation=representation, **options)
+    return KMP.fit(
+        T, Gaussians.of(VALUES, deviation=0.05), representation=representation, **options
+    )
 
 
 def with_rates(**options):
@@ -62,21 +66,26 @@ def test_zero_deviation_is_met(representation, lambdas):
 @pytest.mark.parametrize("lambda_covariance", [None, 1e-4])
 def test_named_least_variance_is_accepted(representation, rates, lambda_covariance):
     """The least variance that a refusal names is accepted."""
-    skill = (with_rates if rates else fitted)(representation=representation, lambda_covariance=lambda_covariance)
+    skill = (with_rates if rates else fitted)(
+        representation=representation, lambda_covariance=lambda_covariance
+    )
     place = skill.mean([[1.0]])
     with pytest.raises(ValueError, match="variance of at least") as refused:
         skill.adapt([[1.0]], Gaussians.of(place, deviation=1e-9))
     named = [
         float(number)
         for number in re.findall(
-            r"at least (\S+?)(?: of the values)?(?: and (\S+) of their rates)? \(", str(refused.value)
+            r"at least (\S+?)(?: of the values)?(?: and (\S+) of their rates)? \(",
+            str(refused.value),
         )[0]
         if number
     ]
     assert len(named) == 1 + rates
     deviation = np.repeat(np.sqrt(named), 2)
     np.testing.assert_allclose(
-        skill.adapt([[1.0]], Gaussians.of(place, deviation=deviation)).mean([[1.0]]), place, atol=1e-3
+        skill.adapt([[1.0]], Gaussians.of(place, deviation=deviation)).mean([[1.0]]),
+        place,
+        atol=1e-3,
     )
     with pytest.raises(ValueError, match="lost in rounding"):
         skill.adapt([[1.0]], Gaussians.of(place, deviation=deviation / 1.2))
@@ -91,7 +100,10 @@ def test_default_tolerance_replaces_nearest():
         through = skill.adapt([[t]], Gaussians.of([0.0, 0.0], deviation=0.3))
         [index] = through.inner.changes.replaced
         assert abs(T[index, 0] - t) <= skill.spacing / 2
-    assert len(skill.adapt([[2.1]], Gaussians.of([0.0, 0.0], deviation=0.3)).inner.changes.replaced) == 0
+    assert (
+        len(skill.adapt([[2.1]], Gaussians.of([0.0, 0.0], deviation=0.3)).inner.changes.replaced)
+        == 0
+    )
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
@@ -106,26 +118,37 @@ def test_other_lambda_keeps_the_mean(representation, changed):
         above = LinearConstraints(T, np.tile([0.0, 1.0], (80, 1)), np.full(80, -0.5))
         return skill.constrained(above) if changed == "constrained" else skill
 
-    updated, expected = made().with_lambda_covariance(7.0), made(lambda_covariance=7.0)
+    updated = made().with_lambda_covariance(7.0)
+    expected = made(lambda_covariance=7.0)
     assert updated.lambda_covariance == 7.0
     assert np.array_equal(updated.mean(T), made().mean(T))
-    np.testing.assert_allclose(updated.predict(T).covariance, expected.predict(T).covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        updated.predict(T).covariance, expected.predict(T).covariance, rtol=1e-6, atol=1e-9
+    )
     place = [[0.5]], Gaussians.of([0.2, 0.2], deviation=0.03)
-    np.testing.assert_allclose(updated.adapt(*place).mean(T), expected.adapt(*place).mean(T), atol=1e-7)
+    np.testing.assert_allclose(
+        updated.adapt(*place).mean(T), expected.adapt(*place).mean(T), atol=1e-7
+    )
     assert updated.base.lambda_covariance == 7.0
 
 
 def test_estimator_is_loaded_when_needed():
     """The estimator is found when it is needed and not before."""
-    code = "import sys, kmp; assert 'sklearn' not in sys.modules; kmp.KMPRegressor(); assert 'sklearn' in sys.modules"
-    subprocess.run([sys.executable, "-c", code + "; assert 'KMPRegressor' in dir(kmp)"], cwd=ROOT, check=True)
+    code = (
+        "import sys, kmp; assert 'sklearn' not in sys.modules; kmp.KMPRegressor(); assert "
+        "'sklearn' in sys.modules"
+    )
+    subprocess.run(
+        [sys.executable, "-c", code + "; assert 'KMPRegressor' in dir(kmp)"], cwd=ROOT, check=True
+    )
     with pytest.raises(AttributeError, match="no attribute 'Unknown'"):
         _ = kmp.Unknown
 
 
 def test_blocks_of_queries_have_same_means():
     """Means of many queries are the same in blocks."""
-    skill, queries = with_rates(), np.linspace(-1, 3, 1001)[:, None]
+    skill = with_rates()
+    queries = np.linspace(-1, 3, 1001)[:, None]
     whole = skill.mean(queries)
     parts = np.concatenate([skill.mean(queries[a : a + 7]) for a in range(0, 1001, 7)])
     np.testing.assert_allclose(whole, parts, atol=1e-12 * np.abs(skill.weights).max())

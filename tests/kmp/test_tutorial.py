@@ -17,11 +17,15 @@ def test_tutorial_runs_as_it_stands():
     """The tutorial runs as it stands and shows what it says."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:
-        code = compile("\n" * line + block, str(PAGE), "exec")  # so that a failure names the page's line
+        code = compile(
+            "\n" * line + block, str(PAGE), "exec"
+        )  # so that a failure names the page's line
         exec(code, names)
 
 
-@pytest.mark.parametrize("subject", ["learn", "predict", "adapt", "uncertainty", "OrientationKMP", "PeriodicKernel"])
+@pytest.mark.parametrize(
+    "subject", ["learn", "predict", "adapt", "uncertainty", "OrientationKMP", "PeriodicKernel"]
+)
 def test_subjects_have_checked_blocks(subject):
     """Each subject has a block that checks itself."""
     assert any(subject in block for _, block in BLOCKS)

@@ -33,13 +33,17 @@ S = np.random.default_rng(0).normal(size=(6, 2))
 R = Gaussians(S, np.tile(0.01 * np.eye(2), (6, 1, 1)))
 K = GaussianKernel(1.0)
 ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
-LOW = KMP.fit(S, R, kernel=K, lambda_mean=1.0, representation="low_rank").adapt(S[:1], R[:1], tolerance=0.1)
+LOW = KMP.fit(S, R, kernel=K, lambda_mean=1.0, representation="low_rank").adapt(
+    S[:1], R[:1], tolerance=0.1
+)
 Q = np.tile([0.0, 0.0, 0.0, 1.0], (6, 1))
 ZETA = Gaussians(0.1 * S @ np.eye(2, 3), np.tile(0.01 * np.eye(3), (6, 1, 1)))
 TURNING = OrientationKMP(KMP.fit(S, ZETA, kernel=K, lambda_mean=1.0), Q[0])
 T = np.linspace(0, 1, 6)[:, None]
 SIX = Gaussians(np.hstack([ZETA.mean, ZETA.mean]), np.tile(0.01 * np.eye(6), (6, 1, 1)))
-IN_TIME = KMP.fit(T, SIX, kernel=VelocityKernel(1.0), lambda_mean=1.0).adapt(T[:1], SIX[:1], tolerance=0.1)
+IN_TIME = KMP.fit(T, SIX, kernel=VelocityKernel(1.0), lambda_mean=1.0).adapt(
+    T[:1], SIX[:1], tolerance=0.1
+)
 TURNING_IN_TIME = OrientationKMP(IN_TIME, Q[0])
 FRAME = CoordinateFrame.at([0.0, 1.0])
 PAIRS = [(S, S + 0.1 * i) for i in range(2)]
@@ -65,8 +69,17 @@ RIGHT = {
     Gaussians.of: {"mean": R.mean, "deviation": np.ones(2)},
     R.affine: {"matrix": np.eye(2), "offset": np.zeros(2)},
     Gaussians.concatenated: {"parts": [R, R]},
-    GaussianMixture: {"weights": np.ones(1), "means": np.zeros((1, 2)), "covariances": np.eye(2)[None]},
-    GaussianMixture.fit: {"samples": np.hstack([S, S]), "components": 2, "seed": 0, "regularization": 1e-6},
+    GaussianMixture: {
+        "weights": np.ones(1),
+        "means": np.zeros((1, 2)),
+        "covariances": np.eye(2)[None],
+    },
+    GaussianMixture.fit: {
+        "samples": np.hstack([S, S]),
+        "components": 2,
+        "seed": 0,
+        "regularization": 1e-6,
+    },
     MIXTURE.regress: {"inputs": S},
     MIXTURE.sample_inputs: {"count": 3, "dimensions": 2, "seed": 0},
     GaussianKernel: {"ell": np.ones(2)},
@@ -84,7 +97,12 @@ RIGHT = {
         "rank": 10,
         "rank_tolerance": 1e-9,
     },
-    ONE.adapt: {"inputs": S[:2], "desired": R[:2], "tolerance": 0.1, "directions": np.zeros((2, 2))},
+    ONE.adapt: {
+        "inputs": S[:2],
+        "desired": R[:2],
+        "tolerance": 0.1,
+        "directions": np.zeros((2, 2)),
+    },
     ONE.adapt_many: {"points": [(S[:2], R[:2]), (S[2:3], R[2:3])], "tolerance": 0.1},
     ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
     ONE.via_point_reach: {"query": S[0], "share": 0.5},
@@ -112,7 +130,12 @@ RIGHT = {
     Correlation.neutral: {"centres": S, "width": 1.0, "outputs": 2},
     NEUTRAL.__call__: {"inputs": S},
     NEUTRAL.applied: {"primitive": ONE},
-    kmp.improve: {"primitive": ONE, "reward": lambda path: -float(path.sum()), "queries": S, **IMPROVE},
+    kmp.improve: {
+        "primitive": ONE,
+        "reward": lambda path: -float(path.sum()),
+        "queries": S,
+        **IMPROVE,
+    },
     AffineMean: {"matrix": np.eye(2), "offset": np.zeros(2)},
     CoordinateFrame: {"matrix": np.eye(2), "offset": np.zeros(2)},
     CoordinateFrame.at: {"origin": np.zeros(2)},
@@ -121,7 +144,13 @@ RIGHT = {
     FRAME.localised: {"normals": R},
     FRAME.placed: {"normals": R},
     LocalKMP: {"primitives": LOCAL.primitives, "frames": FRAMES[0]},
-    LocalKMP.learn: {"demonstrations": PAIRS, "frames": FRAMES, "inputs": S, **LEARN, "regularization": 1e-6},
+    LocalKMP.learn: {
+        "demonstrations": PAIRS,
+        "frames": FRAMES,
+        "inputs": S,
+        **LEARN,
+        "regularization": 1e-6,
+    },
     LOCAL.placed: {"frames": FRAMES[0]},
     LOCAL.mean: {"queries": S},
     LOCAL.predict: {"queries": S},
@@ -143,7 +172,12 @@ RIGHT = {
     orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
     orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
     orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
-    kmp.gaussian_process_reference: {"demonstrations": PAIRS, "inputs": S, "count": 12, "regularization": 1e-6},
+    kmp.gaussian_process_reference: {
+        "demonstrations": PAIRS,
+        "inputs": S,
+        "count": 12,
+        "regularization": 1e-6,
+    },
     kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
     kmp.learn: {
         "demonstrations": PAIRS,
@@ -177,23 +211,85 @@ RIGHT = {
     },
 }
 # Not here: `others` of a product, which are many; what is chosen as NumPy would; what is any truth.
-LEFT_OUT = {("product", "others"), ("take", "index"), ("__getitem__", "index"), ("predict_motion", "covariance")}
-MADE_BY_THE_PACKAGE = {"Improvement", "Learned", "MotionPrediction", "Score", "Stored", "Uncertainty", "KMP"}
-OF_THE_KERNEL = {"check", "coordinates", "variances", "values", "blocks", "row", "jacobian", "curvature"}
+LEFT_OUT = {
+    ("product", "others"),
+    ("take", "index"),
+    ("__getitem__", "index"),
+    ("predict_motion", "covariance"),
+}
+MADE_BY_THE_PACKAGE = {
+    "Improvement",
+    "Learned",
+    "MotionPrediction",
+    "Score",
+    "Stored",
+    "Uncertainty",
+    "KMP",
+}
+OF_THE_KERNEL = {
+    "check",
+    "coordinates",
+    "variances",
+    "values",
+    "blocks",
+    "row",
+    "jacobian",
+    "curvature",
+}
 
 OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "direction", "offset"}
 WRONG_COLUMNS = {0, 1}  # places in the second list of `wrong_arrays`: one column more, and none
-OPTIONAL = {"lambda_covariance", "prior_mean", "directions", "angular_velocities", "velocity_covariance"}
+OPTIONAL = {
+    "lambda_covariance",
+    "prior_mean",
+    "directions",
+    "angular_velocities",
+    "velocity_covariance",
+}
 WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
 LONGEST = 450  # characters of a message
 NO_NUMBERS = [
-    *(None, "text", b"bytes", object(), object, {}, {"a": 1.0}, {1.0}, [["a"]], [[1.0], [1.0, 2.0]], 1j, [1j]),
-    *(lambda: 0.0, np.array("1"), np.array([None]), np.datetime64("2020-01-01"), [{}], 10**400, [[[]]], slice(2)),
+    *(
+        None,
+        "text",
+        b"bytes",
+        object(),
+        object,
+        {},
+        {"a": 1.0},
+        {1.0},
+        [["a"]],
+        [[1.0], [1.0, 2.0]],
+        1j,
+        [1j],
+    ),
+    *(
+        lambda: 0.0,
+        np.array("1"),
+        np.array([None]),
+        np.datetime64("2020-01-01"),
+        [{}],
+        10**400,
+        [[[]]],
+        slice(2),
+    ),
 ]
-NO_SCALARS = [*NO_NUMBERS, np.nan, np.inf, -np.inf, -1.0, [1.0], [], np.ones(2), np.ones((1, 1)), [True]]
+NO_SCALARS = [
+    *NO_NUMBERS,
+    np.nan,
+    np.inf,
+    -np.inf,
+    -1.0,
+    [1.0],
+    [],
+    np.ones(2),
+    np.ones((1, 1)),
+    [True],
+]
 NUMPYS = re.compile(
-    "broadcast|could not|ambiguous|inhomogeneous|ufunc|reshape|matmul|dimension mismatch|out of bounds|unpack|"
-    "core dimension|concatenat|index|iterable|has no attr|unsupported|convert|stack|Object arrays|not callable"
+    "broadcast|could not|ambiguous|inhomogeneous|ufunc|reshape|matmul|dimension mismatch|out of "
+    "bounds|unpack|core dimension|concatenat|index|iterable|has no "
+    "attr|unsupported|convert|stack|Object arrays|not callable"
 )
 
 ACCEPTED = re.compile(r"\b(needed|needs?|must|enough|[Gg]ive|[Dd]ivide|[Ff]it|takes?|[Ss]ave)\b")
@@ -203,9 +299,29 @@ def wrong_arrays(array):
     """What is no array of this shape, and what may be one that works."""
     spoilt = np.array(array, dtype=float)
     spoilt.flat[0] = np.inf
-    wrong = [*NO_NUMBERS, spoilt * 0, spoilt, -spoilt, array[None], array[..., None], 1.0, [], array * 1j]
-    wrong += [np.array(array, dtype=str), np.array(array, dtype=object), np.zeros((*array.shape, 0))]
-    other = [np.concatenate([array, array[..., :1]], axis=-1), array[..., :0], array[:0], array[:-1], array[0]]
+    wrong = [
+        *NO_NUMBERS,
+        spoilt * 0,
+        spoilt,
+        -spoilt,
+        array[None],
+        array[..., None],
+        1.0,
+        [],
+        array * 1j,
+    ]
+    wrong += [
+        np.array(array, dtype=str),
+        np.array(array, dtype=object),
+        np.zeros((*array.shape, 0)),
+    ]
+    other = [
+        np.concatenate([array, array[..., :1]], axis=-1),
+        array[..., :0],
+        array[:0],
+        array[:-1],
+        array[0],
+    ]
     huge = [
         1e308 * np.sign(array),
         1e160 * array,
@@ -227,7 +343,12 @@ def wrong_values(name, right):
     if name in WHOLE:
         return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
     if name == "tolerance":
-        return [value for value in NO_SCALARS if value is not None and value is not np.inf], [1e308, np.inf, 0, True]
+        return [value for value in NO_SCALARS if value is not None and value is not np.inf], [
+            1e308,
+            np.inf,
+            0,
+            True,
+        ]
     if isinstance(right, float):
         return [*NO_SCALARS, 0.0], [1e308, 1e200, 1e-308, True, np.array(1.0), 1e-160]
     if isinstance(right, np.ndarray):
@@ -237,7 +358,13 @@ def wrong_values(name, right):
         others = [R[:1], ZETA, ZETA[:1], [R], Gaussians.concatenated([R, R])]
         return [value for value in objects if not isinstance(value, Gaussians)], [*others, R[:0]]
     if name == "kernel":
-        return [*objects, GaussianKernel([1.0, 2.0, 3.0]), VelocityKernel(1.0), PeriodicKernel(1.0, 1.0), R], []
+        return [
+            *objects,
+            GaussianKernel([1.0, 2.0, 3.0]),
+            VelocityKernel(1.0),
+            PeriodicKernel(1.0, 1.0),
+            R,
+        ], []
     if name in {"path", "input_unit", "output_unit", "label"}:
         return [value for value in objects if not isinstance(value, (str, bytes))], []
     if name == "value":
@@ -246,7 +373,9 @@ def wrong_values(name, right):
         return [*objects, [("ell", 1.0)]], []
     if name == "reward":
         bad = (None, "text", np.nan, np.inf, 1j, S, [1.0, 2.0], object())
-        return [value for value in objects if not callable(value)] + [lambda path, one=value: one for value in bad], []
+        return [value for value in objects if not callable(value)] + [
+            lambda path, one=value: one for value in bad
+        ], []
     return [
         *objects,
         np.zeros((2, 6, 2)),
@@ -266,9 +395,13 @@ def calls():
     for function, right in RIGHT.items():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
-            must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame  # which names its matrix
+            must_fail = (
+                name in OF_KNOWN_COLUMNS and function is not CoordinateFrame
+            )  # which names its matrix
             for candidate in wrong:
-                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(candidate, float):
+                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(
+                    candidate, float
+                ):
                     continue  # one for all inputs
                 if function is regressor and name == "components" and candidate is None:
                     continue  # each sample is a point
@@ -336,7 +469,9 @@ def public():
             if name not in MADE_BY_THE_PACKAGE:
                 yield name, name, inspect.signature(member).parameters
             for part, value in inspect.getmembers(member, callable):
-                if not part.startswith("_") and not (name.endswith("Kernel") and part in OF_THE_KERNEL):
+                if not part.startswith("_") and not (
+                    name.endswith("Kernel") and part in OF_THE_KERNEL
+                ):
                     yield name, part, inspect.signature(value).parameters
     for name, member in inspect.getmembers(orientation, inspect.isfunction):
         if not name.startswith("_") and member.__module__ == orientation.__name__:
@@ -350,14 +485,19 @@ def test_every_public_argument_is_tested():
         (of, name, parameter)
         for of, name, parameters in public()
         for parameter in parameters
-        if parameter != "self" and not of.startswith(("Motion", "Stored")) and (name, parameter) not in tested | LEFT_OUT
+        if parameter != "self"
+        and not of.startswith(("Motion", "Stored"))
+        and (name, parameter) not in tested | LEFT_OUT
     ]
     assert lacking == []
 
 
-@pytest.mark.parametrize("primitive", [LOW, ONE.adapt(S[:1], R[:1], tolerance=0.1), IN_TIME], ids=str)
+@pytest.mark.parametrize(
+    "primitive", [LOW, ONE.adapt(S[:1], R[:1], tolerance=0.1), IN_TIME], ids=str
+)
 def test_every_array_that_is_spoilt_is_named(primitive):
-    arrays, faults = named_arrays.to_arrays(primitive), []
+    arrays = named_arrays.to_arrays(primitive)
+    faults = []
     for name, array in arrays.items():
         for value in [
             None,
@@ -370,7 +510,12 @@ def test_every_array_that_is_spoilt_is_named(primitive):
             array[None],
             array[None, None],
         ]:
-            may_work = np.ndim(array) == 0 and value is not None and np.size(value) == 1 and np.any(value == 1e200)
+            may_work = (
+                np.ndim(array) == 0
+                and value is not None
+                and np.size(value) == 1
+                and np.any(value == 1e200)
+            )
             loader = lambda **given: named_arrays.from_arrays(arrays | given)  # noqa: E731
             finding = fault(loader, name, {name: array}, value, not may_work)
             faults += [finding] if finding else []

@@ -37,7 +37,9 @@ def test_fine_motion_is_legal_if_tracked_well() -> None:
 @pytest.mark.parametrize("noise_m", [0.0, 0.0005])
 def test_opposite_ways_are_refused(noise_m: float) -> None:
     """Takes that go opposite ways are refused however good the tracker."""
-    figures = judged([fine(seed, noise_m, sign) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))])
+    figures = judged(
+        [fine(seed, noise_m, sign) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))]
+    )
     assert figures.ambiguous > 30
     assert any("contradict others" in text for text in figures.unsafe)
 
@@ -45,5 +47,7 @@ def test_opposite_ways_are_refused(noise_m: float) -> None:
 def test_turns_of_fine_motion() -> None:
     """Turns along with fine motion are accepted, alternating ones are not."""
     assert judged([fine(seed, 0.0005, turned=True) for seed in range(4)]).unsafe == ()
-    figures = judged([fine(seed, 0.0005, sign, turned=True) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))])
+    figures = judged(
+        [fine(seed, 0.0005, sign, turned=True) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))]
+    )
     assert any("contradicts itself" in text for text in figures.unsafe)

@@ -18,7 +18,8 @@ from thirdhand_sim.script import HandScript, Teacher
 def shown(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Hands (T, 6) and tool (T, 3) [m] of one run through the scene."""
     scene = Scene()
-    script, teacher = HandScript(scene, seed=seed), Teacher(scene, seed=seed)
+    script = HandScript(scene, seed=seed)
+    teacher = Teacher(scene, seed=seed)
     times = np.arange(0.0, scene.duration_s, 0.1)
     hands = np.array([np.concatenate([pose[:3] for pose in script.sample(t)]) for t in times])
     return hands, np.array([teacher.truth(t).position for t in times])
@@ -30,9 +31,12 @@ def choice() -> DirectSelection:
 
 
 @pytest.mark.parametrize("ridge_m", [None, RIDGE_M])
-def test_residuals_are_those_of_left_out_fits(choice: DirectSelection, ridge_m: float | None) -> None:
+def test_residuals_are_those_of_left_out_fits(
+    choice: DirectSelection, ridge_m: float | None
+) -> None:
     """The residuals left out are those of primitives and means fitted without."""
-    ell, noise = 4.0, 0.1
+    ell = 4.0
+    noise = 0.1
     for group in range(4):
         mine = choice.group == group
         inputs = choice.inputs[~mine]
@@ -41,7 +45,9 @@ def test_residuals_are_those_of_left_out_fits(choice: DirectSelection, ridge_m: 
         if ridge_m is not None:
             prior = ridge_mean(inputs, outputs, ridge_m, max_gain=MAX_GAIN)
         reference = Gaussians.of(outputs, deviation=1.0)
-        fitted = KMP.fit(inputs, reference, kernel=GaussianKernel(ell), lambda_mean=noise, prior_mean=prior)
+        fitted = KMP.fit(
+            inputs, reference, kernel=GaussianKernel(ell), lambda_mean=noise, prior_mean=prior
+        )
         expected = choice.outputs[mine] - fitted.mean(choice.inputs[mine])
         np.testing.assert_allclose(choice.residuals(ell, noise, ridge_m)[mine], expected, atol=1e-9)
 

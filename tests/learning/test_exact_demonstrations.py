@@ -15,7 +15,8 @@ from thirdhand.workbench.learning.learn import learn
 
 NOISE_M = 0.002  # of a usual tracker
 PLACES = tuple(
-    ViaPoint(name, (x, 0.2, 0.2), (x, -0.2, 0.2), (x, 0.0, 0.4)) for name, x in (("near", 0.4), ("far", 0.7))
+    ViaPoint(name, (x, 0.2, 0.2), (x, -0.2, 0.2), (x, 0.0, 0.4))
+    for name, x in (("near", 0.4), ("far", 0.7))
 )
 
 
@@ -23,7 +24,9 @@ def along_a_line(number: int) -> Demonstration:
     """Hands that go exactly from place to place, each time at another speed, and the tool along."""
     t = np.arange(0.0, 6.0, 0.02)
     share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
-    ways = (np.array(ends) for ends in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True))
+    ways = (
+        np.array(ends) for ends in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True)
+    )
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     poses = [np.hstack([begin + share * (end - begin), turn]) for begin, end in ways]
     return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, places=PLACES)
@@ -43,7 +46,10 @@ def test_gate_is_above_noise() -> None:
 
 def test_covariance_is_above_noise() -> None:
     """A covariance is never less than the tracker's noise."""
-    takes = [take._replace(tool=(take.left + take.right) / 2) for take in (circling(seed, noise_m=0.0) for seed in range(4))]
+    takes = [
+        take._replace(tool=(take.left + take.right) / 2)
+        for take in (circling(seed, noise_m=0.0) for seed in range(4))
+    ]
     figures = figures_of(learn(takes, points=80))
     assert figures.all.error_mm < 1.0 < figures.all.predicted_mm
     assert figures.gate_mm > 1.0

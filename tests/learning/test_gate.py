@@ -33,7 +33,10 @@ def unrelated(one: Demonstration) -> Demonstration:
         (0.7 + 0.2 * np.cos(6 * u), 0.3 + 0.2 * np.sin(4 * u), 0.4 + 0.1 * np.cos(3 * u)),
         (0.5 + 0.1 * np.sin(11 * u), 0.3 * np.cos(13 * u), 0.4 + 0.1 * np.sin(5 * u)),
     )
-    parts = [np.hstack([np.stack(path, axis=1), pose[:, 3:]]) for path, pose in zip(ways, one[1:4], strict=True)]
+    parts = [
+        np.hstack([np.stack(path, axis=1), pose[:, 3:]])
+        for path, pose in zip(ways, one[1:4], strict=True)
+    ]
     return one._replace(left=parts[0], right=parts[1], tool=parts[2])
 
 

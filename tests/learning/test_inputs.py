@@ -24,8 +24,12 @@ NOISE_M = 0.001
 
 def smooth(random: np.random.Generator, size: float, count: int = 3) -> np.ndarray:
     """Slow ways (T, count)."""
-    rates, phases = random.uniform(0.5, 1.2, (2, count)), random.uniform(0.0, 6.0, (2, count))
-    return size * sum(np.sin(np.multiply.outer(TIMES, rate) + phase) for rate, phase in zip(rates, phases, strict=True))
+    rates = random.uniform(0.5, 1.2, (2, count))
+    phases = random.uniform(0.0, 6.0, (2, count))
+    return size * sum(
+        np.sin(np.multiply.outer(TIMES, rate) + phase)
+        for rate, phase in zip(rates, phases, strict=True)
+    )
 
 
 def shown(seed: int, kind: str, person: str = "") -> Demonstration:
@@ -34,12 +38,15 @@ def shown(seed: int, kind: str, person: str = "") -> Demonstration:
     """
     random = np.random.default_rng(seed)
     left, right = (np.array([0.6, y, 0.3]) + smooth(random, 0.08) for y in (-0.2, 0.2))
-    turned = Rotation.from_euler("ZYX", smooth(random, 0.4 if kind == "carried" else 0.0) * [1.0, 0.3, 0.3])
+    turned = Rotation.from_euler(
+        "ZYX", smooth(random, 0.4 if kind == "carried" else 0.0) * [1.0, 0.3, 0.3]
+    )
     ways = {
         "both": 0.5 * (left + right) + np.array([0.0, 0.0, 0.2]),
         "left": left + np.array([0.0, 0.1, 0.2]),
         "carried": left + turned.apply(CARRIED),
-        "clock": np.array([0.5, 0.0, 0.4]) + 0.2 * np.sin(np.multiply.outer(TIMES, [0.7, 0.9, 1.1])),
+        "clock": np.array([0.5, 0.0, 0.4])
+        + 0.2 * np.sin(np.multiply.outer(TIMES, [0.7, 0.9, 1.1])),
     }
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(TIMES), 1))
     turns = (turned.as_quat(), still, still)
@@ -77,7 +84,10 @@ def test_one_hand_where_it_tells_as_much() -> None:
     figures = figures_of(skill)
     assert skill.conductor == 0
     assert figures.taken == "positions of the left hand"
-    assert any("the left hand alone" in warning and "may be absent" in warning for warning in figures.warnings)
+    assert any(
+        "the left hand alone" in warning and "may be absent" in warning
+        for warning in figures.warnings
+    )
     hands = shown(9, "left").hands[40].reshape(2, 3)
     away = np.stack([hands[0], [3.0, 3.0, 3.0]])
     np.testing.assert_array_equal(at_rest(skill, hands).position, at_rest(skill, away).position)
@@ -91,8 +101,14 @@ def test_turned_hand_predicts_fixed_tool(carried: StoredSkill) -> None:
     assert carried.model.turned
     takes = [left_out("", "", shown(seed, "carried")) for seed in range(20, 23)]
     by_turns, by_places = (
-        np.sqrt(sum(judged(take, predicted(skill, take)).squares for take in takes) / sum(len(t.tool) for t in takes))
-        for skill in (carried, learn([shown(seed, "carried") for seed in range(6)], points=120, ell=8.0))
+        np.sqrt(
+            sum(judged(take, predicted(skill, take)).squares for take in takes)
+            / sum(len(t.tool) for t in takes)
+        )
+        for skill in (
+            carried,
+            learn([shown(seed, "carried") for seed in range(6)], points=120, ell=8.0),
+        )
     )
     assert by_turns < 0.02
     assert by_turns < 0.5 * by_places
@@ -105,7 +121,8 @@ def test_persons_are_left_out_together() -> None:
     assert persons([take._replace(person="Ada") for take in takes]) == [0, 1, 2, 3]
     assert persons([takes[0], takes[2], takes[0]._replace(person="")]) == [0, 1, 2]
     by_person, alone = (
-        figures_of(learn(variant, points=120)) for variant in (takes, [take._replace(person="") for take in takes])
+        figures_of(learn(variant, points=120))
+        for variant in (takes, [take._replace(person="") for take in takes])
     )
     assert table(by_person).startswith("held out by person")
     assert not table(alone).startswith("held out by")

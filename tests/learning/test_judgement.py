@@ -45,10 +45,18 @@ def test_good_demonstrations_are_safe(good: list[Demonstration]) -> None:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda d: [*d[:2], *(with_tool(take, take.tool[:, :3] * (1, -1, 1)) for take in d[:2])], "contradict others"),
+        (
+            lambda d: [*d[:2], *(with_tool(take, take.tool[:, :3] * (1, -1, 1)) for take in d[:2])],
+            "contradict others",
+        ),
         (lambda d: [with_tool(take, 3 * take.tool[:, :3]) for take in d], "out of the arm's reach"),
         (lambda d: [*d[:3], d[3]._replace(frame="camera")], "different frames: 'base', 'camera'"),
-        (lambda d: [take._replace(tool=np.roll(take.tool, 80 * i, axis=0)) for i, take in enumerate(d)], "too little of"),
+        (
+            lambda d: [
+                take._replace(tool=np.roll(take.tool, 80 * i, axis=0)) for i, take in enumerate(d)
+            ],
+            "too little of",
+        ),
     ],
     ids=["same hands, other tool", "not in metres", "frames", "all out of step"],
 )
@@ -61,9 +69,15 @@ def test_what_would_be_unsafe_is_said(good: list[Demonstration], spoil: object, 
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda d: [d[0], d[0], *d[1:]], "demonstration 2 repeats demonstration 1, and is left out"),
+        (
+            lambda d: [d[0], d[0], *d[1:]],
+            "demonstration 2 repeats demonstration 1, and is left out",
+        ),
         (lambda d: [d[0], d[0].every(2), *d[1:]], "demonstration 2 repeats demonstration 1"),
-        (lambda d: [take._replace(frame="camera") for take in d], "in frame 'camera': it is taken to be 'base'"),
+        (
+            lambda d: [take._replace(frame="camera") for take in d],
+            "in frame 'camera': it is taken to be 'base'",
+        ),
         (lambda d: d[:2], "5 or more advised"),
     ],
     ids=["repeated", "repeated at another rate", "another frame", "two"],
@@ -75,7 +89,9 @@ def test_what_is_doubtful_is_warned_of(good: list[Demonstration], spoil: object,
 
 
 def test_a_demonstration_given_twice_is_one(good: list[Demonstration]) -> None:
-    with pytest.raises(SkillError, match=r"1 demonstration given.*; take-2 repeats take-1, and is left out$"):
+    with pytest.raises(
+        SkillError, match=r"1 demonstration given.*; take-2 repeats take-1, and is left out$"
+    ):
         learn([good[0], good[0]], names=["take-1", "take-2"])
 
 

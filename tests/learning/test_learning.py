@@ -27,7 +27,10 @@ def test_gate_passes_demonstrations_only(aimed: Skill, taught: list[Demonstratio
     """The gate lets demonstrations through and nothing far from them."""
     for take in taught:
         assert deviations(aimed, take.hands[::20]).max() <= aimed.threshold
-        assert deviations(aimed, take.hands[::20] + np.array([0.0, 0.0, 0.5] * 2)).min() > aimed.threshold
+        assert (
+            deviations(aimed, take.hands[::20] + np.array([0.0, 0.0, 0.5] * 2)).min()
+            > aimed.threshold
+        )
 
 
 def test_mean_orientation_ignores_signs() -> None:
@@ -57,17 +60,22 @@ def test_unusable_demonstrations_are_refused(taught: list[Demonstration]) -> Non
         with pytest.raises(SkillError, match=message):
             learn(wrong)
     still = [take._replace(tool=np.tile(pose, (len(take.tool), 1))) for pose in take.tool[[0, -1]]]
-    with pytest.raises(SkillError, match=r"^demonstrations in which hands or tool move by less than 10 mm"):
+    with pytest.raises(
+        SkillError, match=r"^demonstrations in which hands or tool move by less than 10 mm"
+    ):
         learn(still)
     with pytest.raises(SkillError, match=r"^take-2: .*not finite"):
-        learn([take, take._replace(tool=np.full_like(take.tool, np.nan))], names=["take-1", "take-2"])
+        learn(
+            [take, take._replace(tool=np.full_like(take.tool, np.nan))], names=["take-1", "take-2"]
+        )
 
 
 def test_resting_take_is_learned_with_others(taught: list[Demonstration]) -> None:
     """A take in which the hands rest is learned from with others."""
     resting = taught[3].every(8)
     resting = resting._replace(
-        left=np.tile(resting.left[0], (len(resting.left), 1)), right=np.tile(resting.right[0], (len(resting.left), 1))
+        left=np.tile(resting.left[0], (len(resting.left), 1)),
+        right=np.tile(resting.right[0], (len(resting.left), 1)),
     )
     skill = learn([*(take.every(4) for take in taught[:2]), resting], points=60)
     assert len(figures_of(skill).demonstrations) == 3

@@ -24,7 +24,12 @@ APART_M = 0.15  # the takes, from each other: a constant mean holds the tool bac
 @pytest.fixture(scope="module")
 def evidence() -> Evidence:
     results: list[Evidence] = []
-    learn([circling(seed, apart_m=APART_M) for seed in range(5)], points=120, ell=0.5, show=results.append)
+    learn(
+        [circling(seed, apart_m=APART_M) for seed in range(5)],
+        points=120,
+        ell=0.5,
+        show=results.append,
+    )
     return results[0]
 
 
@@ -50,22 +55,30 @@ def test_linear_mean_predicts_better(evidence: Evidence, choice: DirectSelection
     """
     assert mean_of(evidence.skill).matrix.shape == (3, 6)
     error = rms(np.concatenate([fold.errors for fold in evidence.held_out]))
-    constant, residuals = choice.parameters(), choice.residuals(0.5, 0.001)
+    constant = choice.parameters()
+    residuals = choice.residuals(0.5, 0.001)
     over_constant = [
         fold.take.position - choice.primitive(constant, residuals, without=h).mean(fold.take.hands)
         for h, fold in enumerate(evidence.held_out)
     ]
     assert error < 0.010
     assert error < 0.6 * rms(np.concatenate(over_constant))
-    assert error < 0.75 * rms(np.concatenate(held_out_errors([fold.take for fold in evidence.held_out], linear)))
+    assert error < 0.75 * rms(
+        np.concatenate(held_out_errors([fold.take for fold in evidence.held_out], linear))
+    )
 
 
 def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Evidence) -> None:
     """Gate holds where the mean extrapolates."""
     hands = np.concatenate([fold.take.hands[::20] for fold in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
-        assert (skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0])) > skill.threshold).all()
-        assert (skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold).all()
+        assert (
+            skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 1.0, 0, 0]))
+            > skill.threshold
+        ).all()
+        assert (
+            skill.model.gates_m(hands + beside_m * np.array([1.0, 0, 0, 0, 0, 0])) > skill.threshold
+        ).all()
 
 
 def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
@@ -73,10 +86,14 @@ def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
     assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
     random = np.random.default_rng(0)
     hands = random.normal(scale=0.1, size=(200, 6))
-    steep = ridge_mean(hands, hands @ random.normal(scale=20.0, size=(6, 3)), RIDGE_M, max_gain=MAX_GAIN)
+    steep = ridge_mean(
+        hands, hands @ random.normal(scale=20.0, size=(6, 3)), RIDGE_M, max_gain=MAX_GAIN
+    )
     assert np.linalg.norm(steep.matrix, 2) == pytest.approx(MAX_GAIN)
     still = hands * [1, 1, 1, 0.01, 0.01, 0.01]
-    trembling = ridge_mean(still, hands[:, :3] + 3 * hands[:, 3:] * 0.01, RIDGE_M, max_gain=MAX_GAIN)
+    trembling = ridge_mean(
+        still, hands[:, :3] + 3 * hands[:, 3:] * 0.01, RIDGE_M, max_gain=MAX_GAIN
+    )
     assert np.abs(trembling.matrix[:, 3:]).max() < 0.2  # a hand that moved by 1 mm tells nothing
 
 
@@ -85,18 +102,22 @@ def test_file_serves_what_was_learned(skill: StoredSkill) -> None:
     restored = decoded(skill.file, origin="a file")
     hands = skill.hands[::10] + 0.01
     np.testing.assert_array_equal(restored.mean(hands), skill.mean(hands))
-    step, velocity = 1e-4, np.random.default_rng(0).normal(size=(2, 3))
+    step = 1e-4
+    velocity = np.random.default_rng(0).normal(size=(2, 3))
     for positions in hands:
         prediction = restored.predict(positions.reshape(2, 3), velocity, np.zeros((2, 3)))
         np.testing.assert_allclose(prediction.position, skill.mean(positions[None])[0], atol=2e-6)
-        ahead, behind = skill.mean(np.stack([positions + step * velocity.ravel(), positions - step * velocity.ravel()]))
+        ahead, behind = skill.mean(
+            np.stack([positions + step * velocity.ravel(), positions - step * velocity.ravel()])
+        )
         np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * step), atol=1e-4)
 
 
 def test_a_task_between_places_has_none() -> None:
     shipped = decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="shipped")
     primitive = shipped.model.primitive
-    width, outputs = primitive.inputs.shape[1], primitive.outputs
+    width = primitive.inputs.shape[1]
+    outputs = primitive.outputs
     sloped = KMP.fit(
         primitive.inputs,
         primitive.reference,

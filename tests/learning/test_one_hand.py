@@ -60,7 +60,10 @@ def test_take_of_one_hand_through_a_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(got.hands, led(0).hands)
         np.testing.assert_array_equal(got.tool, led(0).tool)
         assert f"the {side} hand leads alone" in lines[0]
-        assert [stream.name for stream in summary(tmp_path / f"{side}.mcap").streams] == [side, "tool"]
+        assert [stream.name for stream in summary(tmp_path / f"{side}.mcap").streams] == [
+            side,
+            "tool",
+        ]
 
 
 def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
@@ -78,9 +81,16 @@ def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
         hands = conducting(skill, AT, other)
         moving = np.stack([[0.1, 0.0, 0.0], [3.0, 3.0, 3.0]])[:: 1 if skill.conductor == 0 else -1]
         found_there = restored.predict(hands.reshape(2, 3), moving, STILL)
-        predictions.append(np.concatenate([*found_there[:3], found_there.covariance.ravel(), restored.mean(hands[None])[0]]))
+        predictions.append(
+            np.concatenate(
+                [*found_there[:3], found_there.covariance.ravel(), restored.mean(hands[None])[0]]
+            )
+        )
     np.testing.assert_array_equal(predictions, [predictions[0]] * 3)
-    assert np.linalg.norm(predictions[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25])) < 0.02
+    assert (
+        np.linalg.norm(predictions[0][:3] - (np.array(AT) * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25]))
+        < 0.02
+    )
     prediction = at_rest(restored, conducting(skill, (1.1, 0.2, 0.3), AT))
     assert prediction.gate_m > skill.threshold
 
@@ -116,8 +126,11 @@ def streams_of_one(side: str, take: Demonstration) -> Streams:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
     """It has no topic, no sample, or is never seen; and the other hand is given as both."""
-    take, other = circling(0), "right" if side == "left" else "left"
-    path, lines, whole = tmp_path / "a.mcap", list[str](), streams_of(take)
+    take = circling(0)
+    other = "right" if side == "left" else "left"
+    path = tmp_path / "a.mcap"
+    lines = list[str]()
+    whole = streams_of(take)
     never = whole[other]._replace(poses=np.full_like(whole[other].poses, np.nan))
     for streams in (streams_of_one(side, take), whole | {other: never}):
         got = read_demonstration(write_streams(path, streams), say=lines.append)
@@ -131,7 +144,11 @@ def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
     ):
         assert read_demonstration(path, topics=topics).conducts == side
     skill = learn(
-        [read_demonstration(write_streams(path, streams_of_one(side, circling(i)))) for i in range(3)], points=60
+        [
+            read_demonstration(write_streams(path, streams_of_one(side, circling(i))))
+            for i in range(3)
+        ],
+        points=60,
     )
     assert skill.conductor == ("left", "right").index(side)
 
@@ -141,12 +158,20 @@ def test_one_stream_for_both_hands_is_refused(tmp_path: Path) -> None:
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
     topics = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
-    with pytest.raises(RecordingError, match=r"cell/tool/pose is given as left and as right; another topic needed"):
+    with pytest.raises(
+        RecordingError, match=r"cell/tool/pose is given as left and as right; another topic needed"
+    ):
         read_demonstration(path, topics=topics)
 
 
 def served(
-    skill: StoredSkill, other_from: int, other_to: int, one_to: int = 10_000, *, count: int = 1200, at: Point = FAR
+    skill: StoredSkill,
+    other_from: int,
+    other_to: int,
+    one_to: int = 10_000,
+    *,
+    count: int = 1200,
+    at: Point = FAR,
 ) -> Records:
     """The frame of each tick, the other hand seen for some, the one until another."""
     side, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
@@ -158,7 +183,9 @@ def served(
     return followed(skill, ticks)
 
 
-def modes(skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200) -> list[tuple[int, int]]:
+def modes(
+    skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200
+) -> list[tuple[int, int]]:
     """Mode and reason of each tick of `served`."""
     records = served(skill, *hands, one_to, count=count)
     return list(zip(records["mode"].tolist(), records["reason"].tolist(), strict=True))

@@ -33,8 +33,12 @@ def test_order_of_files_makes_no_difference(named: bool) -> None:
 
 def test_sitting_is_held_out_together() -> None:
     """Takes of a sitting are held out together."""
-    base, hour_ns = shown()[0], 3600 * 10**9
-    later = [base._replace(stamps_ns=base.stamps_ns + (n // 2) * hour_ns + n % 2 * 60 * 10**9) for n in range(8)]
+    base = shown()[0]
+    hour_ns = 3600 * 10**9
+    later = [
+        base._replace(stamps_ns=base.stamps_ns + (n // 2) * hour_ns + n % 2 * 60 * 10**9)
+        for n in range(8)
+    ]
     assert persons(later) == [0, 0, 1, 1, 2, 2, 3, 3]
     assert persons(later[:4]) == [0, 1, 2, 3]  # two sittings are too few
 

@@ -12,7 +12,9 @@ from support.paths import ROOT
 
 WHOLE_MB = 400  # limit of the process's largest resident memory
 LEARNING_MB = 260  # limit of what learning adds to that of its imports
-TAKES, SAMPLES = 72, 150  # 150 samples last 3 s
+# 150 samples last 3 s
+TAKES = 72
+SAMPLES = 150
 CODE = f"""
 from thirdhand.process import one_blas_thread
 import re

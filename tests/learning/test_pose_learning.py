@@ -37,7 +37,10 @@ def turning(one: Demonstration, whole: Vector) -> Demonstration:
 @pytest.fixture(scope="module")
 def shown() -> list[Demonstration]:
     """Three demonstrations that turn the tool and tell of the gripper."""
-    return [turning(take.every(2), TURN) for take in demonstrations(SCENE, count=3, seed=1, gripper=True)]
+    return [
+        turning(take.every(2), TURN)
+        for take in demonstrations(SCENE, count=3, seed=1, gripper=True)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +51,11 @@ def posed(shown: list[Demonstration]) -> Skill:
 def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]) -> float:
     """Between what is predicted for hands (6,) at rest, and an orientation."""
     prediction = at_rest(skill, hands).turn.orientation
-    return float(np.degrees((Rotation.from_quat(prediction) * Rotation.from_quat(orientation).inv()).magnitude()))
+    return float(
+        np.degrees(
+            (Rotation.from_quat(prediction) * Rotation.from_quat(orientation).inv()).magnitude()
+        )
+    )
 
 
 def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
@@ -58,8 +65,12 @@ def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]
     assert figures.orientation_error_deg < 5
     for row in (0, -1):
         take = shown[0]
-        assert angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15  # smoothed, not averaged: that would be 60
-    assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(np.radians(120))
+        assert (
+            angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15
+        )  # smoothed, not averaged: that would be 60
+    assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(
+        np.radians(120)
+    )
 
 
 def test_pose_comes_back_from_file(posed: Skill) -> None:
@@ -86,15 +97,26 @@ def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) ->
         assert at_rest(taught, hands).closure < 0.1
         assert decoded(taught.file, origin="x").digest == taught.digest
         cleared = adapted(taught, (), tolerance=0.05)
-        assert (cleared.turn is None, cleared.gripper is None) == (base.turn is None, base.gripper is None)
+        assert (cleared.turn is None, cleared.gripper is None) == (
+            base.turn is None,
+            base.gripper is None,
+        )
 
 
 def test_contradicting_via_points_are_refused(skill: Skill) -> None:
     """Places that contradict each other are refused."""
     x, y, z, w = TOOL_ORIENTATION
-    near = ViaPoint("near", PLACES[2].left, PLACES[2].right, PLACES[2].tool, std=0.01, orientation=(y, x, w, z))
-    with pytest.raises(SkillError, match=r"'soldering' and 'near' contradict each other: .* turned by 1\d\d°"):
-        adapted(skill, (msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w)), near), tolerance=0.05)
+    near = ViaPoint(
+        "near", PLACES[2].left, PLACES[2].right, PLACES[2].tool, std=0.01, orientation=(y, x, w, z)
+    )
+    with pytest.raises(
+        SkillError, match=r"'soldering' and 'near' contradict each other: .* turned by 1\d\d°"
+    ):
+        adapted(
+            skill,
+            (msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w)), near),
+            tolerance=0.05,
+        )
     near = msgspec.structs.replace(near, orientation=None, gripper="open")
     with pytest.raises(SkillError, match="gripper open at one and closed"):
         adapted(skill, (msgspec.structs.replace(PLACES[2], gripper="closed"), near), tolerance=0.05)
@@ -123,13 +145,25 @@ def test_wrongly_learned_turns_are_unsafe() -> None:
 
 def spinning(seed: int, turn_deg: float) -> Demonstration:
     """A take in which the tool turns as the hands go, some degrees otherwise in each."""
-    random, t = np.random.default_rng(seed), np.arange(0.0, 8.0, 0.04)
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, 8.0, 0.04)
     progress = 0.5 - 0.5 * np.cos(np.pi * t / 8)
-    ones, unturned = np.ones_like(t), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    left = np.stack([0.4 + 0.5 * progress, 0.3 * ones, 0.3 + 0.05 * np.sin(3 * progress)], axis=1) + 0.01 * random.normal(size=3)
-    right = np.stack([0.5 + 0.4 * progress, -0.3 * ones, 0.3 * ones], axis=1) + 0.01 * random.normal(size=3)
-    turn = Rotation.from_rotvec(np.radians(turn_deg * progress + 2 * random.normal())[:, None] * [0.0, 0.0, 1.0]).as_quat()
+    ones = np.ones_like(t)
+    unturned = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    left = np.stack(
+        [0.4 + 0.5 * progress, 0.3 * ones, 0.3 + 0.05 * np.sin(3 * progress)], axis=1
+    ) + 0.01 * random.normal(size=3)
+    right = np.stack(
+        [0.5 + 0.4 * progress, -0.3 * ones, 0.3 * ones], axis=1
+    ) + 0.01 * random.normal(size=3)
+    turn = Rotation.from_rotvec(
+        np.radians(turn_deg * progress + 2 * random.normal())[:, None] * [0.0, 0.0, 1.0]
+    ).as_quat()
     tool = 0.5 * (left + right) + [0.0, 0.0, 0.2]
-    positions = [position + 1e-3 * random.normal(size=position.shape) for position in (left, right, tool)]
+    positions = [
+        position + 1e-3 * random.normal(size=position.shape) for position in (left, right, tool)
+    ]
     turns = (unturned, unturned, turn * random.choice([-1.0, 1.0]))
-    return Demonstration(np.round(1e9 * t).astype(np.int64), *map(np.hstack, zip(positions, turns, strict=True)))
+    return Demonstration(
+        np.round(1e9 * t).astype(np.int64), *map(np.hstack, zip(positions, turns, strict=True))
+    )

@@ -28,8 +28,10 @@ def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
 def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
     """No reachable place counts as out of reach, also at the joints' limits."""
     cell = cell_with(arm, WIDE, tmp_path)
-    lower, upper = np.array(cell.joints.lower), np.array(cell.joints.upper)
-    random, forward = np.random.default_rng(7), Arm(cell, robot_description(cell))
+    lower = np.array(cell.joints.lower)
+    upper = np.array(cell.joints.upper)
+    random = np.random.default_rng(7)
+    forward = Arm(cell, robot_description(cell))
     shares = random.uniform(size=(1500, len(lower)))
     shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)  # half of the joints at a limit
     places = np.array([forward.at(q).position for q in lower + shares * (upper - lower)])
@@ -42,14 +44,18 @@ def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
 def test_unreachable_place_has_its_distance(arm: str, tmp_path: Path) -> None:
     """A place that no posture reaches is out of reach by its distance."""
     cell = cell_with(arm, WIDE, tmp_path)
-    shoulder, length = np.array(cell_of(arm).reach.centre), 1.0  # no shipped arm is longer
+    # no shipped arm is longer
+    shoulder = np.array(cell_of(arm).reach.centre)
+    length = 1.0
     random = np.random.default_rng(3)
     for _ in range(20):
         outward = random.normal(size=3)
         outward /= np.linalg.norm(outward)
         away_m = random.uniform(0.3, 0.8)
         (distance_m,) = beyond_m(cell, (shoulder + (length + away_m) * outward)[None])
-        assert away_m - 0.1 < distance_m < away_m + 0.5  # an arm reaches less far in some directions
+        assert (
+            away_m - 0.1 < distance_m < away_m + 0.5
+        )  # an arm reaches less far in some directions
 
 
 def test_distance_from_reach_is_exact() -> None:
@@ -62,7 +68,9 @@ def test_distance_from_reach_is_exact() -> None:
         0.03: np.array([0.6, 0.0, reach.min_z - 0.03]),
         0.0: np.array([0.6, 0.1, 0.3]),
     }
-    assert beyond_m(Settings(), np.array(list(cases.values()))) == pytest.approx(list(cases), abs=1e-9)
+    assert beyond_m(Settings(), np.array(list(cases.values()))) == pytest.approx(
+        list(cases), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,6 +94,9 @@ def test_skill_out_of_reach_is_refused(
     number = sum(distance > 0.0 for distance in distances)
     assert bool(finding.text) is bool(number)
     if number:
-        assert f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach" in finding.text
+        assert (
+            f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach"
+            in finding.text
+        )
         assert f"the farthest by {max(distances):.3f} m" in finding.text
         assert ("Learn a skill" in finding.text) is is_refused

@@ -47,12 +47,24 @@ def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
     figures = figures_of(refined)
     assert [row.name for row in figures.demonstrations] == ["a", "b", "c"]
     assert list(figures.weights_mm) == ["1", "4", "16", "64", "yours alone"]
-    assert figures.weights_mm[figures.weight] == min(figures.weights_mm.values()) < figures.weights_mm["1"]
+    assert (
+        figures.weights_mm[figures.weight]
+        == min(figures.weights_mm.values())
+        < figures.weights_mm["1"]
+    )
     assert f"{figures.weight} is taken:" in table(figures)
     assert missed_mm(refined, mine[3]) < 0.5 * missed_mm(others, mine[3])
     # The file suffices for the next one; takes of unnamed persons are then those of others.
     stored = stored_demonstrations(decoded(refined.file, origin="mine.npz"))
-    assert sorted(entry.name for entry in stored) == ["a", "b", "c", "take-0", "take-1", "take-2", "take-3"]
+    assert sorted(entry.name for entry in stored) == [
+        "a",
+        "b",
+        "c",
+        "take-0",
+        "take-1",
+        "take-2",
+        "take-3",
+    ]
 
 
 @pytest.mark.thorough
@@ -69,7 +81,8 @@ def test_earlier_takes_of_a_person_count() -> None:
     assert figures.weights_mm[figures.weight] < figures.weights_mm["1"]
     assert figures.delay_s is not None
     with pytest.raises(
-        SkillError, match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the"
+        SkillError,
+        match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the",
     ):
         learn([take._replace(places=()) for take in mine[:2]], refined=skill)
 
@@ -84,9 +97,17 @@ def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
             learn(mine, refined=replace(others, demonstrations=spoilt))
     with pytest.raises(SkillError, match=r"neither a number of components nor ell"):
         learn(mine, refined=others, ell=4.0)
-    with pytest.raises(SkillError, match=r"1 demonstration given .*again repeats take-0, and is left out"):
-        learn([mine[0], stored_demonstrations(others)[0].demonstration], names=["mine", "again"], refined=others)
-    with pytest.raises(SkillError, match="all demonstrations repeat those of the skill that is refined"):
+    with pytest.raises(
+        SkillError, match=r"1 demonstration given .*again repeats take-0, and is left out"
+    ):
+        learn(
+            [mine[0], stored_demonstrations(others)[0].demonstration],
+            names=["mine", "again"],
+            refined=others,
+        )
+    with pytest.raises(
+        SkillError, match="all demonstrations repeat those of the skill that is refined"
+    ):
         learn([entry.demonstration for entry in stored_demonstrations(others)], refined=others)
 
 
@@ -94,7 +115,9 @@ def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
     take = made("three", [0], each=1)[0]
     closure = np.linspace(0.0, 1.0, len(take.stamps_ns))
     take = take._replace(person="Ada", gripper=closure, begins=(200,), conducts="left")
-    entry, other = (NamedDemonstration(name, part) for name, part in (("a", take), ("b", take.every(2))))
+    entry, other = (
+        NamedDemonstration(name, part) for name, part in (("a", take), ("b", take.every(2)))
+    )
     first, second = stored_demonstrations(replace(others, demonstrations=packed([entry, other])))
     step = max(1, int(1.0 / (KEPT_HZ * take.period_s) + 1e-6))
     expected = take.every(step)
@@ -103,5 +126,7 @@ def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
         assert getattr(first.demonstration, name) == getattr(expected, name), name
     assert np.array_equal(first.demonstration.stamps_ns, expected.stamps_ns)
     for name in ("left", "right", "tool", "gripper"):
-        np.testing.assert_allclose(getattr(first.demonstration, name), getattr(expected, name), atol=1e-6)
+        np.testing.assert_allclose(
+            getattr(first.demonstration, name), getattr(expected, name), atol=1e-6
+        )
     assert first.demonstration.period_s >= 1.0 / KEPT_HZ - 1e-6

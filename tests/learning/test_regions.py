@@ -26,7 +26,8 @@ def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) 
     """A demonstration by someone who errs as no normal says: by three times the covariance, with
     heavy tails, and early or late.
     """
-    count, person = 150, np.exp(0.3 * rng.normal())
+    count = 150
+    person = np.exp(0.3 * rng.normal())
     covariance = np.tile(np.diag([4e-4, 1e-4, 2e-4]), (count, 1, 1))
     velocity = np.clip(rng.normal(size=(count, 3)), -1, 1) * (rng.random(count) < 0.5)[:, None]
     tails = rng.standard_t(4, size=(count, 3)) * np.sqrt(np.diagonal(covariance[0]))
@@ -47,7 +48,9 @@ def test_regions_hold_on_other_people(count: int) -> None:
     assert shares[0.95] == pytest.approx(0.95, abs=0.02)
     assert shares[0.99] > 0.97
     assert regions.radii[LEVELS.index(0.95)] == pytest.approx(REGION_95)
-    assert regions.std_s == pytest.approx(0.07, abs=0.05), "in units of a covariance that is too small"
+    assert regions.std_s == pytest.approx(0.07, abs=0.05), (
+        "in units of a covariance that is too small"
+    )
 
 
 def places(rng: np.random.Generator) -> TimedErrors:
@@ -56,7 +59,9 @@ def places(rng: np.random.Generator) -> TimedErrors:
     """
     std = np.where(rng.random(150) < 0.1, 0.1, 0.01)
     covariance = std[:, None, None] ** 2 * np.eye(3)
-    return TimedErrors(std[:, None] * rng.normal(size=(150, 3)), 0.3 * covariance, np.zeros((150, 3)))
+    return TimedErrors(
+        std[:, None] * rng.normal(size=(150, 3)), 0.3 * covariance, np.zeros((150, 3))
+    )
 
 
 def test_unsure_where_wrong() -> None:
@@ -79,7 +84,8 @@ def test_own_region_has_no_part_in_judgement() -> None:
     spoilt = [*usual[:4], apart(rng, times=30.0), *usual[5:]]
     assert [len(block) for block in blocks_of(np.arange(12))] == [2] * BLOCKS
     together = np.arange(len(usual))
-    before, after = calibrated_without(usual, together), calibrated_without(spoilt, together)
+    before = calibrated_without(usual, together)
+    after = calibrated_without(spoilt, together)
     assert before[4][1] == after[4][1] == after[5][1]
     assert before[0][1] != after[0][1]
     assert after[4][0].inside(after[4][1])[LEVELS.index(0.95)] < 0.5
@@ -87,20 +93,28 @@ def test_own_region_has_no_part_in_judgement() -> None:
 
 def test_covariance_is_scaled_along_motion() -> None:
     """A tool's covariance is scaled along its motion and reaches as far as its longest axis."""
-    rng, out = np.random.default_rng(3), np.empty((3, 3))
+    rng = np.random.default_rng(3)
+    out = np.empty((3, 3))
     for _ in range(50):
-        root, velocity = 0.05 * rng.normal(size=(3, 3)), rng.normal(size=3)
+        root = 0.05 * rng.normal(size=(3, 3))
+        velocity = rng.normal(size=3)
         expected = 2.5 * (root @ root.T + 0.3**2 * np.outer(velocity, velocity))
         reach_m = calibrate(root @ root.T, velocity, 2.5, 0.3, out)
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-10)
-        assert reach_m == pytest.approx(np.sqrt(REGION_95 * np.linalg.eigvalsh(expected)[-1]), rel=1e-6)
-    assert calibrate(1e-4 * np.eye(3), np.zeros(3), 1.0, 0.0, out) == pytest.approx(0.01 * np.sqrt(REGION_95))
+        assert reach_m == pytest.approx(
+            np.sqrt(REGION_95 * np.linalg.eigvalsh(expected)[-1]), rel=1e-6
+        )
+    assert calibrate(1e-4 * np.eye(3), np.zeros(3), 1.0, 0.0, out) == pytest.approx(
+        0.01 * np.sqrt(REGION_95)
+    )
 
 
 def test_unsure_flag_does_not_flicker() -> None:
     """The flag for uncertainty is raised where the region is too large, and does not flicker."""
-    settings, skill = Settings(), shipped_skill()
-    state, frame = start_state(settings, skill), blank(frame_layout(len(settings.joints.names)))
+    settings = Settings()
+    skill = shipped_skill()
+    state = start_state(settings, skill)
+    frame = blank(frame_layout(len(settings.joints.names)))
     state["hands"][:, 0] = skill.hands[0].reshape(2, 3)
 
     def told(times: float) -> bool:
@@ -108,11 +122,21 @@ def test_unsure_flag_does_not_flicker() -> None:
         state["covariance"] = np.eye(3) * (times * UNSURE_M) ** 2 / REGION_95
         segment = SkillStage(settings, replace(skill, regions=Regions(1.0)))
         segment.step(state, frame)
-        assert np.sqrt(REGION_95 * np.linalg.eigvalsh(frame["covariance"])[-1]) == pytest.approx(times * UNSURE_M)
+        assert np.sqrt(REGION_95 * np.linalg.eigvalsh(frame["covariance"])[-1]) == pytest.approx(
+            times * UNSURE_M
+        )
         return bool(state["unsure"])
 
-    state["tick"], state["hand_ticks"] = 5, 3
-    assert [told(times) for times in (0.9, 1.1, 0.9, 0.7, 0.9, 1.1)] == [False, True, True, False, False, True]
+    state["tick"] = 5
+    state["hand_ticks"] = 3
+    assert [told(times) for times in (0.9, 1.1, 0.9, 0.7, 0.9, 1.1)] == [
+        False,
+        True,
+        True,
+        False,
+        False,
+        True,
+    ]
     SkillStage(settings, skill).nothing(state, frame)
     assert not state["unsure"]
 

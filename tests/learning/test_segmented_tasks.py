@@ -46,10 +46,13 @@ def hands_at(place: ViaPoint, off: float = 0.0) -> np.ndarray:
     return np.array([[*place.left, *place.right]]) + off
 
 
-def moved(places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]]) -> tuple[ViaPoint, ...]:
+def moved(
+    places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]]
+) -> tuple[ViaPoint, ...]:
     """The places with the tool elsewhere at some of them."""
     return tuple(
-        msgspec.structs.replace(p, tool=tuple(np.add(p.tool, by.get(p.name, (0, 0, 0))).tolist())) for p in places
+        msgspec.structs.replace(p, tool=tuple(np.add(p.tool, by.get(p.name, (0, 0, 0))).tolist()))
+        for p in places
     )
 
 
@@ -71,7 +74,9 @@ def test_tool_goes_to_told_places(between: Skill, shown: list[Demonstration]) ->
         for place in places:
             near = aimed.mean(hands_at(place, 0.02))[0] - (0.02 if place.follow == "left" else 0.0)
             assert np.linalg.norm(near - place.tool) < 0.015
-        far, near = (aimed.model.gates_m(hands_at(places[2], offset_m))[0] for offset_m in (0.3, 0.0))
+        far, near = (
+            aimed.model.gates_m(hands_at(places[2], offset_m))[0] for offset_m in (0.3, 0.0)
+        )
         assert far > aimed.threshold > near
 
 
@@ -80,7 +85,10 @@ def test_unusable_places_are_explained(shown: list[Demonstration]) -> None:
     assert task_of([take._replace(places=()) for take in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
-    assert "1 named via-points: 2 to 65" in task_of([take._replace(places=take.places[:1]) for take in shown])[1]
+    assert (
+        "1 named via-points: 2 to 65"
+        in task_of([take._replace(places=take.places[:1]) for take in shown])[1]
+    )
 
 
 def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
@@ -91,9 +99,12 @@ def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
     assert via_points_never_reached(task, shown, names) == []
     wrong = [take._replace(places=moved(take.places, {"glass": (0.0, 0.4, 0.3)})) for take in shown]
     (message,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
-    assert re.fullmatch(r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", message)
+    assert re.fullmatch(
+        r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", message
+    )
     with pytest.raises(
-        SkillError, match=r"via-point 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)"
+        SkillError,
+        match=r"via-point 'glass': the tool never came nearer to it than \d{3} mm \(take-\d\)",
     ):
         learn(wrong, names=names)
 
@@ -122,12 +133,14 @@ def test_file_holds_segments_or_is_refused(between: Skill) -> None:
 
 def rms_mm(kind: str, skill: Skill) -> float:
     """The error at the moment in four takes of other people, through the core."""
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for demonstration in made(kind, (6, 7)):
         take = left_out("", "", demonstration)
         aimed = adapted(skill, demonstration.places, tolerance=0.05)
         score = judged(take, predicted(aimed, take))
-        total, count = total + score.squares, count + score.samples
+        total = total + score.squares
+        count = count + score.samples
     return 1000.0 * float(np.sqrt(total / count))
 
 
@@ -139,10 +152,13 @@ def cyclic() -> Skill:
 def test_place_is_visited_twice(cyclic: Skill) -> None:
     """Once the hands left it, what was before tells which visit it is."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
-    assert rms_mm("cyclic", cyclic) < 50.0  # a Gaussian process with 2 s of memory: 51, one without: 101
+    assert (
+        rms_mm("cyclic", cyclic) < 50.0
+    )  # a Gaussian process with 2 s of memory: 51, one without: 101
     places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
     aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
-    visit, revisit = places["left out"], places["left out again"]
+    visit = places["left out"]
+    revisit = places["left out again"]
     assert np.allclose(visit.left, revisit.left)
     assert np.linalg.norm(np.subtract(visit.tool, revisit.tool)) > 0.1
     assert max(point.missed_by_m for point in in_force(aimed)) < 0.005
@@ -151,8 +167,11 @@ def test_place_is_visited_twice(cyclic: Skill) -> None:
 def test_delay_of_teacher_is_learned(cyclic: Skill) -> None:
     """The teacher's delay is learned, and the tool lags by less."""
     figures = figures_of(cyclic)
-    late_s, std_s = figures.delay_s, figures.delay_std_s
-    assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)  # the mean of 0.09 to 0.34 s
+    late_s = figures.delay_s
+    std_s = figures.delay_std_s
+    assert (
+        cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)
+    )  # the mean of 0.09 to 0.34 s
     assert 0.0 < std_s < 0.2
     assert f"the teacher was {late_s:.2f} s late" in table(figures)
 
@@ -166,7 +185,9 @@ def late_right(shown: Demonstration, by_s: float) -> Demonstration:
 
 def without_follow(shown: Demonstration) -> Demonstration:
     """A demonstration whose via-points do not state which hand the tool follows."""
-    return shown._replace(places=tuple(msgspec.structs.replace(place, follow="none") for place in shown.places))
+    return shown._replace(
+        places=tuple(msgspec.structs.replace(place, follow="none") for place in shown.places)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -216,9 +237,14 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
-    assert rms_mm("heading", carried) < 22.0  # without the orientation: 39; a Gaussian process told the places: 80
+    assert (
+        rms_mm("heading", carried) < 22.0
+    )  # without the orientation: 39; a Gaussian process told the places: 80
     restored = decoded(carried.file, origin="a file")
-    assert restored.model.own_arrays()["levers"].tobytes() == carried.model.own_arrays()["levers"].tobytes()
+    assert (
+        restored.model.own_arrays()["levers"].tobytes()
+        == carried.model.own_arrays()["levers"].tobytes()
+    )
     assert with_file(replace(restored, file=b"")).file == carried.file
 
 
@@ -226,12 +252,18 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
 def test_carried_tool_has_velocity_of_turn(carried: StoredSkill) -> None:
     """Its velocity is that of the turning hand and without orientation it moves only."""
     model = carried.model
-    hands, belief = model.hands[1].reshape(2, 3), model.belief(model.hands[1])
-    lag_s, h, rate = turn_lag_s(model.delay_s), 1e-3, np.array([0.0, 0.0, 0.5])
+    hands = model.hands[1].reshape(2, 3)
+    belief = model.belief(model.hands[1])
+    lag_s = turn_lag_s(model.delay_s)
+    h = 1e-3
+    rate = np.array([0.0, 0.0, 0.5])
     behind, now, ahead = (
-        at_rest(carried, hands, turns=turns_of(rate, at_s, lag_s), belief=belief.copy()) for at_s in (-h, 0.0, h)
+        at_rest(carried, hands, turns=turns_of(rate, at_s, lag_s), belief=belief.copy())
+        for at_s in (-h, 0.0, h)
     )
-    np.testing.assert_allclose(now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3)
+    np.testing.assert_allclose(
+        now.velocity, (ahead.position - behind.position) / (2 * h), atol=2e-3
+    )
     lever = Rotation.from_rotvec(-TURNS * lag_s * rate).apply(CARRIED_M)
     np.testing.assert_allclose(now.velocity, np.cross(rate, lever), atol=0.01)
     np.testing.assert_allclose(now.position, hands[0] + lever, atol=0.02)

@@ -20,12 +20,18 @@ def stacked(hands: HandMotions) -> tuple[Vector, Vector, Vector]:
 @pytest.mark.parametrize("t", [1.5, 5.9])
 def test_prediction_has_derivatives_of_motion(aimed: Skill, t: float) -> None:
     """Velocity and acceleration are those of the predicted motion."""
-    script, h = HandScript(SCENE, seed=11), 1e-3
-    before, now, after = (aimed.mean(stacked(script.truth(time_s))[0].reshape(1, 6))[0] for time_s in (t - h, t, t + h))
+    script = HandScript(SCENE, seed=11)
+    h = 1e-3
+    before, now, after = (
+        aimed.mean(stacked(script.truth(time_s))[0].reshape(1, 6))[0]
+        for time_s in (t - h, t, t + h)
+    )
     prediction = aimed.predict(*stacked(script.truth(t)))
     np.testing.assert_allclose(prediction.position, now, atol=1e-6)
     np.testing.assert_allclose(prediction.velocity, (after - before) / (2 * h), atol=1e-5)
-    np.testing.assert_allclose(prediction.acceleration, (after - 2 * now + before) / h**2, atol=1e-4)
+    np.testing.assert_allclose(
+        prediction.acceleration, (after - 2 * now + before) / h**2, atol=1e-4
+    )
 
 
 def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> None:
@@ -38,5 +44,7 @@ def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> N
         np.testing.assert_array_equal(value, np.round(value, 6))
     np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)
     assert np.linalg.eigvalsh(prediction.covariance).min() > 0
-    gate_m = learned.model.gates_m(taught[4].hands[300:301])[0]  # of the primitive's covariance, not of held-out errors
+    gate_m = learned.model.gates_m(taught[4].hands[300:301])[
+        0
+    ]  # of the primitive's covariance, not of held-out errors
     assert prediction.gate_m == pytest.approx(gate_m, rel=1e-4)

@@ -28,7 +28,9 @@ def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:
 
 
 @pytest.mark.parametrize("places", [(), PLACES])
-def test_file_returns_same_bits(learned: Skill, places: tuple[ViaPoint, ...], taught: list[Demonstration]) -> None:
+def test_file_returns_same_bits(
+    learned: Skill, places: tuple[ViaPoint, ...], taught: list[Demonstration]
+) -> None:
     """Saving and loading changes no bit."""
     sent = adapted(learned, places, tolerance=0.04)
     back = with_file(replace(decoded(sent.file, origin="a file"), file=b""))
@@ -43,7 +45,10 @@ def test_file_returns_same_bits(learned: Skill, places: tuple[ViaPoint, ...], ta
     queries = taught[5].hands[::50]
     for array, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
         assert array.tobytes() == other.tobytes()
-    assert adapted(back, PLACES[:2], tolerance=0.05).file == adapted(learned, PLACES[:2], tolerance=0.05).file
+    assert (
+        adapted(back, PLACES[:2], tolerance=0.05).file
+        == adapted(learned, PLACES[:2], tolerance=0.05).file
+    )
 
 
 def test_figures_of_a_file(skill: Skill, learned: Skill) -> None:
@@ -64,7 +69,15 @@ def empty_archive() -> bytes:
 
 
 @pytest.mark.parametrize(
-    "garbage", [b"", b"nonsense", b"PK\x03\x04 nonsense", pickle.dumps({"a": 1}), empty_archive(), array_file()]
+    "garbage",
+    [
+        b"",
+        b"nonsense",
+        b"PK\x03\x04 nonsense",
+        pickle.dumps({"a": 1}),
+        empty_archive(),
+        array_file(),
+    ],
 )
 def test_foreign_file_is_refused(garbage: bytes) -> None:
     """A file that is no skill is refused by name."""
@@ -75,13 +88,22 @@ def test_foreign_file_is_refused(garbage: bytes) -> None:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"format": np.array(5)}, "skill of format 5, of 6 needed: learn it anew with this version"),
+        (
+            {"format": np.array(5)},
+            "skill of format 5, of 6 needed: learn it anew with this version",
+        ),
         ({"corners": np.zeros(1)}, "is missing"),
         ({"via_directions": np.zeros((0, 6))}, "an array 'via_directions', which no skill has"),
         ({"figures": np.array("{")}, "figures is no JSON"),
         ({"format": np.array([1, 2])}, "x.npz"),
-        ({"conductor": np.array(-1)}, "conductor is -1: 0 for the left hand or 1 for the right one accepted"),
-        ({"base_inputs": np.zeros((200, 2)), "via_inputs": np.zeros((0, 2))}, "2 inputs and 3 outputs, 6 and 3 needed"),
+        (
+            {"conductor": np.array(-1)},
+            "conductor is -1: 0 for the left hand or 1 for the right one accepted",
+        ),
+        (
+            {"base_inputs": np.zeros((200, 2)), "via_inputs": np.zeros((0, 2))},
+            "2 inputs and 3 outputs, 6 and 3 needed",
+        ),
         ({"name": np.array([{}], dtype=object)}, "x.npz"),
         ({"task_clock": np.full(13, np.inf)}, "task_clock is [inf"),
         ({"threshold": np.array(np.nan)}, "threshold"),
@@ -89,8 +111,14 @@ def test_foreign_file_is_refused(garbage: bytes) -> None:
         ({"box": np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])}, "box"),
         ({"orientation": np.zeros(4)}, "orientation"),
         ({"weights": np.full((200, 3), 1e300)}, "weights has 1e+300, -1e+12 to 1e+12 accepted"),
-        ({"base_weights": np.full((200, 3), 5e3), "weights": np.full((200, 3), 5e3)}, "where it was learned, the tool"),
-        ({"weights": np.zeros((200, 3), complex)}, "weights has numbers of type complex128, real ones needed"),
+        (
+            {"base_weights": np.full((200, 3), 5e3), "weights": np.full((200, 3), 5e3)},
+            "where it was learned, the tool",
+        ),
+        (
+            {"weights": np.zeros((200, 3), complex)},
+            "weights has numbers of type complex128, real ones needed",
+        ),
         ({"ell": np.array(1e300)}, "ell has 1e+300, 0.001 to 10000 1/m² accepted"),
         ({"prior_mean": np.array([0.0, 1e5, 0.0])}, "prior_mean has 100000, -10 to 10 m accepted"),
         ({"base_inputs": np.zeros((2501, 6))}, "2501 reference points, at most 2500 accepted"),
@@ -110,8 +138,11 @@ def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message:
 
 
 @pytest.mark.parametrize("begin", [b"", b"PK\x01\x02"], ids=["anywhere", "in the directory"])
-def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -> None:
-    random, whole = np.random.default_rng(8), aimed.file
+def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(
+    aimed: Skill, begin: bytes
+) -> None:
+    random = np.random.default_rng(8)
+    whole = aimed.file
     unchanged = 0
     for _ in range(400):
         damaged = bytearray(whole)
@@ -128,7 +159,10 @@ def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(aimed: Skill, 
 def test_large_archive_is_not_unpacked(skill: Skill) -> None:
     """A file that would unpack to too many bytes is not unpacked."""
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("format.npy", "w") as file:
+    with (
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("format.npy", "w") as file,
+    ):
         file.write(b"\x93NUMPY\x01\x00")
         for _ in range(101):
             file.write(bytes(1_000_000))

@@ -27,7 +27,9 @@ def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float
     glass = PLACES[1]
     followed = aimed.mean([with_hands(HANDOVER, left=step)])[0]
     np.testing.assert_allclose(followed, np.add(HANDOVER.tool, step), atol=0.006)
-    np.testing.assert_allclose(aimed.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006)
+    np.testing.assert_allclose(
+        aimed.mean([with_hands(glass, left=step)])[0], glass.tool, atol=0.006
+    )
 
 
 def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
@@ -39,9 +41,14 @@ def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None
 
 def moved(point: ViaPoint, name: str, *, hands: float, tool: float, **more: Any) -> ViaPoint:
     """A via-point whose left hand and tool are elsewhere [m]."""
-    left, tool_m = point.left, point.tool
+    left = point.left
+    tool_m = point.tool
     return msgspec.structs.replace(
-        point, name=name, left=(left[0] + hands, left[1], left[2]), tool=(tool_m[0], tool_m[1] + tool, tool_m[2]), **more
+        point,
+        name=name,
+        left=(left[0] + hands, left[1], left[2]),
+        tool=(tool_m[0], tool_m[1] + tool, tool_m[2]),
+        **more,
     )
 
 
@@ -52,10 +59,16 @@ EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
 def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> None:
     """Places that contradict each other are refused by name."""
     steep = 4.0 * hands + 0.001 + 0.0006
-    with pytest.raises(SkillError, match=r"'handover' and 'twin' contradict each other: their hands are") as caught:
-        adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05)
+    with pytest.raises(
+        SkillError, match=r"'handover' and 'twin' contradict each other: their hands are"
+    ) as caught:
+        adapted(
+            skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep + 0.001)), tolerance=0.05
+        )
     assert f"at most {steep:.4f} m accepted, 4 times the hands' distance" in str(caught.value)
-    allowed = adapted(skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05)
+    allowed = adapted(
+        skill, (EXACT, moved(EXACT, "twin", hands=hands, tool=steep - 0.0005)), tolerance=0.05
+    )
     query = np.array([*EXACT.left, *EXACT.right])
     assert np.linalg.norm(allowed.model.primitive.jacobian(query), 2) < 10.0
 
@@ -79,5 +92,9 @@ def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
 
     soft = moved(HANDOVER, "soft", hands=0.0, tool=0.0, radius=0.0, std=0.02)
     first = adapted(aimed, (soft,), tolerance=0.05)
-    second = adapted(aimed, (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)), tolerance=0.05)
+    second = adapted(
+        aimed,
+        (soft, moved(HANDOVER, "hard", hands=0.03, tool=0.1, radius=0.0, std=0.0001)),
+        tolerance=0.05,
+    )
     assert any("via-point 'soft' is moved by" in text for text in warnings_of(first, second))

@@ -13,7 +13,15 @@ from thirdhand.workbench.learning.records import Figures, Row
 from thirdhand.workbench.learning.table import table
 from thirdhand.workbench.learning.verdicts import Subject, verdicts
 
-GOOD = Row(name="all", error_mm=20.0, worst_mm=60.0, predicted_mm=20.0, within_50=50.0, within_95=95.0, held=1.0)
+GOOD = Row(
+    name="all",
+    error_mm=20.0,
+    worst_mm=60.0,
+    predicted_mm=20.0,
+    within_50=50.0,
+    within_95=95.0,
+    held=1.0,
+)
 FIGURES = Figures(
     demonstrations=(GOOD,) * 4,
     all=GOOD,
@@ -28,7 +36,9 @@ FIGURES = Figures(
 GATE = Gate(0.05, Caught(1.0, 1.0, 1.0), capped=False, floored=False)
 
 
-def found(frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float = 20.0, **change: Any) -> dict[str, str]:
+def found(
+    frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float = 20.0, **change: Any
+) -> dict[str, str]:
     """Texts and severities of figures that differ in these from good ones."""
     row = msgspec.structs.replace(GOOD, error_mm=error_mm, held=change.pop("held", 1.0))
     row = msgspec.structs.replace(row, predicted_mm=change.pop("expected_mm", row.predicted_mm))
@@ -50,7 +60,11 @@ def test_good_figures_have_no_remarks() -> None:
         ({"error_mm": 126.0, "explained": 78.0}, "residual", "missed by 126 mm"),
         ({"error_mm": 150.0, "explained": 15.0}, "unsafe", "15 % of its variance in held-out"),
         ({"capped": True}, "residual", "up to the largest deviation that is allowed, 50 mm"),
-        ({"expected_mm": 260.0}, "residual", "more than the tool moves about its mean position, 250 mm"),
+        (
+            {"expected_mm": 260.0},
+            "residual",
+            "more than the tool moves about its mean position, 250 mm",
+        ),
         ({"takes": 2, "error_mm": 93.0}, "unsafe", "as they miss each other by 93 mm: record more"),
         ({"ambiguous": 8.0}, "warning", "8 % of the samples contradict others"),
         ({"ambiguous": 12.0}, "residual", "12 % of the samples contradict others"),
@@ -60,16 +74,32 @@ def test_good_figures_have_no_remarks() -> None:
             "30 % of the samples contradict others, up to 10 % accepted: a and b. Leave out",
         ),
         ({"beyond_reach": 10.0}, "warning", "10.0 % of the tool's path"),
-        ({"beyond_reach": 30.0}, "unsafe", "in frame base? If it is, demonstrate nearer to the arm"),
+        (
+            {"beyond_reach": 30.0},
+            "unsafe",
+            "in frame base? If it is, demonstrate nearer to the arm",
+        ),
         ({"held": 30.0}, "warning", "holds 30 % of what was demonstrated"),
         ({"beside": 80.0}, "warning", "the gate holds 80.0 % of hands 30 cm beside"),
-        ({"beside": 3.0}, "residual", "the gate holds 3.0 % of hands 30 cm beside, 50 % wanted: the arm follows hands"),
-        ({"frames": ("base", "camera")}, "unsafe", "'base', 'camera'; one needed: record them again in one frame"),
+        (
+            {"beside": 3.0},
+            "residual",
+            "the gate holds 3.0 % of hands 30 cm beside, 50 % wanted: the arm follows hands",
+        ),
+        (
+            {"frames": ("base", "camera")},
+            "unsafe",
+            "'base', 'camera'; one needed: record them again in one frame",
+        ),
     ],
 )
 def test_verdict_of_each_figure(change: dict[str, Any], severity: str, says: str) -> None:
     """A poor figure is warned of, accepted by a person, or refused."""
-    texts = {text: kind for text, kind in found(**change).items() if says in text} if says else found(**change)
+    texts = (
+        {text: kind for text, kind in found(**change).items() if says in text}
+        if says
+        else found(**change)
+    )
     assert list(texts.values()) == [severity] * bool(says)
 
 
@@ -81,7 +111,9 @@ def test_residual_risk_needs_acceptance() -> None:
         ("", "nobody has accepted its residual risk: the gate holds 3 %. Who takes", ""),
         ("Ada", "", "accepted by Ada: the gate holds 3 %"),
     ):
-        figures = msgspec.json.encode(msgspec.structs.replace(risky, accepted_by=accepted_by)).decode()
+        figures = msgspec.json.encode(
+            msgspec.structs.replace(risky, accepted_by=accepted_by)
+        ).decode()
         risk = ResidualRisk.of(figures)
         assert risk.refusal.startswith(refused)
         assert bool(risk.refusal) == bool(refused)

@@ -85,24 +85,43 @@ main()
 
 
 @pytest.mark.parametrize(
-    "module", ["thirdhand.process.interrupt", "contextlib", "thirdhand.cli", "thirdhand.client", "thirdhand.cli.status"]
+    "module",
+    [
+        "thirdhand.process.interrupt",
+        "contextlib",
+        "thirdhand.cli",
+        "thirdhand.client",
+        "thirdhand.cli.status",
+    ],
 )
 def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: str) -> None:
     """At imports from the first line of the program on; Python's own come before that."""
-    code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace("MODULE", module)
+    code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace(
+        "MODULE", module
+    )
     command = [sys.executable, "-S", "-c", code, "status", "--connect", "tcp/127.0.0.1:1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
     assert "Traceback" not in done.stderr
     assert done.returncode in (130, -signal.SIGINT)
 
 
 @pytest.mark.parametrize(
     ("name", "delay_s"),
-    [*(("serve", delay_s) for delay_s in DELAYS_S), *((name, 0.1) for name in OTHERS), ("demo", 1.5)],
+    [
+        *(("serve", delay_s) for delay_s in DELAYS_S),
+        *((name, 0.1) for name in OTHERS),
+        ("demo", 1.5),
+    ],
 )
 @pytest.mark.one_case
-def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, name: str, delay_s: float) -> None:
-    (tmp_path / "cell.toml").write_text(f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n')
+def test_an_interrupt_ends_a_command_with_one_line(
+    tmp_path: Path, nobody: str, name: str, delay_s: float
+) -> None:
+    (tmp_path / "cell.toml").write_text(
+        f'[network]\nlisten = ["tcp/127.0.0.1:0"]\n[files]\nstate = "{tmp_path}"\n'
+    )
     arguments = {
         "serve": ["--config", str(tmp_path / "cell.toml"), "--connect", nobody],
         "demo": ["--output", str(tmp_path / "demo")],
@@ -124,7 +143,8 @@ def test_an_interrupt_ends_a_command_with_one_line(tmp_path: Path, nobody: str, 
 
 @pytest.mark.thorough
 def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
-    output, skill = tmp_path / "said", tmp_path / "skill.npz"
+    output = tmp_path / "said"
+    skill = tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
     wait_for(lambda: "choosing parameters" in output.read_text())
     process.send_signal(signal.SIGINT)
@@ -135,7 +155,8 @@ def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
-    output, skill = tmp_path / "said", tmp_path / "skill.npz"
+    output = tmp_path / "said"
+    skill = tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
     wait_for(skill.exists)
     while process.poll() is None:  # also while the interpreter takes itself down
@@ -145,15 +166,21 @@ def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Pat
     assert "Traceback" not in output.read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name
+)
 @pytest.mark.thorough
-def test_a_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_demo_that_is_ended_leaves_no_process_behind(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     output = tmp_path / "said"
     process = begun(["demo", "--output", str(tmp_path / "demo")], output)
     wait_for(lambda: "commands arrive" in output.read_text(), 100)
 
     def services() -> list[bytes]:
-        lines = subprocess.run(["ps", "-ewwo", "args"], capture_output=True, check=True).stdout.splitlines()
+        lines = subprocess.run(
+            ["ps", "-ewwo", "args"], capture_output=True, check=True
+        ).stdout.splitlines()
         return [line for line in lines if str(tmp_path).encode() in line and b"defunct" not in line]
 
     assert len(services()) == 3  # the demo, its daemon and its bench
@@ -170,7 +197,9 @@ def test_a_bench_that_says_nothing_ends_with_the_process_that_runs_it(tmp_path: 
     """A bench that prints would end with the pipe that nobody reads any more."""
     output = tmp_path / "said"
     with subprocess.Popen(["sleep", "600"]) as runs_it:
-        bench = begun(["sim", "--listen", "tcp/127.0.0.1:0", "--end-with", str(runs_it.pid)], output)
+        bench = begun(
+            ["sim", "--listen", "tcp/127.0.0.1:0", "--end-with", str(runs_it.pid)], output
+        )
         try:
             wait_for(lambda: "listening on" in output.read_text(), 100)
             assert bench.poll() is None
@@ -184,7 +213,11 @@ def test_a_bench_that_says_nothing_ends_with_the_process_that_runs_it(tmp_path: 
 
 def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", CLEAN_UP_SLOWLY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True
+        [sys.executable, "-c", CLEAN_UP_SLOWLY],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+        text=True,
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"
@@ -198,17 +231,25 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
 
 def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:
     command = [sys.executable, "-c", INTERRUPTED_JUST_BEFORE]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=30, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, timeout=30, check=False
+    )
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 
 
 def test_an_interrupt_that_is_ignored_stays_so() -> None:
     """As a shell starts what runs in its background."""
     code = (
-        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom thirdhand.process import interrupt\n"
+        "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom thirdhand.process "
+        "import interrupt\n"
         "interrupt.watch()\nsignal.raise_signal(signal.SIGINT)\nprint('goes on')"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30, check=True
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=30,
+        check=True,
     )
     assert done.stdout == "goes on\n"

@@ -29,7 +29,9 @@ print(used_mb, left_mb)
 
 
 def test_code_that_only_the_start_used_is_released_and_runs_again() -> None:
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT, check=False
+    )
     assert done.returncode == 0, done.stderr
     used_mb, left_mb = map(float, done.stdout.split())
     assert used_mb > 60

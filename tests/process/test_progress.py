@@ -13,7 +13,8 @@ from thirdhand.process.progress import progress, steps
 
 def until_said(capsys: pytest.CaptureFixture[str], words: str) -> str:
     """What was said on standard error until the words were."""
-    text, wait = "", threading.Event()
+    text = ""
+    wait = threading.Event()
     for _ in range(500):
         text += capsys.readouterr().err
         if words in text:
@@ -28,7 +29,9 @@ def test_what_is_quick_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == ""
 
 
-def test_where_nobody_watches_it_says_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_nobody_watches_it_says_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with progress("reading", total=200, after_s=0.01, every_s=0.01) as done:
         done(50)
         assert "reading: 25 % of 200 ticks, 0 s\n" in until_said(capsys, "25 %")
@@ -39,15 +42,21 @@ def test_where_nobody_watches_it_says_a_line_now_and_then(capsys: pytest.Capture
         until_said(capsys, "reading: 7 ticks, 0 s\n")
 
 
-def test_steps_are_named_as_they_begin_and_again_where_they_last(capsys: pytest.CaptureFixture[str]) -> None:
+def test_steps_are_named_as_they_begin_and_again_where_they_last(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with steps("learning", after_s=0.01, every_s=0.01) as doing:
         doing("choosing")
-        assert until_said(capsys, "choosing: 0 s\n").startswith(("choosing\n", "learning: 0 s\nchoosing\n"))
+        assert until_said(capsys, "choosing: 0 s\n").startswith(
+            ("choosing\n", "learning: 0 s\nchoosing\n")
+        )
         doing("fitting")
         until_said(capsys, "fitting: 0 s\n")
 
 
-def test_on_a_terminal_a_bar_is_drawn_and_the_cursor_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_terminal_a_bar_is_drawn_and_the_cursor_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Ctrl-C ends a command at once: nobody would show a hidden cursor again."""
     ours, theirs = pty.openpty()
     drawn = b""

@@ -33,7 +33,8 @@ LOST = range(3000, 3100)
 @pytest.fixture(scope="module")
 def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds of the golden session, in which 0.2 s are missing."""
-    path, old = tmp_path_factory.mktemp("gapped") / "gapped.mcap", Recording.open(golden)
+    path = tmp_path_factory.mktemp("gapped") / "gapped.mcap"
+    old = Recording.open(golden)
     start, *steps = old.steps()
     with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
         for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 5000):
@@ -47,7 +48,12 @@ def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def data_set(gapped: Path, golden: Path) -> Path:
     folder = gapped.parent / "data"
     files = [str(gapped), str(golden)]
-    assert main(["report", *files, "--lerobot", str(folder), "--fps", "30", "--task", "Hold the board."]) == 0
+    assert (
+        main(
+            ["report", *files, "--lerobot", str(folder), "--fps", "30", "--task", "Hold the board."]
+        )
+        == 0
+    )
     return folder
 
 
@@ -56,44 +62,65 @@ def test_rows_are_what_was_seen_and_commanded_at_their_times(data_set: Path, gol
     episode = table["episode_index"].to_numpy()
     last = table.filter(episode == 2).to_pydict()
     steps = [step for step in Recording.open(golden).steps() if step.frame is not None]
-    ready = [step for step in steps if step.frame["commanded"] and (step.frame["hand_ages"] >= 0).all()]
-    measured, frames = None, {}
+    ready = [
+        step for step in steps if step.frame["commanded"] and (step.frame["hand_ages"] >= 0).all()
+    ]
+    measured = None
+    frames = {}
     for step in steps:
         for kind, payload in step.events:
             measured = cdr.decode_joints(payload).position if kind == "joints/state" else measured
         frames[step.tick] = (measured, step.frame["hands"].ravel(), step.frame["joints"])
     assert len(last["index"]) == (steps[-1].tick - ready[0].tick) * 30 // 500 + 1 > 590
     for row in (0, 1, 7, 200, 400, len(last["index"]) - 1):
-        newest = max(step.tick for step in ready if (step.tick - ready[0].tick) / 500 <= row / 30 + 1e-9)
+        newest = max(
+            step.tick for step in ready if (step.tick - ready[0].tick) / 500 <= row / 30 + 1e-9
+        )
         names = ("observation.state", "observation.environment_state", "action")
         for name, value in zip(names, frames[newest], strict=True):
             np.testing.assert_array_equal(last[name][row], np.float32(value))
-    np.testing.assert_array_equal(last["timestamp"], (np.arange(len(last["index"])) / 30).astype(np.float32))
+    np.testing.assert_array_equal(
+        last["timestamp"], (np.arange(len(last["index"])) / 30).astype(np.float32)
+    )
 
 
 def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
-    table, about = (parquet.read_table(data_set / part / FIRST) for part in ("data", "meta/episodes"))
+    table, about = (
+        parquet.read_table(data_set / part / FIRST) for part in ("data", "meta/episodes")
+    )
     assert table["index"].to_pylist() == list(range(len(table)))
     assert set(table["task_index"].to_pylist()) == {0}
     rows = about.to_pylist()
     assert [episode["episode_index"] for episode in rows] == [0, 1, 2]
-    assert [episode["dataset_from_index"] for episode in rows[1:]] == [episode["dataset_to_index"] for episode in rows[:-1]]
+    assert [episode["dataset_from_index"] for episode in rows[1:]] == [
+        episode["dataset_to_index"] for episode in rows[:-1]
+    ]
     assert 170 < rows[0]["length"] < 180  # from when both hands had been seen
     for episode in rows:
         part = table.slice(episode["dataset_from_index"], episode["length"])
         assert set(part["episode_index"].to_pylist()) == {episode["episode_index"]}
         assert part["frame_index"].to_pylist() == list(range(episode["length"]))
         assert episode["tasks"] == ["Hold the board."]
-        assert {episode[f"{of}/{kind}_index"] for of in ("data", "meta/episodes") for kind in ("chunk", "file")} == {0}
+        assert {
+            episode[f"{of}/{kind}_index"]
+            for of in ("data", "meta/episodes")
+            for kind in ("chunk", "file")
+        } == {0}
         assert episode["stats/action/count"] == [episode["length"]]
     assert parquet.ParquetFile(data_set / "data" / FIRST).num_row_groups == 3
 
 
 def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
-    info, stats = (json.loads((data_set / "meta" / f"{name}.json").read_text()) for name in ("info", "stats"))
+    info, stats = (
+        json.loads((data_set / "meta" / f"{name}.json").read_text()) for name in ("info", "stats")
+    )
     table = parquet.read_table(data_set / "data" / FIRST)
     assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 30, "wam")
-    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (3, len(table), {"train": "0:3"})
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (
+        3,
+        len(table),
+        {"train": "0:3"},
+    )
     assert (data_set / info["data_path"].format(chunk_index=0, file_index=0)).is_file()
     assert [*info["features"]] == [*stats] == table.column_names
     for name, feature in info["features"].items():
@@ -101,10 +128,19 @@ def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
         assert "/" not in name
         assert feature["shape"] == ([values.shape[1]] if values.ndim == 2 else [1])
         stored = table.schema.field(name).type
-        assert {"float": "float32"}.get(str(getattr(stored, "value_type", stored)), "int64") == feature["dtype"]
-        np.testing.assert_allclose(stats[name]["mean"], np.atleast_1d(values.mean(0)), rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(stats[name]["q90"], np.atleast_1d(np.quantile(values, 0.9, axis=0)), rtol=1e-5)
-        assert all(len(stats[name][kind]) == feature["shape"][0] for kind in ("min", "max", "std", "q01", "q99"))
+        assert {"float": "float32"}.get(
+            str(getattr(stored, "value_type", stored)), "int64"
+        ) == feature["dtype"]
+        np.testing.assert_allclose(
+            stats[name]["mean"], np.atleast_1d(values.mean(0)), rtol=1e-5, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            stats[name]["q90"], np.atleast_1d(np.quantile(values, 0.9, axis=0)), rtol=1e-5
+        )
+        assert all(
+            len(stats[name][kind]) == feature["shape"][0]
+            for kind in ("min", "max", "std", "q01", "q99")
+        )
     assert info["features"]["action"]["names"] == list(JOINT_NAMES)
     tasks = parquet.read_table(data_set / "meta" / "tasks.parquet")
     assert tasks.to_pylist() == [{"task_index": 0, "task": "Hold the board."}]
@@ -117,16 +153,32 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pictures brighten with time. After three seconds the clock is set ahead by an hour.
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
-    path, old = tmp_path_factory.mktemp("filmed") / "filmed.mcap", Recording.open(golden)
+    path = tmp_path_factory.mktemp("filmed") / "filmed.mcap"
+    old = Recording.open(golden)
     start, *steps = old.steps()
     with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
         for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 3000):
             time_ns = step.time_ns + 3_600_000_000_000 * (tick.index >= 1500)
             recorder.write(tick, step.frame, time_ns=time_ns)
             if tick.index % 50 == 0:
-                image = encode_image(CompressedImage(time_ns, "lens", "jpeg", grey(tick.index // 20)))
+                image = encode_image(
+                    CompressedImage(time_ns, "lens", "jpeg", grey(tick.index // 20))
+                )
                 recorder.image("camera/front", image, time_ns)
-    assert main(["report", str(path), str(path), "--lerobot", str(path.parent / "data"), "--task", "Hold."]) == 0
+    assert (
+        main(
+            [
+                "report",
+                str(path),
+                str(path),
+                "--lerobot",
+                str(path.parent / "data"),
+                "--task",
+                "Hold.",
+            ]
+        )
+        == 0
+    )
     return path.parent / "data"
 
 
@@ -134,7 +186,8 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
     av = pytest.importorskip("av")
     name = "observation.images.camera_front"
     info = json.loads((filmed / "meta" / "info.json").read_text())
-    feature, fps = info["features"][name], info["fps"]
+    feature = info["features"][name]
+    fps = info["fps"]
     assert (feature["dtype"], feature["shape"], feature["names"]) == (
         "video",
         [48, 64, 3],
@@ -144,18 +197,29 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
     assert name not in rows
     first, second = parquet.read_table(filmed / "meta" / "episodes" / FIRST).to_pylist()
     assert first[f"videos/{name}/from_timestamp"] == 0.0
-    assert first[f"videos/{name}/to_timestamp"] == second[f"videos/{name}/from_timestamp"] == first["length"] / fps
+    assert (
+        first[f"videos/{name}/to_timestamp"]
+        == second[f"videos/{name}/from_timestamp"]
+        == first["length"] / fps
+    )
     path = filmed / info["video_path"].format(video_key=name, chunk_index=0, file_index=0)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        assert (stream.codec_context.name, stream.average_rate) == (feature["info"]["video.codec"], fps)
+        assert (stream.codec_context.name, stream.average_rate) == (
+            feature["info"]["video.codec"],
+            fps,
+        )
         pictures = [
             (float(picture.pts * stream.time_base), picture.to_ndarray(format="rgb24").mean())
             for picture in container.decode(stream)
         ]
     assert len(pictures) == info["total_frames"] == len(rows["index"])
-    np.testing.assert_allclose([time_s for time_s, _ in pictures], np.arange(len(pictures)) / fps, atol=1e-4)
-    began = 3000 - 1 - round((first["length"] - 1) / fps * 500)  # the tick of the first row, up to half a row
+    np.testing.assert_allclose(
+        [time_s for time_s, _ in pictures], np.arange(len(pictures)) / fps, atol=1e-4
+    )
+    began = (
+        3000 - 1 - round((first["length"] - 1) / fps * 500)
+    )  # the tick of the first row, up to half a row
     expected = [(began + row / fps * 500) // 50 * 2.5 for row in rows["frame_index"]]
     assert np.abs(np.array([level for _, level in pictures]) - expected).max() < 5.0
     stats = json.loads((filmed / "meta" / "stats.json").read_text())[name]
@@ -164,12 +228,20 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
 
 
 def test_lerobot_itself_loads_it(data_set: Path) -> None:
-    loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot brings PyTorch: not installed")
-    loaded = loader.LeRobotDataset("local/thirdhand", root=data_set, delta_timestamps={"action": [0.0, 1 / 30]})
+    loader = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="lerobot brings PyTorch: not installed"
+    )
+    loaded = loader.LeRobotDataset(
+        "local/thirdhand", root=data_set, delta_timestamps={"action": [0.0, 1 / 30]}
+    )
     assert (loaded.num_episodes, loaded.fps) == (3, 30)
     item = loaded[loaded.meta.episodes["dataset_to_index"][0]]
     assert item["task"] == "Hold the board."
-    assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (1, 0, (2, 7))
+    assert (int(item["episode_index"]), int(item["frame_index"]), tuple(item["action"].shape)) == (
+        1,
+        0,
+        (2, 7),
+    )
     rows = parquet.read_table(data_set / "data" / FIRST)
     assert len(loaded) == len(rows)
     for i in range(0, len(loaded), 50):
@@ -186,14 +258,18 @@ def recorded(
 ) -> Path:
     """A recording of an arm that tells nothing of its joints; `images` by tick and key."""
     controller = Controller(ASSUMED, skill, urdf=URDF)
-    with Recorder(path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf) as recorder:
+    with Recorder(
+        path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
+    ) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
             time_ns = tick.index * 2_000_000
             recorder.write(tick, frame, time_ns=time_ns)
             for index, key, file in images:
                 if index == tick.index:
-                    recorder.image(key, encode_image(CompressedImage(time_ns, "lens", "png", file)), time_ns)
+                    recorder.image(
+                        key, encode_image(CompressedImage(time_ns, "lens", "png", file)), time_ns
+                    )
 
         run(controller, inputs, [keep])
     return path
@@ -201,7 +277,8 @@ def recorded(
 
 def png(mode: str = "RGB", size: tuple[int, int] = (64, 48)) -> bytes:
     """The file of a picture of level 77, or 77 of 255 with 16 bits."""
-    out, level = io.BytesIO(), {"RGB": (77, 77, 77), "RGBA": (77, 77, 77, 9), "L": 77, "I;16": 77 * 257}[mode]
+    out = io.BytesIO()
+    level = {"RGB": (77, 77, 77), "RGBA": (77, 77, 77, 9), "L": 77, "I;16": 77 * 257}[mode]
     Image.new(mode, size, level).save(out, "PNG")
     return out.getvalue()
 
@@ -209,14 +286,20 @@ def png(mode: str = "RGB", size: tuple[int, int] = (64, 48)) -> bytes:
 def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    disk, path = tmp_path / "disk", recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    disk = tmp_path / "disk"
+    path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
     disk.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", disk], capture_output=True, check=False)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", disk], capture_output=True, check=False
+    )
     if done.returncode != 0:
         pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
     try:
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1
-        assert f"{disk}/data: No space left on device; room on that disk needed" in capsys.readouterr().err
+        assert (
+            f"{disk}/data: No space left on device; room on that disk needed"
+            in capsys.readouterr().err
+        )
         assert list(disk.iterdir()) == []
         subprocess.run(["mount", "-o", "remount,size=4m", disk], check=True)
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
@@ -228,7 +311,9 @@ def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     followed = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
-    of_another = recorded(tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1))
+    of_another = recorded(
+        tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1)
+    )
     alone = recorded(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
     for files, why in (
         ([followed, of_another], "one arm is needed"),
@@ -247,7 +332,12 @@ def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
     ],
 )
 def test_what_makes_no_data_set_is_said(
-    options: list[str], code: int, says: str, gapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str],
+    code: int,
+    says: str,
+    gapped: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = tmp_path / "data"
     try:

@@ -35,7 +35,8 @@ from thirdhand.workbench.report.tables import tables, verdict
 from thirdhand_sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 
 SETTINGS = Settings()
-PERIOD_S, PERIOD_NS = SETTINGS.period_s, round(SETTINGS.period_s * 1e9)
+PERIOD_S = SETTINGS.period_s
+PERIOD_NS = round(SETTINGS.period_s * 1e9)
 START_NS = 1_700_000_000_000_000_000
 FAULT_AT = 600  # ticks
 FIELDS: dict[str, Any] = {  # of a status, that the core knows nothing of
@@ -61,12 +62,22 @@ class Told:
     """
 
     def __init__(
-        self, skill: Skill, path: Path, what: str = "", *, lost_at: int | None = None, statuses: bool = True
+        self,
+        skill: Skill,
+        path: Path,
+        what: str = "",
+        *,
+        lost_at: int | None = None,
+        statuses: bool = True,
     ) -> None:
-        self.what, self.joints = what, SETTINGS.arm.posture
+        self.what = what
+        self.joints = SETTINGS.arm.posture
         self.said: list[Status] = []
-        controller, monitor = Controller(SETTINGS, skill, urdf=URDF), InputMonitor(SETTINGS)
-        with Recorder(path, settings=SETTINGS, skill=skill.file, state=controller.state) as recorder:
+        controller = Controller(SETTINGS, skill, urdf=URDF)
+        monitor = InputMonitor(SETTINGS)
+        with Recorder(
+            path, settings=SETTINGS, skill=skill.file, state=controller.state
+        ) as recorder:
             for k in range(1200):
                 tick = Tick(k, tuple(self.inbox(k)))
                 frame = controller.step(tick)
@@ -76,20 +87,30 @@ class Told:
                     continue
                 lost = 100 if lost_at is not None and k == lost_at + 100 else 0
                 timing = timed(
-                    k, stamp(k), k // 300, 50.0 + k % 7, 200.0, 1500.0 if k % 5 == 0 else 0.0, (0.0,) * len(STAGES)
+                    k,
+                    stamp(k),
+                    k // 300,
+                    50.0 + k % 7,
+                    200.0,
+                    1500.0 if k % 5 == 0 else 0.0,
+                    (0.0,) * len(STAGES),
                 )
                 state = controller.state if lost else None
                 recorder.write(tick, frame, time_ns=stamp(k), timing=timing, state=state, lost=lost)
                 sources = dict(monitor.update(controller, controller.state, k * PERIOD_S))
                 if statuses and k % 50 == 0:
                     failure = "the request thread failed: out of paper" if what == "failed" else ""
-                    cell = CellStatus(frame, controller, controller.state, sources, SETTINGS, failure)
+                    cell = CellStatus(
+                        frame, controller, controller.state, sources, SETTINGS, failure
+                    )
                     self.said.append(cell.status(**FIELDS))
                     recorder.note("status", encode_json(self.said[-1]).decode(), stamp(k))
 
     def first(self, reason: str, *, after: int = 0) -> Status:
         """The first status of a reason from a tick on."""
-        return next(status for status in self.said if status.reason == reason and status.tick >= after)
+        return next(
+            status for status in self.said if status.reason == reason and status.tick >= after
+        )
 
     def inbox(self, k: int) -> Iterable[Event]:
         late = k >= FAULT_AT
@@ -98,9 +119,11 @@ class Told:
             yield hand("left", LEFT, stamp_ns)
             yield hand("right", RIGHT, stamp_ns)
         if k % 2 == 0 and not (
-            (self.what in ("silent", "stepped") and FAULT_AT <= k < 900) or (self.what == "left alone" and k >= 850)
+            (self.what in ("silent", "stepped") and FAULT_AT <= k < 900)
+            or (self.what == "left alone" and k >= 850)
         ):
-            q, dq = list(self.joints), [0.0] * 7
+            q = list(self.joints)
+            dq = [0.0] * 7
             if late and self.what == "pushed":
                 q[3] += min(0.15, 0.003 * (k - FAULT_AT))
             if late and self.what == "fast":
@@ -117,7 +140,9 @@ def session(golden: Path) -> Report:
     return reported(golden)
 
 
-def test_the_distance_of_a_stop_is_that_of_the_measured_tool_and_is_compared_with_people(golden: Path) -> None:
+def test_the_distance_of_a_stop_is_that_of_the_measured_tool_and_is_compared_with_people(
+    golden: Path,
+) -> None:
     columns = read(Recording.open(golden))
     report = Report(columns)
     assert report.stop_mm is not None
@@ -147,7 +172,10 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand comes back by a jump
     for reason, (begin_s, end_s) in {
-        Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),  # until then the tool does not depend on that hand
+        Reason.STALE_HAND: (
+            DROPOUT_S[0] + 0.45,
+            DROPOUT_S[1],
+        ),  # until then the tool does not depend on that hand
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: (AWAY_S[0], far_end_s),
     }.items():
@@ -156,20 +184,29 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     # made in process, without a status: what the first frame of each holds
     assert re.fullmatch(r"the left hand was last seen [34]\d\d ms ago", held[Reason.STALE_HAND].why)
     asked = held[Reason.OPERATOR]
-    assert (asked.why, asked.remedy) == ("an operator requested a hold, or the daemon was stopped", "thirdhand resume")
+    assert (asked.why, asked.remedy) == (
+        "an operator requested a hold, or the daemon was stopped",
+        "thirdhand resume",
+    )
     far = re.fullmatch(
         r"the distance of a hand from its paths is (.*) cm, 11.0 accepted",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
     )
     assert far is not None
     assert float(far[1]) > 11.0
-    assert session.seconds(Mode.FOLLOW) + session.seconds(Mode.HOLD) == pytest.approx(session.lasts_s)
+    assert session.seconds(Mode.FOLLOW) + session.seconds(Mode.HOLD) == pytest.approx(
+        session.lasts_s
+    )
     assert (session.faults, session.lacks) == ((), ())
 
 
 def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
-    frames = np.array([step.frame for step in Recording.open(session.path).steps() if step.frame is not None])
-    assert sum(rejection.samples for rejection in session.rejections) == int(frames[-1]["rejected"].sum())
+    frames = np.array(
+        [step.frame for step in Recording.open(session.path).steps() if step.frame is not None]
+    )
+    assert sum(rejection.samples for rejection in session.rejections) == int(
+        frames[-1]["rejected"].sum()
+    )
     assert all(BAD_S[0] <= rejection.first_s <= AWAY_S[1] + 0.1 for rejection in session.rejections)
     for limit in session.limits:
         raised = (frames["flags"] & Flag[limit.name.upper()]) > 0
@@ -183,12 +220,18 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][is_hand_seen].min()
 
 
-def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(session: Report) -> None:
+def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(
+    session: Report,
+) -> None:
     by_name = [(place.name, place.start_s) for place in session.places]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
     first, second = [place for place in session.places if place.name == "handover"]
     assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
-    assert first.end_s == pytest.approx(second.start_s, abs=1.5 * PERIOD_S) == pytest.approx(RETEACH_S, abs=0.1)
+    assert (
+        first.end_s
+        == pytest.approx(second.start_s, abs=1.5 * PERIOD_S)
+        == pytest.approx(RETEACH_S, abs=0.1)
+    )
     assert first.best_m is not None
     assert first.best_m < 0.02
     assert (second.visits, second.best_m) == ((), None)
@@ -199,10 +242,20 @@ def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_pa
     """Hands that rest where it was taught, and a tool that goes there."""
     Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
     [place] = reported(tmp_path / "a.mcap").places
-    frames = np.array([step.frame for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None])
+    frames = np.array(
+        [
+            step.frame
+            for step in Recording.open(tmp_path / "a.mcap").steps()
+            if step.frame is not None
+        ]
+    )
     [visit] = place.visits
-    assert visit.nearest_m == pytest.approx(np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min())
-    assert visit.settled_m == pytest.approx(np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4)
+    assert visit.nearest_m == pytest.approx(
+        np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min()
+    )
+    assert visit.settled_m == pytest.approx(
+        np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4
+    )
     assert place.hands_m < 1e-3
 
 
@@ -210,15 +263,30 @@ def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_pa
 @pytest.mark.parametrize(
     ("what", "reason", "why", "about"),
     [
-        ("silent", Reason.ARM_SILENT, "no joint states for 1", "no joint states arrived for 100 ms ([arm] silent_ms)"),
+        (
+            "silent",
+            Reason.ARM_SILENT,
+            "no joint states for 1",
+            "no joint states arrived for 100 ms ([arm] silent_ms)",
+        ),
         (
             "pushed",
             Reason.ARM_ERROR,
             "now wam/elbow_pitch_joint is off by 0.1",
             "a joint was measured more than 0.1 rad",
         ),
-        ("fast", Reason.TOOL_SPEED, " m/s, 1 accepted", "the tool was measured faster than 1 m/s ([tool] fault"),
-        ("failed", Reason.SERVICE, "the request thread failed: out of paper", "the request thread failed: out of"),
+        (
+            "fast",
+            Reason.TOOL_SPEED,
+            " m/s, 1 accepted",
+            "the tool was measured faster than 1 m/s ([tool] fault",
+        ),
+        (
+            "failed",
+            Reason.SERVICE,
+            "the request thread failed: out of paper",
+            "the request thread failed: out of",
+        ),
     ],
 )
 def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_how_it_ended(
@@ -235,7 +303,9 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
         assert why in fault.why
     else:
         assert fault.why.startswith(about)
-    assert re.search(rf"and {len(report.faults)} faults?; the worst was fault: \w+, for ", verdict(report))
+    assert re.search(
+        rf"and {len(report.faults)} faults?; the worst was fault: \w+, for ", verdict(report)
+    )
     assert any(line.startswith("before it: it followed for 1.") for line in fault.before)
     assert fault.ended.startswith("ended by a `reset` after 0.")
     missed = why_missed(report, "here", begun_s=1.0, start_s=0.0, end_s=2.0)
@@ -246,34 +316,54 @@ def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_ho
 def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path: Path) -> None:
     Told(skill, tmp_path / "a.mcap", "stepped")
     lines = reported(tmp_path / "a.mcap").faults[0].before
-    words = "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock stepped ahead"
+    words = (
+        "left hand: rejected as ahead: stamped 10 s after the newest accepted one: its clock "
+        "stepped ahead"
+    )
     assert words in lines
 
 
 def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
     def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
-        timeline, at_s = [], 0.0
+        timeline = []
+        at_s = 0.0
         for lasts_s, mode, reason in parts:
             timeline.append(Span(at_s, lasts_s, mode, reason))
             at_s += lasts_s
         return tuple(timeline)
 
-    hold, follow, fault = Mode.HOLD, Mode.FOLLOW, Mode.FAULT
-    waits, ends = (6.0, hold, Reason.NO_HANDS), [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
-    moves, stops = (4.0, follow, Reason.NONE), (1.0, hold, Reason.STALE_HAND)
+    hold = Mode.HOLD
+    follow = Mode.FOLLOW
+    fault = Mode.FAULT
+    waits = (6.0, hold, Reason.NO_HANDS)
+    ends = [(3.0, hold, Reason.STALE_HAND), (0.1, hold, Reason.OPERATOR)]
+    moves = (4.0, follow, Reason.NONE)
+    stops = (1.0, hold, Reason.STALE_HAND)
     cases = {
         "a bench": (waits, moves, *ends),
         "a stop": (waits, moves, stops, moves, *ends),
-        "a hold before it": (moves, (0.1, hold, Reason.STALE_HAND), (1.0, fault, Reason.ARM_SILENT)),
+        "a hold before it": (
+            moves,
+            (0.1, hold, Reason.STALE_HAND),
+            (1.0, fault, Reason.ARM_SILENT),
+        ),
     }
-    verdicts, report = {}, reported(golden)
+    verdicts = {}
+    report = reported(golden)
     for name, parts in cases.items():
-        report.spans, report.lasts_s = spans(*parts), sum(part[0] for part in parts)
+        report.spans = spans(*parts)
+        report.lasts_s = sum(part[0] for part in parts)
         verdicts[name] = verdict(report)
-    assert verdicts["a bench"].startswith("It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults")
+    assert verdicts["a bench"].startswith(
+        "It followed 100 % of 4.0 s, from 6.0 to 10.0 s, with no holds and no faults"
+    )
     assert verdicts["a bench"].endswith("It ended with hold: stale_hand, 3.1 s before the end.")
-    assert verdicts["a stop"].startswith("It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults")
-    assert "with 1 hold and 1 fault; the worst was fault: arm_silent" in verdicts["a hold before it"]
+    assert verdicts["a stop"].startswith(
+        "It followed 89 % of 9.0 s, from 6.0 to 15.0 s, with 1 hold and no faults"
+    )
+    assert (
+        "with 1 hold and 1 fault; the worst was fault: arm_silent" in verdicts["a hold before it"]
+    )
     assert "It ended with" not in verdicts["a hold before it"]
 
 
@@ -283,7 +373,10 @@ def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: 
     held = {Reason.ARM_NOT_READY: first, Reason.STALE_HAND: alone}
     for reason, span in held.items():
         assert span.reason is reason
-        assert (span.why, span.remedy) == (session.first(str(reason.name).lower()).because, span.remedy)
+        assert (span.why, span.remedy) == (
+            session.first(str(reason.name).lower()).because,
+            span.remedy,
+        )
     assert "hand was last seen" in alone.why
     assert last.reason is Reason.ARM_NOT_READY
     assert last.why == session.first("arm_not_ready", after=850).because
@@ -314,7 +407,8 @@ def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page
     Told(decoded(wicked_skill(), origin="wicked"), path)
     html_path = tmp_path / "page.html"
     assert main(["report", str(path), "--html", str(html_path)]) == 0
-    output, page = capsys.readouterr().out, html_path.read_text(encoding="utf-8")
+    output = capsys.readouterr().out
+    page = html_path.read_text(encoding="utf-8")
     for text in (output, page):
         assert all(line.isprintable() for line in text.splitlines())
     assert r"skill a\nb\x1b[31mred" in output
@@ -332,7 +426,9 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_mm.largest > 400.0
     if far_ticks is None:
         assert report.lag_mm is None
-        report.spans = tuple(span for span in report.spans if span.mode is Mode.FOLLOW)  # else a stop is the worst
+        report.spans = tuple(
+            span for span in report.spans if span.mode is Mode.FOLLOW
+        )  # else a stop is the worst
         assert "did not reach the target" in verdict(report)
         return
     assert report.initial_mm.samples == far_ticks

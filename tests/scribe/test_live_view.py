@@ -29,7 +29,8 @@ def received(*, first: int, end: int, skill_at: int = -1, skill: bytes = b"") ->
     messages = []
     for tick, frame, timing in ticks(end - first, first=first):
         if tick.index == HELD_AT:
-            frame["mode"], frame["reason"] = Mode.HOLD, Reason.OPERATOR
+            frame["mode"] = Mode.HOLD
+            frame["reason"] = Reason.OPERATOR
         inbox = (Event("skill", skill, None),) if tick.index == skill_at else ()
         messages.append(TickMessage(Tick(tick.index, inbox), frame, timing, None, None, 0))
     return messages
@@ -37,7 +38,11 @@ def received(*, first: int, end: int, skill_at: int = -1, skill: bytes = b"") ->
 
 def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[str, Any]]]:
     """The rows that a live view draws, which is paused while it is fed."""
-    view = LiveView(lambda: Viewer(urdf=WAM, settings=Settings(recording=RecordingSettings(also=("lens",))), rrd=path))
+    view = LiveView(
+        lambda: Viewer(
+            urdf=WAM, settings=Settings(recording=RecordingSettings(also=("lens",))), rrd=path
+        )
+    )
     feed(view)
     view.is_paused = False
     view.close()
@@ -45,12 +50,18 @@ def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[s
     return drawn(path)
 
 
-def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_is(tmp_path: Path, skill: Skill) -> None:
+def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_is(
+    tmp_path: Path, skill: Skill
+) -> None:
     def feed(view: LiveView) -> None:
         for message in received(first=0, end=END, skill_at=HELD_AT + 100, skill=skill.file):
             view.add(message)
             if message.tick.index == HELD_AT + 50:
-                view.put(lambda viewer: viewer.note("requests", 'via_points {"op": "clear"}', at_ns(HELD_AT + 50)))
+                view.put(
+                    lambda viewer: viewer.note(
+                        "requests", 'via_points {"op": "clear"}', at_ns(HELD_AT + 50)
+                    )
+                )
                 image = encode_image(CompressedImage(at_ns(0), "lens", "jpeg", grey(1)))
                 view.image(ImageArrival("lens", at_ns(HELD_AT + 50), image))
 
@@ -64,7 +75,9 @@ def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_i
     assert left_out > 100
     assert breaks == [drawn_ticks[-3] + 1]
     log = [text for (text,) in values(rows["/log"], TEXT)]
-    assert f"{left_out} frames and images before tick {HELD_AT} are left out: too slow to draw" in log
+    assert (
+        f"{left_out} frames and images before tick {HELD_AT} are left out: too slow to draw" in log
+    )
     assert "All via-points were removed." in log
     modes = [mode for (mode,) in values(rows["/mode"], "StateChange:state")]
     assert modes == ["hold", "follow", "hold", "follow"]

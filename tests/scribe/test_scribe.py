@@ -54,13 +54,23 @@ def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
         assert time.monotonic() < deadline, "waited too long"
 
 
-@pytest.mark.parametrize("every", [{"state": None, "with_skill": False}, {"state": state_after(3), "with_skill": True}])
+@pytest.mark.parametrize(
+    "every", [{"state": None, "with_skill": False}, {"state": state_after(3), "with_skill": True}]
+)
 def test_a_message_tells_of_a_tick_all_there_is(every: dict[str, Any]) -> None:
     for tick, frame, timing in ticks(60):
-        skills = [event.payload for event in tick.inbox if event.kind == "skill"] + [SKILL] * every["with_skill"]
+        skills = [event.payload for event in tick.inbox if event.kind == "skill"] + [SKILL] * every[
+            "with_skill"
+        ]
         message = unpack(pack(tick, frame, timing, lost=7, **every), skills, joints=7)
-        assert message.tick == Tick(tick.index, tuple(Event(event.kind, event.payload, None) for event in tick.inbox))
-        assert (encode(message.frame), encode(message.timing), message.lost) == (encode(frame), encode(timing), 7)
+        assert message.tick == Tick(
+            tick.index, tuple(Event(event.kind, event.payload, None) for event in tick.inbox)
+        )
+        assert (encode(message.frame), encode(message.timing), message.lost) == (
+            encode(frame),
+            encode(timing),
+            7,
+        )
         assert (message.state is None) == (every["state"] is None)
         assert message.skill == (SKILL if every["with_skill"] else None)
 
@@ -71,17 +81,29 @@ def test_what_is_told_is_recorded(tmp_path: Path) -> None:
         sent = tell(writer, 200)
         writer.note("requests", "via_points add handover", at_ns(20))
         status = writer.status()
-        assert (status["alive"], status["sent"], status["lost"], status["errors"]) == (True, 200, 0, [])
+        assert (status["alive"], status["sent"], status["lost"], status["errors"]) == (
+            True,
+            200,
+            0,
+            [],
+        )
         assert status["free_mb"] == pytest.approx(shutil.disk_usage(tmp_path).free / 1e6, rel=0.2)
     recording = Recording.open(status["recording"])
     first, *steps = recording.steps()
     assert Path(status["recording"]).name.startswith("hall-bench-1-2")
-    assert (recording.settings, recording.skill, recording.truncated, first.tick) == (settings, SKILL, False, -1)
+    assert (recording.settings, recording.skill, recording.truncated, first.tick) == (
+        settings,
+        SKILL,
+        False,
+        -1,
+    )
     assert [step.events for step in steps] == [
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in sent
     ]
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in sent]
-    assert [step.tick for step in steps if step.state is not None] == [49]  # the next one is due 10 s later
+    assert [step.tick for step in steps if step.state is not None] == [
+        49
+    ]  # the next one is due 10 s later
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
 
 
@@ -97,11 +119,15 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
         status = writer.status()
         assert status["lost"] == 0
     recording = Recording.open(status["recording"])
-    assert [*recording.images()] == [("camera/front", image, at_ns(40 + i)) for i, image in enumerate(images)]
+    assert [*recording.images()] == [
+        ("camera/front", image, at_ns(40 + i)) for i, image in enumerate(images)
+    ]
     assert len(list(recording.steps())) == 201
 
 
-def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(tmp_path: Path) -> None:
+def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(
+    tmp_path: Path,
+) -> None:
     with scribe(recording=tmp_path / "a.mcap") as writer:
         pid = writer.status()["pid"]
         os.kill(pid, signal.SIGSTOP)
@@ -110,7 +136,13 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
         for i in range(6000):
             tick, frame, timing = cycle[i % 40]
             began = time.perf_counter()
-            writer.send(Tick(i, tick.inbox), frame, timing, state=lambda i=i: state_after(i), skill=b"another skill")
+            writer.send(
+                Tick(i, tick.inbox),
+                frame,
+                timing,
+                state=lambda i=i: state_after(i),
+                skill=b"another skill",
+            )
             durations.append(time.perf_counter() - began)
         lost = writer.status()["lost"]
         assert lost > 100
@@ -130,10 +162,14 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
     _, *steps = Recording.open(tmp_path / "a.mcap").steps()
     assert [(step.lost, step.skill) for step in steps if step.lost] == [(lost, b"another skill")]
     assert next(step for step in steps if step.lost).state is not None
-    assert next(Recording.open(tmp_path / "a.mcap").notes("log"))[1].startswith(f"{lost} ticks before tick ")
+    assert next(Recording.open(tmp_path / "a.mcap").notes("log"))[1].startswith(
+        f"{lost} ticks before tick "
+    )
 
 
-def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp_path: Path) -> None:
+def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(
+    tmp_path: Path,
+) -> None:
     with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as writer:
         tell(writer, 20)
         killed = writer.status()["pid"]
@@ -144,7 +180,11 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(tmp
         assert writer.ready(60)
         status = writer.status()
         assert status["pid"] != killed
-        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)  # those not yet on disk
+        assert (status["alive"], status["restarts"], status["lost"]) == (
+            True,
+            1,
+            20,
+        )  # those not yet on disk
         assert status["errors"] == ["the scribe ended with code -9"]
     recording = Recording.open(tmp_path / "a-2.mcap")
     steps = list(recording.steps())
@@ -198,7 +238,9 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
             writer.supervise()
             time.sleep(0.01)
             status = writer.status()
-            return status["pid"] != stopped and status["sent"] > 300 and status["state"] == "recording"
+            return (
+                status["pid"] != stopped and status["sent"] > 300 and status["state"] == "recording"
+            )
 
         until(replaced)
         status = writer.status()
@@ -222,7 +264,8 @@ def test_the_ticks_lost_at_the_end_of_a_scribe_that_is_behind_are_those_not_on_d
     """Thousands of ticks wait, and more reports come than the socket holds unless they are read.
     One chunk may be on disk whose report a kill prevents.
     """
-    count, chunk = 12_000, 60
+    count = 12_000
+    chunk = 60
     with scribe(msgspec.structs.replace(SETTINGS, rate_hz=1000), folder=tmp_path) as writer:
         tell(writer, count)
         (path,) = tmp_path.glob("*.mcap")
@@ -255,10 +298,15 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("how", ["running", "stopped"])
-def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(tmp_path: Path, how: str) -> None:
-    command, path = [sys.executable, "-c", DAEMON, str(tmp_path), how], os.pathsep.join(sys.path)
+def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(
+    tmp_path: Path, how: str
+) -> None:
+    command = [sys.executable, "-c", DAEMON, str(tmp_path), how]
+    path = os.pathsep.join(sys.path)
     environment = os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60, check=False, env=environment)
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, text=True, timeout=60, check=False, env=environment
+    )
     assert done.returncode == -signal.SIGKILL
     until(lambda: not Path(f"/proc/{int(done.stdout)}").exists() or _is_dead(int(done.stdout)))
     (path,) = tmp_path.glob("*.mcap")
@@ -274,12 +322,17 @@ def _is_dead(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
-def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(tmp_path: Path, place: str) -> None:
+def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(
+    tmp_path: Path, place: str
+) -> None:
     with scribe(recording=Path(place), live_port=0) as writer:
         tell(writer, 100)
         until(lambda: writer.supervise() or writer.status()["live"])
         status = writer.status()
-    assert any(place in error and ("No space left" in error or "File exists" in error) for error in status["errors"])
+    assert any(
+        place in error and ("No space left" in error or "File exists" in error)
+        for error in status["errors"]
+    )
     assert status["recording"] is None
     assert status["live"].startswith("rerun+http://127.0.0.1:")
 
@@ -290,7 +343,12 @@ def test_without_anything_to_write_there_is_no_process_and_nothing_is_lost() -> 
         writer.note("requests", "x", 0)
         writer.supervise()
         status = writer.status()
-    assert (status["pid"], status["alive"], status["lost"], status["errors"]) == (None, False, 0, [])
+    assert (status["pid"], status["alive"], status["lost"], status["errors"]) == (
+        None,
+        False,
+        0,
+        [],
+    )
 
 
 def test_a_skill_larger_than_a_message_is_told_and_recorded(tmp_path: Path) -> None:
@@ -300,11 +358,17 @@ def test_a_skill_larger_than_a_message_is_told_and_recorded(tmp_path: Path) -> N
         writer.keep(large)
         for i in range(8):
             writer.send(
-                Tick(i, (Event("skill", large[i:], None),)), frame, timing, state=lambda: state_after(0), skill=large
+                Tick(i, (Event("skill", large[i:], None),)),
+                frame,
+                timing,
+                state=lambda: state_after(0),
+                skill=large,
             )
         assert writer.status()["lost"] == 0
     _, *steps = Recording.open(tmp_path / "a.mcap").steps()
-    assert [payload for step in steps for _, payload in step.events] == [large[i:] for i in range(8)]
+    assert [payload for step in steps for _, payload in step.events] == [
+        large[i:] for i in range(8)
+    ]
 
 
 SLOW = """
@@ -341,21 +405,32 @@ def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
 
 
 @pytest.mark.thorough
-def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(slow_child: Callable[..., Child]) -> None:
+def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(
+    slow_child: Callable[..., Child],
+) -> None:
     """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
 
     def seconds_until_hung(one: Child, limit_s: float, most_s: float) -> float:
-        progress, began = Progress(one), time.monotonic()
+        progress = Progress(one)
+        began = time.monotonic()
         one.socket.send(b"0")
-        while not progress.is_hung(limit_s) and time.monotonic() - began < most_s and one.poll() is None:
+        while (
+            not progress.is_hung(limit_s)
+            and time.monotonic() - began < most_s
+            and one.poll() is None
+        ):
             time.sleep(0.02)
         return time.monotonic() - began
 
     slow = slow_child(0.4, "channel.recv(1)")
     assert slow.pid is not None
     os.sched_setaffinity(slow.pid, {min(os.sched_getaffinity(0))})
-    busy = f"import os\nos.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\nwhile True: pass"
-    hogs = [subprocess.Popen([sys.executable, "-c", busy], start_new_session=True) for _ in range(25)]
+    busy = (
+        f"import os\nos.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\nwhile True: pass"
+    )
+    hogs = [
+        subprocess.Popen([sys.executable, "-c", busy], start_new_session=True) for _ in range(25)
+    ]
     try:
         assert seconds_until_hung(slow, 1.0, 4.0) > 3.9
     finally:

@@ -51,7 +51,8 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
 
     def tell(tick: Tick, frame: Frame) -> None:
         timing = blank(TIMING)
-        timing["tick"], timing["time_ns"] = tick.index, tick.index * 2_000_000
+        timing["tick"] = tick.index
+        timing["time_ns"] = tick.index * 2_000_000
         scribe.send(tick, frame, timing, state=lambda: controller.state, skill=skill.file)
         if tick.index % 100 == 0:
             time.sleep(0.02)
@@ -64,7 +65,9 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
     return sorted(folder.glob("*.mcap"))
 
 
-def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rotated: list[Path]) -> None:
+def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(
+    rotated: list[Path],
+) -> None:
     assert len(rotated) >= 3
     steps = [step for path in rotated for step in Recording.open(path).steps()]
     decided = [step for step in steps if step.frame is not None or step.checksum is not None]
@@ -77,7 +80,9 @@ def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(rota
         assert alone.exact, alone.text()
 
 
-def test_a_recording_missing_in_a_row_is_a_gap(rotated: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_missing_in_a_row_is_a_gap(
+    rotated: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["replay", str(rotated[0]), str(rotated[2]), "--exact"]) == 1
     output = capsys.readouterr().out
     assert "gap after tick " in output
@@ -89,7 +94,9 @@ def with_limits(**limits: float) -> Settings:
     return msgspec.structs.replace(CELL, files=Files(**limits))
 
 
-def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp_path: Path) -> None:
+def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(
+    tmp_path: Path,
+) -> None:
     settings = with_limits()
     current = RecordingPaths(settings, str(tmp_path), None).next()
     assert current is not None
@@ -97,9 +104,14 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
     for path in (*old, current):
         write(path, 3, settings=settings)
     other = msgspec.structs.replace(CELL, cell="hall-bench/1")
-    spared = [tmp_path / name for name in ("hall-bench-1-20260101T000001Z.mcap", "north-20200101T000000Z.mcap")]
+    spared = [
+        tmp_path / name
+        for name in ("hall-bench-1-20260101T000001Z.mcap", "north-20200101T000000Z.mcap")
+    ]
     write(spared[0], 3, settings=other)  # a name like ours, of another cell
-    spared += [tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.rrd")]
+    spared += [
+        tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.rrd")
+    ]
     for path in spared[1:]:
         path.write_bytes(bytes(80_000))
     size_mb = old[0].stat().st_size / 1e6
@@ -121,24 +133,42 @@ def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(tmp
 @pytest.mark.parametrize(
     ("set_years", "set_before", "right_after", "count"),
     [(0, 0, 0, 24), (10, 0, 0, 12), (10, 5, 0, 13), (-2, 0, 0, 25), (-2, 5, 0, 25), (10, 6, 2, 24)],
-    ids=["right", "ahead now", "ahead five files ago", "back now", "back five files ago", "ahead for four files"],
+    ids=[
+        "right",
+        "ahead now",
+        "ahead five files ago",
+        "back now",
+        "back five files ago",
+        "ahead for four files",
+    ],
 )
 def test_a_clock_that_was_set_makes_no_recording_much_older(
-    set_years: int, set_before: int, right_after: int, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    set_years: int,
+    set_before: int,
+    right_after: int,
+    count: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A recording an hour, of which those of a day are kept; the clock was set before the last
     `set_before` of them, and right again for the last `right_after`.
     """
-    settings, now_s, set_s = with_limits(keep_hours=24), 1.8e9, set_years * 365 * 86400
+    settings = with_limits(keep_hours=24)
+    now_s = 1.8e9
+    set_s = set_years * 365 * 86400
     for hours in range(31):
         path = tmp_path / f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap"
         path.write_bytes(b"")
         changed_s = now_s - 3600 * hours + set_s * (right_after <= hours < set_before)
         os.utime(path, (changed_s, changed_s))
-    monkeypatch.setattr("thirdhand.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1)
+    monkeypatch.setattr(
+        "thirdhand.scribe.paths.time.time", lambda: now_s + set_s * (right_after == 0) + 1
+    )
     RecordingPaths(settings, str(tmp_path), None).prune(None)
     left = sorted(path.name for path in tmp_path.iterdir())
-    assert left == [f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap" for hours in reversed(range(count))]
+    assert left == [
+        f"hall-bench-1-20260101T{30 - hours:06d}Z.mcap" for hours in reversed(range(count))
+    ]
 
 
 class Session:
@@ -154,11 +184,19 @@ class Session:
         for _ in range(count):
             tick, frame, timing = self._ticks[self.told % 40]
             index = self.told
-            self.scribe.send(Tick(index, tick.inbox), frame, timing, state=lambda at=index: state_after(at), skill=SKILL)
+            self.scribe.send(
+                Tick(index, tick.inbox),
+                frame,
+                timing,
+                state=lambda at=index: state_after(at),
+                skill=SKILL,
+            )
             self.told += 1
         self.scribe.supervise()
 
-    def until(self, what: Callable[[dict[str, Any]], bool], *, timeout_s: float = 20.0) -> dict[str, Any]:
+    def until(
+        self, what: Callable[[dict[str, Any]], bool], *, timeout_s: float = 20.0
+    ) -> dict[str, Any]:
         """Tells ticks until something is true of the status."""
         deadline = time.monotonic() + timeout_s
         while not what(status := self.scribe.status()):
@@ -179,7 +217,9 @@ def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
         sender.missing = sender.scribe.close(10)
 
 
-def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growth_is_told_once_there_is_enough_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(segments, "MIN_GROWTH_S", 0.5)
     settings = msgspec.structs.replace(CELL, files=Files(segment_mb=0.3))
     paths = RecordingPaths(settings, str(tmp_path), None)
@@ -187,7 +227,9 @@ def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: 
     writer.begin(SKILL, state_after(-1))
     writer.flush()
     assert writer.mb_per_hour() is None
-    begin_s, before, cycle = time.monotonic(), sum(path.stat().st_size for path in tmp_path.iterdir()), list(ticks(40))
+    begin_s = time.monotonic()
+    before = sum(path.stat().st_size for path in tmp_path.iterdir())
+    cycle = list(ticks(40))
     for i in range(2000):
         tick, frame, timing = cycle[i % 40]
         state = state_after(i) if i % 50 == 49 else None
@@ -198,14 +240,18 @@ def test_growth_is_told_once_there_is_enough_of_it(tmp_path: Path, monkeypatch: 
     writer.flush()
     grown_mb = (sum(path.stat().st_size for path in tmp_path.iterdir()) - before) / 1e6
     assert len(list(tmp_path.iterdir())) > 2
-    assert writer.mb_per_hour() == pytest.approx(grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1)
+    assert writer.mb_per_hour() == pytest.approx(
+        grown_mb * 3600 / (time.monotonic() - begin_s), rel=0.1
+    )
     assert writer.keep_mb_left is not None
     writer.close()
 
 
 def accounted(paths: list[Path], told: int) -> tuple[int, int]:
     """The number of ticks in recordings, and of those that they say are missing."""
-    steps = [step for path in paths for step in Recording.open(path).steps() if step.frame is not None]
+    steps = [
+        step for path in paths for step in Recording.open(path).steps() if step.frame is not None
+    ]
     indices = [step.tick for step in steps]
     assert indices == sorted(set(indices))
     assert indices[-1] == told - 1
@@ -218,7 +264,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 6 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], capture_output=True, check=False)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], capture_output=True, check=False
+    )
     if done.returncode != 0:
         pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
     try:
@@ -235,7 +283,9 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
         with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
             while file.write(bytes(4096)):
                 pass
-        status = sender.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
+        status = sender.until(
+            lambda status: status["state"] == "interrupted" and status["lost"] > 200
+        )
         assert status["recording"] is None
         assert sender.scribe.newest_recording == str(*small_disk.glob("*.mcap"))
         full = [error for error in status["errors"] if error.startswith("recording to ")]
@@ -244,7 +294,9 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> 
         ballast.unlink()
         sender.until(lambda status: status["state"] == "recording")
         sent = sender.told
-        status = sender.until(lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1])
+        status = sender.until(
+            lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1]
+        )
         assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
     recordings = sorted(small_disk.glob("*.mcap"))
     recorded, lost = accounted(recordings, sender.told)
@@ -262,18 +314,24 @@ def test_a_limit_on_files_interrupts_a_recording_until_it_is_lifted(tmp_path: Pa
         pid = sender.scribe.status()["pid"]
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
         sender.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        resource.prlimit(
+            pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        )
         sender.until(lambda status: status["state"] == "recording")
     recorded, lost = accounted(sorted(tmp_path.glob("*.mcap")), sender.told)
     assert recorded + lost == sender.told
 
 
-def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(tmp_path: Path) -> None:
+def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "records"
     with session(folder=folder) as sender:
         sender.until(lambda status: status["sent"] > 200)
         shutil.rmtree(folder)
-        status = sender.until(lambda status: status["lost"] > 0 and status["state"] == "recording" and folder.exists())
+        status = sender.until(
+            lambda status: status["lost"] > 0 and status["state"] == "recording" and folder.exists()
+        )
         assert any("was removed while it was written" in error for error in status["errors"])
     recorded, lost = accounted(sorted(folder.glob("*.mcap")), sender.told)
     assert recorded + lost == sender.told
@@ -288,4 +346,7 @@ def test_a_recording_that_is_moved_is_ended_where_it_is_and_nothing_is_lost(tmp_
         first.rename(tmp_path / "elsewhere.mcap")
         status = sender.until(lambda status: status["recording"] != str(first))
     assert sender.missing == ""
-    assert accounted([tmp_path / "elsewhere.mcap", Path(status["recording"])], sender.told) == (sender.told, 0)
+    assert accounted([tmp_path / "elsewhere.mcap", Path(status["recording"])], sender.told) == (
+        sender.told,
+        0,
+    )

@@ -21,7 +21,16 @@ from thirdhand.client.client_settings import client_settings
 from thirdhand.contract.requests import List, ViaPointsRequest, decode_request
 from thirdhand.daemon.launch import described
 from thirdhand.recordings.shipped import cell_of
-from thirdhand.settings.config import FOLLOWING, WAM, Files, Settings, converted, load, parse, robot_description
+from thirdhand.settings.config import (
+    FOLLOWING,
+    WAM,
+    Files,
+    Settings,
+    converted,
+    load,
+    parse,
+    robot_description,
+)
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.network import Network, is_local
 from thirdhand_sim.scene import Scene, SceneError
@@ -35,7 +44,9 @@ def refusal(text: str) -> str:
 
 
 def test_limits_may_be_lowered() -> None:
-    settings = parse("[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml")
+    settings = parse(
+        "[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml"
+    )
     assert settings.joints.velocity[6] == 0.5
     assert settings.tool.max_speed == 0.3
 
@@ -68,16 +79,32 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
         ("[hands]\nunit = 'inch'", "[hands] unit", "mm"),
         ("[hands]\nstale_ms = 0", "[hands] stale_ms", "above 0"),
         ("[hands]\nstale_ms = nan", "[hands] stale_ms", "accepted"),
-        ("[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]", "[hands] base_from_tracker", "1 needed (x y z w)"),
-        ("[trackers.mocap]\nunit = 'inch'", "[trackers.mocap] unit", "'inch' given; cm, m, mm accepted"),
+        (
+            "[hands]\nbase_from_tracker = [0, 0, 0, 0, 0, 0, 0]",
+            "[hands] base_from_tracker",
+            "1 needed (x y z w)",
+        ),
+        (
+            "[trackers.mocap]\nunit = 'inch'",
+            "[trackers.mocap] unit",
+            "'inch' given; cm, m, mm accepted",
+        ),
         (
             "[trackers.a]\nunit = 'm'\n[trackers.b]\nbase_from_tracker = [1]",
             "[trackers.b] base_from_tracker",
             "7 needed",
         ),
         ("[trackers.a]\nunits = 'm'", "[trackers] a: unknown field 'units'", "did you mean unit?"),
-        ("[trackers.'a b']\nunit = 'm'", "trackers", "'a b' given; 1 to 64 letters, digits and _ . / -"),
-        ("[hands]\nframe = 'a'\n[trackers.a]\nunit = 'm'", "[trackers] a", "another one than 'base' and [hands] frame"),
+        (
+            "[trackers.'a b']\nunit = 'm'",
+            "trackers",
+            "'a b' given; 1 to 64 letters, digits and _ . / -",
+        ),
+        (
+            "[hands]\nframe = 'a'\n[trackers.a]\nunit = 'm'",
+            "[trackers] a",
+            "another one than 'base' and [hands] frame",
+        ),
         ("[tool]\nmax_speed = -1", "[tool] max_speed", "above 0"),
         ("[joints]\nvelocity = [9, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "1.5"),
         ("[joints]\nvelocity = [nan, 1, 1, 1, 1, 1, 1]", "[joints] velocity, entry 1", "finite"),
@@ -88,8 +115,16 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[joints] lower, entry 1",
             "less than [joints] upper, entry 1 =",
         ),
-        ("[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]", "[arm] posture, entry 6", "-1.5707 to 1.5707 accepted"),
-        ("[network]\nlisten = 'tcp/0.0.0.0:1'", "[network] listen", "'tcp/0.0.0.0:1' given; a list needed"),
+        (
+            "[arm]\nposture = [0, 0, 0, 0, 0, 2, 0]",
+            "[arm] posture, entry 6",
+            "-1.5707 to 1.5707 accepted",
+        ),
+        (
+            "[network]\nlisten = 'tcp/0.0.0.0:1'",
+            "[network] listen",
+            "'tcp/0.0.0.0:1' given; a list needed",
+        ),
         ("[obstacles]\nclearence = 1", "unknown field 'clearence'", "did you mean clearance?"),
         ("[files]\nstate = '~nobody-of-this-name/x'", "[files] state", "no user of this name"),
         ('[network]\ncertificate = "a\\u0000b"', "[network] certificate", "no zero bytes"),
@@ -103,27 +138,48 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[network] listen, entry 2",
             "or else allow_insecure",
         ),
-        ("[network]\nlisten = ['tls/127.0.0.1:1']", "[network] certificate", "the folder of one needed"),
-        ("[network]\ncertificate = 'x'\nlisten = ['tcp/127.0.0.1:1']", "[network] listen, entry 1", "tls/... needed"),
+        (
+            "[network]\nlisten = ['tls/127.0.0.1:1']",
+            "[network] certificate",
+            "the folder of one needed",
+        ),
+        (
+            "[network]\ncertificate = 'x'\nlisten = ['tcp/127.0.0.1:1']",
+            "[network] listen, entry 1",
+            "tls/... needed",
+        ),
         (
             "[network]\nconnect = ['tcp/127.0.0.1:1', 'tcp/10.0.0.1:1']",
             "[network] connect, entry 2",
             "or else allow_insecure",
         ),
-        ("[network]\nconnect = ['tls/10.0.0.1:1']", "[network] certificate", "the folder of one needed"),
+        (
+            "[network]\nconnect = ['tls/10.0.0.1:1']",
+            "[network] certificate",
+            "the folder of one needed",
+        ),
         (
             "[network]\ncertificate = 'x'\nlisten = []\nconnect = ['tcp/127.0.0.1:1']",
             "[network] connect, entry 1",
             "tls/... needed",
         ),
-        ("[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]", "[tool] plate_from_tool", "1 needed (x y z w)"),
+        (
+            "[tool]\nplate_from_tool = [0, 0, 0, 0.5, 0, 0, 0]",
+            "[tool] plate_from_tool",
+            "1 needed (x y z w)",
+        ),
         ("[network]\nrevoked = ['tracker']", "[network] revoked", "no client has a certificate"),
         (
-            "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', 'tracer']",
+            "[network]\ncertificate = 'x'\nlisten = ['tls/127.0.0.1:1']\nrevoked = ['tracker-2', "
+            "'tracer']",
             "[network] revoked, entry 2",
             "with a number, like tracker-2",
         ),
-        ("[hands]\nbase_from_tracker = [101, 0, 0, 0, 0, 0, 1]", "[hands] base_from_tracker", "100 m or less on each"),
+        (
+            "[hands]\nbase_from_tracker = [101, 0, 0, 0, 0, 0, 1]",
+            "[hands] base_from_tracker",
+            "100 m or less on each",
+        ),
         ("[reach]\ninner = 0.9\nouter = 0.5", "[reach] inner", ""),
     ],
 )
@@ -220,9 +276,13 @@ def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
     network = Settings().network
     assert [is_local(endpoint) for endpoint in network.listen] == [True]
     assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
-    insecure = parse("[network]\nlisten = ['tcp/0.0.0.0:1']\nallow_insecure = true", origin="cell.toml")
+    insecure = parse(
+        "[network]\nlisten = ['tcp/0.0.0.0:1']\nallow_insecure = true", origin="cell.toml"
+    )
     assert insecure.network.listen == ("tcp/0.0.0.0:1",)
-    routed = parse("[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml")
+    routed = parse(
+        "[network]\nconnect = ['tcp/10.0.0.1:1']\nallow_insecure = true", origin="cell.toml"
+    )
     assert routed.network.connect == ("tcp/10.0.0.1:1",)
 
 
@@ -230,11 +290,17 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """The paths of all numbers with decimals in settings."""
     if isinstance(value, float):
         yield path
-    for key, inner in value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ()):
+    for key, inner in (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value if isinstance(value, list) else ())
+    ):
         yield from leaves(inner, (*path, key))
 
 
-@pytest.mark.parametrize("number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf, math.nan])
+@pytest.mark.parametrize(
+    "number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf, math.nan]
+)
 def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float) -> None:
     usual = msgspec.json.decode(msgspec.json.encode(Settings()))
     paths = list(leaves(usual))
@@ -242,7 +308,9 @@ def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float
     for path in paths:
         document = copy.deepcopy(usual)
         functools.reduce(lambda part, key: part[key], path[:-1], document)[path[-1]] = number
-        with pytest.raises(SettingsError, match=str(path[-1]) if isinstance(path[-1], str) else str(path[-2])):
+        with pytest.raises(
+            SettingsError, match=str(path[-1]) if isinstance(path[-1], str) else str(path[-2])
+        ):
             converted(document, origin="cell.toml")
 
 
@@ -263,7 +331,11 @@ def test_a_text_of_another_encoding_is_read_or_named(
     path.write_text("# for the \u00e4rm\n", encoding=encoding)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     for read in (load, lambda _: client_settings(), Scene.load):
-        refused = pytest.raises((SettingsError, SceneError), match=words) if words else contextlib.nullcontext()
+        refused = (
+            pytest.raises((SettingsError, SceneError), match=words)
+            if words
+            else contextlib.nullcontext()
+        )
         with refused:
             read(path)
     if not words:
@@ -271,7 +343,9 @@ def test_a_text_of_another_encoding_is_read_or_named(
         assert decode_request(data[:3] + b'{"op": "list"}', ViaPointsRequest) == List()
 
 
-def test_a_key_of_many_parts_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_of_many_parts_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = "\n" + ".".join(["a"] * 20_000) + " = 1"
     assert "line 2 has 19999 dots, at most 1000 accepted" in refusal(text)
     path = tmp_path / "thirdhand" / "client.toml"
@@ -279,16 +353,27 @@ def test_a_key_of_many_parts_is_refused_before_it_is_read(tmp_path: Path, monkey
     path.write_text(text)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     for read in (client_settings, lambda: Scene.load(path)):
-        with pytest.raises((SettingsError, SceneError), match="line 2 has 19999 dots, at most 1000 accepted"):
+        with pytest.raises(
+            (SettingsError, SceneError), match="line 2 has 19999 dots, at most 1000 accepted"
+        ):
             read()
 
 
-def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_become_absolute_where_the_configuration_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "my" / "share").mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "my" / "arm.urdf").write_bytes(WAM.with_name("ur5.urdf").read_bytes())
-    cell = WAM.with_name("ur5.toml").read_text().replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
-    network = '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = "../zenoh.json5"'
+    cell = (
+        WAM.with_name("ur5.toml")
+        .read_text()
+        .replace('urdf = "ur5.urdf"', 'urdf = "arm.urdf"\npackages = ["share"]')
+    )
+    network = (
+        '[network]\nlisten = ["tls/localhost:0"]\ncertificate = "secrets"\nzenoh_config = '
+        '"../zenoh.json5"'
+    )
     files = '[files]\nrecord = "records"\nskill = "mine.npz"\nstate = "~/state"'
     (tmp_path / "my" / "cell.toml").write_text(f"{cell}\n{network}\n{files}\n")
     monkeypatch.chdir(tmp_path)
@@ -308,16 +393,25 @@ def test_paths_become_absolute_where_the_configuration_is_read(tmp_path: Path, m
 
 
 def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
-    bare = re.sub(r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>', r"\1", continuous_urdf())
+    bare = re.sub(
+        r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>',
+        r"\1",
+        continuous_urdf(),
+    )
     assert bare.count("<limit") == continuous_urdf().count("<limit") - 1
     posture = (NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0)
     cell = cell_in(tmp_path, bare, posture=posture)
     assert cell.joints.velocity[5] == 2.0
-    assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (-6000.0, 6000.0, "continuous")
+    assert (cell.joints.lower[5], cell.joints.upper[5], cell.joints.kinds[5]) == (
+        -6000.0,
+        6000.0,
+        "continuous",
+    )
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     (tmp_path / "cell.toml").write_text(re.sub(r"velocity = .*", "", text), encoding="utf-8")
     with pytest.raises(
-        SettingsError, match=r"\[joints\] velocity: missing; the URDF does not define it, 6 numbers needed"
+        SettingsError,
+        match=r"\[joints\] velocity: missing; the URDF does not define it, 6 numbers needed",
     ):
         load(tmp_path / "cell.toml")
 
@@ -337,10 +431,14 @@ def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_pat
         ),
     ],
 )
-def test_kinds_and_limits_that_contradict_the_urdf_are_refused(tmp_path: Path, line: str, message: str) -> None:
+def test_kinds_and_limits_that_contradict_the_urdf_are_refused(
+    tmp_path: Path, line: str, message: str
+) -> None:
     continuous_cell(tmp_path)
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
-    (tmp_path / "cell.toml").write_text(text.replace("[joints]", f"[joints]\n{line}"), encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(
+        text.replace("[joints]", f"[joints]\n{line}"), encoding="utf-8"
+    )
     with pytest.raises(SettingsError) as caught:
         load(tmp_path / "cell.toml")
     assert message in str(caught.value)
@@ -370,13 +468,24 @@ network.listen = ["tcp/127.0.0.1:7448"]
 """
 
 
-def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_own(tmp_path: Path) -> None:
+def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_own(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(LAB, encoding="utf-8")
-    first, second, third = (cell_of(f"{path}:{name}") for name in ("bench1", "lab/bench2", "bench3"))
-    assert [settings.cell for settings in (first, second, third)] == ["bench1", "lab/bench2", "hall/bench3"]
+    first, second, third = (
+        cell_of(f"{path}:{name}") for name in ("bench1", "lab/bench2", "bench3")
+    )
+    assert [settings.cell for settings in (first, second, third)] == [
+        "bench1",
+        "lab/bench2",
+        "hall/bench3",
+    ]
     assert [settings.rate_hz for settings in (first, second, third)] == [250, 500, 250]
-    assert [(settings.tool.max_speed, settings.tool.max_jerk) for settings in (first, second)] == [(0.5, 200.0), (0.3, 200.0)]
+    assert [(settings.tool.max_speed, settings.tool.max_jerk) for settings in (first, second)] == [
+        (0.5, 200.0),
+        (0.3, 200.0),
+    ]
     assert third.network.listen == ("tcp/127.0.0.1:7448",)
     assert first.network.listen == second.network.listen == ("tcp/127.0.0.1:0",)
 
@@ -391,7 +500,9 @@ def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_
         ("[cells.a]\ntool = 3", "a", "tool: 3 given"),
     ],
 )
-def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text: str, cell: str, words: str) -> None:
+def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(
+    text: str, cell: str, words: str
+) -> None:
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
@@ -401,7 +512,10 @@ def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(text
     ("network", "endpoints"),
     [
         ({}, ("tcp/127.0.0.1:7447",)),
-        ({"listen": ("tcp/0.0.0.0:1", "tcp/[::]:2"), "allow_insecure": True}, ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2")),
+        (
+            {"listen": ("tcp/0.0.0.0:1", "tcp/[::]:2"), "allow_insecure": True},
+            ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"),
+        ),
         ({"listen": ("tcp/127.0.0.1:0",)}, ()),
         ({"listen": ("tcp/127.0.0.1:0",), "connect": ("tcp/[::1]:5",)}, ("tcp/[::1]:5",)),
         ({"listen": ("unixsock-stream//run/th.sock",)}, ("unixsock-stream//run/th.sock",)),

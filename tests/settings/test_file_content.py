@@ -37,7 +37,9 @@ def odd(folder: Path, kind: str) -> Path:
         os.mkfifo(path)
     elif kind == "a folder":
         path.mkdir()
-    return {"a device without end": Path("/dev/zero"), "a full device": Path("/dev/full")}.get(kind, path)
+    return {"a device without end": Path("/dev/zero"), "a full device": Path("/dev/full")}.get(
+        kind, path
+    )
 
 
 KINDS = ("a device without end", "a full device", "a pipe", "a folder", "nothing")
@@ -56,8 +58,11 @@ def test_what_is_no_file_is_refused_with_the_cause(tmp_path: Path, kind: str) ->
 
 @pytest.mark.parametrize("size", [0, 1, LARGEST - 1, LARGEST, LARGEST + 1, 50 * LARGEST])
 @pytest.mark.parametrize("is_pipe", [True, False])
-def test_a_file_or_pipe_is_read_whole_up_to_what_is_accepted(tmp_path: Path, size: int, is_pipe: bool) -> None:
-    path, data = tmp_path / "file", os.urandom(size)
+def test_a_file_or_pipe_is_read_whole_up_to_what_is_accepted(
+    tmp_path: Path, size: int, is_pipe: bool
+) -> None:
+    path = tmp_path / "file"
+    data = os.urandom(size)
     if is_pipe:
         ends = os.pipe()
         path = Path(f"/dev/fd/{ends[0]}")

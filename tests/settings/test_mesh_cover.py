@@ -31,7 +31,8 @@ Points = NDArray[np.float64]
 
 def outside(points: Points, ends: Points, radius: float) -> float:
     """How far the farthest of points (N, 3) is out of a capsule [m]."""
-    start, span = ends[0], ends[1] - ends[0]
+    start = ends[0]
+    span = ends[1] - ends[0]
     share = np.clip((points - start) @ span / max(span @ span, 1e-18), 0.0, 1.0)
     return float(np.linalg.norm(points - start - share[:, None] * span, axis=1).max() - radius)
 
@@ -48,15 +49,24 @@ def stl(points: Points) -> bytes:
 
 
 def box(x: float, y: float, z: float) -> Points:
-    return np.array([(a * x, b * y, c * z) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+    return np.array(
+        [(a * x, b * y, c * z) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)]
+    )
 
 
 @settings(deadline=None, max_examples=40, derandomize=True)
-@given(arrays(float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)))
-def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(points: Points) -> None:
+@given(
+    arrays(
+        float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)
+    )
+)
+def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(
+    points: Points,
+) -> None:
     """Flat ones, and one alone, too."""
     capsule = np.array(capsule_around(points))
-    ends, radius = capsule[:6].reshape(2, 3), float(capsule[6])
+    ends = capsule[:6].reshape(2, 3)
+    radius = float(capsule[6])
     assert outside(points, ends, radius) <= 1e-9
     widest = np.linalg.norm(points - points.mean(axis=0), axis=1).max() + 0.001
     assert volume(ends, radius) <= 1.05 * volume(np.zeros((2, 3)), widest)
@@ -72,7 +82,10 @@ def described(name: str, scale: str = "") -> str:
     """The WAM, whose forearm has this mesh alone as its collision shape, turned and moved."""
     begin = WAM.index('<link name="forearm">')
     end = WAM.index("</link>", begin)
-    shape = f'<collision><origin xyz="0.01 0 0.1" rpy="0 0.5 0"/><geometry><mesh filename="{name}"{scale}/></geometry>'
+    shape = (
+        '<collision><origin xyz="0.01 0 0.1" rpy="0 0.5 0"/><geometry><mesh '
+        f'filename="{name}"{scale}/></geometry>'
+    )
     return f'{WAM[:begin]}<link name="forearm">{shape}</collision>{WAM[end:]}'
 
 
@@ -84,12 +97,18 @@ def described(name: str, scale: str = "") -> str:
         ("../a%20b.stl", "a%20b.stl", ""),
         ("meshes/arm.stl", "linked/meshes/arm.stl", ""),  # the URDF is a link
         ("package://linked/arm.stl", "linked/arm.stl", ""),
-        ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),  # the folder above the URDF is the package
+        (
+            "package://my_arm/meshes/arm.stl",
+            "meshes/arm.stl",
+            "",
+        ),  # the folder above the URDF is the package
         ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
         ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
     ],
 )
-def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: str, packages: str) -> None:
+def test_a_mesh_is_found_where_its_name_leads(
+    tmp_path: Path, name: str, file: str, packages: str
+) -> None:
     folder = tmp_path / "my_arm"
     (folder / "cell").mkdir(parents=True)
     (folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +138,11 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
     shape = next(candidate for candidate in Urdf(text).shapes if candidate.link == "forearm")
     points_m = points * 0.001 @ rotation(shape.rotation).T + shape.translation
     capsules = body_of(cell, text).capsules
-    mine = [capsule for capsule in capsules if outside(points_m, capsule["ends"], capsule["radius"]) <= 1e-9]
+    mine = [
+        capsule
+        for capsule in capsules
+        if outside(points_m, capsule["ends"], capsule["radius"]) <= 1e-9
+    ]
     assert [round(float(capsule["radius"]), 2) for capsule in mine] == [0.04]
     assert capsules["radius"].max() < 0.2  # none by `link_radius`
 
@@ -133,12 +156,15 @@ def test_a_mesh_is_found_where_its_name_leads(tmp_path: Path, name: str, file: s
         ),
         (
             "meshes/link.stl",
-            "there is no {folder}/meshes/link.stl; put it there. Links with a box, cylinder or sphere instead",
+            "there is no {folder}/meshes/link.stl; put it there. Links with a box, cylinder or "
+            "sphere instead",
         ),
         ("broken.stl", "cannot be read"),
     ],
 )
-def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(tmp_path: Path, name: str, told: str) -> None:
+def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(
+    tmp_path: Path, name: str, told: str
+) -> None:
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(described(name))
@@ -188,8 +214,18 @@ TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
         ("a.stl", stl(LEG), ' scale="1 -1 1"', LEG * (1, -1, 1)),
         ("a.stl", stl(LEG), ' scale="-1 2 0.5"', LEG * (-1, 2, 0.5)),
         ("a.dae", collada(1000 * LEG, "0.001"), "", LEG),
-        ("a.dae", collada(1000 * LEG, "0.001", QUARTER, "Y_UP"), "", TURNED),  # as RViz and MoveIt have it
-        ("a.obj", "".join(f"v {x} {y} {z}\n" for x, y, z in LEG) + "f 1 2 3\nf 4 5 6\nf 6 7 8\n", "", LEG),
+        (
+            "a.dae",
+            collada(1000 * LEG, "0.001", QUARTER, "Y_UP"),
+            "",
+            TURNED,
+        ),  # as RViz and MoveIt have it
+        (
+            "a.obj",
+            "".join(f"v {x} {y} {z}\n" for x, y, z in LEG) + "f 1 2 3\nf 4 5 6\nf 6 7 8\n",
+            "",
+            LEG,
+        ),
     ],
 )
 def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
@@ -197,7 +233,11 @@ def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
 ) -> None:
     (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
     (tmp_path / "arm.urdf").write_text(described(name, scale))
-    shape = next(candidate for candidate in Urdf(description(tmp_path / "arm.urdf")).shapes if candidate.link == "forearm")
+    shape = next(
+        candidate
+        for candidate in Urdf(description(tmp_path / "arm.urdf")).shapes
+        if candidate.link == "forearm"
+    )
     points_m = expected @ rotation(shape.rotation).T + shape.translation
     assert around(shape, points_m) <= 1e-5
     ends = np.reshape(shape.size[:6], (2, 3))
@@ -208,10 +248,16 @@ def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Pat
     for name, points in (("a.stl", LEG), ("b.stl", LEG + np.array((0.2, 0.0, 0.0)))):
         (tmp_path / name).write_bytes(stl(points))
     second = '</collision><collision><geometry><mesh filename="b.stl"/></geometry></collision>'
-    text = described("a.stl").replace('<mesh filename="a.stl"/></geometry></collision>',
-                                      f'<mesh filename="a.stl"/></geometry>{second}')  # fmt: skip
+    text = described("a.stl").replace(
+        '<mesh filename="a.stl"/></geometry></collision>',
+        f'<mesh filename="a.stl"/></geometry>{second}',
+    )
     (tmp_path / "arm.urdf").write_text(text)
-    shapes = [shape for shape in Urdf(description(tmp_path / "arm.urdf")).shapes if shape.link == "forearm"]
+    shapes = [
+        shape
+        for shape in Urdf(description(tmp_path / "arm.urdf")).shapes
+        if shape.link == "forearm"
+    ]
     assert [round(shape.size[6], 2) for shape in shapes] == [0.04, 0.04]
     assert around(shapes[1], LEG + np.array((0.2, 0.0, 0.0))) <= 1e-5
 
@@ -219,7 +265,11 @@ def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Pat
 @pytest.mark.parametrize(
     ("data", "scale", "said"),
     [
-        (stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.nan)), "", "finite numbers"),
+        (
+            stl(LEG).replace(struct.pack("<f", np.float32(LEG[1, 2])), struct.pack("<f", np.nan)),
+            "",
+            "finite numbers",
+        ),
         (bytes(80) + struct.pack("<I", 0), "", "vertices with finite numbers needed"),
         (stl(LEG)[:-20], "", "cannot be read"),
         (stl(LEG), ' scale="nan 1 1"', "finite numbers up to 1e+06 needed"),
@@ -227,15 +277,24 @@ def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Pat
         (stl(1000 * LEG), "", "the mesh of link 'forearm' is 378 m long"),
     ],
 )
-def test_what_is_no_mesh_of_an_arm_is_refused(data: bytes, scale: str, said: str, tmp_path: Path) -> None:
+def test_what_is_no_mesh_of_an_arm_is_refused(
+    data: bytes, scale: str, said: str, tmp_path: Path
+) -> None:
     (tmp_path / "a.stl").write_bytes(data)
     (tmp_path / "arm.urdf").write_text(described("a.stl", scale))
     defaults = Settings()
     with pytest.raises(SettingsError, match=re.escape(said)) as error:
         converted(
             {
-                "arm": {"urdf": "arm.urdf", "plate": defaults.arm.plate, "posture": list(defaults.arm.posture)},
-                "joints": {"acceleration": list(defaults.joints.acceleration), "jerk": list(defaults.joints.jerk)},
+                "arm": {
+                    "urdf": "arm.urdf",
+                    "plate": defaults.arm.plate,
+                    "posture": list(defaults.arm.posture),
+                },
+                "joints": {
+                    "acceleration": list(defaults.joints.acceleration),
+                    "jerk": list(defaults.joints.jerk),
+                },
             },
             origin="cell.toml",
             folder=tmp_path,

@@ -48,7 +48,11 @@ def every(attribute: str, value: str | None) -> str:
 
 def chain_of(count: int) -> str:
     links = "".join(f'<link name="l{i}"/>' for i in range(count))
-    return more(links + fixed("tool0", "l0") + "".join(fixed(f"l{i}", f"l{i + 1}") for i in range(count - 1)))
+    return more(
+        links
+        + fixed("tool0", "l0")
+        + "".join(fixed(f"l{i}", f"l{i + 1}") for i in range(count - 1))
+    )
 
 
 def tried(folder: Path, text: str | bytes) -> Settings:
@@ -59,7 +63,8 @@ def tried(folder: Path, text: str | bytes) -> Settings:
     finally:
         assert time.process_time() - start < BOUND_S
     robot = robot_description(cell)
-    arm, body = Arm(cell, robot), body_of(cell, robot)
+    arm = Arm(cell, robot)
+    body = body_of(cell, robot)
     pose = arm.at(np.array(cell.arm.posture))
     for numbers in (pose.position, pose.jacobian, body.frames, body.axes, body.capsules["ends"]):
         assert np.isfinite(numbers).all()
@@ -74,7 +79,10 @@ REFUSED = {
         "the joints above 'x', 'y' form a cycle",
     ),
     "a closed loop through the plate": (more(fixed("tool0", "base_link")), "form a cycle"),
-    "a link on itself": (more('<link name="x"/>' + fixed("x", "x")), "the joints above 'x' form a cycle"),
+    "a link on itself": (
+        more('<link name="x"/>' + fixed("x", "x")),
+        "the joints above 'x' form a cycle",
+    ),
     "a link with two parents": (
         more('<link name="x"/>' + fixed("x", "tool0", "second")),
         "link 'tool0' is the child of two joints, 'wrist_3-tool0_fixed_joint' and 'second'",
@@ -94,15 +102,24 @@ REFUSED = {
     "a velocity of 0": (every("velocity", "0"), "'shoulder_pan_joint' has the velocity 0; above 0"),
     "a velocity of inf": (every("velocity", "inf"), "'shoulder_pan_joint' has the velocity inf"),
     "no velocity": (every("velocity", None), "'shoulder_pan_joint' has the velocity none"),
-    "a velocity in words": (every("velocity", "fast"), "'shoulder_pan_joint' has the velocity none"),
+    "a velocity in words": (
+        every("velocity", "fast"),
+        "'shoulder_pan_joint' has the velocity none",
+    ),
     "no lower limit": (every("lower", None), "'shoulder_pan_joint' has the limits none to"),
-    "limits the other way round": (every("upper", "-9"), "'shoulder_pan_joint' has the limits -6.2832 to -9"),
+    "limits the other way round": (
+        every("upper", "-9"),
+        "'shoulder_pan_joint' has the limits -6.2832 to -9",
+    ),
     "a limit without end": (every("upper", "1e300"), "within 1000 rad, needed"),
     "no limits": (
         re.sub(r"<limit[^>]*/>", "", UR5),
         "has the limits none to none; lower below upper, within 1000 rad, needed",
     ),
-    "an axis of 0": (every("xyz", "0 0 0"), "'shoulder_pan_joint' has the axis 0 0 0; a direction needed"),
+    "an axis of 0": (
+        every("xyz", "0 0 0"),
+        "'shoulder_pan_joint' has the axis 0 0 0; a direction needed",
+    ),
     "an axis of NaN": (every("xyz", "nan 0 0"), "<axis xyz='nan 0 0'>: finite numbers"),
     "an axis of two numbers": (every("xyz", "0 1"), "<axis xyz='0 1'>: 2 numbers, 3 needed"),
     "an origin without end": (UR5.replace('xyz="0', 'xyz="inf', 1), "finite numbers up to"),
@@ -110,7 +127,10 @@ REFUSED = {
         re.sub("<cylinder[^>]*/>", '<box size="0.1 0.1"/>', UR5),
         "the collision of link 'base_link': <box> has no size",
     ),
-    "an unknown shape": (UR5.replace("<cylinder", "<ellipsoid"), "<ellipsoid> is no shape; box, cylinder"),
+    "an unknown shape": (
+        UR5.replace("<cylinder", "<ellipsoid"),
+        "<ellipsoid> is no shape; box, cylinder",
+    ),
     "a shape longer than the arm": (
         re.sub("<cylinder[^>]*/>", '<box size="60 60 60"/>', UR5),
         "the box of link 'base_link' is 104 m long, and the arm 1.33 m",
@@ -124,28 +144,47 @@ REFUSED = {
         UR5.replace('<link name="tool0"/>', f'<link name="tool0">{600 * SPHERE}</link>'),
         "collision shapes; up to 500 accepted",
     ),
-    "very deep XML": ("<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>", "more than 64 elements in each"),
+    "very deep XML": (
+        "<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>",
+        "more than 64 elements in each",
+    ),
     "very many elements": ("<robot>" + "<a/>" * 300_000 + "</robot>", "more than 100000 elements"),
     "entities that grow": (
         "<!DOCTYPE r [<!ENTITY a 'aaaaaaaaaa'>"
-        + "".join(f"<!ENTITY {b} '{f'&{a};' * 10}'>" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+        + "".join(
+            f"<!ENTITY {b} '{f'&{a};' * 10}'>" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+        )
         + "]><robot>&i;</robot>",
         "amplification",
     ),
-    "macros of xacro": (more('<xacro:include filename="arm.xacro"/>'), "`xacro arm.urdf.xacro > arm.urdf`"),
-    "a macro's argument": (UR5.replace('xyz="0 0', 'xyz="${x} 0', 1), "its macros are not expanded"),
-    "an unknown encoding": (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
+    "macros of xacro": (
+        more('<xacro:include filename="arm.xacro"/>'),
+        "`xacro arm.urdf.xacro > arm.urdf`",
+    ),
+    "a macro's argument": (
+        UR5.replace('xyz="0 0', 'xyz="${x} 0', 1),
+        "its macros are not expanded",
+    ),
+    "an unknown encoding": (
+        b'<?xml version="1.0" encoding="klingon"?><robot/>',
+        "unknown encoding",
+    ),
     "bytes": (bytes(range(256)), "no XML"),
     "an empty file": ("", "not a robot description"),
     "half a file": (UR5[: len(UR5) // 2], "no XML"),
     "an SDF": ('<sdf version="1.6"><model name="arm"/></sdf>', "a <robot> with joints needed"),
-    "a robot without joints": ('<robot name="r"><link name="a"/></robot>', "a <robot> with joints needed"),
+    "a robot without joints": (
+        '<robot name="r"><link name="a"/></robot>',
+        "a <robot> with joints needed",
+    ),
     "no plate": (UR5.replace("tool0", "flange"), "no link 'tool0'; the last ones of the arm are"),
 }
 
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.values(), ids=REFUSED)
-def test_what_is_no_arm_is_refused_in_one_sentence(text: str | bytes, said: str, tmp_path: Path) -> None:
+def test_what_is_no_arm_is_refused_in_one_sentence(
+    text: str | bytes, said: str, tmp_path: Path
+) -> None:
     with pytest.raises(SettingsError) as error:
         tried(tmp_path, text)
     message = str(error.value)
@@ -155,7 +194,9 @@ def test_what_is_no_arm_is_refused_in_one_sentence(text: str | bytes, said: str,
     assert "\n" not in message
 
 
-LATIN = '<?xml version="1.0" encoding="ISO-8859-1"?>' + UR5[UR5.index("<robot") :].replace("base_link", "grün")
+LATIN = '<?xml version="1.0" encoding="ISO-8859-1"?>' + UR5[UR5.index("<robot") :].replace(
+    "base_link", "grün"
+)
 LOADED = {
     "no effort": re.sub(r' effort="[^"]*"', "", UR5),
     "an undeclared prefix": more('<gazebo><sensor:camera a:b="1"><x/></sensor:camera></gazebo>'),
@@ -168,7 +209,9 @@ LOADED = {
         '<axis xyz="0 0 1e-3"', '<axis xyz="0 1e5 0"', 1
     ),
     "a link named as a joint": UR5.replace("wrist_3-tool0_fixed_joint", "tool0"),
-    "masses that are none": UR5.replace('<link name="tool0"/>', '<link name="tool0"><inertial/></link>'),
+    "masses that are none": UR5.replace(
+        '<link name="tool0"/>', '<link name="tool0"><inertial/></link>'
+    ),
     "900 links": chain_of(900),
     "joints of a gripper without limits": more(
         '<link name="x"/><joint name="g" type="prismatic"><parent link="tool0"/><child link="x"/>'
@@ -195,13 +238,30 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
             description(path)
     with (tmp_path / "large.urdf").open("wb") as file:
         file.truncate(1_000_000_000)
-    with pytest.raises(SettingsError, match="it has 1000000000 bytes, at most 20000000 accepted; a URDF needed"):
+    with pytest.raises(
+        SettingsError, match="it has 1000000000 bytes, at most 20000000 accepted; a URDF needed"
+    ):
         description(tmp_path / "large.urdf")
 
 
 # --- drawn ----------------------------------------------------------------------------------------
 
-VALUES = ("", "0", "-1", "nan", "inf", "-inf", "1e300", "1e-320", "x", "0 0 0", "0 0", "1 2 3 4", "nan nan nan", "1_0")
+VALUES = (
+    "",
+    "0",
+    "-1",
+    "nan",
+    "inf",
+    "-inf",
+    "1e300",
+    "1e-320",
+    "x",
+    "0 0 0",
+    "0 0",
+    "1 2 3 4",
+    "nan nan nan",
+    "1_0",
+)
 COUNT = len(list(ElementTree.fromstring(UR5).iter()))
 
 
@@ -214,7 +274,9 @@ def spoilt(draw: st.DrawFn) -> bytes:
         element = elements[draw(st.integers(0, COUNT)) % len(elements)]
         match draw(st.sampled_from(("value", "drop", "double", "remove", "move", "tag"))):
             case "value" if element.attrib:
-                element.set(draw(st.sampled_from(sorted(element.attrib))), draw(st.sampled_from(VALUES)))
+                element.set(
+                    draw(st.sampled_from(sorted(element.attrib))), draw(st.sampled_from(VALUES))
+                )
             case "drop" if element.attrib:
                 del element.attrib[draw(st.sampled_from(sorted(element.attrib)))]
             case "double" if len(element):
@@ -226,7 +288,11 @@ def spoilt(draw: st.DrawFn) -> bytes:
                 for end in element.findall("parent") + element.findall("child"):
                     end.set("link", draw(st.sampled_from(links)))
             case "tag":
-                element.tag = draw(st.sampled_from(("link", "joint", "robot", "collision", "geometry", "axis", "mesh")))
+                element.tag = draw(
+                    st.sampled_from(
+                        ("link", "joint", "robot", "collision", "geometry", "axis", "mesh")
+                    )
+                )
             case _:
                 pass
     return ElementTree.tostring(robot)

@@ -32,7 +32,8 @@ MOUNTS = {
 def mounted(text: str, xyz: str, rpy: str) -> str:
     return text.replace(
         "</robot>",
-        f'<link name="world"/><joint name="mount" type="fixed"><parent link="world"/><child link="base_link"/>'
+        '<link name="world"/><joint name="mount" type="fixed"><parent link="world"/><child '
+        'link="base_link"/>'
         f'<origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>',
     )
 
@@ -42,19 +43,26 @@ def reached(cell: Settings, points: NDArray[np.float64]) -> float:
     least squares from several postures.
     """
     arm = Arm(cell, robot_description(cell))
-    lower, upper = np.maximum(cell.joints.lower, -math.pi), np.minimum(cell.joints.upper, math.pi)
-    random, count = np.random.default_rng(3), 0
+    lower = np.maximum(cell.joints.lower, -math.pi)
+    upper = np.minimum(cell.joints.upper, math.pi)
+    random = np.random.default_rng(3)
+    count = 0
     for point in points:
         for _ in range(25):
-            q, damping = random.uniform(lower, upper), 1e-3
+            q = random.uniform(lower, upper)
+            damping = 1e-3
             for _ in range(60):
                 pose = arm.at(q)
                 error = point - pose.position
                 if (distance := float(np.linalg.norm(error))) < 0.01:
                     break
                 jacobian = pose.jacobian[:3]
-                step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(3), error)
-                q = np.clip(q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-9)), lower, upper)
+                step = jacobian.T @ np.linalg.solve(
+                    jacobian @ jacobian.T + damping * np.eye(3), error
+                )
+                q = np.clip(
+                    q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-9)), lower, upper
+                )
             if distance < 0.01:
                 count += 1
                 break
@@ -63,10 +71,16 @@ def reached(cell: Settings, points: NDArray[np.float64]) -> float:
 
 def targets(cell: Settings, count: int) -> NDArray[np.float64]:
     """Places (N, 3) at which targets may be [m]."""
-    reach, random = cell.reach, np.random.default_rng(1)
+    reach = cell.reach
+    random = np.random.default_rng(1)
     points = np.array(reach.centre) + reach.outer * random.uniform(-1.0, 1.0, (50 * count, 3))
     away = np.linalg.norm(points - reach.centre, axis=1)
-    is_inside = (away >= reach.inner) & (away <= reach.outer) & (points[:, 0] >= reach.min_x) & (points[:, 2] >= reach.min_z)
+    is_inside = (
+        (away >= reach.inner)
+        & (away <= reach.outer)
+        & (points[:, 0] >= reach.min_x)
+        & (points[:, 2] >= reach.min_z)
+    )
     return points[is_inside][:count]
 
 
@@ -82,13 +96,17 @@ def test_all_targets_of_a_default_reach_are_reached_by_inverse_kinematics(
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_shipped_cells_have_a_reach_about_as_their_kinematics_give(arm: str) -> None:
     cell = cell_of(arm)
-    joints, reach = cell.joints, cell.reach
+    joints = cell.joints
+    reach = cell.reach
     chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
     workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
     shell = workspace.shell(reach.min_x, reach.min_z)
     assert shell.centre == pytest.approx(reach.centre, abs=0.001)
     assert shell.outer == pytest.approx(reach.outer, abs=0.07)
-    assert workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z) > 0.99
+    assert (
+        workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
+        > 0.99
+    )
 
 
 def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
@@ -106,7 +124,11 @@ def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mount", "reach", "share"),
     [
-        (("0 -0.6 0", "0 0 0"), "centre = [0.0, 0.0, 0.089]\ninner = 0.3\nouter = 0.85", r"[56]\d %"),
+        (
+            ("0 -0.6 0", "0 0 0"),
+            "centre = [0.0, 0.0, 0.089]\ninner = 0.3\nouter = 0.85",
+            r"[56]\d %",
+        ),
         (("0 0 0", "0 0 0"), "outer = 2.0", r"[12]?\d %"),
         (("-2.5 0 0", "0 0 0"), "", "0 %"),
         (("0 0 0", "0 0 0"), "min_x = 1.0", "0 %"),
@@ -115,5 +137,8 @@ def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
 def test_a_reach_that_the_arm_has_not_is_refused_with_what_it_has(
     mount: tuple[str, str], reach: str, share: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(SettingsError, match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics"):
+    with pytest.raises(
+        SettingsError,
+        match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics",
+    ):
         cell_in(tmp_path, mounted(UR5, *mount), f"[reach]\n{reach}\n")

@@ -12,14 +12,20 @@ from thirdhand.settings.whole_file import whole
 
 
 def test_a_file_and_a_folder_appear_once_they_are_complete(tmp_path: Path) -> None:
-    file, folder, link = tmp_path / "a.txt", tmp_path / "data", tmp_path / "link"
+    file = tmp_path / "a.txt"
+    folder = tmp_path / "data"
+    link = tmp_path / "link"
     file.write_text("before")
     file.chmod(0o600)
     link.symlink_to(file)
     with whole(link) as part:
         part.write_text("after")
         assert file.read_text() == "before"
-    assert (file.read_text(), link.is_symlink(), stat.S_IMODE(file.stat().st_mode)) == ("after", True, 0o600)
+    assert (file.read_text(), link.is_symlink(), stat.S_IMODE(file.stat().st_mode)) == (
+        "after",
+        True,
+        0o600,
+    )
     with whole(folder) as part:
         (part / "meta").mkdir(parents=True)
         assert not folder.exists()
@@ -32,9 +38,13 @@ def _write_half(path: Path, error: BaseException) -> None:
     raise error
 
 
-@pytest.mark.parametrize("error", [OSError(28, "Detail: [errno 28]"), KeyboardInterrupt()], ids=["full", "interrupt"])
+@pytest.mark.parametrize(
+    "error", [OSError(28, "Detail: [errno 28]"), KeyboardInterrupt()], ids=["full", "interrupt"]
+)
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_a_failure_leaves_nothing_and_names_the_path(kind: str, error: BaseException, tmp_path: Path) -> None:
+def test_a_failure_leaves_nothing_and_names_the_path(
+    kind: str, error: BaseException, tmp_path: Path
+) -> None:
     (tmp_path / "earlier").write_text("before")
     (tmp_path / ".new.part").mkdir()  # of a process that was killed
     for name in ("new", "earlier"):

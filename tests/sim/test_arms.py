@@ -37,7 +37,9 @@ LOWEST = np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196
 HIGHEST = np.array([2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196])
 
 
-def fr3_velocities(q: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def fr3_velocities(
+    q: npt.NDArray[np.float64],
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """The lowest and highest velocity at positions (..., 7) that an FR3 accepts."""
     high = np.minimum(FLAT, np.sqrt(np.maximum(SLOPE * (HIGHEST - q), 0.0)) - OFF)
     low = np.maximum(-FLAT, OFF - np.sqrt(np.maximum(SLOPE * (q - LOWEST), 0.0)))
@@ -47,22 +49,38 @@ def fr3_velocities(q: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64],
 @pytest.mark.parametrize("arm", ["franka", "ur5"])
 def test_shipped_arm_does_the_task(arm: str) -> None:
     """A shipped arm does the task within its limits and away from the hands."""
-    cell, near = cell_of(arm), []
+    cell = cell_of(arm)
+    near = []
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
 
     def look(bench: Bench) -> None:
         if bench.tick % 10 == 0:
-            near.append(min(bench.world.clearance(bench.world.left), bench.world.clearance(bench.world.right)))
+            near.append(
+                min(
+                    bench.world.clearance(bench.world.left),
+                    bench.world.clearance(bench.world.right),
+                )
+            )
 
-    run = rehearse(HandScript(SCENE, seed=1), lambda _: taught, settings=cell, rate_hz=100, keep=True, look=look)
+    run = rehearse(
+        HandScript(SCENE, seed=1),
+        lambda _: taught,
+        settings=cell,
+        rate_hz=100,
+        keep=True,
+        look=look,
+    )
     assert run.events.success
     assert max(run.errors_mm) <= 3.0, run.errors_mm
-    frames, limits = run.frames, cell.joints
+    frames = run.frames
+    limits = cell.joints
     assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
     assert (run.joints[:, 0] >= np.array(limits.lower) - 1e-3).all()
     assert (run.joints[:, 0] <= np.array(limits.upper) + 1e-3).all()
     assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
-    assert (np.abs(frames["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
+    assert (
+        np.abs(frames["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)
+    ).all()
     assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
     assert min(near) > 0.01
     if arm == "franka":
@@ -74,7 +92,9 @@ def test_shipped_arm_does_the_task(arm: str) -> None:
 def test_franka_keeps_makers_velocity_limits() -> None:
     """Who can stop before an end at `upper` with `acceleration` is at most so fast there."""
     limits = cell_of("franka").joints
-    lower, upper, acceleration = (np.array(getattr(limits, name)) for name in ("lower", "upper", "acceleration"))
+    lower, upper, acceleration = (
+        np.array(getattr(limits, name)) for name in ("lower", "upper", "acceleration")
+    )
     assert (acceleration <= 10.0).all()
     assert max(limits.jerk) <= 5000
     for share in np.linspace(0.0, 1.0, 1001)[:, None]:
@@ -90,13 +110,16 @@ def test_ur5_needs_half_of_its_torque() -> None:
     """All joints about the posture, at full speed and acceleration, each the worse way round."""
     cell = cell_of("ur5")
     model = pin.buildModelFromXML(robot_description(cell))
-    data, rng = model.createData(), np.random.default_rng(0)
+    data = model.createData()
+    rng = np.random.default_rng(0)
     for _ in range(300):
         q = np.array(cell.arm.posture) + rng.uniform(-0.5, 0.5, model.nv)
         velocity = np.array(cell.joints.velocity) * rng.choice([-1.0, 1.0], model.nv)
         inertia = pin.crba(model, data, q)
         inertia = np.triu(inertia) + np.triu(inertia, 1).T
-        torque = np.abs(inertia) @ cell.joints.acceleration + np.abs(pin.nonLinearEffects(model, data, q, velocity))
+        torque = np.abs(inertia) @ cell.joints.acceleration + np.abs(
+            pin.nonLinearEffects(model, data, q, velocity)
+        )
         assert (torque < 0.5 * model.effortLimit).all(), torque
 
 
@@ -106,15 +129,25 @@ def test_ur5_needs_half_of_its_torque() -> None:
 def published(name: str) -> Path:
     """A file of `example-robot-data`; who asks is skipped where that is not installed."""
     try:
-        return next(Path(str(file.locate())) for file in files("example-robot-data") or () if str(file).endswith(name))
+        return next(
+            Path(str(file.locate()))
+            for file in files("example-robot-data") or ()
+            if str(file).endswith(name)
+        )
     except PackageNotFoundError:
-        pytest.skip("example-robot-data, whose descriptions ours are compared with, is not installed")
+        pytest.skip(
+            "example-robot-data, whose descriptions ours are compared with, is not installed"
+        )
 
 
-def tips(text: str, names: tuple[str, ...], tip: str, postures: npt.NDArray[np.float64]) -> list[pin.SE3]:
+def tips(
+    text: str, names: tuple[str, ...], tip: str, postures: npt.NDArray[np.float64]
+) -> list[pin.SE3]:
     """Where a link is in postures (N, J) of some joints; others are at 0."""
     model = pin.buildModelFromXML(text)
-    data, frame, placed = model.createData(), model.getFrameId(tip), []
+    data = model.createData()
+    frame = model.getFrameId(tip)
+    placed = []
     for posture in postures:
         q = pin.neutral(model)
         for name, angle in zip(names, posture, strict=True):
@@ -127,7 +160,13 @@ def tips(text: str, names: tuple[str, ...], tip: str, postures: npt.NDArray[np.f
 @pytest.mark.parametrize(
     ("arm", "file", "theirs", "tip", "stand"),
     [
-        ("franka", "panda.urdf", tuple(f"panda_joint{i}" for i in range(1, 8)), "panda_hand_tcp", (-0.15, 0, 0)),
+        (
+            "franka",
+            "panda.urdf",
+            tuple(f"panda_joint{i}" for i in range(1, 8)),
+            "panda_hand_tcp",
+            (-0.15, 0, 0),
+        ),
         ("ur5", "ur5_robot.urdf", (), "tool0", (0, 0, 0)),
     ],
 )
@@ -137,9 +176,13 @@ def test_shipped_arm_moves_as_published(
     """A shipped arm moves as the one that others describe."""
     cell = cell_of(arm)
     names = cell.joints.names
-    postures = np.random.default_rng(0).uniform(cell.joints.lower, cell.joints.upper, (20, len(names)))
+    postures = np.random.default_rng(0).uniform(
+        cell.joints.lower, cell.joints.upper, (20, len(names))
+    )
     ours = tips(robot_description(cell), names, cell.arm.plate, postures)
-    for pose, other in zip(ours, tips(published(file).read_text(), theirs or names, tip, postures), strict=True):
+    for pose, other in zip(
+        ours, tips(published(file).read_text(), theirs or names, tip, postures), strict=True
+    ):
         np.testing.assert_allclose(pose.translation, other.translation + stand, atol=1e-4)
         np.testing.assert_allclose(pose.rotation, other.rotation, atol=1e-4)
 
@@ -151,7 +194,10 @@ UR5_MESHES = {f"{link}_link": f"ur5/collision/{link.replace('_', '')}.stl" for l
 
 @pytest.mark.parametrize(
     ("arm", "meshes"),
-    [("franka", FR3_MESHES | {"fr3_hand": "panda_description/meshes/collision/hand.stl"}), ("ur5", UR5_MESHES)],
+    [
+        ("franka", FR3_MESHES | {"fr3_hand": "panda_description/meshes/collision/hand.stl"}),
+        ("ur5", UR5_MESHES),
+    ],
 )
 def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> None:
     """A shipped arm's capsules cover the meshes that others publish."""
@@ -160,13 +206,18 @@ def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> No
     urdf = Urdf(text)
     for link, file in meshes.items():
         data = published(file).read_bytes()
-        triangles = np.frombuffer(data[84:], np.dtype("3<f4, 9<f4, <u2"), struct.unpack("<I", data[80:84])[0])
+        triangles = np.frombuffer(
+            data[84:], np.dtype("3<f4, 9<f4, <u2"), struct.unpack("<I", data[80:84])[0]
+        )
         alone = [shape for shape in urdf.shapes if shape.link == link]
-        points, beyond = triangles["f1"].reshape(-1, 3), np.inf
+        points = triangles["f1"].reshape(-1, 3)
+        beyond = np.inf
         for shape in alone:  # a cylinder's; the capsules that the service keeps apart are larger
             local = (points - shape.translation) @ rotation(shape.rotation)
             sides = np.column_stack((np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])))
-            beyond = np.minimum(beyond, np.hypot(*np.maximum(sides - (shape.size[0], shape.size[1] / 2), 0.0).T))
+            beyond = np.minimum(
+                beyond, np.hypot(*np.maximum(sides - (shape.size[0], shape.size[1] / 2), 0.0).T)
+            )
         assert np.max(beyond) < 0.008, f"{link}: {1000 * np.max(beyond):.1f} mm"
     assert len(body_of(cell, text).capsules) == len(urdf.shapes)
 
@@ -189,8 +240,11 @@ def test_places_are_moved_into_reach() -> None:
         assert SCENE.in_reach(cell_of(arm).reach) == (SCENE, ())
     short = Reach(centre=(0.0, 0.0, 0.3), inner=0.2, outer=0.6)
     moved, notes = SCENE.in_reach(short)
-    assert notes == ("handover moved by 2 cm into the arm's reach", "glass moved by 5 cm into the arm's reach",
-                    "soldering moved by 3 cm into the arm's reach")  # fmt: skip
+    assert notes == (
+        "handover moved by 2 cm into the arm's reach",
+        "glass moved by 5 cm into the arm's reach",
+        "soldering moved by 3 cm into the arm's reach",
+    )
     for tool in (moved.offer, moved.glass, moved.carry):
         assert np.linalg.norm(np.subtract(tool, short.centre)) <= short.outer
     assert moved.robot_start == SCENE.robot_start
@@ -201,11 +255,15 @@ def test_places_are_moved_into_reach() -> None:
     [
         (
             Reach(centre=(0.0, -0.05, 0.12), inner=0.23, outer=0.26),  # an SO-100
-            "moved by 0.15 m: handover needs the tool 0.64 m from the shoulder; glass needs the tool 0.66 m from the "
-            "shoulder; soldering needs the tool 0.64 m from the shoulder. Its tool reaches from 0.23 to 0.26 m around "
-            "its shoulder at [0.0, -0.05, 0.12], where x is at least 0.15 and z at least 0.02 m. What to do: use a",
+            "moved by 0.15 m: handover needs the tool 0.64 m from the shoulder; glass needs the "
+            "tool 0.66 m from the shoulder; soldering needs the tool 0.64 m from the shoulder. "
+            "Its tool reaches from 0.23 to 0.26 m around its shoulder at [0.0, -0.05, 0.12], "
+            "where x is at least 0.15 and z at least 0.02 m. What to do: use a",
         ),
-        (Reach(min_z=0.2), "moved by 0.15 m: glass needs the tool at x = 0.50, z = 0.16 m. Its tool reaches"),
+        (
+            Reach(min_z=0.2),
+            "moved by 0.15 m: glass needs the tool at x = 0.50, z = 0.16 m. Its tool reaches",
+        ),
         (Reach(inner=2.0, outer=2.5), "Its tool reaches from 2.00 to 2.50 m around its shoulder"),
     ],
 )

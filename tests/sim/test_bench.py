@@ -52,11 +52,15 @@ class Follower:
         self.posture = self.joints.copy()
 
     def command(self, point: npt.ArrayLike) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        jacobian = pin.computeFrameJacobian(self.model, self.data, self.joints, self.frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        jacobian = pin.computeFrameJacobian(
+            self.model, self.data, self.joints, self.frame, pin.LOCAL_WORLD_ALIGNED
+        )[:3]
         pin.framesForwardKinematics(self.model, self.data, self.joints)
         error = np.subtract(point, self.data.oMf[self.frame].translation)
         inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + 1e-4 * np.eye(3))
-        velocity = inverse @ (30.0 * error) + (np.eye(7) - inverse @ jacobian) @ (self.posture - self.joints)
+        velocity = inverse @ (30.0 * error) + (np.eye(7) - inverse @ jacobian) @ (
+            self.posture - self.joints
+        )
         velocity = np.clip(velocity, -1.5, 1.5)
         self.joints = self.joints + 0.002 * velocity
         return tuple(self.joints.tolist()), tuple(velocity.tolist())
@@ -71,14 +75,18 @@ def test_opening_fingers_let_go() -> None:
         assert closures[-1] == pytest.approx(0.0, abs=1e-9)
         assert closures[len(closures) // 2] == pytest.approx(0.5, abs=0.02)
         assert held[2] > 0.2
-        assert bench.world.pose(bench.world.board).position[2] == pytest.approx(0.0)  # no hand was there to take it
+        assert bench.world.pose(bench.world.board).position[2] == pytest.approx(
+            0.0
+        )  # no hand was there to take it
         assert not bench.events().handover.reached
 
 
 def test_learned_gripper_does_the_task() -> None:
     """A learned gripper hands the board over and grasps the glass."""
     takes = [take.every(2) for take in demonstrations(SCENE, count=3, seed=1, gripper=True)]
-    taught = adapted(learn(takes, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05)
+    taught = adapted(
+        learn(takes, components=5, points=60), SCENE.via_points(gripper=True), tolerance=0.05
+    )
     run = rehearse(HandScript(SCENE, seed=31), lambda bench: taught, rate_hz=100, keep=True)
     assert run.events.success
     changes = np.flatnonzero(np.diff(run.frames["gripper"].astype(int)))
@@ -93,13 +101,16 @@ def bench() -> Iterator[Bench]:
 
 def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[Observation]:
     """A whole run in which the tool goes as it was taught, but `aside` [m] of it."""
-    follower, teacher = Follower(bench.observe().joints), Teacher(SCENE, seed=1, clock=bench.script.clock)
+    follower = Follower(bench.observe().joints)
+    teacher = Teacher(SCENE, seed=1, clock=bench.script.clock)
     for _ in range(750):
         bench.step(*follower.command(teacher.truth(0.0).position))
     bench.begin()
     observations = []
     while not bench.finished:
-        observations.append(bench.step(*follower.command(teacher.truth(bench.time_s).position + aside)))
+        observations.append(
+            bench.step(*follower.command(teacher.truth(bench.time_s).position + aside))
+        )
     return observations
 
 
@@ -110,9 +121,15 @@ def test_taught_path_does_the_task(bench: Bench) -> None:
     events = bench.events()
     assert events.success
     assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 30.0
-    assert [round(event.time_s, 1) for event in (events.handover, events.grasp, events.carry)] == [3.0, 6.9, 10.3]
+    assert [round(event.time_s, 1) for event in (events.handover, events.grasp, events.carry)] == [
+        3.0,
+        6.9,
+        10.3,
+    ]
     world = bench.world
-    assert np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.11  # it lies at the hand
+    assert (
+        np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.11
+    )  # it lies at the hand
     assert np.linalg.norm(np.subtract(world.pose(world.glass).position, SCENE.carry)) < 0.06
     assert np.linalg.norm(np.subtract(world.pose(world.iron).position, SCENE.right_final)) < 0.06
 
@@ -132,7 +149,9 @@ def test_same_commands_give_same_run() -> None:
     traces = []
     for _ in range(2):
         with Bench(HandScript(SCENE, seed=2)) as bench:
-            traces.append([(observation.joints, observation.tool) for observation in play(bench)[::50]])
+            traces.append(
+                [(observation.joints, observation.tool) for observation in play(bench)[::50]]
+            )
     assert traces[0] == traces[1]
 
 
@@ -155,9 +174,12 @@ def test_arm_brakes_without_commands(bench: Bench) -> None:
 def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
     """An arm that finds its commands far ahead does not leap after them."""
     joints = np.array(bench.observe().joints)
-    speed, speeds = np.array([0.8, 0, 0, 0, 0, 0, 0]), []
+    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
+    speeds = []
     for tick in range(400):
-        joints = joints + (26 if tick == 100 else 1) * 0.002 * speed  # the bench had slept for 50 ms
+        joints = (
+            joints + (26 if tick == 100 else 1) * 0.002 * speed
+        )  # the bench had slept for 50 ms
         observation = bench.step(tuple(joints), tuple(speed))
         speeds.append(max(map(abs, observation.joint_velocities)))
     assert max(speeds) < 0.8 + 0.3
@@ -198,8 +220,15 @@ def test_hands_return_the_way_they_went() -> None:
         bench.turn_back()
         steps = 0
         while not bench.back:
-            observation, steps = bench.step(), steps + 1
-            assert min(np.linalg.norm(np.subtract(observation.hands.left.position, was)) for was in (start, *forth)) < 1e-9
+            observation = bench.step()
+            steps = steps + 1
+            assert (
+                min(
+                    np.linalg.norm(np.subtract(observation.hands.left.position, was))
+                    for was in (start, *forth)
+                )
+                < 1e-9
+            )
         np.testing.assert_array_equal(observation.hands.left.position, start)
         assert steps == np.ceil(bench.script.duration_s / 0.002)
 
@@ -228,9 +257,13 @@ class Service:
         if self.joints is not None:
             tick = len(self.hands["left"])
             stamp_ns = 10_000_000 * tick  # of 100 Hz, however late this machine is
-            command = messages.JointState(stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL)
+            command = messages.JointState(
+                stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL
+            )
             attachment = messages.Attachment(tick, time.time_ns(), pose.stamp_ns)
-            self._command.put(cdr.encode_joints(command), attachment=cdr.encode_attachment(attachment))
+            self._command.put(
+                cdr.encode_joints(command), attachment=cdr.encode_attachment(attachment)
+            )
 
 
 @pytest.fixture
@@ -247,8 +280,16 @@ def test_run_on_network_reports_latency(
     service = Service(listening, "lab/bench")
     reports: list[RunReport] = []
     lines: list[str] = []
-    live = Live(cell="lab/bench", once=True, wait_s=10.0, dropout=Dropout(start_s=0.2, lasts_s=0.2, hand="right"))
-    with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench, open_session(connect=[endpoint]) as session:
+    live = Live(
+        cell="lab/bench",
+        once=True,
+        wait_s=10.0,
+        dropout=Dropout(start_s=0.2, lasts_s=0.2, hand="right"),
+    )
+    with (
+        Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench,
+        open_session(connect=[endpoint]) as session,
+    ):
         run(bench, session, live, stop=threading.Event(), report=reports.append, say=lines.append)
     (report,) = reports
     assert not report.success
@@ -279,7 +320,9 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     for _ in range(1000):
         joints, _ = follower.command(SCENE.offer)
     state = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, joints, STILL))
-    publisher, keys, over = listening.declare_publisher("lab/joints/state"), list[str](), threading.Event()
+    publisher = listening.declare_publisher("lab/joints/state")
+    keys = list[str]()
+    over = threading.Event()
     heard = [
         listening.declare_subscriber(f"lab/{key}", lambda sample: keys.append(str(sample.key_expr)))
         for key in ("joints/state", "hands/left", "objects")
@@ -291,14 +334,27 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
 
     Service(listening, "lab")
     reports: list[RunReport] = []
-    script, arm = HandScript(SCENE, seed=1, speed=20.0), threading.Thread(target=tell)
+    script = HandScript(SCENE, seed=1, speed=20.0)
+    arm = threading.Thread(target=tell)
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
         with pytest.raises(BenchError, match="no joint states arrive on lab/joints/state"):
-            run(bench, session, Live(cell="lab", wait_s=1.0), stop=threading.Event(), report=reports.append)
+            run(
+                bench,
+                session,
+                Live(cell="lab", wait_s=1.0),
+                stop=threading.Event(),
+                report=reports.append,
+            )
         assert set(keys) == {"lab/hands/left", "lab/objects"}
         arm.start()
         try:
-            run(bench, session, Live(cell="lab", once=True), stop=threading.Event(), report=reports.append)
+            run(
+                bench,
+                session,
+                Live(cell="lab", once=True),
+                stop=threading.Event(),
+                report=reports.append,
+            )
         finally:
             over.set()
             arm.join()
@@ -310,7 +366,9 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     assert not report.events.carry.reached
 
 
-def test_process_ends_on_signal_with_report(network: tuple[zenoh.Session, str], tmp_path: Path) -> None:
+def test_process_ends_on_signal_with_report(
+    network: tuple[zenoh.Session, str], tmp_path: Path
+) -> None:
     """A process plays until it is asked to stop and leaves its reports."""
     service = Service(network[0], "thirdhand")
     target = tmp_path / "report.json"
@@ -328,7 +386,11 @@ def test_process_ends_on_signal_with_report(network: tuple[zenoh.Session, str], 
         "5",
     ]
     with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1]
+        command,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[1],
     ) as process:
         assert process.stderr is not None
         for line in process.stderr:
@@ -406,7 +468,14 @@ def test_first_answer_counts_for_latency() -> None:
     commands = Commands(JOINT_NAMES)
     payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
     now = time.time_ns()
-    for stamp in (now - 10**10, now, now, now + 1, now, now + 1):  # the first is older than the counting
+    for stamp in (
+        now - 10**10,
+        now,
+        now,
+        now + 1,
+        now,
+        now + 1,
+    ):  # the first is older than the counting
         commands.receive(_Sample(payload, cdr.encode_attachment(messages.Attachment(1, 0, stamp))))  # type: ignore[arg-type]
     assert commands.count == 6
     assert len(commands.latencies_ms) == 2

@@ -22,7 +22,9 @@ from thirdhand.settings.config import Settings
 
 RATE_HZ = 100  # a tick of 10 ms leaves a busy machine room for a simulated arm beside the daemon
 HALFWAY = (0.80, -0.31, 0.19)  # of the left hand, on its way to the handover
-LED = np.array([0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0])  # [rad] more than an arm may be off its command
+LED = np.array(
+    [0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0]
+)  # [rad] more than an arm may be off its command
 NEAR_M = 0.004
 
 
@@ -36,7 +38,8 @@ def has_arrived(status: dict[str, Any], at: Any = None) -> bool:
 
 def move(tracker: Tracker, to: tuple[float, float, float]) -> None:
     """Move the left hand, slowly enough for a tracker that is late."""
-    start, pause = np.array(tracker.left), threading.Event()
+    start = np.array(tracker.left)
+    pause = threading.Event()
     for share in np.linspace(0.0, 1.0, 40):
         tracker.left = tuple((start + share * (np.array(to) - start)).tolist())  # type: ignore[assignment]
         pause.wait(0.03)
@@ -56,7 +59,8 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 @pytest.mark.thorough
 def test_correction_from_end_to_end(tmp_path: Path) -> None:
     """A correction moves the tool to where it was led, and undoing it moves it back."""
-    settings, records = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), tmp_path / "records"
+    settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
+    records = tmp_path / "records"
     with (
         serving(tmp_path, "--rate", str(RATE_HZ), "--record", str(records)) as daemon,
         Tracker(daemon.session) as tracker,
@@ -108,10 +112,15 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:
     (path,) = records.glob("*.mcap")
     whole = tmp_path / "whole.mcap"
     assert replay(path, output=whole).exact
-    frames = np.array([step.frame for step in Recording.open(whole).steps() if step.frame is not None])
+    frames = np.array(
+        [step.frame for step in Recording.open(whole).steps() if step.frame is not None]
+    )
     assert not (frames["mode"] == Mode.FAULT).any()
     assert (frames["reason"] == Reason.GUIDED).sum() > RATE_HZ / 2
     commanded = frames[frames["commanded"] == 1]
     speeds = RATE_HZ * np.linalg.norm(np.diff(commanded["tool"], axis=0), axis=1)
     is_engaging = (commanded["flags"][1:] & int(Flag.ENGAGING)) > 0
-    assert speeds[is_engaging & (np.diff(commanded["tick"]) == 1)].max() < 1.15 * settings.tool.engage_speed
+    assert (
+        speeds[is_engaging & (np.diff(commanded["tick"]) == 1)].max()
+        < 1.15 * settings.tool.engage_speed
+    )

@@ -19,7 +19,9 @@ from thirdhand_sim.script import HandScript
 from thirdhand_sim.world import LEVEL, Pose, pixels
 
 SCENE = Scene()
-EYE, TARGET, SIZE = (1.66, -0.78, 0.80), (0.53, -0.02, 0.31), (160, 120)
+EYE = (1.66, -0.78, 0.80)
+TARGET = (0.53, -0.02, 0.31)
+SIZE = (160, 120)
 
 
 @pytest.fixture(params=ENGINES)
@@ -37,7 +39,9 @@ def bench(engine: str) -> Iterator[Bench]:
 
 def played(engine: str) -> Rehearsed:
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
-    return rehearse(HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True)
+    return rehearse(
+        HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True
+    )
 
 
 def test_engines_give_same_scores() -> None:
@@ -48,7 +52,10 @@ def test_engines_give_same_scores() -> None:
     assert result.events.success
     assert other.events.success
     assert max(*result.errors_mm, *other.errors_mm) < 3.0
-    assert np.abs(np.subtract(result.errors_mm, other.errors_mm)).max() < 0.1, (result.errors_mm, other.errors_mm)
+    assert np.abs(np.subtract(result.errors_mm, other.errors_mm)).max() < 0.1, (
+        result.errors_mm,
+        other.errors_mm,
+    )
     apart_mm = 1000 * np.linalg.norm(result.tool - other.tool, axis=1)
     assert 0.0 < apart_mm.max() < 1.0, f"{apart_mm.max():.3f} mm"
 
@@ -56,10 +63,12 @@ def test_engines_give_same_scores() -> None:
 @pytest.mark.quick
 def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
     """The arm follows moving commands within a millimetre."""
-    start, wrong = np.array(bench.observe().joints), []
+    start = np.array(bench.observe().joints)
+    wrong = []
     for tick in range(1000):
         t = 0.002 * tick
-        position, velocity = start + 0.2 * (1 - np.cos(2 * t)), np.full(7, 0.4 * np.sin(2 * t))
+        position = start + 0.2 * (1 - np.cos(2 * t))
+        velocity = np.full(7, 0.4 * np.sin(2 * t))
         observation = bench.step(tuple(position), tuple(velocity))
         # Velocity fed forward: a command is where the arm starts the period, and it ends it one
         # period on.
@@ -71,7 +80,9 @@ def test_motors_are_no_stronger_than_described(bench: Bench) -> None:
     """The motors' efforts are those of the description."""
     start = np.array(bench.observe().joints)
     for _ in range(20):  # no motor of 60 N m turns the stretched arm so fast within 40 ms
-        bench.world.follow(tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5))
+        bench.world.follow(
+            tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5)
+        )
         bench.world.step()
     turned = np.array(bench.world.joints()[1])
     assert turned[1] == pytest.approx(-1.76, abs=0.05)  # [rad/s] of 100 wanted
@@ -123,7 +134,9 @@ def test_pictures_show_what_is_there(bench: Bench) -> None:
 
 def test_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """An engine that is not installed is named."""
-    monkeypatch.setattr("thirdhand.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"})
+    monkeypatch.setattr(
+        "thirdhand.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"}
+    )
     assert engine_of() == "msgspec"
     with pytest.raises(LaunchError, match="needs NoneSuch, which is not installed"):
         engine_of("none_such")

@@ -50,9 +50,19 @@ class TestSeeds:
         stream = Stream("scene", 1, range(10))
         assert stream.overlaps(stream._replace(numbers=range(9, 12)))
         assert not any(
-            map(stream.overlaps, (stream._replace(numbers=range(10, 12)), stream._replace(seed=2), stream._replace(kind="x")))
+            map(
+                stream.overlaps,
+                (
+                    stream._replace(numbers=range(10, 12)),
+                    stream._replace(seed=2),
+                    stream._replace(kind="x"),
+                ),
+            )
         )
-        assert (list(stream.share(0.5)), list(stream.share(0.01, least=2))) == ([0, 1, 2, 3, 4], [0, 1])
+        assert (list(stream.share(0.5)), list(stream.share(0.01, least=2))) == (
+            [0, 1, 2, 3, 4],
+            [0, 1],
+        )
 
 
 class TestDigests:
@@ -61,7 +71,9 @@ class TestDigests:
     def test_core_digest_changes_with_decisions(self, tmp_path: Path) -> None:
         golden = Recording.open(recordings() / "golden.mcap")
         inputs = list(itertools.islice(ticks(golden), 1510))
-        slower = msgspec.structs.replace(Settings(), tool=msgspec.structs.replace(Settings().tool, max_speed=0.1))
+        slower = msgspec.structs.replace(
+            Settings(), tool=msgspec.structs.replace(Settings().tool, max_speed=0.1)
+        )
         paths = [tmp_path / name for name in ("first.mcap", "again.mcap", "slower.mcap")]
         for path, settings in zip(paths, (golden.settings, golden.settings, slower), strict=True):
             record(path, settings, shipped_skill(), inputs)
@@ -71,21 +83,27 @@ class TestDigests:
     def test_kmp_digest_changes_from_a_millionth_on(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """That of kmp changes from a millionth on."""
         compute: Callable[[], str] = kmp_digest.__wrapped__
-        outputs, was = list(evidence.kmp_outputs()), compute()
+        outputs = list(evidence.kmp_outputs())
+        was = compute()
         for change, is_equal in ((1e-12, True), (2e-6, False)):
-            monkeypatch.setattr(evidence, "kmp_outputs", lambda off=change: [*outputs[:-1], outputs[-1] + off])
+            monkeypatch.setattr(
+                evidence, "kmp_outputs", lambda off=change: [*outputs[:-1], outputs[-1] + off]
+            )
             assert (compute() == was) == is_equal
 
     def test_learning_digest_is_that_of_shipped_skill(self, tmp_path: Path) -> None:
         """To six digits: CPUs differ in the last ones."""
-        path, takes = tmp_path / "soldering.npz", sorted((recordings() / "people").glob("*.mcap"))
+        path = tmp_path / "soldering.npz"
+        takes = sorted((recordings() / "people").glob("*.mcap"))
         done = thirdhand("learn", *map(str, takes), "--output", str(path))
         assert done.returncode == 0, done.stderr
         with np.load(recordings() / "soldering.npz") as shipped, np.load(path) as learned:
             assert set(shipped) == set(learned)
             for name in set(shipped) - {"checksum", "figures"}:
                 if shipped[name].dtype.kind == "f":
-                    np.testing.assert_allclose(learned[name], shipped[name], rtol=1e-6, atol=1e-6, err_msg=name)
+                    np.testing.assert_allclose(
+                        learned[name], shipped[name], rtol=1e-6, atol=1e-6, err_msg=name
+                    )
                 else:
                     assert learned[name].tobytes() == shipped[name].tobytes(), name
 
@@ -109,7 +127,11 @@ def test_result_names_its_origin(tmp_path: Path) -> None:
 def test_result_is_stale_where_dependency_changed() -> None:
     """A result is stale where what it depends on changed and only there."""
     digests = {"core": "1", "learning": "2", "kmp": "3"}
-    result = {"commit": "12ab", "depends_on": {"kmp": "3"}, "options": {"share": 1.0, "letters": {"files": 10}}}
+    result = {
+        "commit": "12ab",
+        "depends_on": {"kmp": "3"},
+        "options": {"share": 1.0, "letters": {"files": 10}},
+    }
     assert staleness("letters", result, digests | {"core": "other"}) == ""
     assert staleness("letters", result, digests | {"kmp": "other"}) == "kmp changed since 12ab"
     assert staleness("letters", result | {"depends_on": {}}, digests) == "kmp changed since 12ab"
@@ -124,7 +146,12 @@ class TestAll:
     @pytest.fixture(autouse=True)
     def runs(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         """How often each was run, and the error of the one that fails."""
-        counts: dict[str, Any] = {"letters": 0, "statistics": 0, "table": 0, "error": ExperimentError("no letters")}
+        counts: dict[str, Any] = {
+            "letters": 0,
+            "statistics": 0,
+            "table": 0,
+            "error": ExperimentError("no letters"),
+        }
 
         def module(name: str) -> ModuleType:
             def run(results: Any, options: Options) -> dict[str, Any]:
@@ -139,15 +166,22 @@ class TestAll:
 
         few = {name: EXPERIMENTS[name] for name in ("letters", "statistics", "table")}
         for name in few:
-            monkeypatch.setitem(sys.modules, f"thirdhand_sim.lab.{EXPERIMENTS[name].module}", module(name))
+            monkeypatch.setitem(
+                sys.modules, f"thirdhand_sim.lab.{EXPERIMENTS[name].module}", module(name)
+            )
         monkeypatch.setattr(
-            "thirdhand_sim.lab.__main__.EXPERIMENTS", {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]}
+            "thirdhand_sim.lab.__main__.EXPERIMENTS",
+            {**few, "motion-of-others": EXPERIMENTS["motion-of-others"]},
         )
         return counts
 
     @pytest.mark.parametrize("error", [ExperimentError("no letters"), ValueError("of two kinds")])
     def test_goes_on_after_a_failure(
-        self, runs: dict[str, Any], error: Exception, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self,
+        runs: dict[str, Any],
+        error: Exception,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
     ) -> None:
         """Goes on after a failure and makes only what is missing the next time."""
         runs["error"] = error
@@ -185,5 +219,7 @@ class TestAll:
         (tmp_path / "letters.json").write_text("{")
         for command in ("stale", "all"):
             assert main([command, "--output", str(tmp_path), "--quiet"]) == 1
-            assert f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
+            assert (
+                f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
+            )
         assert [runs[name] for name in ("letters", "statistics", "table")] == [0, 1, 1]

@@ -16,9 +16,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
 pytest.importorskip(
-    "movement_primitives", reason="ProMPs need movement_primitives: pip install 'thirdhand[experiments]'"
+    "matplotlib",
+    reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'",
+)
+pytest.importorskip(
+    "movement_primitives",
+    reason="ProMPs need movement_primitives: pip install 'thirdhand[experiments]'",
 )
 
 from support.paths import ROOT
@@ -41,7 +45,10 @@ def letters(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("letters")
     for name in "DG":
         np.savez(
-            folder / f"{name}.npz", **{f"demo{k:02d}": letter[::2] for k, letter in enumerate(write(name, count=6, seed=9))}
+            folder / f"{name}.npz",
+            **{
+                f"demo{k:02d}": letter[::2] for k, letter in enumerate(write(name, count=6, seed=9))
+            },
         )
     return folder
 
@@ -56,7 +63,10 @@ def close_figures() -> Iterator[None]:
 
 def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
     """The JSON of an experiment at a tenth of its size, once its files are there."""
-    assert main([name, "--output", str(folder), "--share", "0.1", "--workers", "1", "--quiet", *more]) == 0
+    assert (
+        main([name, "--output", str(folder), "--share", "0.1", "--workers", "1", "--quiet", *more])
+        == 0
+    )
     result: dict[str, Any] = json.loads((folder / f"{name}.json").read_text())
     assert result["figures"]
     for figure in result["figures"]:
@@ -71,7 +81,9 @@ def follows_better(found: dict[str, Any]) -> bool:
     for rival in (name for name in rivals if not name.startswith("ours")):
         for group in ("clean", "recorded"):
             assert ours[group]["jerk_ratio"] < 0.7 * rivals[rival][group]["jerk_ratio"], rival
-            assert rivals[rival][group]["error_rms_mm"] < 35, rival  # a rival that does not follow is none
+            assert rivals[rival][group]["error_rms_mm"] < 35, (
+                rival
+            )  # a rival that does not follow is none
             if rival != "no smoothing":  # it is as near, and shakes
                 assert ours[group]["error_rms_mm"] < rivals[rival][group]["error_rms_mm"], rival
     assert all(group["top_speed"] <= 0.8 + 1e-6 for group in ours.values())
@@ -94,7 +106,10 @@ def meets_points(found: dict[str, Any]) -> bool:
     """True if letters go through their desired points and stay as they were elsewhere."""
     summaries = found["model_summary"], found["recorded_summary"]
     misses = [summary["largest_miss_at_desired_points_cm"] for summary in summaries]
-    return max(misses) < 0.01 and max(summary["rms_deviation_elsewhere_cm"] for summary in summaries) < 1.0
+    return (
+        max(misses) < 0.01
+        and max(summary["rms_deviation_elsewhere_cm"] for summary in summaries) < 1.0
+    )
 
 
 def is_stable_only_with_places(found: dict[str, Any]) -> bool:
@@ -107,7 +122,10 @@ CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's nu
     "motion": follows_better,
     "letters": meets_points,
     "separation": keeps_separation,
-    "table": lambda found: max(found["modelled"][method]["largest_miss_of_via_cm"] for method in ("kmp", "promp")) < 0.02,
+    "table": lambda found: (
+        max(found["modelled"][method]["largest_miss_of_via_cm"] for method in ("kmp", "promp"))
+        < 0.02
+    ),
     "hands": lambda found: is_evidence(found["evidence_is_periods_skipped_at_most"]),
     "statistics": is_stable_only_with_places,
 }
@@ -135,7 +153,9 @@ def test_experiment_bears_out_its_claim(
 DRAWN = [
     name
     for name in EXPERIMENTS
-    if hasattr(importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}"), "draw_numbers")
+    if hasattr(
+        importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}"), "draw_numbers"
+    )
 ]
 
 
@@ -156,12 +176,15 @@ def test_figures_are_of_shipped_numbers(name: str, tmp_path: Path) -> None:
     figures = list(tmp_path.glob("*.png"))
     assert figures
     for figure in figures:
-        np.testing.assert_allclose(grey(figure), grey(SHIPPED / figure.name), atol=10, err_msg=figure.name)
+        np.testing.assert_allclose(
+            grey(figure), grey(SHIPPED / figure.name), atol=10, err_msg=figure.name
+        )
 
 
 @pytest.mark.parametrize("number", range(100))
 def test_random_scenes_are_within_reach_and_end(number: int) -> None:
-    drawn, nominal = draw(number, seed=SCENES.seed), Scene()
+    drawn = draw(number, seed=SCENES.seed)
+    nominal = Scene()
     for name in ("handover", "glass", "soldering"):
         place = getattr(drawn.scene, name)
         assert np.linalg.norm(np.subtract(place, getattr(nominal, name))) <= MOST_MOVED
@@ -177,7 +200,21 @@ def test_missing_letters_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
     """A folder without letters says what is needed."""
     with pytest.raises(ExperimentError, match="demo00"):
         recorded(tmp_path)
-    assert main(["letters", "--output", str(tmp_path), "--letters", str(tmp_path), "--share", "0.1", "--quiet"]) == 1
+    assert (
+        main(
+            [
+                "letters",
+                "--output",
+                str(tmp_path),
+                "--letters",
+                str(tmp_path),
+                "--share",
+                "0.1",
+                "--quiet",
+            ]
+        )
+        == 1
+    )
     assert "No letters in" in capsys.readouterr().err
 
 

@@ -38,7 +38,9 @@ from thirdhand_sim.teach import places_of
 pytestmark = pytest.mark.thorough
 
 PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "gate_m")
-ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
+ASSUMED = msgspec.structs.replace(
+    Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed")
+)
 
 
 def of_the_service(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> np.ndarray:
@@ -72,7 +74,9 @@ def wanted(shown: Seen, taught: Skill) -> np.ndarray:
         for stamp, position in zip(stamps, samples, strict=True):
             arrives = int(np.ceil(stamp * RATE_HZ - 1e-9))
             if arrives < len(inboxes):
-                inboxes[arrives].append(sample(side, position.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp))))
+                inboxes[arrives].append(
+                    sample(side, position.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp)))
+                )
     ticks = [Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes)]
     return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ))
 
@@ -99,22 +103,38 @@ def test_motion_follows_through_controller() -> None:
     skill = shipped_skill()
     hands = stops(skill.hands.mean(axis=0), numbers=(0,), rate_hz=30, noise=0.002)[0]
     motion = followers.ours(skill, Settings())(hands)
-    settle, period_s = followers.SETTLE_TICKS, followers.PERIOD_S
+    settle = followers.SETTLE_TICKS
+    period_s = followers.PERIOD_S
     arrives = np.ceil(hands.stamps / period_s - 1e-9).astype(int) + settle
     ticks = []
     for k in range(settle + len(hands.truth)):
         rows = [hands.samples[np.flatnonzero(arrives == k)[-1]]] if k in arrives else []
         rows = [hands.truth[0]] if k < settle and k % 5 == 0 and not rows else rows
-        samples = [(side, part) for row in rows for side, part in zip(SIDES, (row[:3], row[3:]), strict=True)]
-        ticks.append(Tick(k, tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in samples)))
+        samples = [
+            (side, part)
+            for row in rows
+            for side, part in zip(SIDES, (row[:3], row[3:]), strict=True)
+        ]
+        ticks.append(
+            Tick(
+                k,
+                tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in samples),
+            )
+        )
     expected = of_the_service(replace(skill, threshold=np.inf), ticks, ASSUMED)[settle:]
-    for name, array in (("target", motion.target), ("setpoint", motion.setpoint), ("tool", motion.tool)):
+    for name, array in (
+        ("target", motion.target),
+        ("setpoint", motion.setpoint),
+        ("tool", motion.tool),
+    ):
         assert array is not None
         assert array.tobytes() == expected[name].tobytes(), name
 
 
 @pytest.mark.parametrize("teach", [True, False])
-def test_rehearsal_is_what_the_controller_does(teach: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rehearsal_is_what_the_controller_does(
+    teach: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`statistics`, `separation`, and `hands` in process."""
     consumed: list[Tick] = []
     run = rehearsal.run
@@ -124,10 +144,15 @@ def test_rehearsal_is_what_the_controller_does(teach: bool, monkeypatch: pytest.
             consumed.append(tick)
             yield tick
 
-    monkeypatch.setattr(rehearsal, "run", lambda controller, ticks, taps: run(controller, kept(ticks), taps))
-    scene, skill = Scene(), shipped_skill()
+    monkeypatch.setattr(
+        rehearsal, "run", lambda controller, ticks, taps: run(controller, kept(ticks), taps)
+    )
+    scene = Scene()
+    skill = shipped_skill()
     skill_for = ours(scene) if teach else lambda bench: skill
-    done = rehearsal.rehearse(HandScript(scene, seed=3, speed=2.0), skill_for, rate_hz=125, keep=True)
+    done = rehearsal.rehearse(
+        HandScript(scene, seed=3, speed=2.0), skill_for, rate_hz=125, keep=True
+    )
     taught = adapted(skill, scene.via_points(), tolerance=TOLERANCE_M) if teach else skill
     expected = of_the_service(taught, consumed, msgspec.structs.replace(Settings(), rate_hz=125))
     assert done.frames.tobytes() == expected.tobytes()

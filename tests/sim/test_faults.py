@@ -14,7 +14,10 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("matplotlib", reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'")
+pytest.importorskip(
+    "matplotlib",
+    reason="the experiments draw with Matplotlib: pip install 'thirdhand[experiments]'",
+)
 
 from thirdhand_sim.lab.__main__ import main
 from thirdhand_sim.lab.load.faults import SHORT
@@ -44,7 +47,9 @@ def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
     assert 80 <= fault["hold_ms"] <= 120
     assert fault["rest_ms"] < 700
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
-    assert fault["travelled_mm"] == pytest.approx(fault["commanded_mm"], abs=10)  # the arm did as it was told
+    assert fault["travelled_mm"] == pytest.approx(
+        fault["commanded_mm"], abs=10
+    )  # the arm did as it was told
     assert fault["lost_ticks"] == 0
 
 
@@ -55,7 +60,11 @@ def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it
     if name not in suffered["faults"]:
         pytest.skip("a network namespace is not allowed here")
     fault = suffered["faults"][name]
-    assert fault["reason"] in ("arm_error", "arm_silent", *["stale_hand"] * (name == "cable pulled"))
+    assert fault["reason"] in (
+        "arm_error",
+        "arm_silent",
+        *["stale_hand"] * (name == "cable pulled"),
+    )
     assert fault["hold_ms"] <= 120
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
@@ -63,7 +72,9 @@ def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it
     assert fault["lost_ticks"] == 0
 
 
-def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whole(suffered: dict[str, Any]) -> None:
+def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whole(
+    suffered: dict[str, Any],
+) -> None:
     fault = suffered["faults"]["service killed"]
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
@@ -79,7 +90,9 @@ def test_a_router_that_is_killed_stops_the_arm_and_all_meet_again(suffered: dict
     assert fault["moves_again_ms"] > 0
 
 
-def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(suffered: dict[str, Any]) -> None:
+def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(
+    suffered: dict[str, Any],
+) -> None:
     fault = suffered["faults"]["scribe killed"]
     assert fault["lost_ticks"] > 0
     assert fault["command_mean_gap_ms"] < 1.5 * fault["command_mean_gap_before_ms"]

@@ -28,7 +28,9 @@ SCENE = Scene()
 def with_gripper(folder: Path) -> Settings:
     """A cell whose arm has a gripper with <mimic>, and a wheel and a cart beside it."""
     posture = continuous_cell(folder).arm.posture
-    return cell_in(folder, continuous_urdf().replace("</robot>", BEYOND + "</robot>"), posture=posture)
+    return cell_in(
+        folder, continuous_urdf().replace("</robot>", BEYOND + "</robot>"), posture=posture
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -38,10 +40,18 @@ def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engi
     cell = made(tmp_path)
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
     world = world_of(engine)
-    run = rehearse(HandScript(SCENE, seed=1), lambda _: taught, settings=cell, rate_hz=100, keep=True, world=world)
+    run = rehearse(
+        HandScript(SCENE, seed=1),
+        lambda _: taught,
+        settings=cell,
+        rate_hz=100,
+        keep=True,
+        world=world,
+    )
     assert run.events.success
     assert max(run.errors_mm) <= 3.0, run.errors_mm
-    frames, limits = run.frames, cell.joints
+    frames = run.frames
+    limits = cell.joints
     assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
     assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
     assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
@@ -55,7 +65,10 @@ def test_bench_and_core_agree_on_the_tool(tmp_path: Path, engine: str) -> None:
     posture = (0.2, *cell.arm.posture[1:])
     with (
         Bench(HandScript(SCENE, seed=1), settings=cell, world=world_of(engine)) as at_zero,
-        Bench(HandScript(SCENE, seed=1), settings=cell, posture=posture, world=world_of(engine)) as moved,
+        Bench(
+            HandScript(SCENE, seed=1), settings=cell, posture=posture, world=world_of(engine)
+        ) as moved,
     ):
-        before, after = at_zero.observe().tool.position, moved.observe().tool.position
+        before = at_zero.observe().tool.position
+        after = moved.observe().tool.position
     np.testing.assert_allclose(np.subtract(after, before), [0.0, 0.2, 0.0], atol=1e-4)

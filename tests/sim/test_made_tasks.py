@@ -19,7 +19,10 @@ def test_takes_follow_from_their_numbers() -> None:
         assert [take.person for take in first] == [0, 0, 1, 1]
         for a, b in zip(first, other, strict=True):
             for name in ("stamps_ns", "left", "right", "tool"):
-                assert getattr(a.demonstration, name).tobytes() == getattr(b.demonstration, name).tobytes()
+                assert (
+                    getattr(a.demonstration, name).tobytes()
+                    == getattr(b.demonstration, name).tobytes()
+                )
             assert a.demonstration.places == b.demonstration.places
         first += takes(kind, people=(0,), each=1, seed=1)
         assert len({take.demonstration.left.tobytes() for take in first}) == 5

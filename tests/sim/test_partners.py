@@ -25,7 +25,9 @@ pytestmark = pytest.mark.thorough
 
 
 def of_kind(kind: str, people: range) -> list[LeftOut]:
-    return [left_out(f"{t.person}", "", t.demonstration) for t in takes(kind, people=people, each=1)]
+    return [
+        left_out(f"{t.person}", "", t.demonstration) for t in takes(kind, people=people, each=1)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -55,19 +57,31 @@ def test_core_predicts_as_the_skill(shown: list[LeftOut]) -> None:
 
 
 def test_coverage_is_what_a_covariance_says(asked: list[LeftOut]) -> None:
-    take, random = asked[0], np.random.default_rng(0)
+    take = asked[0]
+    random = np.random.default_rng(0)
     long = take._replace(tool=np.zeros((20_000, 3)))
-    prediction = Predicted(0.02 * random.standard_normal((20_000, 3)), np.tile(4e-4 * np.eye(3), (20_000, 1, 1)))
+    prediction = Predicted(
+        0.02 * random.standard_normal((20_000, 3)), np.tile(4e-4 * np.eye(3), (20_000, 1, 1))
+    )
     score = judged(long, prediction)
     assert score.inside is not None
     assert np.array(score.inside) / score.samples == pytest.approx(LEVELS, abs=0.01)
 
 
 def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut]) -> None:
-    informed = {name: rms_mm(left_out_by(rival, shown, asked, told=True), asked) for name, rival in RIVALS.items()}
-    untold = {name: rms_mm(left_out_by(RIVALS[name], shown, asked, told=False), asked) for name in ("linear", "mean")}
+    informed = {
+        name: rms_mm(left_out_by(rival, shown, asked, told=True), asked)
+        for name, rival in RIVALS.items()
+    }
+    untold = {
+        name: rms_mm(left_out_by(RIVALS[name], shown, asked, told=False), asked)
+        for name in ("linear", "mean")
+    }
     assert informed["linear"] < untold["linear"] < untold["mean"]
-    assert max(informed[name] for name in informed if name not in ("mean", "same elapsed time")) < untold["linear"]
+    assert (
+        max(informed[name] for name in informed if name not in ("mean", "same elapsed time"))
+        < untold["linear"]
+    )
     twice = of_kind("cyclic", range(4)), of_kind("cyclic", range(6, 8))
     by = {name: rms_mm(left_out_by(RIVALS[name], *twice, told=True), twice[1]) for name in RIVALS}
     assert by["HMM over demonstrations"] < 0.7 * by["Gaussian process"]
@@ -99,16 +113,23 @@ def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
     """The takes, with hands, tool and via-points moved along x."""
-    moved, out = np.array([metres, 0, 0, 0, 0, 0, 0]), []
+    moved = np.array([metres, 0, 0, 0, 0, 0, 0])
+    out = []
     for take in takes_:
         d = take.demonstration
         places = tuple(
             msgspec.structs.replace(
-                p, **{part: tuple(np.add(getattr(p, part), moved[:3]).tolist()) for part in ("left", "right", "tool")}
+                p,
+                **{
+                    part: tuple(np.add(getattr(p, part), moved[:3]).tolist())
+                    for part in ("left", "right", "tool")
+                },
             )
             for p in d.places
         )
-        d = d._replace(left=d.left + moved, right=d.right + moved, tool=d.tool + moved, places=places)
+        d = d._replace(
+            left=d.left + moved, right=d.right + moved, tool=d.tool + moved, places=places
+        )
         out.append(left_out(take.name, take.group, d))
     return out
 
@@ -124,7 +145,11 @@ def test_judged_and_refused_as_the_command_does(
         write_demonstration(path, take.demonstration)
     skill, refusals = as_command(moved, told=True)
     written = tmp_path / "skill.npz"
-    assert command(["learn", *map(str, files), "--output", str(written)]) == bool(refusals) == (metres > 0)
+    assert (
+        command(["learn", *map(str, files), "--output", str(written)])
+        == bool(refusals)
+        == (metres > 0)
+    )
     stderr = capsys.readouterr().err
     assert written.exists() == (not refusals)
     assert all(text in stderr for text in refusals)
@@ -142,19 +167,36 @@ def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut])
     def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
         predictions = left_out_by(RIVALS["mean"], takes_, tested, told=True)
         rows = [judged(*pair) for pair in zip(tested, predictions, strict=True)]
-        return Found(dict.fromkeys((f"{name}, told" for name in RIVALS), rows), {"service, told": fold(takes_, tested)})
+        return Found(
+            dict.fromkeys((f"{name}, told" for name in RIVALS), rows),
+            {"service, told": fold(takes_, tested)},
+        )
 
     def fold(takes_: list[LeftOut], tested: list[LeftOut]) -> Fold:
         return served(takes_, tested, told=True)
 
-    good, refused = found(shown, asked), found(beside(shown, 1.0), beside(asked, 1.0))
-    alone, pooled = (numbers_of(rows)["methods"]["service, told"] for rows in ([good], [good, refused]))
+    good = found(shown, asked)
+    refused = found(beside(shown, 1.0), beside(asked, 1.0))
+    alone, pooled = (
+        numbers_of(rows)["methods"]["service, told"] for rows in ([good], [good, refused])
+    )
     for summary, folds, refuses in ((alone, 0, 0), (pooled, 1, len(asked))):
-        assert (summary["folds_refused"], summary["refuses"], summary["takes"]) == (folds, refuses, len(asked))
-    assert pooled["rms_mm"] == alone["rms_mm"] < alone["beside_mm"]["mean"] == pooled["beside_mm"]["mean"]
+        assert (summary["folds_refused"], summary["refuses"], summary["takes"]) == (
+            folds,
+            refuses,
+            len(asked),
+        )
+    assert (
+        pooled["rms_mm"]
+        == alone["rms_mm"]
+        < alone["beside_mm"]["mean"]
+        == pooled["beside_mm"]["mean"]
+    )
     assert alone["in_spite_of_refusal"] == {"takes": 0}
     assert pooled["in_spite_of_refusal"]["takes"] == len(asked)
-    assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)  # the same takes elsewhere
+    assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(
+        alone["rms_mm"], rel=0.2
+    )  # the same takes elsewhere
     nothing = numbers_of([refused])["methods"]["service, told"]
     assert nothing["takes"] == 0
     assert "rms_mm" not in nothing

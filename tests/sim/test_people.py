@@ -49,7 +49,9 @@ def test_hands_come_to_their_places(mistake: str) -> None:
     for number in range(4):
         subject = person("tuning", number)
         scene = session(subject, 0, group="tuning")
-        motion = played(subject, 0, scene.places, scene.places, seed=(1, 2, number), mistake=mistake)
+        motion = played(
+            subject, 0, scene.places, scene.places, seed=(1, 2, number), mistake=mistake
+        )
         times = np.arange(0.0, motion.lasts_s, 0.005)
         hands = motion.hands(times)
         speed = np.linalg.norm(np.diff(hands.reshape(-1, 2, 3), axis=0), axis=2) / 0.005
@@ -71,14 +73,17 @@ class Still:
     depends_on = DependsOn.HANDS
 
     def __init__(self, at: np.ndarray, *, far: bool) -> None:
-        self.at, self.far = at, far
+        self.at = at
+        self.far = far
 
     def mean(self, seen: Observed) -> np.ndarray:
         return np.tile(self.at, (len(seen.hands), 1))
 
     def predict(self, seen: Observed) -> Predicted:
         count = len(seen.hands)
-        return Predicted(self.mean(seen), np.tile(np.eye(3), (count, 1, 1)), np.full(count, self.far))
+        return Predicted(
+            self.mean(seen), np.tile(np.eye(3), (count, 1, 1)), np.full(count, self.far)
+        )
 
 
 class TestJudging:
@@ -107,7 +112,9 @@ class TestJudging:
         assert not any(event.reached for event in judgement.events)
         assert all(event.held for event in judgement.events)
         due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
-        assert judgement.falsely_held == pytest.approx(1.0 - due)  # stale and swapped hands are held for rightly
+        assert judgement.falsely_held == pytest.approx(
+            1.0 - due
+        )  # stale and swapped hands are held for rightly
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
         """By one that is not where the tracker says."""
@@ -117,7 +124,9 @@ class TestJudging:
         assert not judgement.success
 
 
-@pytest.mark.parametrize("method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), Service()])
+@pytest.mark.parametrize(
+    "method", [NoDemonstrations(), LookUp(), GaussianProcess(each=12), Service()]
+)
 def test_skills_go_to_told_places(
     method: NoDemonstrations | LookUp | GaussianProcess | Service, run_of_tuning: Session
 ) -> None:
@@ -127,7 +136,11 @@ def test_skills_go_to_told_places(
     hands = frames(places)[1:, :6]
 
     def mean() -> np.ndarray:
-        return placed.mean(hands) if isinstance(placed, Skill) else placed.mean(Observed.resting(hands))
+        return (
+            placed.mean(hands)
+            if isinstance(placed, Skill)
+            else placed.mean(Observed.resting(hands))
+        )
 
     np.testing.assert_allclose(mean(), frames(places)[1:, 6:], atol=0.008)
     if not isinstance(placed, Skill):
@@ -138,9 +151,11 @@ def test_skills_go_to_told_places(
 
 
 def test_each_method_had_as_many_candidates() -> None:
-    assert {len(entry.candidates) for name, entry in METHODS.items() if not name.startswith(("ours", "as_paper"))} == {
-        6
-    }
+    assert {
+        len(entry.candidates)
+        for name, entry in METHODS.items()
+        if not name.startswith(("ours", "as_paper"))
+    } == {6}
 
 
 @pytest.mark.timeout(120)
@@ -148,18 +163,27 @@ def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.Monk
     """A reduced comparison keeps the order that is stable."""
     pytest.importorskip("matplotlib")
     for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
-        monkeypatch.setattr(f"thirdhand_sim.lab.people.comparison.{table}", {"tuning": value, "test": value})
+        monkeypatch.setattr(
+            f"thirdhand_sim.lab.people.comparison.{table}", {"tuning": value, "test": value}
+        )
     monkeypatch.setattr("thirdhand_sim.lab.people.comparison.BREAKING", BREAKING[:1])
     few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
     monkeypatch.setattr("thirdhand_sim.lab.people.comparison.METHODS", few)
     results = Results(tmp_path, "people", said=False)
-    result = json.loads(results.numbers(run(results, Options(group="tuning", share=0.99))).read_text())
-    mean = {name: {m: method[m]["mean"] for m in ("success", "path_rms_mm")} for name, method in result["methods"].items()}
+    result = json.loads(
+        results.numbers(run(results, Options(group="tuning", share=0.99))).read_text()
+    )
+    mean = {
+        name: {m: method[m]["mean"] for m in ("success", "path_rms_mm")}
+        for name, method in result["methods"].items()
+    }
     assert result["people"] == 3
     assert mean["teacher"]["success"] == 1.0
     assert mean["look_up"]["success"] >= mean["none"]["success"] > mean["gmr"]["success"]
     # what demonstrations buy is the way between the places
-    assert mean["ours"]["path_rms_mm"] < mean["none"]["path_rms_mm"] < mean["look_up"]["path_rms_mm"]
+    assert (
+        mean["ours"]["path_rms_mm"] < mean["none"]["path_rms_mm"] < mean["look_up"]["path_rms_mm"]
+    )
     assert mean["look_up"]["path_rms_mm"] < mean["gmr"]["path_rms_mm"]
     assert mean["ours"]["success"] >= mean["look_up"]["success"]
     assert (tmp_path / "people.png").read_bytes()[:4] == b"\x89PNG"

@@ -36,7 +36,12 @@ def assert_succeeded(run: Played, rate_hz: int, bench_hz: int | None = None) -> 
 
 @pytest.mark.parametrize(
     ("rate_hz", "arm", "engine"),
-    [(100, "ur5", "mujoco"), (250, "franka", "pybullet"), (700, "ur5", "pybullet"), (1000, "wam", "mujoco")],
+    [
+        (100, "ur5", "mujoco"),
+        (250, "franka", "pybullet"),
+        (700, "ur5", "pybullet"),
+        (1000, "wam", "mujoco"),
+    ],
 )
 @pytest.mark.one_case
 def test_the_demo_succeeds_at_other_rates(rate_hz: int, arm: str, engine: str) -> None:
@@ -65,5 +70,7 @@ def test_loop_at_50_hz_does_the_task(arm: str) -> None:
     run = rehearse(HandScript(SCENE, seed=1), lambda _: taught(), settings=cell)
     assert run.events.success
     assert max(run.errors_mm) < 1.0
-    with pytest.raises(BenchError, match=r"50 Hz is too slow: .* an arm brakes 20 ms after its last command; 67 Hz"):
+    with pytest.raises(
+        BenchError, match=r"50 Hz is too slow: .* an arm brakes 20 ms after its last command; 67 Hz"
+    ):
         played(cell)

@@ -17,7 +17,9 @@ def motions(script: HandScript, t: float) -> tuple[PointMotion, PointMotion, Poi
     return (*script.truth(t), Teacher(SCENE, seed=3, clock=script.clock).truth(t))
 
 
-@pytest.mark.parametrize("options", [{}, {"speed": 1.7}, {"pauses": (ScriptPause(1.2, 1.0), ScriptPause(5.0, 0.6))}])
+@pytest.mark.parametrize(
+    "options", [{}, {"speed": 1.7}, {"pauses": (ScriptPause(1.2, 1.0), ScriptPause(5.0, 0.6))}]
+)
 def test_motion_has_its_derivatives(options: dict[str, object]) -> None:
     """Velocity and acceleration are the derivatives of position."""
     script = HandScript(SCENE, seed=3, **options)  # type: ignore[arg-type]
@@ -26,12 +28,15 @@ def test_motion_has_its_derivatives(options: dict[str, object]) -> None:
         before, now, after = (motions(script, t + step) for step in (-h, 0.0, h))
         for b, n, a in zip(before, now, after, strict=True):
             np.testing.assert_allclose(n.velocity, (a.position - b.position) / (2 * h), atol=1e-6)
-            np.testing.assert_allclose(n.acceleration, (a.velocity - b.velocity) / (2 * h), atol=1e-4)
+            np.testing.assert_allclose(
+                n.acceleration, (a.velocity - b.velocity) / (2 * h), atol=1e-4
+            )
 
 
 def test_places_are_passed_without_scatter() -> None:
     """Hands and tool pass the scene's places when nothing scatters."""
-    script, teacher = HandScript(SCENE, seed=1, offset_std=0.0), Teacher(SCENE, seed=1, offset_std=0.0)
+    script = HandScript(SCENE, seed=1, offset_std=0.0)
+    teacher = Teacher(SCENE, seed=1, offset_std=0.0)
     ends = [0.0, *(end for end, _ in SCENE.dwells)]
     np.testing.assert_allclose(
         [script.truth(t).left.position for t in ends],
@@ -73,7 +78,9 @@ def test_tremor_has_size_and_band() -> None:
 def test_hands_go_back_in_a_deep_pause() -> None:
     """In a long pause, the hands return along their path and come again."""
     clock = HandScript(SCENE, seed=1, pauses=(ScriptPause(4.0, 1.5, depth=2.0),)).clock
-    before, turned, after = clock.at(3.9), clock.at(4.8), clock.at(6.0)
+    before = clock.at(3.9)
+    turned = clock.at(4.8)
+    after = clock.at(6.0)
     assert (before[1], turned[1], after[1]) == pytest.approx((1.0, -1.0, 1.0))
     assert after[0] == pytest.approx(6.0 - 2 * (1.5 - 0.3))
     assert clock.elapsed(SCENE.duration_s) == pytest.approx(SCENE.duration_s + 2 * (1.5 - 0.3))
@@ -83,7 +90,11 @@ def test_hands_go_back_in_a_deep_pause() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"speed": 0.0}, {"pauses": (ScriptPause(1.0, 0.1),)}, {"pauses": (ScriptPause(1.0, 2.0), ScriptPause(2.0, 1.0))}],
+    [
+        {"speed": 0.0},
+        {"pauses": (ScriptPause(1.0, 0.1),)},
+        {"pauses": (ScriptPause(1.0, 2.0), ScriptPause(2.0, 1.0))},
+    ],
 )
 def test_a_clock_that_cannot_run_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"speed|pause"):

@@ -13,7 +13,8 @@ from thirdhand_sim.lab import sensitivity
 
 # Values that another limit of the shipped cell keeps from having an effect.
 BOUND_BY_SETTINGS = {"arm.position_gain_rate_share 2", "separation.planned_brake_limits 2"}
-CELL, SKILL = Settings(), shipped_skill()
+CELL = Settings()
+SKILL = shipped_skill()
 URDF = robot_description(CELL)
 
 
@@ -36,9 +37,17 @@ def test_tuned_number_reaches_constants() -> None:
 
 def test_tuned_number_is_read_by_core() -> None:
     """The records of intake, decision and setpoint hold all their numbers, read or not."""
-    sources = [path for path in (ROOT / "service" / "thirdhand" / "core").rglob("*.py") if path.name != "tuning.py"]
-    read = set(re.findall(r"\.(\w+)", "".join(path.read_text(encoding="utf-8") for path in sources)))
-    derived = (ROOT / "service" / "thirdhand" / "core" / "intake" / "tuning.py").read_text(encoding="utf-8")
+    sources = [
+        path
+        for path in (ROOT / "service" / "thirdhand" / "core").rglob("*.py")
+        if path.name != "tuning.py"
+    ]
+    read = set(
+        re.findall(r"\.(\w+)", "".join(path.read_text(encoding="utf-8") for path in sources))
+    )
+    derived = (ROOT / "service" / "thirdhand" / "core" / "intake" / "tuning.py").read_text(
+        encoding="utf-8"
+    )
     read |= set(re.findall(r"self\.(\w+)", derived))
     assert {number.name for number in sensitivity.numbers().values()} - read == set()
 
@@ -46,6 +55,7 @@ def test_tuned_number_is_read_by_core() -> None:
 def test_number_changes_its_own_stages() -> None:
     """A number changes what follows from it and no other controller."""
     arm = TUNING.arm._replace(position_gain_per_s=25.0)
-    tuned, changed = constants(TUNING), constants(TUNING._replace(arm=arm))
+    tuned = constants(TUNING)
+    changed = constants(TUNING._replace(arm=arm))
     assert {stage for stage in tuned if tuned[stage] != changed[stage]} == {"setpoint", "arm"}
     assert constants(TUNING) == tuned

@@ -19,7 +19,10 @@ from thirdhand_sim.scene import Scene
 def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two"):
         assert teach.main(["--output", str(tmp_path / name), "--count", "2", "--seed", "3"]) == 0
-    first, two = ([path.read_bytes() for path in sorted((tmp_path / name).iterdir())] for name in ("one", "two"))
+    first, two = (
+        [path.read_bytes() for path in sorted((tmp_path / name).iterdir())]
+        for name in ("one", "two")
+    )
     assert len(first) == 2
     assert first == two
     assert first[0] != first[1]
@@ -27,7 +30,12 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
 
 def test_file_of_a_demonstration(tmp_path: Path) -> None:
     """A file holds hands and tool at a hundred hertz in frame base."""
-    assert teach.main(["--output", str(tmp_path), "--count", "1", "--seed", "3", "--cell", "lab/bench2"]) == 0
+    assert (
+        teach.main(
+            ["--output", str(tmp_path), "--count", "1", "--seed", "3", "--cell", "lab/bench2"]
+        )
+        == 0
+    )
     taught = teach.demonstrations(Scene(), count=1, seed=3)[0]
     with (tmp_path / "demonstration-1.mcap").open("rb") as stream:
         reader = make_reader(stream)
@@ -41,12 +49,22 @@ def test_file_of_a_demonstration(tmp_path: Path) -> None:
                 "cdr",
             )
             by_topic.setdefault(channel.topic, []).append(cdr.decode_pose(message.data))
-    assert set(by_topic) == {"/lab/bench2/hands/left", "/lab/bench2/hands/right", "/lab/bench2/tool/pose"}
-    for topic, poses in (("hands/left", taught.left), ("hands/right", taught.right), ("tool/pose", taught.tool)):
+    assert set(by_topic) == {
+        "/lab/bench2/hands/left",
+        "/lab/bench2/hands/right",
+        "/lab/bench2/tool/pose",
+    }
+    for topic, poses in (
+        ("hands/left", taught.left),
+        ("hands/right", taught.right),
+        ("tool/pose", taught.tool),
+    ):
         messages = by_topic[f"/lab/bench2/{topic}"]
         assert {message.frame_id for message in messages} == {"base"}
         np.testing.assert_array_equal([message.stamp_ns for message in messages], taught.stamps_ns)
-        np.testing.assert_array_equal([(*message.position, *message.orientation) for message in messages], poses)
+        np.testing.assert_array_equal(
+            [(*message.position, *message.orientation) for message in messages], poses
+        )
     assert set(np.diff(taught.stamps_ns)) == {10_000_000}
 
 
@@ -67,7 +85,8 @@ def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
     assert [place.name for place in places] == ["start", "tray", "work", "tray again", "done"]
     assert places[1].left == places[3].left
     assert np.linalg.norm(np.subtract(places[1].tool, places[3].tool)) > 0.1
-    first, other = teach.visits(1), teach.visits(2)
+    first = teach.visits(1)
+    other = teach.visits(2)
     for take in (first, other):
         for place in places:
             assert off_via_point(take, place, NONE).min() < 0.02

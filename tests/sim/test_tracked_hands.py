@@ -26,7 +26,8 @@ class Player:
     """A person who moves one hand at a time to the places that the bench shows."""
 
     def __init__(self, hands: TrackedHands, *, segments: int) -> None:
-        self._hands, self._stages = hands, segments
+        self._hands = hands
+        self._stages = segments
         self._at: dict[str, Point] = {"left": SCENE.left_start, "right": SCENE.right_start}
         self.shown: list[str] = []
 
@@ -39,7 +40,9 @@ class Player:
         if moving and len(self.shown) <= self._stages:
             side, to = moving[0]
             share = min(1.0, SPEED_M_S * bench.period_s / math.dist(self._at[side], to))
-            self._at[side] = tuple(a + share * (b - a) for a, b in zip(self._at[side], to, strict=True))  # type: ignore[assignment]
+            self._at[side] = tuple(
+                a + share * (b - a) for a, b in zip(self._at[side], to, strict=True)
+            )  # type: ignore[assignment]
         for side, position in self._at.items():
             self._hands.receive(side, PoseStamped(1, BASE, position, HAND_ORIENTATION))
 
@@ -62,7 +65,9 @@ def test_hands_in_turn_play_the_whole_task() -> None:
     events, labels, hands = played(segments=5)
     assert events.success
     assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 5.0
-    assert labels == [f"{side} hand: {task}" for segment in hand_places(SCENE) for side, _, task in segment]
+    assert labels == [
+        f"{side} hand: {task}" for segment in hand_places(SCENE) for side, _, task in segment
+    ]
     assert hands.places() == ()
     assert events.carry.time_s < hands.duration_s < TIMEOUT_S
 

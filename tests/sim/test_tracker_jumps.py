@@ -11,7 +11,11 @@ from thirdhand_sim.lab.people.tracker_jumps import repair
 from thirdhand_sim.lab.results import Array
 
 WAY = np.array([0.6, 0.64, 0.48])
-TRACKERS = {"24 Hz": (24.0, 0.0002), "30 Hz": (30.0, 0.002), "120 Hz": (120.0, 0.0003)}  # rate, noise [m]
+TRACKERS = {
+    "24 Hz": (24.0, 0.0002),
+    "30 Hz": (30.0, 0.002),
+    "120 Hz": (120.0, 0.0003),
+}  # rate, noise [m]
 Position = Callable[[Array], Array]
 
 
@@ -72,12 +76,17 @@ def test_quick_true_motion_is_not_touched(name: str, tracker: str) -> None:
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("name", ["rest", "reach at 1 m/s", "reach at 2 m/s"])
-@pytest.mark.parametrize("offsets_mm", [(60,), (68, 80), (70, 70, 70), (70, 70, 70, 70, 70), (150, -60, 90)])
+@pytest.mark.parametrize(
+    "offsets_mm", [(60,), (68, 80), (70, 70, 70), (70, 70, 70, 70, 70), (150, -60, 90)]
+)
 @pytest.mark.one_case
-def test_jumps_are_taken_out_of_the_truth(name: str, tracker: str, offsets_mm: tuple[int, ...]) -> None:
+def test_jumps_are_taken_out_of_the_truth(
+    name: str, tracker: str, offsets_mm: tuple[int, ...]
+) -> None:
     for seed, begin_s in enumerate((-0.1, 0.2)):
         t, true, tracked = hands(PATHS[name], tracker, seed)
-        begin, clean_mm = int(np.searchsorted(t, begin_s)), off_mm(tracked, true)
+        begin = int(np.searchsorted(t, begin_s))
+        clean_mm = off_mm(tracked, true)
         run = slice(begin, begin + len(offsets_mm))
         tracked[run, :3] += np.array(offsets_mm)[:, None] / 1000 * np.array([0.0, -0.8, 0.6])
         repaired = repair(t, tracked)
@@ -85,14 +94,17 @@ def test_jumps_are_taken_out_of_the_truth(name: str, tracker: str, offsets_mm: t
         wrong[run, 0] = True
         np.testing.assert_array_equal(repaired.wrong, wrong)
         # A quarter of a second of a reach at 2 m/s that nobody has seen is known to 14 mm.
-        assert off_mm(repaired.hands, true) < clean_mm + (14 if t[run][-1] - t[run][0] > 0.12 else 5)
+        assert off_mm(repaired.hands, true) < clean_mm + (
+            14 if t[run][-1] - t[run][0] > 0.12 else 5
+        )
 
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("samples", [1, 3, 5, 15])
 def test_exchanged_hands_are_put_right(samples: int, tracker: str) -> None:
     t, true, tracked = hands(PATHS["reach at 2 m/s"], tracker, seed=5)
-    begin, clean_mm = int(np.searchsorted(t, 0.1)), off_mm(tracked, true)
+    begin = int(np.searchsorted(t, 0.1))
+    clean_mm = off_mm(tracked, true)
     run = slice(begin, begin + samples)
     tracked[run] = np.roll(tracked[run], 3, axis=1)
     repaired = repair(t, tracked)

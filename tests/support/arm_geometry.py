@@ -31,14 +31,21 @@ class ArmGeometry:
 
     def __init__(self, settings: Settings, urdf: str) -> None:
         body = body_of(settings, urdf)
-        self.links, self.radii = np.array(body.capsules["link"]), np.array(body.capsules["radius"])
-        self.pairs, self.joints = body.pairs, len(settings.joints.names)
+        self.links = np.array(body.capsules["link"])
+        self.radii = np.array(body.capsules["radius"])
+        self.pairs = body.pairs
+        self.joints = len(settings.joints.names)
         self._ends = np.array(body.capsules["ends"])
-        self._names, self._chain = settings.joints.names, Urdf(urdf).chain(settings.arm.plate)
+        self._names = settings.joints.names
+        self._chain = Urdf(urdf).chain(settings.arm.plate)
         self._tool = np.array(settings.tool.plate_from_tool[:3])
-        centre, half = np.array(settings.table.centre), np.array([*settings.table.half_size, 0.0])
+        centre = np.array(settings.table.centre)
+        half = np.array([*settings.table.half_size, 0.0])
         boxes = [(centre - half - (0.0, 0.0, TABLE_DEPTH_M), centre + half)]
-        boxes += [(np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)) for b in settings.obstacles.boxes]
+        boxes += [
+            (np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size))
+            for b in settings.obstacles.boxes
+        ]
         self.boxes = np.array(boxes)
         toward = np.array(settings.people.toward_elbow)
         self.forearm = settings.people.length * toward / np.linalg.norm(toward)
@@ -47,7 +54,8 @@ class ArmGeometry:
         """Ends of the capsules (T, N, 2, 3) and positions of the tool (T, 3) [m] at postures
         (T, J) [rad].
         """
-        turned, origins = np.tile(np.eye(3), (len(postures), 1, 1)), np.zeros((len(postures), 3))
+        turned = np.tile(np.eye(3), (len(postures), 1, 1))
+        origins = np.zeros((len(postures), 3))
         capsules = np.empty((len(postures), len(self.links), 2, 3))
         capsules[:, self.links == 0] = self._ends[self.links == 0]
         for joint in self._chain:
@@ -55,7 +63,10 @@ class ArmGeometry:
             turned = turned @ Rotation.from_quat(joint.rotation).as_matrix()
             if joint.name in self._names:
                 number = self._names.index(joint.name)
-                turned = turned @ Rotation.from_rotvec(np.outer(postures[:, number], joint.axis)).as_matrix()
+                turned = (
+                    turned
+                    @ Rotation.from_rotvec(np.outer(postures[:, number], joint.axis)).as_matrix()
+                )
                 for k in np.flatnonzero(self.links == number + 1):
                     capsules[:, k] = origins[:, None] + self._ends[k] @ turned.transpose(0, 2, 1)
         return capsules, origins + turned @ self._tool
@@ -68,8 +79,11 @@ class ArmGeometry:
 
 def between_points_and_segments(points: Vector, segments: Vector) -> Vector:
     """Distances (T,) of points (T, 3) and segments (T, 2, 3)."""
-    along, offset = segments[:, 1] - segments[:, 0], points - segments[:, 0]
-    share = np.einsum("ti,ti->t", offset, along) / np.maximum(np.einsum("ti,ti->t", along, along), 1e-300)
+    along = segments[:, 1] - segments[:, 0]
+    offset = points - segments[:, 0]
+    share = np.einsum("ti,ti->t", offset, along) / np.maximum(
+        np.einsum("ti,ti->t", along, along), 1e-300
+    )
     return np.linalg.norm(offset - np.clip(share, 0.0, 1.0)[:, None] * along, axis=1)
 
 
@@ -79,12 +93,17 @@ def between_segments(first: Vector, second: Vector) -> Vector:
     """
     ends = [between_points_and_segments(first[:, k], second) for k in (0, 1)]
     ends += [between_points_and_segments(second[:, k], first) for k in (0, 1)]
-    u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
-    uu, uv, vv, uw, vw = (np.einsum("ti,ti->t", a, b) for a, b in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    u = first[:, 1] - first[:, 0]
+    v = second[:, 1] - second[:, 0]
+    w = first[:, 0] - second[:, 0]
+    uu, uv, vv, uw, vw = (
+        np.einsum("ti,ti->t", a, b) for a, b in ((u, u), (u, v), (v, v), (u, w), (v, w))
+    )
     determinant = uu * vv - uv * uv
     crosses = determinant > 1e-12 * uu * vv
     divisor = np.where(crosses, determinant, 1.0)
-    s, t = (uv * vw - vv * uw) / divisor, (uu * vw - uv * uw) / divisor
+    s = (uv * vw - vv * uw) / divisor
+    t = (uu * vw - uv * uw) / divisor
     inside = crosses & (s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0)
     between = np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)
     return np.minimum(np.min(ends, axis=0), np.where(inside, between, np.inf))
@@ -93,7 +112,9 @@ def between_segments(first: Vector, second: Vector) -> Vector:
 def points_to_box(points: Vector, box: Vector) -> Vector:
     """Distances (T,) of points (T, 3) from a box (2, 3) of two corners; negative inside."""
     outside = np.linalg.norm(points - np.clip(points, *box), axis=1)
-    return np.where(outside > 0.0, outside, -np.minimum(points - box[0], box[1] - points).min(axis=1))
+    return np.where(
+        outside > 0.0, outside, -np.minimum(points - box[0], box[1] - points).min(axis=1)
+    )
 
 
 def segments_to_box(segments: Vector, box: Vector) -> Vector:
@@ -102,14 +123,18 @@ def segments_to_box(segments: Vector, box: Vector) -> Vector:
     The signed distance from a convex body is convex along a line, so a golden-section search finds
     its minimum.
     """
-    begin, along = segments[:, 0], segments[:, 1] - segments[:, 0]
-    low, high = np.zeros(len(segments)), np.ones(len(segments))
+    begin = segments[:, 0]
+    along = segments[:, 1] - segments[:, 0]
+    low = np.zeros(len(segments))
+    high = np.ones(len(segments))
     for _ in range(SEARCH_STEPS):
-        first, second = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        first = high - GOLDEN * (high - low)
+        second = low + GOLDEN * (high - low)
         nearer = points_to_box(begin + first[:, None] * along, box) < points_to_box(
             begin + second[:, None] * along, box
         )
-        low, high = np.where(nearer, low, first), np.where(nearer, second, high)
+        low = np.where(nearer, low, first)
+        high = np.where(nearer, second, high)
     return points_to_box(begin + (0.5 * (low + high))[:, None] * along, box)
 
 

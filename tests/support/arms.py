@@ -25,14 +25,18 @@ class Model(NamedTuple):
 
 # The postures have the tool where the demonstrations begin, 45 degrees down.
 MODELS = {
-    "panda": Model("panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)),
+    "panda": Model(
+        "panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)
+    ),
     "ur5": Model("ur5_robot.urdf", "tool0", (-0.39, -1.67, 2.129, -2.772, -1.303, 0.0)),
 }
 
 
 def urdf_of(model: Model) -> Path:
     """Where the file is installed."""
-    return next(Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == model.file)
+    return next(
+        Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == model.file
+    )
 
 
 def toml_of(model: Model, **changed: str) -> str:

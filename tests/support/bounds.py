@@ -22,26 +22,47 @@ ROUNDING = 1e-9  # of numbers in SI units, and relative
 POSITION_ROUNDING_M = 1e-6
 AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
 SPEED_ROUNDING_MPS = 1e-6
-STOP_RISE, STOP_RISE_MPS = 1.01, 0.01  # the tool's speed in a stop, beyond its speed limit
+# the tool's speed in a stop, beyond its speed limit
+STOP_RISE = 1.01
+STOP_RISE_MPS = 0.01
 SLOW_RISE_MPS = 0.1  # the same, beyond its speed at the start of the stop
 BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
-WAITING_M = 0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
+WAITING_M = (
+    0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
+)
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
 SLIP_MPS = 0.01  # joints that start one after the other approach so fast
 RESTING_S = 0.6  # a hand that has been still for this time is at rest, also as it is estimated
-ESTIMATE_M = 0.006  # error of a resting hand's estimate, beside 3 standard deviations of the tracker's noise
-RESTING_MPS, ESTIMATED_MPS = 0.03, 0.02  # excess speed toward a hand at rest, and toward a hand as it is estimated
-BRAKED_S, BRAKED_SHARE, SLOW_MPS = 0.12, 0.9, 0.05  # within this time an excess has fallen to this share, or is slow
+ESTIMATE_M = (
+    0.006  # error of a resting hand's estimate, beside 3 standard deviations of the tracker's noise
+)
+# excess speed toward a hand at rest, and toward a hand as it is estimated
+RESTING_MPS = 0.03
+ESTIMATED_MPS = 0.02
+# within this time an excess has fallen to this share, or is slow
+BRAKED_S = 0.12
+BRAKED_SHARE = 0.9
+SLOW_MPS = 0.05
 NEAR_M = 0.55  # a hand farther off allows any speed
 MOVING_MPS = 0.005  # slower capsules are not looked at
-PASSED_M, WORSE_M = 0.005, 0.002  # depth in a clearance; increase of the depth at the start
+# depth in a clearance; increase of the depth at the start
+PASSED_M = 0.005
+WORSE_M = 0.002
 OWN_CLEARANCE_M = 0.01
 EVERY = 4  # frames: clearances change slowly
 SETTLED_S = 6.0  # with the hands at rest, in which an arm comes to rest
-LOOK_S, STUCK_S = 0.5, 2.5  # at the end: of accelerations; in which a stuck tool is reported
-AT_REST_RADPS2, AT_REST_NOISY_RADPS2, KEPT_BACK_RADPS2 = 0.05, 0.3, 0.5  # root mean square of all joints
-THERE_M, NET_MOTION_M = 0.01, 0.004
-STUCK_M = 0.02  # a tool that is farther from its target is reported as stuck; a nearer one as kept away
+# at the end: of accelerations; in which a stuck tool is reported
+LOOK_S = 0.5
+STUCK_S = 2.5
+# root mean square of all joints
+AT_REST_RADPS2 = 0.05
+AT_REST_NOISY_RADPS2 = 0.3
+KEPT_BACK_RADPS2 = 0.5
+THERE_M = 0.01
+NET_MOTION_M = 0.004
+STUCK_M = (
+    0.02  # a tool that is farther from its target is reported as stuck; a nearer one as kept away
+)
 
 
 @dataclass(frozen=True)
@@ -82,13 +103,17 @@ class Session:
     @cached_property
     def placed_on(self) -> Vector:
         """The same (T - 1, N, 2, 3), of all frames but the last, STEP_S into the next motion."""
-        return self.geometry.place(self.frames["joints"][:-1] + STEP_S * self.frames["joint_velocities"][1:])[0]
+        return self.geometry.place(
+            self.frames["joints"][:-1] + STEP_S * self.frames["joint_velocities"][1:]
+        )[0]
 
     @cached_property
     def tool_speeds(self) -> tuple[Vector, Vector]:
         """Speeds (T,) of the tool [m/s]: now, and when all joint accelerations have come to 0."""
-        joints, velocities = self.frames["joints"], self.frames["joint_velocities"]
-        accelerations, jerk = self.frames["joint_accelerations"], np.array(self.settings.joints.jerk)
+        joints = self.frames["joints"]
+        velocities = self.frames["joint_velocities"]
+        accelerations = self.frames["joint_accelerations"]
+        jerk = np.array(self.settings.joints.jerk)
         crest = velocities + accelerations * np.abs(accelerations) / (2.0 * jerk)
         speeds = self.geometry.tool_speeds
         return speeds(joints, velocities), speeds(joints, crest)
@@ -122,7 +147,8 @@ def _following(session: Session) -> np.ndarray:
 
 def _jumps(session: Session) -> np.ndarray:
     """Whether joints came to a frame (T - 1,) otherwise than by their velocities."""
-    frames, dt = session.frames, session.settings.period_s
+    frames = session.frames
+    dt = session.settings.period_s
     moved = np.diff(frames["joints"], axis=0)
     moved -= 0.5 * dt * (frames["joint_velocities"][1:] + frames["joint_velocities"][:-1])
     jumped = np.abs(moved) > np.array(session.settings.joints.jerk) * dt**3 + 2 * ROUNDING
@@ -143,7 +169,8 @@ def every_number_is_finite(session: Session) -> Vector:
 
 
 def joints_are_within_limits_or_move_inwards(session: Session) -> Vector:
-    joints, limits = session.frames["joints"], session.settings.joints
+    joints = session.frames["joints"]
+    limits = session.settings.joints
     beyond = np.maximum(joints - limits.upper, limits.lower - joints)
     excess = (beyond[1:] - np.maximum(0.0, beyond[:-1])).max(axis=1) - ROUNDING
     return _with_first(np.where(_pairs(_commanded(session)), excess, 0.0))
@@ -163,7 +190,8 @@ def joint_accelerations_are_within_limits(session: Session) -> Vector:
 
 
 def joint_jerks_are_within_limits(session: Session) -> Vector:
-    jerk, dt = np.array(session.settings.joints.jerk), session.settings.period_s
+    jerk = np.array(session.settings.joints.jerk)
+    dt = session.settings.period_s
     jerks = np.abs(np.diff(session.frames["joint_accelerations"], axis=0)) / dt
     excess = (jerks - jerk * (1.0 + ROUNDING) - ROUNDING / dt).max(axis=1)
     return _with_first(np.where(_pairs(_commanded(session)) & ~_jumps(session), excess, 0.0))
@@ -173,12 +201,17 @@ def joints_jump_only_at_rest_and_to_where_the_arm_is(session: Session) -> Vector
     frames = session.frames
     speed = np.abs(frames["joint_velocities"][:-1]).max(axis=1)
     error_rad = np.abs(frames["joints"][1:] - session.measured[1:]).max(axis=1)
-    return _with_first(np.where(_jumps(session), np.maximum(speed, error_rad - AS_MEASURED_RAD), 0.0))
+    return _with_first(
+        np.where(_jumps(session), np.maximum(speed, error_rad - AS_MEASURED_RAD), 0.0)
+    )
 
 
 def joints_that_move_are_commanded(session: Session) -> Vector:
     return _excess(
-        len(session.frames), np.abs(session.frames["joint_velocities"]).max(axis=1), 0.0, ~_commanded(session)
+        len(session.frames),
+        np.abs(session.frames["joint_velocities"]).max(axis=1),
+        0.0,
+        ~_commanded(session),
     )
 
 
@@ -198,7 +231,8 @@ def setpoint_speed_is_within_its_limit(session: Session) -> Vector:
 
 def setpoint_is_slow_while_it_engages(session: Session) -> Vector:
     """A setpoint that begins faster than that may only come down."""
-    speed, limit = _norms(session.frames["setpoint_velocity"]), session.settings.tool.engaging_speed
+    speed = _norms(session.frames["setpoint_velocity"])
+    limit = session.settings.tool.engaging_speed
     excess = speed[1:] - np.maximum(speed[:-1], limit) * (1.0 + ROUNDING) - ROUNDING
     engages = session.frames["flags"] & Flag.ENGAGING > 0
     return _with_first(np.where(_pairs(_following(session)) & engages[1:], excess, 0.0))
@@ -209,14 +243,16 @@ def setpoint_acceleration_is_within_its_limit(session: Session) -> Vector:
 
 
 def setpoint_jerk_is_within_its_limit(session: Session) -> Vector:
-    jerk, dt = session.settings.tool.jerk, session.settings.period_s
+    jerk = session.settings.tool.jerk
+    dt = session.settings.period_s
     jerks = _norms(np.diff(session.frames["setpoint_acceleration"], axis=0)) / dt
     excess = jerks - jerk * (1.0 + 1e-6) - ROUNDING / dt
     return _with_first(np.where(_pairs(_following(session)), excess, 0.0))
 
 
 def setpoint_does_not_jump(session: Session) -> Vector:
-    frames, dt = session.frames, session.settings.period_s
+    frames = session.frames
+    dt = session.settings.period_s
     moved = np.diff(frames["setpoint"], axis=0)
     moved -= 0.5 * dt * (frames["setpoint_velocity"][1:] + frames["setpoint_velocity"][:-1])
     excess = np.abs(moved).max(axis=1) - session.settings.tool.jerk * dt**3 - ROUNDING
@@ -233,7 +269,8 @@ def setpoint_turning_speed_is_within_its_limit(session: Session) -> Vector:
 
 
 def setpoint_turning_acceleration_is_within_its_limit(session: Session) -> Vector:
-    limit, dt = session.settings.tool.max_turn_acceleration, session.settings.period_s
+    limit = session.settings.tool.max_turn_acceleration
+    dt = session.settings.period_s
     accelerations = _norms(np.diff(session.frames["setpoint_turning"], axis=0)) / dt
     excess = accelerations - limit * (1.0 + 1e-6) - 1e-5
     return _with_first(np.where(_pairs(_following(session)), excess, 0.0))
@@ -244,7 +281,9 @@ def setpoint_turning_acceleration_is_within_its_limit(session: Session) -> Vecto
 
 def _runs(session: Session) -> Iterator[slice]:
     """Frames in which it follows without a pause, and in the same workspace."""
-    is_unchanged = np.concatenate([[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))])
+    is_unchanged = np.concatenate(
+        [[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))]
+    )
     following = _following(session)
     begins = np.flatnonzero(following & ~(np.concatenate([[False], following[:-1]]) & is_unchanged))
     ends = np.append(begins, len(following))[1:]
@@ -257,14 +296,16 @@ def _outside(session: Session, point: str) -> Vector:
     """How far a point is outside of the workspace and of the planes of the reach (T,) [m]; negative
     inside.
     """
-    reach, positions_m = session.settings.reach, session.frames[point]
+    reach = session.settings.reach
+    positions_m = session.frames[point]
     lower = np.maximum(session.boxes[:, 0], (reach.min_x, -np.inf, reach.min_z))
     return np.maximum(lower - positions_m, positions_m - session.boxes[:, 1]).max(axis=1)
 
 
 def setpoint_stays_in_the_workspace(session: Session) -> Vector:
     """Where following began there, at rest. One that begins outside moves no farther out."""
-    outside, excess = _outside(session, "setpoint"), np.zeros(len(session.frames))
+    outside = _outside(session, "setpoint")
+    excess = np.zeros(len(session.frames))
     for run in _runs(session):
         if not session.frames["setpoint_velocity"][run.start].any():
             excess[run] = outside[run] - max(0.0, outside[run.start]) - POSITION_ROUNDING_M
@@ -272,7 +313,8 @@ def setpoint_stays_in_the_workspace(session: Session) -> Vector:
 
 
 def tool_leaves_the_workspace_by_little(session: Session) -> Vector:
-    outside, excess = _outside(session, "tool"), np.zeros(len(session.frames))
+    outside = _outside(session, "tool")
+    excess = np.zeros(len(session.frames))
     for run in _runs(session):
         excess[run] = outside[run] - max(0.0, outside[run.start]) - OUTSIDE_M
     return excess
@@ -280,8 +322,11 @@ def tool_leaves_the_workspace_by_little(session: Session) -> Vector:
 
 def tool_is_near_its_setpoint(session: Session) -> Vector:
     """Within BEHIND_M, or within WAITING_M and the way of a stop from the greatest speed."""
-    gap, tool = _norms(session.frames["tool"] - session.frames["setpoint"]), session.settings.tool
-    v, a, j = tool.max_speed, 0.4 * tool.acceleration, tool.jerk / np.sqrt(3.0)
+    gap = _norms(session.frames["tool"] - session.frames["setpoint"])
+    tool = session.settings.tool
+    v = tool.max_speed
+    a = 0.4 * tool.acceleration
+    j = tool.jerk / np.sqrt(3.0)
     stop_m = 0.5 * v * (v / a + a / j) if v > a**2 / j else v * np.sqrt(v / j)
     return _excess(len(gap), gap, max(BEHIND_M, WAITING_M + stop_m), _following(session))
 
@@ -298,7 +343,8 @@ def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
     """Below 1.01 times the greater of its speed and the speed it was coming to, plus 100 mm/s; and
     always below 1.01 times its limit, plus 10 mm/s.
     """
-    (speed, crest), following = session.tool_speeds, _following(session)
+    speed, crest = session.tool_speeds
+    following = _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
     allowed = np.full(len(speed), limit)
     is_over = ~session.frames["joint_velocities"].any(axis=1)
@@ -342,14 +388,18 @@ def _approaches(
     capsule then and STEP_S later; distances [m], and speeds [m/s] toward the hand as if that
     rested.
     """
-    geometry, frames = session.geometry, session.frames
-    now, later = session.placed[:-1, capsule], session.placed_on[:, capsule]
+    geometry = session.geometry
+    frames = session.frames
+    now = session.placed[:-1, capsule]
+    later = session.placed_on[:, capsule]
     radius = geometry.radii[capsule] + session.settings.people.radius
     half = 0.5 * geometry.forearm
     where = at_least(now, hands + half, float(np.linalg.norm(half))) < NEAR_M + radius
     where &= _norms(later - now).max(axis=1) > MOVING_MPS * STEP_S
     k = np.flatnonzero(where & (frames["hand_ages"][1:, side] >= 0) & _pairs(_commanded(session)))
-    before, after = (between_segments(ends[k], _forearms(session, hands[k])) for ends in (now, later))
+    before, after = (
+        between_segments(ends[k], _forearms(session, hands[k])) for ends in (now, later)
+    )
     return k, later[k], before - radius, (before - after) / STEP_S, before
 
 
@@ -363,7 +413,8 @@ def _moving_capsules(session: Session) -> np.ndarray:
 
 def arm_does_not_approach_a_resting_hand_too_fast(session: Session) -> Vector:
     """Toward hands that truly rest, and are seen."""
-    excess, stale = np.zeros(len(session.frames)), session.settings.hands.stale_ms / 1000.0
+    excess = np.zeros(len(session.frames))
+    stale = session.settings.hands.stale_ms / 1000.0
     for side in (0, 1):
         ages_s = session.frames["hand_ages"][1:, side] * session.settings.period_s
         resting = (session.still_s[1:, side] > RESTING_S) & (ages_s < stale)
@@ -380,52 +431,75 @@ def arm_does_not_approach_a_resting_hand_too_fast(session: Session) -> Vector:
 
 def arm_brakes_where_it_approaches_a_hand_too_fast(session: Session) -> Vector:
     """Toward hands as they are estimated, which may come faster than joints brake."""
-    excess, frames = np.zeros(len(session.frames)), session.frames
+    excess = np.zeros(len(session.frames))
+    frames = session.frames
     ticks = max(1, int(BRAKED_S / session.settings.period_s))
     for side in (0, 1):
-        hands, velocities = frames["hands"][1:, side], frames["hand_velocities"][1:, side]
+        hands = frames["hands"][1:, side]
+        velocities = frames["hand_velocities"][1:, side]
         for capsule in _moving_capsules(session):
             k, _, distance, speed, before = _approaches(session, side, capsule, hands)
             later = _forearms(session, hands[k] + STEP_S * velocities[k])
-            coming = np.maximum(0.0, (before - between_segments(session.placed[k, capsule], later)) / STEP_S)
-            allowed = _with_contact(session, side, capsule, k, allowed_speeds(distance, coming, session))
-            over, speeds = np.full(len(frames), -1.0), np.zeros(len(frames))
-            over[k + 1], speeds[k + 1] = speed - allowed - SLIP_MPS - ESTIMATED_MPS, speed
+            coming = np.maximum(
+                0.0, (before - between_segments(session.placed[k, capsule], later)) / STEP_S
+            )
+            allowed = _with_contact(
+                session, side, capsule, k, allowed_speeds(distance, coming, session)
+            )
+            over = np.full(len(frames), -1.0)
+            speeds = np.zeros(len(frames))
+            over[k + 1] = speed - allowed - SLIP_MPS - ESTIMATED_MPS
+            speeds[k + 1] = speed
             too_fast = np.flatnonzero(over > 0.0)
             for run in np.split(too_fast, np.flatnonzero(np.diff(too_fast) > 1) + 1):
-                if len(run) > ticks and speeds[run[ticks]] > max(BRAKED_SHARE * speeds[run[0]], SLOW_MPS):
+                if len(run) > ticks and speeds[run[ticks]] > max(
+                    BRAKED_SHARE * speeds[run[0]], SLOW_MPS
+                ):
                     excess[run] = np.maximum(excess[run], over[run])
     return excess
 
 
-def _with_contact(session: Session, side: int, capsule: int, k: np.ndarray, allowed: Vector) -> Vector:
+def _with_contact(
+    session: Session, side: int, capsule: int, k: np.ndarray, allowed: Vector
+) -> Vector:
     """The tool's link may touch a hand that a via-point lets receive."""
     if session.geometry.links[capsule] < session.geometry.joints:
         return allowed
-    return np.where(session.receiving[k + 1, side], np.maximum(allowed, session.settings.people.contact_speed), allowed)
+    return np.where(
+        session.receiving[k + 1, side],
+        np.maximum(allowed, session.settings.people.contact_speed),
+        allowed,
+    )
 
 
 # --- table, boxes, the arm itself ---
 
 
-def _intrusion(session: Session, distances: Callable[[np.ndarray], Vector], clearance: float) -> Vector:
+def _intrusion(
+    session: Session, distances: Callable[[np.ndarray], Vector], clearance: float
+) -> Vector:
     """How far a clearance is passed, beside what was passed where the arm was last found. Given the
     distances (K,) [m] at frames (K,).
     """
     commanded = _commanded(session)
     is_start = commanded & ~np.concatenate([[False], commanded[:-1] & ~_jumps(session)])
-    frames = np.unique(np.concatenate([np.arange(0, len(commanded), EVERY), np.flatnonzero(is_start)]))
+    frames = np.unique(
+        np.concatenate([np.arange(0, len(commanded), EVERY), np.flatnonzero(is_start)])
+    )
     frames = frames[commanded[frames]]
     excess = np.zeros(len(commanded))
     if len(frames):
         distance = distances(frames)
-        begin = distance[np.maximum.accumulate(np.where(is_start[frames], np.arange(len(frames)), 0))]
+        begin = distance[
+            np.maximum.accumulate(np.where(is_start[frames], np.arange(len(frames)), 0))
+        ]
         excess[frames] = np.minimum(clearance - PASSED_M, begin - WORSE_M) - distance
     return excess
 
 
 def _intrusion_of_boxes(session: Session, boxes: Vector) -> Vector:
-    excess, clearance = np.zeros(len(session.frames)), session.settings.obstacles.clearance
+    excess = np.zeros(len(session.frames))
+    clearance = session.settings.obstacles.clearance
     for box in boxes:
         for capsule in _moving_capsules(session):
             distances = partial(_distances_of_box, session, box, capsule, clearance)
@@ -433,9 +507,12 @@ def _intrusion_of_boxes(session: Session, boxes: Vector) -> Vector:
     return excess
 
 
-def _distances_of_box(session: Session, box: Vector, capsule: int, clearance: float, frames: np.ndarray) -> Vector:
+def _distances_of_box(
+    session: Session, box: Vector, capsule: int, clearance: float, frames: np.ndarray
+) -> Vector:
     """Distances (K,) of a capsule at frames (K,) from a box, or less where it is clear anyway."""
-    ends, radius = session.placed[frames, capsule], session.geometry.radii[capsule]
+    ends = session.placed[frames, capsule]
+    radius = session.geometry.radii[capsule]
     out = at_least(ends, box.mean(axis=0), 0.5 * float(np.linalg.norm(box[1] - box[0]))) - radius
     near = out < clearance
     out[near] = segments_to_box(ends[near], box) - radius
@@ -451,16 +528,20 @@ def arm_keeps_clear_of_boxes(session: Session) -> Vector:
 
 
 def arm_keeps_clear_of_itself(session: Session) -> Vector:
-    excess, clearance = np.zeros(len(session.frames)), min(OWN_CLEARANCE_M, session.settings.obstacles.clearance)
+    excess = np.zeros(len(session.frames))
+    clearance = min(OWN_CLEARANCE_M, session.settings.obstacles.clearance)
     for first, second in session.geometry.pairs:
         distances = partial(_distances_of_pair, session, first, second, clearance)
         excess = np.maximum(excess, _intrusion(session, distances, clearance))
     return excess
 
 
-def _distances_of_pair(session: Session, first: int, second: int, clearance: float, frames: np.ndarray) -> Vector:
+def _distances_of_pair(
+    session: Session, first: int, second: int, clearance: float, frames: np.ndarray
+) -> Vector:
     """Distances (K,) of two capsules at frames (K,), or less where they are clear anyway."""
-    ends, others = session.placed[frames, first], session.placed[frames, second]
+    ends = session.placed[frames, first]
+    others = session.placed[frames, second]
     radii = session.geometry.radii[first] + session.geometry.radii[second]
     out = at_least(ends, others.mean(axis=1), 0.5 * _norms(others[:, 1] - others[:, 0])) - radii
     near = out < clearance
@@ -500,7 +581,11 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
     a steep skill amplifies the noise of a tracker.
     """
     settled = _last(session, SETTLED_S)
-    if session.quiet_s < SETTLED_S or (settled["mode"] != Mode.FOLLOW).any() or not _is_target_steady(session):
+    if (
+        session.quiet_s < SETTLED_S
+        or (settled["mode"] != Mode.FOLLOW).any()
+        or not _is_target_steady(session)
+    ):
         return _at_the_end(session, 0.0)
     distance_m = _norms(settled["tool"] - settled["target"])
     if (distance_m < THERE_M).all():
@@ -509,7 +594,10 @@ def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
         allowed = KEPT_BACK_RADPS2
     else:
         return _at_the_end(session, 0.0)
-    return _at_the_end(session, float(np.sqrt((_last(session, LOOK_S)["joint_accelerations"] ** 2).mean())) - allowed)
+    return _at_the_end(
+        session,
+        float(np.sqrt((_last(session, LOOK_S)["joint_accelerations"] ** 2).mean())) - allowed,
+    )
 
 
 def tool_is_never_stuck_in_silence(session: Session) -> Vector:
@@ -570,6 +658,10 @@ def broken(session: Session) -> list[str]:
         excess = bound(session)
         worst = int(np.argmax(excess))
         if not excess[worst] <= 0.0:
-            mode, reason = Mode(session.frames["mode"][worst]), Reason(session.frames["reason"][worst])
-            out.append(f"{bound.__name__}: by {excess[worst]:.5g} at frame {worst} ({mode.name} {reason.name})")
+            mode = Mode(session.frames["mode"][worst])
+            reason = Reason(session.frames["reason"][worst])
+            out.append(
+                f"{bound.__name__}: by {excess[worst]:.5g} at frame {worst} ({mode.name} "
+                f"{reason.name})"
+            )
     return out

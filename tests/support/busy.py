@@ -13,7 +13,9 @@ from _pytest.runner import runtestprotocol
 
 WAITING_SHARE = 0.5  # of the time in which a process could have run; see the module's text
 BUSY = "busy"
-SCHEDULED = Path("/proc/self/schedstat")  # of the main thread [ns]: on a processor, and waiting for one
+SCHEDULED = Path(
+    "/proc/self/schedstat"
+)  # of the main thread [ns]: on a processor, and waiting for one
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
@@ -41,10 +43,14 @@ def _reports(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.Tes
     item.session._setupstate.teardown_exact(None)  # noqa: SLF001  # as a plug-in that runs tests again has to
     item._initrequest()  # type: ignore[attr-defined]  # noqa: SLF001
     rerun = runtestprotocol(item, nextitem=nextitem, log=False)
-    words = f"its process waited for a processor {100 * share:.0f} % of the time that it could have run"
+    words = (
+        f"its process waited for a processor {100 * share:.0f} % of the time that it could have run"
+    )
     for report in rerun:
         if any(other.failed for other in rerun):
-            report.sections.append((f"run twice, as {words}; the first failure", failures[0].longreprtext))
+            report.sections.append(
+                (f"run twice, as {words}; the first failure", failures[0].longreprtext)
+            )
         else:
             report.user_properties.append((BUSY, f"{words}; it passed when it was run again"))
     return rerun

@@ -23,18 +23,26 @@ from thirdhand.contract import cdr, messages
 from thirdhand.daemon.launch import Launched, launched
 
 LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
-LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
+# where the hands rest [m]
+LEFT = (0.98, -0.32, 0.06)
+RIGHT = (0.98, 0.32, 0.06)
 
 
-def thirdhand(*arguments: str, timeout: float = 60, **more: Any) -> subprocess.CompletedProcess[str]:
+def thirdhand(
+    *arguments: str, timeout: float = 60, **more: Any
+) -> subprocess.CompletedProcess[str]:
     """A `thirdhand` command, run to its end."""
     command = [sys.executable, "-m", "thirdhand", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more
+    )
 
 
 def told(*arguments: str) -> subprocess.CompletedProcess[str]:
     """A `thirdhand` command, run to its end in this process, which has imported all it needs."""
-    out, errors, mask = io.StringIO(), io.StringIO(), os.umask(0o022)
+    out = io.StringIO()
+    errors = io.StringIO()
+    mask = os.umask(0o022)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
         try:
             code = main(list(arguments))
@@ -45,7 +53,9 @@ def told(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), errors.getvalue())
 
 
-def until(what: Callable[[], Any], words: str = "it did not come to hold", *, within_s: float = 20.0) -> Any:
+def until(
+    what: Callable[[], Any], words: str = "it did not come to hold", *, within_s: float = 20.0
+) -> Any:
     """What a call returns, once that is true."""
     end = time.monotonic() + within_s
     while not (value := what()):
@@ -58,12 +68,16 @@ class Daemon:
     """A running `thirdhand serve` and a client's session to it."""
 
     def __init__(self, service: Launched, session: zenoh.Session) -> None:
-        self.process, self.endpoint, self.session = service.process, service.endpoint, session
+        self.process = service.process
+        self.endpoint = service.endpoint
+        self.session = session
         self.log = service.log
         self.client = Client(session)
         self.end = service.stop  # the exit code after being asked to stop
 
-    def until(self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0) -> dict[str, Any]:
+    def until(
+        self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0
+    ) -> dict[str, Any]:
         """The first status of which something is true."""
         end = time.monotonic() + timeout_s
         while not what(status := self.client.ask("status")):
@@ -104,7 +118,9 @@ class Tracker:
         self.left: tuple[float, float, float] | None = LEFT
         self.right: tuple[float, float, float] | None = RIGHT
         self.ahead_ns = 0
-        self._publishers = {side: session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")}
+        self._publishers = {
+            side: session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")
+        }
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._publish)
         self._thread.start()
@@ -114,7 +130,9 @@ class Tracker:
             stamp_ns = time.time_ns() + self.ahead_ns
             for side, position in (("left", self.left), ("right", self.right)):
                 if position is not None:
-                    pose = messages.PoseStamped(stamp_ns, messages.BASE, position, (0.0, 0.0, 0.0, 1.0))
+                    pose = messages.PoseStamped(
+                        stamp_ns, messages.BASE, position, (0.0, 0.0, 0.0, 1.0)
+                    )
                     self._publishers[side].put(cdr.encode_pose(pose))
 
     def __enter__(self) -> Tracker:

@@ -14,9 +14,13 @@ def make_certificates(folder: Path, *more: str, expired: str = "") -> Path:
     `more` names, and for `expired` names, which are separated by spaces.
     """
     page = (ROOT / "docs" / "access.md").read_text(encoding="utf-8")
-    authority, names, loop = re.findall(r"```sh\n(umask .*?)for name in (.*?);(.*?)```", page, re.DOTALL)[0]
+    authority, names, loop = re.findall(
+        r"```sh\n(umask .*?)for name in (.*?);(.*?)```", page, re.DOTALL
+    )[0]
     commands = f"{authority}for name in {' '.join([names, *more])};{loop}"
     commands += f"for name in {expired};{loop.replace('-days 3650', '-days -1')}"
     folder.mkdir(parents=True, exist_ok=True)
-    subprocess.run(["bash", "-euo", "pipefail", "-c", commands], cwd=folder, check=True, capture_output=True)
+    subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", commands], cwd=folder, check=True, capture_output=True
+    )
     return folder / "secrets"

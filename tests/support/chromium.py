@@ -16,8 +16,9 @@ from typing import Any
 
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser")
 _OPTIONS = (
-    "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist --no-first-run --remote-debugging-pipe --ignore-certificate-errors"
+    "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader --ignore-gpu-blocklist --no-first-run --remote-debugging-pipe "
+    "--ignore-certificate-errors"
 )
 
 
@@ -25,10 +26,17 @@ class Tab:
     """A page in a browser."""
 
     def __init__(self, to: int, source: int, url: str, timeout_s: float, before: str) -> None:
-        self._to, self._source, self._rest, self._number = to, source, b"", 0
+        self._to = to
+        self._source = source
+        self._rest = b""
+        self._number = 0
         self._until = time.monotonic() + timeout_s
-        target = self._call("Target.createTarget", {"url": "about:blank" if before else url})["targetId"]
-        self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True})["sessionId"]
+        target = self._call("Target.createTarget", {"url": "about:blank" if before else url})[
+            "targetId"
+        ]
+        self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True})[
+            "sessionId"
+        ]
         if before:
             self._call("Page.enable", {}, self._session)
             self._call("Page.addScriptToEvaluateOnNewDocument", {"source": before}, self._session)
@@ -60,7 +68,9 @@ class Tab:
 
     def ask(self, expression: str) -> Any:
         """The value of an expression of JavaScript in the page."""
-        reply = self._call("Runtime.evaluate", {"expression": expression, "awaitPromise": True}, self._session)
+        reply = self._call(
+            "Runtime.evaluate", {"expression": expression, "awaitPromise": True}, self._session
+        )
         return reply.get("result", {}).get("value")
 
     def until(self, expression: str) -> Any:
@@ -80,7 +90,10 @@ class Tab:
 
         Its answer is not waited for: it comes with the next picture, which may be late.
         """
-        button = {"button": "none" if kind == "Wheel" else "left", "buttons": int(kind in ("Pressed", "Moved"))}
+        button = {
+            "button": "none" if kind == "Wheel" else "left",
+            "buttons": int(kind in ("Pressed", "Moved")),
+        }
         self._post(
             "Input.dispatchMouseEvent",
             {"type": f"mouse{kind}", "x": x, "y": y, "clickCount": 1} | button | more,
@@ -103,14 +116,23 @@ class Tab:
 
 @contextlib.contextmanager
 def opened(
-    url: str, folder: Path, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0, before: str = ""
+    url: str,
+    folder: Path,
+    *,
+    size: tuple[int, int] = (1600, 1000),
+    timeout_s: float = 60.0,
+    before: str = "",
 ) -> Iterator[Tab]:
     """A page of a browser of its own, whose files are in a folder; the script `before` runs ahead
     of the page's own, also when it is loaded again.
     """
-    (reader, to), (source, tell) = os.pipe(), os.pipe()
+    reader, to = os.pipe()
+    source, tell = os.pipe()
     arguments = [str(PROGRAM), str(folder / "profile")]
-    command = f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{reader} 4>&{tell}'
+    command = (
+        f'exec "$0" {_OPTIONS} --window-size={size[0]},{size[1]} "--user-data-dir=$1" 3<&{reader} '
+        f"4>&{tell}"
+    )
     with (folder / "chromium.log").open("wb") as log:
         browser = subprocess.Popen(
             ["bash", "-c", command, *arguments],

@@ -20,7 +20,13 @@ from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench, TaskEvents
-from thirdhand_sim.closed_loop import HANDS_HZ, START_NS, begin_when_settled, hand_event, joints_event
+from thirdhand_sim.closed_loop import (
+    HANDS_HZ,
+    START_NS,
+    begin_when_settled,
+    hand_event,
+    joints_event,
+)
 from thirdhand_sim.engines import world_of
 from thirdhand_sim.network import Commands, Gripper, Led
 from thirdhand_sim.scene import Scene
@@ -65,13 +71,17 @@ def played(settings: Settings, engine: str | None = None, *, bench_hz: int | Non
 
     Raises BenchError.
     """
-    period_s, names = settings.period_s, settings.joints.names
+    period_s = settings.period_s
+    names = settings.joints.names
     at_bench = msgspec.structs.replace(settings, rate_hz=bench_hz or settings.rate_hz)
     controller = Controller(settings, taught(), urdf=robot_description(settings))
-    error_rad, followed, index = 0.0, True, 0
+    error_rad = 0.0
+    followed = True
+    index = 0
     with Bench(HandScript(SCENE, seed=1), settings=at_bench, world=world_of(engine)) as bench:
         commands = Commands(names)
-        led, every = Led(bench, commands, Gripper()), max(1, round(at_bench.rate_hz / HANDS_HZ))
+        led = Led(bench, commands, Gripper())
+        every = max(1, round(at_bench.rate_hz / HANDS_HZ))
         while not bench.finished:
             inbox: list[Event] = []
             while bench.tick * bench.period_s <= index * period_s + 1e-9:
@@ -79,17 +89,23 @@ def played(settings: Settings, engine: str | None = None, *, bench_hz: int | Non
                 observation = led.step()[0]
                 stamp_ns = START_NS + round(bench.tick * bench.period_s * 1e9)
                 if bench.tick % every == 0:
-                    for side, pose in zip(SIDES, bench.script.sample(observation.time_s), strict=True):
+                    for side, pose in zip(
+                        SIDES, bench.script.sample(observation.time_s), strict=True
+                    ):
                         x, y, z, *orientation = pose.tolist()
                         inbox.append(hand_event(side, (x, y, z), stamp_ns, tuple(orientation)))  # type: ignore[arg-type]
-                inbox.append(joints_event(names, observation.joints, observation.joint_velocities, stamp_ns))
+                inbox.append(
+                    joints_event(names, observation.joints, observation.joint_velocities, stamp_ns)
+                )
             frame = controller.step(Tick(index, tuple(inbox)))
             tick_ns = START_NS + round(index * period_s * 1e9)
             for key, payload in outgoing(frame, tick_ns, names):
                 if key == "joints/command":
                     attachment = _Bytes(encode_attachment(Attachment(index, tick_ns, 0)))
                     commands.receive(_Sample(_Bytes(payload), attachment))  # type: ignore[arg-type]
-                    error_rad = max(error_rad, float(np.abs(frame["joints"] - observation.joints).max()))
+                    error_rad = max(
+                        error_rad, float(np.abs(frame["joints"] - observation.joints).max())
+                    )
             followed &= bool(bench.waiting or frame["mode"] == Mode.FOLLOW)
             index += 1
         return Played(bench.events(), error_rad, followed)

@@ -31,7 +31,9 @@ class Person:
     def pixel(self, at: tuple[float, float, float]) -> tuple[float, float]:
         """The pixel of the page at which a point of the bench is drawn."""
         corner = "canvas.getBoundingClientRect()"
-        x, y = self._found(f"(shown.plan ?? plan()).flat({list(at)}).map((v, i) => v + {corner}[i ? 'y' : 'x'])")
+        x, y = self._found(
+            f"(shown.plan ?? plan()).flat({list(at)}).map((v, i) => v + {corner}[i ? 'y' : 'x'])"
+        )
         return x, y
 
     def _found(self, expression: str) -> Any:
@@ -45,20 +47,29 @@ class Person:
         while math.dist(self.hand(side, "aim")[:2], to[:2]) > PIXEL_M and time.monotonic() < end:
             time.sleep(STEP_S)
         pixel = self.pixel(self.hand(side, "aim"))
-        self.tab.mouse("Wheel", *pixel, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M)
+        self.tab.mouse(
+            "Wheel", *pixel, deltaX=0, deltaY=-(to[2] - self.hand(side, "aim")[2]) / WHEEL_M
+        )
 
     @staticmethod
-    def along(start: tuple[float, float], end: tuple[float, float], mouse: Callable[..., None]) -> None:
+    def along(
+        start: tuple[float, float], end: tuple[float, float], mouse: Callable[..., None]
+    ) -> None:
         """Press at a pixel, move evenly to another one, and release."""
         mouse("Pressed", *start)
-        steps, begun_s = round(DRAG_S / STEP_S), time.monotonic()
+        steps = round(DRAG_S / STEP_S)
+        begun_s = time.monotonic()
         for i in range(1, steps + 1):
             mouse("Moved", *(a + i / steps * (b - a) for a, b in zip(start, end, strict=True)))
             time.sleep(max(0.0, begun_s + i * STEP_S - time.monotonic()))
         mouse("Released", *end)
 
     def arrive(
-        self, side: str, to: tuple[float, float, float], within_m: float = 0.01, within_s: float = ARRIVE_S
+        self,
+        side: str,
+        to: tuple[float, float, float],
+        within_m: float = 0.01,
+        within_s: float = ARRIVE_S,
     ) -> None:
         """Wait until a hand has arrived at a point."""
         end = time.monotonic() + within_s

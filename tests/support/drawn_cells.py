@@ -40,11 +40,17 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
     def one_of(*values: float) -> float:
         return float(random.choice(values))
 
-    tool, skill, hands, obstacles, people = cell.tool, cell.skill, cell.hands, cell.obstacles, cell.people
+    tool = cell.tool
+    skill = cell.skill
+    hands = cell.hands
+    obstacles = cell.obstacles
+    people = cell.people
     if happens(0.35):
         tool = replace(tool, orientation="full")
     if happens(0.25):
-        tool = replace(tool, plate_from_tool=(*TOOLS_M[random.integers(len(TOOLS_M))], 0.0, 0.0, 0.0, 1.0))
+        tool = replace(
+            tool, plate_from_tool=(*TOOLS_M[random.integers(len(TOOLS_M))], 0.0, 0.0, 0.0, 1.0)
+        )
     if happens(0.3):
         tool = replace(
             tool,
@@ -55,7 +61,9 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
     if happens(0.3):
         tool = replace(tool, follow=("closely", "calmly")[random.integers(2)])
     if happens(0.2):
-        tool = replace(tool, max_turn_speed=one_of(0.2, 0.5, 2.0), max_turn_acceleration=one_of(0.5, 2.0, 20.0))
+        tool = replace(
+            tool, max_turn_speed=one_of(0.2, 0.5, 2.0), max_turn_acceleration=one_of(0.5, 2.0, 20.0)
+        )
     if happens(0.3):
         skill = replace(skill, lead_s=one_of(0.02, 0.1, 0.2, 0.5))
     if happens(0.3):
@@ -63,7 +71,9 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
     if happens(0.15):
         hands = replace(hands, stale_ms=one_of(20.0, 50.0, 300.0, 1000.0))
     if happens(0.25):
-        obstacles = replace(obstacles, boxes=tuple(_box(random) for _ in range(random.integers(1, 4))))
+        obstacles = replace(
+            obstacles, boxes=tuple(_box(random) for _ in range(random.integers(1, 4)))
+        )
     if happens(0.2):
         obstacles = replace(obstacles, clearance=one_of(0.0, 0.005, 0.03, 0.05))
     if happens(0.2):
@@ -74,7 +84,10 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
     if happens(0.2):
         limits = ("velocity", "acceleration", "jerk")
         shares = random.uniform(0.1, 1.0, (len(limits), len(joints.names)))
-        slower = {name: tuple((s * getattr(joints, name)).tolist()) for name, s in zip(limits, shares, strict=True)}
+        slower = {
+            name: tuple((s * getattr(joints, name)).tolist())
+            for name, s in zip(limits, shares, strict=True)
+        }
         joints = replace(joints, **slower)
     return replace(
         cell,
@@ -91,12 +104,15 @@ def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
 
 def _box(random: np.random.Generator) -> Box:
     sizes = random.uniform(0.02, 0.15, 3)
-    return Box(centre=tuple(random.uniform(*BOX_CENTRES_M).tolist()), half_size=tuple(sizes.tolist()))
+    return Box(
+        centre=tuple(random.uniform(*BOX_CENTRES_M).tolist()), half_size=tuple(sizes.tolist())
+    )
 
 
 def changes(cell: Settings, arm: str) -> str:
     """What was drawn of a cell, to be read in a failure."""
-    default, drawn = msgspec.to_builtins(cell_with(arm)), msgspec.to_builtins(cell)
+    default = msgspec.to_builtins(cell_with(arm))
+    drawn = msgspec.to_builtins(cell)
     return ", ".join(
         f"{section}.{name} = {value}"
         for section, values in drawn.items()
@@ -110,5 +126,7 @@ def engaging_cell(random: np.random.Generator, cell: Settings) -> Settings:
     """A drawn cell with a clutch, whose setpoint engages at a speed drawn at random."""
     speed = min(float(random.choice(ENGAGE_SPEEDS_MPS)), cell.tool.max_speed)
     return replace(
-        cell, tool=replace(cell.tool, engage_speed=speed), hands=replace(cell.hands, clutch="key", gripper="key")
+        cell,
+        tool=replace(cell.tool, engage_speed=speed),
+        hands=replace(cell.hands, clutch="key", gripper="key"),
     )

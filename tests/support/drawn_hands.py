@@ -33,10 +33,16 @@ class Surroundings:
     where they are; `tool` and `elbow` (3,) [m].
     """
 
-    def __init__(self, random: np.random.Generator, period_s: float, known: Vector, tool: Vector) -> None:
-        self.random, self.period_s, self.known = random, period_s, known
+    def __init__(
+        self, random: np.random.Generator, period_s: float, known: Vector, tool: Vector
+    ) -> None:
+        self.random = random
+        self.period_s = period_s
+        self.known = known
         self.home = known[random.integers(len(known))]
-        self.hands, self.tool, self.elbow = self.home, tool, tool
+        self.hands = self.home
+        self.tool = tool
+        self.elbow = tool
 
     def place(self, scatter_m: float) -> Vector:
         """Somewhere near hands that the skill knows (2, 3)."""
@@ -85,7 +91,8 @@ def reaches(around: Surroundings) -> Motion:
 
 def script(around: Surroundings) -> Motion:
     """The soldering task of the scripted person, again and again."""
-    seed, speed = int(around.random.integers(1000)), float(around.random.choice([0.5, 1.0, 2.0]))
+    seed = int(around.random.integers(1000))
+    speed = float(around.random.choice([0.5, 1.0, 2.0]))
     person = HandScript(Scene(), seed=seed, speed=speed)
     for t in around.seconds():
         left, right = person.sample(t % person.duration_s)
@@ -100,7 +107,8 @@ def wander(around: Surroundings) -> Motion:
 
 def fly(around: Surroundings) -> Motion:
     """Straight at up to 3 m/s, to and fro between the sides of a box."""
-    lower, upper = np.array([-0.5, -1.0, -0.2]), np.array([1.5, 1.0, 1.2])
+    lower = np.array([-0.5, -1.0, -0.2])
+    upper = np.array([1.5, 1.0, 1.2])
     velocities = around.random.uniform(-1.7, 1.7, (2, 3))
     while True:
         goal = around.hands + velocities * around.period_s
@@ -110,7 +118,8 @@ def fly(around: Surroundings) -> Motion:
 
 def tremble(around: Surroundings) -> Motion:
     """There and back by 0.5 to 100 mm at 1 to 12 Hz."""
-    size_m, hz = around.size_m(0.0005, 0.1), around.random.uniform(1.0, 12.0)
+    size_m = around.size_m(0.0005, 0.1)
+    hz = around.random.uniform(1.0, 12.0)
     for t in around.seconds():
         yield around.home + size_m * np.sin(2 * np.pi * hz * t + PHASES)
 
@@ -165,7 +174,12 @@ def cross(around: Surroundings) -> Motion:
     left, right = around.home
     for t in around.seconds():
         u = 0.5 - 0.5 * np.cos(2 * np.pi * t / 3.0)
-        yield np.array([left + u * (right - left), right + u * (left - right) + (0.0, 0.0, 0.06 * np.sin(np.pi * u))])
+        yield np.array(
+            [
+                left + u * (right - left),
+                right + u * (left - right) + (0.0, 0.0, 0.06 * np.sin(np.pi * u)),
+            ]
+        )
 
 
 def merge(around: Surroundings) -> Motion:
@@ -207,14 +221,22 @@ def chase_elbow(around: Surroundings) -> Motion:
 def _toward(around: Surroundings, goal: Vector) -> Vector:
     left, right = around.hands
     delta = goal - left
-    return np.array([left + delta * min(1.0, FASTEST_MPS * around.period_s / max(np.linalg.norm(delta), 1e-9)), right])
+    return np.array(
+        [
+            left
+            + delta * min(1.0, FASTEST_MPS * around.period_s / max(np.linalg.norm(delta), 1e-9)),
+            right,
+        ]
+    )
 
 
 def thrust(around: Surroundings) -> Motion:
     """The right hand is thrust at the tool within 0.35 s, stays, and goes back."""
     while True:
         back = around.hands
-        yield from around.reach(np.array([back[0], around.tool + around.random.normal(0.0, 0.03, 3)]), 0.35)
+        yield from around.reach(
+            np.array([back[0], around.tool + around.random.normal(0.0, 0.03, 3)]), 0.35
+        )
         yield from around.wait(0.6)
         yield from around.reach(back, 0.25)
 
@@ -223,7 +245,8 @@ def pass_by(around: Surroundings) -> Motion:
     """The left hand passes the tool 6 cm away, at 1.2 m/s."""
     while True:
         for sign in (1.0, -1.0):
-            path, right = np.array([0.0, sign * FASTEST_MPS, 0.0]), around.hands[1]
+            path = np.array([0.0, sign * FASTEST_MPS, 0.0])
+            right = around.hands[1]
             begin = around.tool + np.array([0.03, 0.0, 0.05]) - path
             for k in range(around.ticks(2.0)):
                 yield np.array([begin + k * around.period_s * path, right])
@@ -296,4 +319,14 @@ def odd_numbers(hands: Vector, seconds: float, random: np.random.Generator) -> S
     ]
 
 
-REPORTS: tuple[Report, ...] = (both, both, both, losses, losses, none, one_in_turns, dropouts, odd_numbers)
+REPORTS: tuple[Report, ...] = (
+    both,
+    both,
+    both,
+    losses,
+    losses,
+    none,
+    one_in_turns,
+    dropouts,
+    odd_numbers,
+)

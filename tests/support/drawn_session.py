@@ -43,10 +43,19 @@ TRACKERS_HZ = (10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 240.0, 500.0)
 MISSED = (1, 2, 5, 30, 49, 50, 100, 250, 499, 3000)  # ticks
 WRONG_STAMPS_NS = (-(10**9), 10**9, 0, -2_000_000, 10**15)  # beside the right one
 LATEST_S = 0.09
-SEARCH_S, SEARCH_AGAIN_S, SEARCHES = 0.3, 2.0, 4  # of a way out: it takes; until the next; at most
-ELBOW_LINK, ELBOW_EVERY = 4, 10  # ticks
-CLUTCH_S, CLUTCH_SHARE = (0.002, 0.05, 1.0), 0.9  # mean time between press and release; ticks with a message
-STATES, REPLAYED = 2, 150  # from which the session is replayed, and for how many ticks
+# of a way out: it takes; until the next; at most
+SEARCH_S = 0.3
+SEARCH_AGAIN_S = 2.0
+SEARCHES = 4
+# ticks
+ELBOW_LINK = 4
+ELBOW_EVERY = 10
+# mean time between press and release; ticks with a message
+CLUTCH_S = (0.002, 0.05, 1.0)
+CLUTCH_SHARE = 0.9
+# from which the session is replayed, and for how many ticks
+STATES = 2
+REPLAYED = 150
 
 
 class Played(NamedTuple):
@@ -65,9 +74,13 @@ def skills() -> dict[str, Skill]:
     segments, one of a made task, and two that are followed however far hands are from what was
     demonstrated.
     """
-    random, base = np.random.default_rng(5), shipped_skill()
+    random = np.random.default_rng(5)
+    base = shipped_skill()
     paper = RECORDINGS / "experiments" / "as-paper.npz"
-    by_name: dict[str, Skill] = {"shipped": base, "paper": decoded(paper.read_bytes(), origin=paper.name)}
+    by_name: dict[str, Skill] = {
+        "shipped": base,
+        "paper": decoded(paper.read_bytes(), origin=paper.name),
+    }
     demonstrations = [take.demonstration for take in takes("three", people=(0,), each=2)]
     by_name["made"] = learn(demonstrations)
     while len(by_name) < 11:
@@ -79,14 +92,19 @@ def skills() -> dict[str, Skill]:
             )
         except SkillError:  # via-points that contradict each other
             continue
-    return by_name | {f"{name}, anywhere": replace(by_name[name], threshold=math.inf) for name in ("shipped", "taught 3")}
+    return by_name | {
+        f"{name}, anywhere": replace(by_name[name], threshold=math.inf)
+        for name in ("shipped", "taught 3")
+    }
 
 
 def _moved(random: np.random.Generator) -> tuple[ViaPoint, ...]:
     """The scene's via-points, all moved the same way by up to 1.5 cm."""
     offset_m = random.uniform(-0.015, 0.015, 3)
     return tuple(
-        msgspec.structs.replace(p, tool=tuple((p.tool + offset_m).tolist()), left=tuple((p.left + offset_m).tolist()))
+        msgspec.structs.replace(
+            p, tool=tuple((p.tool + offset_m).tolist()), left=tuple((p.left + offset_m).tolist())
+        )
         for p in Scene().via_points()
     )
 
@@ -95,7 +113,9 @@ def _anywhere(random: np.random.Generator, skill: Skill) -> tuple[ViaPoint, ...]
     """Up to six via-points with the tool anywhere in the workspace."""
     out = []
     for number in range(random.integers(1, 7)):
-        left, right = script_hands()[random.integers(len(script_hands()))] + random.normal(0.0, 0.02, (2, 3))
+        left, right = script_hands()[random.integers(len(script_hands()))] + random.normal(
+            0.0, 0.02, (2, 3)
+        )
         turn = random.normal(size=4)
         out.append(
             ViaPoint(
@@ -106,7 +126,9 @@ def _anywhere(random: np.random.Generator, skill: Skill) -> tuple[ViaPoint, ...]
                 std=float(10.0 ** random.uniform(-5.0, -1.0)),
                 radius=float(random.choice([0.0, 0.001, 0.03, 0.1])),
                 follow=str(random.choice(["none", "left", "right"])),
-                orientation=tuple((turn / np.linalg.norm(turn)).tolist()) if random.random() < 0.4 else None,
+                orientation=tuple((turn / np.linalg.norm(turn)).tolist())
+                if random.random() < 0.4
+                else None,
                 gripper=str(random.choice(["open", "closed"])) if random.random() < 0.3 else None,
             )
         )
@@ -117,11 +139,19 @@ def _anywhere(random: np.random.Generator, skill: Skill) -> tuple[ViaPoint, ...]
 def script_hands() -> Vector:
     """Places of both hands (M, 2, 3) in the scripted task."""
     script = HandScript(Scene(), seed=0)
-    return np.array([[hand[:3] for hand in script.sample(t)] for t in np.linspace(0.0, script.duration_s, 25)])
+    return np.array(
+        [[hand[:3] for hand in script.sample(t)] for t in np.linspace(0.0, script.duration_s, 25)]
+    )
 
 
 def play(
-    seed: int, arm: str, *, wild_ticks: int, quiet_s: float, most_quiet_ticks: int, engages: bool = False
+    seed: int,
+    arm: str,
+    *,
+    wild_ticks: int,
+    quiet_s: float,
+    most_quiet_ticks: int,
+    engages: bool = False,
 ) -> Played:
     """The session of a seed: ticks in which anything may happen, then hands that come to rest. In a
     cell that `engages`, the setpoint begins slowly, and a clutch is pressed and released.
@@ -130,44 +160,68 @@ def play(
     settings = drawn_cell(random, arm)
     if engages:
         settings = engaging_cell(random, settings)
-    urdf, hz = robot_description(settings), settings.rate_hz
+    urdf = robot_description(settings)
+    hz = settings.rate_hz
     player = _Player(random, settings, urdf, wild_ticks)
     for _ in range(wild_ticks + min(round(quiet_s * hz), most_quiet_ticks)):
         player.step()
-    return Played(player.session(), player.replayed_otherwise(), [f"drawn: {changes(settings, arm)}", *player.what])
+    return Played(
+        player.session(),
+        player.replayed_otherwise(),
+        [f"drawn: {changes(settings, arm)}", *player.what],
+    )
 
 
 class _Player:
     """A controller, its surroundings, and what has come of them so far."""
 
-    def __init__(self, random: np.random.Generator, settings: Settings, urdf: str, wild_ticks: int) -> None:
-        self.random, self.settings, self.urdf, self.quiet_from = random, settings, urdf, wild_ticks
+    def __init__(
+        self, random: np.random.Generator, settings: Settings, urdf: str, wild_ticks: int
+    ) -> None:
+        self.random = random
+        self.settings = settings
+        self.urdf = urdf
+        self.quiet_from = wild_ticks
         self._has_clutch = settings.hands.clutch == "key"
         self.geometry = ArmGeometry(settings, urdf)
         self.name = str(random.choice(list(skills())))
         self.skill = skills()[self.name]
-        skill_hands = self.skill.hands.reshape(-1, 2, 3) if random.random() < 0.5 else np.empty((0, 2, 3))
-        posture, is_assumed = np.array(settings.arm.posture), settings.arm.source == "assumed"
+        skill_hands = (
+            self.skill.hands.reshape(-1, 2, 3) if random.random() < 0.5 else np.empty((0, 2, 3))
+        )
+        posture = np.array(settings.arm.posture)
+        is_assumed = settings.arm.source == "assumed"
         if not is_assumed and random.random() < 0.4:
             posture = free_postures(settings, 1, int(random.integers(10**6)))[0]
         capsules, tool = self.geometry.place(posture[None])
-        self.around = Surroundings(random, settings.period_s, np.concatenate([skill_hands, script_hands()]), tool[0])
+        self.around = Surroundings(
+            random, settings.period_s, np.concatenate([skill_hands, script_hands()]), tool[0]
+        )
         self.elbow = int(np.flatnonzero(self.geometry.links == ELBOW_LINK)[0])
         self.around.elbow = capsules[0, self.elbow, 0]
         follows = is_assumed or random.random() < 0.5
         self.arm = None if is_assumed else DrawnArm(WELL, posture, settings, random)
         self.wild_arm = WELL if follows else str(random.choice(KINDS))
-        self.segments = [(MOTIONS[random.integers(len(MOTIONS))], self._report()) for _ in range(SEGMENTS)]
+        self.segments = [
+            (MOTIONS[random.integers(len(MOTIONS))], self._report()) for _ in range(SEGMENTS)
+        ]
         self.every = max(1, round(settings.rate_hz / random.choice(TRACKERS_HZ)))
         self.noise_m = float(random.choice([0.0, 0.0005, 0.002]))
-        self.p_miss, self.p_late = random.choice([0.0, 0.0, 0.0005, 0.005]), random.choice([0.0, 0.0, 0.1, 0.5])
-        self.p_wrong_stamp, self.p_hold = random.choice([0.0, 0.0, 0.01, 0.1]), random.choice([0.0, 0.003, 0.01])
-        self.clutch_s, self.is_pressed = float(random.choice(CLUTCH_S)) if self._has_clutch else 0.0, False
-        self.p_reset, self.skill_every = random.choice([0.001, 0.02]), int(random.choice([0, 0, 0, 0, 50, 500, 7]))
-        self.changes_to = [name for name in skills() if random.random() < 0.5 or name.startswith("taught")]
+        self.p_miss = random.choice([0.0, 0.0, 0.0005, 0.005])
+        self.p_late = random.choice([0.0, 0.0, 0.1, 0.5])
+        self.p_wrong_stamp = random.choice([0.0, 0.0, 0.01, 0.1])
+        self.p_hold = random.choice([0.0, 0.003, 0.01])
+        self.clutch_s = float(random.choice(CLUTCH_S)) if self._has_clutch else 0.0
+        self.is_pressed = False
+        self.p_reset = random.choice([0.001, 0.02])
+        self.skill_every = int(random.choice([0, 0, 0, 0, 50, 500, 7]))
+        self.changes_to = [
+            name for name in skills() if random.random() < 0.5 or name.startswith("taught")
+        ]
         self.kept_at = set(random.integers(1, wild_ticks, STATES).tolist())
         self.controller = explained_controller(settings, self.skill, urdf=urdf)
-        self.motion, self.report = iter(()), both
+        self.motion = iter(())
+        self.report = both
         self.index = self.asked = self.searches = 0
         self.later: list[tuple[int, Event]] = []
         self.ticks: list[Tick] = []
@@ -176,7 +230,10 @@ class _Player:
         self.still_s: list[Vector] = []
         self.measured: list[Vector] = []
         self.skills: list[Skill] = []
-        self.what = [f"skill {self.name}, arm {self.wild_arm}, {settings.rate_hz / self.every:.0f} samples a second"]
+        self.what = [
+            f"skill {self.name}, arm {self.wild_arm}, {settings.rate_hz / self.every:.0f} samples "
+            "a second"
+        ]
         self.kept: list[tuple[int, Skill, Record]] = []
         self.way_out: WayOut | None = None
 
@@ -185,7 +242,8 @@ class _Player:
 
     def step(self) -> None:
         """Play one tick."""
-        number, random = len(self.frames), self.random
+        number = len(self.frames)
+        random = self.random
         is_quiet = number >= self.quiet_from
         self.index += 1
         if not is_quiet and random.random() < self.p_miss:
@@ -214,7 +272,9 @@ class _Player:
         self.skills.append(self.controller.skill)
         before = self.frames[-1] if self.frames else frame
         self.frames.append(frame)
-        begins = not before["joint_velocities"].any() and (frame["joints"] != before["joints"]).any()
+        begins = (
+            not before["joint_velocities"].any() and (frame["joints"] != before["joints"]).any()
+        )
         is_stuck = frame["flags"] & Flag.STUCK or frame["reason"] == Reason.BLOCKED
         if not (begins or is_stuck or number in self.kept_at):
             self.measured.append(self.measured[-1] if self.measured else frame["joints"])
@@ -231,14 +291,18 @@ class _Player:
 
     def _hands(self, number: int, is_quiet: bool) -> list[Event]:
         """Move the hands, and report them now or later."""
-        random, around = self.random, self.around
+        random = self.random
+        around = self.around
         length = -(-self.quiet_from // SEGMENTS)
         if number == self.quiet_from:
-            self.motion, self.report = come_to_rest(around), both
+            self.motion = come_to_rest(around)
+            self.report = both
         elif not is_quiet and number % length == 0:
             motion, self.report = self.segments[number // length]
             self.motion = motion(around)
-            self.what.append(f"from frame {number}: {motion.__name__}, reported as {self.report.__name__}")
+            self.what.append(
+                f"from frame {number}: {motion.__name__}, reported as {self.report.__name__}"
+            )
         before = around.hands
         around.hands = next(self.motion)
         moved = (around.hands != before).any(axis=1)
@@ -248,21 +312,27 @@ class _Player:
         out = []
         if number % self.every == 0:
             for side, hand in self.report(around.hands, number * self.settings.period_s, random):
-                stamp_ns, position = self._stamp_ns(), hand + random.normal(0.0, self.noise_m, 3)
+                stamp_ns = self._stamp_ns()
+                position = hand + random.normal(0.0, self.noise_m, 3)
                 if not is_quiet and random.random() < self.p_wrong_stamp:
                     wrong = stamp_ns + np.array(WRONG_STAMPS_NS)
-                    stamp_ns = int([*wrong, *ODD_STAMPS_NS][random.integers(len(wrong) + len(ODD_STAMPS_NS))])
+                    stamp_ns = int(
+                        [*wrong, *ODD_STAMPS_NS][random.integers(len(wrong) + len(ODD_STAMPS_NS))]
+                    )
                 pose = PoseStamped(stamp_ns, "base", tuple(position.tolist()), (0.0, 0.0, 0.0, 1.0))
                 event = Event(f"hands/{side}", b"", pose)
                 if not is_quiet and random.random() < self.p_late:
-                    self.later.append((number + 1 + int(random.integers(around.ticks(LATEST_S))), event))
+                    self.later.append(
+                        (number + 1 + int(random.integers(around.ticks(LATEST_S))), event)
+                    )
                 else:
                     out.append(event)
         return out
 
     def _requests(self, number: int) -> list[Event]:
         """Orders at any time, and other skills."""
-        random, out = self.random, []
+        random = self.random
+        out = []
         if random.random() < self.p_hold:
             out.append(order("hold" if random.random() < 0.5 else "resume"))
         if random.random() < self.p_reset:
@@ -295,12 +365,17 @@ class _Player:
 
     def _look_for_a_way(self, number: int, frame: Frame, state: Record) -> None:
         """As the daemon does where the tool is stuck."""
-        if self.searches == SEARCHES or (self.searches and number - self.asked < self.around.ticks(SEARCH_AGAIN_S)):
+        if self.searches == SEARCHES or (
+            self.searches and number - self.asked < self.around.ticks(SEARCH_AGAIN_S)
+        ):
             return
-        self.asked, self.searches = number, self.searches + 1
+        self.asked = number
+        self.searches = self.searches + 1
         self.way_out = self.way_out or WayOut(self.settings, self.urdf)
         hands = np.array(frame["hands"])
-        postures = self.way_out.find(state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands)
+        postures = self.way_out.find(
+            state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands
+        )
         event = order("way", json.dumps([posture.tolist() for posture in postures]))
         self.later.append((number + self.around.ticks(SEARCH_S), event))
 
@@ -318,7 +393,8 @@ class _Player:
     def session(self) -> Session:
         """What is judged."""
         receiving = {
-            skill.digest: [any(p.follow == side for p in skill.via_points) for side in SIDES] for skill in self.skills
+            skill.digest: [any(p.follow == side for p in skill.via_points) for side in SIDES]
+            for skill in self.skills
         }
         return Session(
             settings=self.settings,

@@ -39,9 +39,12 @@ class Explained(SetpointGenerator):
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
         super().__init__(settings, tuning=tuning)
-        self._tool, self._period = settings.tool, settings.period_s
+        self._tool = settings.tool
+        self._period = settings.period_s
         self._margin = margin(settings.tool)
-        self._last = np.empty((HULL_SPANS * max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)), 2, 3))
+        self._last = np.empty(
+            (HULL_SPANS * max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)), 2, 3)
+        )
         self._steps = -1
         self.closest = np.inf  # [m] that a setpoint has come to its bound
 
@@ -50,14 +53,19 @@ class Explained(SetpointGenerator):
         self._steps = -1
 
     def step(self, state: Record, target: Target, box: Vector, costs: Vector, slow: float) -> int:
-        before, tool = state["setpoint"].copy(), self._tool
+        before = state["setpoint"].copy()
+        tool = self._tool
         max_speed = float(self.limits(state)["max_speed"][0])
         if self._steps < 0:
             ends = [
-                [farthest(before, i, side, tool.stop_acceleration, tool.stop_jerk, 0.0) for i in range(3)]
+                [
+                    farthest(before, i, side, tool.stop_acceleration, tool.stop_jerk, 0.0)
+                    for i in range(3)
+                ]
                 for side in (1.0, -1.0)
             ]
-            self._most, self._steps = np.array(ends), 0
+            self._most = np.array(ends)
+            self._steps = 0
             self._last[:] = [before[0], -before[0]]
         result = super().step(state, target, box, costs, slow)
         self._last[self._steps % len(self._last)] = [target.position, -target.position]

@@ -8,23 +8,31 @@ import numpy as np
 
 from thirdhand.skills.demonstration import Demonstration
 
-FINE_M, TIMES = 0.015, 8.0  # the left hand goes to and fro so far, and the tool so many times as far
+# the left hand goes to and fro so far, and the tool so many times as far
+FINE_M = 0.015
+TIMES = 8.0
 
 
 def fine(seed: int, noise_m: float, way: float = 1.0, *, turned: bool = False) -> Demonstration:
     """A take of the left hand moving by 15 mm, and the tool by 12 cm along it, or against it; or
     turned by 90° as far.
     """
-    random, t = np.random.default_rng(seed), np.arange(0.0, 10.0, 0.02)
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, 10.0, 0.02)
     going = 0.5 * np.sin(2 * np.pi * 0.3 * t + random.uniform(0, 6))
-    along, straight = np.eye(3)[:1] * going[:, None], np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    along = np.eye(3)[:1] * going[:, None]
+    straight = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     places = (
         [0.5, 0.2, 0.3] + FINE_M * along,
         [0.5, -0.2, 0.3] + 0.0 * along,
         [0.5, 0.0, 0.4] + way * TIMES * FINE_M * along,
     )
-    poses = [np.hstack([positions + noise_m * random.normal(size=positions.shape), straight]) for positions in places]
+    poses = [
+        np.hstack([positions + noise_m * random.normal(size=positions.shape), straight])
+        for positions in places
+    ]
     if turned:
         half = way * math.pi / 4 * going
-        poses[2][:, 5], poses[2][:, 6] = np.sin(half), np.cos(half)
+        poses[2][:, 5] = np.sin(half)
+        poses[2][:, 6] = np.cos(half)
     return Demonstration(np.round(1e9 * t).astype(np.int64), *poses)

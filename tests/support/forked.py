@@ -35,14 +35,31 @@ class Popen(RealPopen):  # type: ignore[type-arg]
     """`subprocess.Popen` whose commands of the service are forked."""
 
     def _execute_child(self, args, executable, preexec_fn, *more) -> None:  # type: ignore[no-untyped-def]
-        _, pass_fds, cwd, env, _, _, shell, stdin, stdin_end, stdout_end, stdout, stderr_end, stderr, *tail = more
+        (
+            _,
+            pass_fds,
+            cwd,
+            env,
+            _,
+            _,
+            shell,
+            stdin,
+            stdin_end,
+            stdout_end,
+            stdout,
+            stderr_end,
+            stderr,
+            *tail,
+        ) = more
         module = None if executable or preexec_fn or pass_fds or shell else _module_of(args)
         environment = dict(os.environ if env is None else env)
         session, group = tail[-2:]
         if module is None or group > 0 or _is_read_at_import(environment):
             super()._execute_child(args, executable, preexec_fn, *more)  # type: ignore[misc]
             return
-        streams = [fd if stream == -1 else stream for fd, stream in enumerate((stdin, stdout, stderr))]
+        streams = [
+            fd if stream == -1 else stream for fd, stream in enumerate((stdin, stdout, stderr))
+        ]
         command = list(map(os.fspath, args))
         request = {
             "module": module,
@@ -55,9 +72,12 @@ class Popen(RealPopen):  # type: ignore[type-arg]
         socket.send_fds(child.socket, [json.dumps(request).encode()], streams)
         while not child.has_begun(BEGIN_POLL_S):
             if child.returncode is not None:
-                raise ChildProcessError("the fork server of the tests has ended; its output says why")
+                raise ChildProcessError(
+                    "the fork server of the tests has ended; its output says why"
+                )
         child.socket.close()
-        self.pid, self._child_created = child.pid, True
+        self.pid = child.pid
+        self._child_created = True
         self._close_pipe_fds(stdin, stdin_end, stdout_end, stdout, stderr_end, stderr)  # type: ignore[attr-defined]
 
 

@@ -18,10 +18,13 @@ from thirdhand.settings.config import JointSettings, Settings, parse
 
 PERIOD = 0.001  # [s]
 STANDS = np.array((0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785))  # where franky-sim begins
-ACCELERATION, JERK = 10.0, 5000.0  # as published
+# as published
+ACCELERATION = 10.0
+JERK = 5000.0
 Vector = npt.NDArray[np.float64]
 simulated = pytest.mark.skipif(
-    importlib.util.find_spec("franky_sim") is None or importlib.util.find_spec("pylibfranka") is None,
+    importlib.util.find_spec("franky_sim") is None
+    or importlib.util.find_spec("pylibfranka") is None,
     reason="franky-sim or pylibfranka is not installed: pip install franky-sim 'thirdhand[franka]'",
 )
 
@@ -70,20 +73,27 @@ class Robot:
     """A simulated robot at an address; once it is ended, what it was told."""
 
     def __init__(self, address: str, file: Path) -> None:
-        self.address, self._file = address, file
+        self.address = address
+        self._file = file
         self.new = self.velocity = self.joints = np.empty(0)
 
     def load(self) -> None:
         with np.load(self._file) as cycles:
-            self.new, self.velocity, self.joints = cycles["new"], cycles["velocity"], cycles["joints"]
+            self.new = cycles["new"]
+            self.velocity = cycles["velocity"]
+            self.joints = cycles["joints"]
 
 
 @contextlib.contextmanager
 def robot(tmp_path: Path, *options: str) -> Iterator[Robot]:
     """Within it there is a robot."""
-    script, file = ROOT / "tests" / "support" / "franka_robot.py", tmp_path / "cycles.npz"
+    script = ROOT / "tests" / "support" / "franka_robot.py"
+    file = tmp_path / "cycles.npz"
     process = subprocess.Popen(
-        [sys.executable, str(script), str(file), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, str(script), str(file), *options],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert process.stdin is not None
     assert process.stdout is not None

@@ -16,7 +16,9 @@ import numpy as np
 from franky_sim import SimulationServer
 from franky_sim.mujoco_simulator import MujocoSimulator
 
-FIRST_S, NEXT_S = 0.002, 5.0  # that a command is waited for
+# that a command is waited for
+FIRST_S = 0.002
+NEXT_S = 5.0
 
 
 def main(path: str, *, fast: bool) -> None:
@@ -41,12 +43,19 @@ def main(path: str, *, fast: bool) -> None:
         robot.joint_velocity_control = controlled
         with SimulationServer(sim) as server:
             print(robot.hostname, flush=True)
-            robots, led, due = server.robot_servers, False, time.monotonic()
+            robots = server.robot_servers
+            led = False
+            due = time.monotonic()
             while not ended.is_set():
                 commands.clear()
                 robots[0].process_commands()
                 patience = time.monotonic() + (NEXT_S if led else FIRST_S)
-                while commands and not commands[0][1] and time.monotonic() < patience and not ended.is_set():
+                while (
+                    commands
+                    and not commands[0][1]
+                    and time.monotonic() < patience
+                    and not ended.is_set()
+                ):
                     time.sleep(2e-5)
                     commands.clear()
                     robots[0].process_commands()

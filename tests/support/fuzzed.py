@@ -43,18 +43,29 @@ class Traffic:
 
     def at(self, t: float, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
         """What is sent at a time [s] since the start, stamped so."""
-        random, hostile = self._random, t % (2.0 * QUIET_S) >= QUIET_S
+        random = self._random
+        hostile = t % (2.0 * QUIET_S) >= QUIET_S
         for side, home in zip(SIDES, (LEFT, RIGHT), strict=True):
             x, y, z = home
             away = 0.06 * math.sin(2.0 * math.pi * t / 1.5)
             pose = cdr.encode_pose(
-                PoseStamped(stamp_ns, BASE, (x - abs(away), y + away, z + 0.05), (0.0, 0.0, 0.0, 1.0))
+                PoseStamped(
+                    stamp_ns, BASE, (x - abs(away), y + away, z + 0.05), (0.0, 0.0, 0.0, 1.0)
+                )
             )
-            yield f"hands/{side}", mutated("pose", pose, random) if hostile and random.random() < 0.3 else pose
+            yield (
+                f"hands/{side}",
+                mutated("pose", pose, random) if hostile and random.random() < 0.3 else pose,
+            )
         if self.joints is not None:
-            message = JointState(stamp_ns, JOINT_NAMES, tuple(self.joints.tolist()), (0.0,) * len(JOINT_NAMES))
+            message = JointState(
+                stamp_ns, JOINT_NAMES, tuple(self.joints.tolist()), (0.0,) * len(JOINT_NAMES)
+            )
             state = cdr.encode_joints(message)
-            yield "joints/state", mutated("joints", state, random) if hostile and random.random() < 0.3 else state
+            yield (
+                "joints/state",
+                mutated("joints", state, random) if hostile and random.random() < 0.3 else state,
+            )
         if hostile and random.random() < 0.1:
             key = random.choice(ASKED)
             yield key, mutated(DECODERS.get(key, "nothing"), REQUEST.get(key, b"{}"), random)
@@ -69,7 +80,8 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
     result = replay(path)
     assert result.exact, result.text()
     recording = Recording.open(path)
-    settings, urdf = recording.settings, robot_description(recording.settings)
+    settings = recording.settings
+    urdf = robot_description(recording.settings)
     skill = decoded(recording.skill, origin=str(path))
     controller = explained_controller(settings, skill, urdf=urdf)
     frames: list[Frame] = []
@@ -87,7 +99,9 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
         boxes=np.tile(skill.workspace, (count, 1, 1)),
         receiving=np.zeros((count, 2), bool),
         hands=np.zeros((count, 2, 3)),
-        still_s=np.zeros((count, 2)),  # where the hands were is not recorded, only what was reported
+        still_s=np.zeros(
+            (count, 2)
+        ),  # where the hands were is not recorded, only what was reported
         noise_m=0.0,
         quiet_from=count,
         arm_follows=False,

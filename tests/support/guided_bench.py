@@ -27,7 +27,8 @@ class GuidedBench:
     """A simulated arm in a thread: it follows the cell's commands, or is led by `lead`."""
 
     def __init__(self, session: zenoh.Session, settings: Settings) -> None:
-        self._session, self._settings = session, settings
+        self._session = session
+        self._settings = settings
         self._goal: Vector | None = None
         self._joints = np.zeros(len(settings.joints.names))
         self._stop = threading.Event()
@@ -42,7 +43,9 @@ class GuidedBench:
     @property
     def is_led_there(self) -> bool:
         """True once the arm is where it was led to."""
-        return self._goal is not None and bool(np.abs(self._goal - self._joints).max() < SETTLED_RAD)
+        return self._goal is not None and bool(
+            np.abs(self._goal - self._joints).max() < SETTLED_RAD
+        )
 
     def let_go(self) -> None:
         """End guiding: the arm stands where it is, and follows commands again."""
@@ -52,22 +55,25 @@ class GuidedBench:
         publisher = Publisher(self._session, self._settings.cell, "joints/guided")
         with Bench(HandScript(Scene(), seed=1), settings=self._settings) as bench:
             bridge = Bridge(self._session, Live(cell=self._settings.cell), bench.joint_names)
-            drive, deadlines, before = (
-                Led(bench, bridge.commands, bridge.gripper),
-                Deadlines(self._settings.rate_hz),
-                -1,
-            )
+            drive = Led(bench, bridge.commands, bridge.gripper)
+            deadlines = Deadlines(self._settings.rate_hz)
+            before = -1
             while not self._stop.is_set():
                 index = deadlines.wait()[0]
                 if (goal := self._goal) is None:
                     observation = drive.step(index - before)[0]
                 else:
                     step = goal - self._joints
-                    step *= min(1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9))
+                    step *= min(
+                        1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9)
+                    )
                     observation = bench.step(tuple((self._joints + step).tolist()))
-                    drive = Led(bench, bridge.commands, bridge.gripper)  # it begins anew where the arm is let go
+                    drive = Led(
+                        bench, bridge.commands, bridge.gripper
+                    )  # it begins anew where the arm is let go
                     bridge.commands.queued()
-                before, self._joints = index, np.array(observation.joints)
+                before = index
+                self._joints = np.array(observation.joints)
                 bridge.publish_joints(observation)
                 publisher.put(cdr.encode_bool(goal is not None))
             bridge.close()
@@ -77,7 +83,10 @@ class GuidedBench:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._stop.set()
         self._thread.join()

@@ -93,7 +93,12 @@ def _fetch() -> None:
         return
     CACHE.mkdir(parents=True, exist_ok=True)
     fetched = subprocess.run(
-        ["npm", "pack", "--silent", f"iwer@{IWER}"], cwd=CACHE, check=True, timeout=60, capture_output=True, text=True
+        ["npm", "pack", "--silent", f"iwer@{IWER}"],
+        cwd=CACHE,
+        check=True,
+        timeout=60,
+        capture_output=True,
+        text=True,
     )
     with tarfile.open(CACHE / fetched.stdout.split()[-1]) as package:
         script = package.extractfile("package/build/iwer.min.js")
@@ -110,7 +115,9 @@ def emulation(*, without: tuple[str, ...] = (), stereo: bool = False) -> str:
 
 
 @contextlib.contextmanager
-def worn(url: str, folder: Path, *, size: tuple[int, int] = (320, 240), **more: Any) -> Iterator[chromium.Tab]:
+def worn(
+    url: str, folder: Path, *, size: tuple[int, int] = (320, 240), **more: Any
+) -> Iterator[chromium.Tab]:
     """The page in the browser of a headset, with its session started."""
     with chromium.opened(url, folder, size=size, timeout_s=250, before=emulation(**more)) as tab:
         tab.until("document.getElementById('start')?.disabled === false")
@@ -123,7 +130,9 @@ class Served:
     """A running `thirdhand hands --web`."""
 
     def __init__(self, process: subprocess.Popen[str], url: str) -> None:
-        self.process, self.url, self.ended = process, url, ""
+        self.process = process
+        self.url = url
+        self.ended = ""
 
     def end(self) -> str:
         """End it; returns what it wrote to standard error at its end."""
@@ -135,7 +144,9 @@ class Served:
 
     def counts(self) -> tuple[int, int, int]:
         """Messages published, lost and dropped as too late, once it has ended."""
-        matched = re.search(r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended)
+        matched = re.search(
+            r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended
+        )
         assert matched is not None, self.ended
         return int(matched[1]), int(matched[2]), int(matched[3])
 
@@ -143,12 +154,26 @@ class Served:
 @contextlib.contextmanager
 def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> Iterator[Served]:
     """The command, connected to a Zenoh endpoint, with its token under a home folder."""
-    command = [sys.executable, "-m", "thirdhand", "hands", "--web", "--connect", endpoint, *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "thirdhand",
+        "hands",
+        "--web",
+        "--connect",
+        endpoint,
+        *arguments,
+    ]
     if "--listen" not in arguments:
         command += ["--listen", f"127.0.0.1:{port}"]
     environment = os.environ | {"HOME": str(home)}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=environment,
     ) as process:
         watchdog = threading.Timer(60, process.kill)
         watchdog.start()

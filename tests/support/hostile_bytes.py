@@ -39,7 +39,8 @@ from thirdhand.contract.messages import (
 
 LONGEST_WORDS = 600  # of a refusal, which is sent and logged
 NAMES = ("wam/base_yaw_joint", "b", "c")
-POSITION, TURN = (0.5, -0.1, 0.2), (0.0, 0.0, 0.0, 1.0)
+POSITION = (0.5, -0.1, 0.2)
+TURN = (0.0, 0.0, 0.0, 1.0)
 POINT = (
     b'{"name": "handover", "left": [0.5, 0.1, 0.2], "right": [0.5, -0.1, 0.2], "tool": [0.6, 0, 0.3], '
     b'"std": 0.0001, "radius": 0.02, "follow": "left"}'
@@ -74,7 +75,9 @@ def _transforms(data: bytes) -> Any:
 _request = partial(partial, requests.decode_request)
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     "pose": partial(_again, cdr.encode_pose, cdr.decode_pose),
-    "pose_with_covariance": partial(_again, cdr.encode_pose_with_covariance, cdr.decode_pose_with_covariance),
+    "pose_with_covariance": partial(
+        _again, cdr.encode_pose_with_covariance, cdr.decode_pose_with_covariance
+    ),
     "joints": partial(_again, cdr.encode_joints, cdr.decode_joints),
     "joints_in_order": _joints,
     "bool": partial(_again, cdr.encode_bool, cdr.decode_bool),
@@ -94,7 +97,9 @@ REQUESTS = ("via_points", "skill_request", "nothing")
 _SEEDS: dict[str, list[bytes]] = {
     "pose": [cdr.encode_pose(PoseStamped(1_500_000_001, "base", POSITION, TURN))],
     "pose_with_covariance": [
-        cdr.encode_pose_with_covariance(PoseWithCovarianceStamped(-1, "", POSITION, TURN, (0.0,) * 36))
+        cdr.encode_pose_with_covariance(
+            PoseWithCovarianceStamped(-1, "", POSITION, TURN, (0.0,) * 36)
+        )
     ],
     "joints": [
         cdr.encode_joints(JointState(1, NAMES, POSITION, POSITION, (), "base")),
@@ -104,7 +109,11 @@ _SEEDS: dict[str, list[bytes]] = {
     "bool": [cdr.encode_bool(True), cdr.encode_bool(False), cdr.encode_bool(True) + bytes(3)],
     "closure": [cdr.encode_joints(JointState(1, (GRIPPER,), (0.25,), ()))],
     "string": [cdr.encode_string("{}"), cdr.encode_string("é")],
-    "transforms": [cdr.encode_transforms(7, [Transform("a", "b", POSITION, TURN), Transform("", "c", POSITION, TURN)])],
+    "transforms": [
+        cdr.encode_transforms(
+            7, [Transform("a", "b", POSITION, TURN), Transform("", "c", POSITION, TURN)]
+        )
+    ],
     "tick": [cdr.encode_tick(7, [0, 1, 6], 2)],
     "skill": [cdr.encode_skill(b"PK")],
     "record": [cdr.encode_record(bytes(60))],
@@ -122,7 +131,9 @@ _SEEDS["joints_in_order"] = _SEEDS["joints"][:2]
 # What was found: each once ended in another error, or is the smallest of what could.
 FOUND: dict[str, list[bytes]] = {
     # seconds and nanoseconds that come to more than a stamp holds
-    "joints": [_SEEDS["joints"][0][:4] + b"\xff\xff\xff\x7f\xff\xff\xff\xff" + _SEEDS["joints"][0][12:]],
+    "joints": [
+        _SEEDS["joints"][0][:4] + b"\xff\xff\xff\x7f\xff\xff\xff\xff" + _SEEDS["joints"][0][12:]
+    ],
     "pose": [_SEEDS["pose"][0][:4] + b"\xff\xff\xff\x7f\x00\xca\x9a\x3b" + _SEEDS["pose"][0][12:]],
 }
 
@@ -151,10 +162,37 @@ HOSTILE_WORDS = tuple(
     for size in (1, 4, 8)
     for word in {0, 1, 2**31 - 1 & 2 ** (8 * size) - 1, 2 ** (8 * size - 1), 2 ** (8 * size) - 1}
 )
-HOSTILE_NUMBERS = tuple(struct.pack("<d", x) for x in (math.nan, math.inf, -math.inf, 5e-324, 1e308, -0.0))
+HOSTILE_NUMBERS = tuple(
+    struct.pack("<d", x) for x in (math.nan, math.inf, -math.inf, 5e-324, 1e308, -0.0)
+)
 HOSTILE_JSON: tuple[Any, ...] = (
-    *(None, True, 0, -1, 2**63, 10**400, 1e308, -0.0, 5e-324, "", "a", "\0", "$.points[0]", "é" * 300, "x" * 3000),
-    *([], {}, [[]] * 50, {"op": "add"}, {"name": 3}, {"a.b[1]": {}, "`": 1}, [0.1, 0.2], [0.1, 0.2, 0.3, 0.4]),
+    *(
+        None,
+        True,
+        0,
+        -1,
+        2**63,
+        10**400,
+        1e308,
+        -0.0,
+        5e-324,
+        "",
+        "a",
+        "\0",
+        "$.points[0]",
+        "é" * 300,
+        "x" * 3000,
+    ),
+    *(
+        [],
+        {},
+        [[]] * 50,
+        {"op": "add"},
+        {"name": 3},
+        {"a.b[1]": {}, "`": 1},
+        [0.1, 0.2],
+        [0.1, 0.2, 0.3, 0.4],
+    ),
 )
 
 
@@ -182,7 +220,9 @@ def mutated(name: str, data: bytes, random: Random) -> bytes:
             case 4:
                 out[offset:offset] = random.randbytes(random.choice((1, 4, 8, 100)))
             case _:
-                out[offset:offset] = out[random.randrange(len(out) + 1) :][: random.choice((4, 24, 200))]
+                out[offset:offset] = out[random.randrange(len(out) + 1) :][
+                    : random.choice((4, 24, 200))
+                ]
     return bytes(out)
 
 
@@ -191,15 +231,26 @@ def _spoilt(value: Any, random: Random) -> Any:
     if random.random() < 0.15 or not isinstance(value, dict | list) or not value:
         return random.choice(HOSTILE_JSON)
     if isinstance(value, list):
-        index, chance = random.randrange(len(value)), random.random()
-        inner = [] if chance < 0.1 else [value[index]] * 2 if chance < 0.2 else [_spoilt(value[index], random)]
+        index = random.randrange(len(value))
+        chance = random.random()
+        inner = (
+            []
+            if chance < 0.1
+            else [value[index]] * 2
+            if chance < 0.2
+            else [_spoilt(value[index], random)]
+        )
         return value[:index] + inner + value[index + 1 :]
-    key, chance = random.choice(list(value)), random.random()
+    key = random.choice(list(value))
+    chance = random.random()
     remaining = {k: v for k, v in value.items() if k != key}
     if chance < 0.1:
         return remaining
     if chance < 0.2:
-        return {**remaining, random.choice(("", "op", "name", "a.b[0]", "`", "é\n" * 200, "x" * 2000)): value[key]}
+        return {
+            **remaining,
+            random.choice(("", "op", "name", "a.b[0]", "`", "é\n" * 200, "x" * 2000)): value[key],
+        }
     return {**remaining, key: _spoilt(value[key], random)}
 
 

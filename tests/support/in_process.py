@@ -23,8 +23,12 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.closed_loop import hand_event, joints_event
 from thirdhand_sim.script import HandScript
 
-ASSUMED = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed"))
-LEFT, RIGHT = (0.98, -0.32, 0.06), (0.98, 0.32, 0.06)  # where the hands rest [m]
+ASSUMED = msgspec.structs.replace(
+    Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed")
+)
+# where the hands rest [m]
+LEFT = (0.98, -0.32, 0.06)
+RIGHT = (0.98, 0.32, 0.06)
 
 
 def hand(side: str, position: tuple[float, float, float], stamp_ns: int) -> Event:
@@ -32,7 +36,9 @@ def hand(side: str, position: tuple[float, float, float], stamp_ns: int) -> Even
     return hand_event(side, position, stamp_ns)
 
 
-def arm(joints: tuple[float, ...], stamp_ns: int, velocities: tuple[float, ...] = (0.0,) * 7) -> Event:
+def arm(
+    joints: tuple[float, ...], stamp_ns: int, velocities: tuple[float, ...] = (0.0,) * 7
+) -> Event:
     """The arm's sample as an event."""
     return joints_event(JOINT_NAMES, joints, velocities, stamp_ns)
 
@@ -50,7 +56,10 @@ def wish(closure: float) -> Event:
 
 def seen(hands: Vector, k: int) -> tuple[Event, ...]:
     """Samples of both hands (2, 3) [m] that arrive in tick k."""
-    return tuple(hand(side, tuple(position.tolist()), k + 1) for side, position in zip(SIDES, hands, strict=True))
+    return tuple(
+        hand(side, tuple(position.tolist()), k + 1)
+        for side, position in zip(SIDES, hands, strict=True)
+    )
 
 
 def nothing(k: int) -> tuple[Event, ...]:
@@ -59,7 +68,11 @@ def nothing(k: int) -> tuple[Event, ...]:
 
 
 def led(
-    hands: Iterable[Vector], extra: Callable[[int], tuple[Event, ...]] = nothing, *, first: int = 0, every: int = 5
+    hands: Iterable[Vector],
+    extra: Callable[[int], tuple[Event, ...]] = nothing,
+    *,
+    first: int = 0,
+    every: int = 5,
 ) -> Iterator[Tick]:
     """Ticks while the hands are at positions (T, 2, 3) [m], of which a tracker samples some."""
     for k, positions in enumerate(hands, first):
@@ -67,7 +80,12 @@ def led(
 
 
 def ticks_of(
-    script: HandScript, *, wait_s: float = 1.5, tail_s: float = 0.5, period_s: float = 0.002, every: int = 5
+    script: HandScript,
+    *,
+    wait_s: float = 1.5,
+    tail_s: float = 0.5,
+    period_s: float = 0.002,
+    every: int = 5,
 ) -> Iterator[Tick]:
     """Ticks with the script's hands, which first rest at their start for a while."""
     times = np.arange(round((wait_s + script.duration_s + tail_s) / period_s)) * period_s
@@ -92,7 +110,8 @@ def assert_limits_hold(seen: np.ndarray, cell: Settings = ASSUMED) -> None:
     """Assert that every number is finite, that joints are within their limits or move inwards, and
     that speeds, accelerations, jerks and consecutive commands are as their limits allow.
     """
-    limits, dt = cell.joints, cell.period_s
+    limits = cell.joints
+    dt = cell.period_s
     for name in seen.dtype.names or ():
         assert np.isfinite(seen[name]).all(), name
     sent = seen[seen["commanded"] == 1]
@@ -111,7 +130,9 @@ class Loop:
     velocities as `reports` says. The hands are where `hands` has them in a tick; None: unseen.
     """
 
-    def __init__(self, cell: Settings, skill: Skill, start: Vector | tuple[float, ...] | None = None) -> None:
+    def __init__(
+        self, cell: Settings, skill: Skill, start: Vector | tuple[float, ...] | None = None
+    ) -> None:
         self.controller = Controller(cell, skill, urdf=robot_description(cell))
         self.joints = np.array(cell.arm.posture if start is None else start)
         self.speed = np.zeros(len(self.joints))
@@ -138,16 +159,22 @@ class Loop:
         self.steps.append((tick, frame))
         self.index += 1
         if frame["commanded"]:
-            self.joints, self.speed = frame["joints"].copy(), frame["joint_velocities"].copy()
+            self.joints = frame["joints"].copy()
+            self.speed = frame["joint_velocities"].copy()
         return frame
 
-    def run(self, ticks: int, events: Mapping[int, Event] | None = None, *, every: int = 1) -> np.ndarray:
+    def run(
+        self, ticks: int, events: Mapping[int, Event] | None = None, *, every: int = 1
+    ) -> np.ndarray:
         """The frames of more ticks, with events by their ticks counted from here. The arm is heard
         in every so many ticks, or never.
         """
         events = events or {}
         for k in range(ticks):
-            self.step(*([events[k]] if k in events else []), is_heard=bool(every) and self.index % every == 0)
+            self.step(
+                *([events[k]] if k in events else []),
+                is_heard=bool(every) and self.index % every == 0,
+            )
         return self.frames[-ticks:]
 
 
@@ -162,7 +189,11 @@ def script_hands(script: HandScript, *, wait_s: float = 1.5) -> Callable[[int], 
 
 
 def assert_replays(
-    path: Path, cell: Settings, skill: Skill, steps: list[tuple[Tick, Frame]], state: Record | None = None
+    path: Path,
+    cell: Settings,
+    skill: Skill,
+    steps: list[tuple[Tick, Frame]],
+    state: Record | None = None,
 ) -> None:
     """Assert that ticks with their frames, recorded from a state on, replay identically."""
     state = start_state(cell, skill) if state is None else state

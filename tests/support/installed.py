@@ -39,5 +39,10 @@ def isolated(site: Path, code: str, *needs: str, **more: Any) -> subprocess.Comp
             link.symlink_to(Path(spec.origin).parent)
     program = f"import site; site.addsitedir({str(site)!r})\n{code}"
     return subprocess.run(
-        [sys.executable, "-I", "-S", "-c", program], capture_output=True, text=True, timeout=60, check=False, **more
+        [sys.executable, "-I", "-S", "-c", program],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        **more,
     )

@@ -29,18 +29,26 @@ def takes(count: int, *, timetable: bool) -> list[Demonstration]:
     """Hands that come at different speeds and then rest; the tool moves on while they rest, or goes
     with the left hand.
     """
-    out, times = [], np.arange(0.0, 7.0, 0.02)
+    out = []
+    times = np.arange(0.0, 7.0, 0.02)
     for i in range(count):
         rng = np.random.default_rng(i)
         share = np.clip((times - 0.4 - 0.3 * rng.random()) / rng.uniform(0.7, 1.6), 0.0, 1.0)
         began = times - times[np.argmax(share > 0)]
         progress = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
-        left = np.array((0.6, -0.2, 0.2)) + (1.0 - progress) * (0.0, 0.25, 0.0) + rng.normal(0.0, 0.01, 3)
+        left = (
+            np.array((0.6, -0.2, 0.2))
+            + (1.0 - progress) * (0.0, 0.25, 0.0)
+            + rng.normal(0.0, 0.01, 3)
+        )
         right = np.array((0.7, 0.3, 0.2)) + 0.0 * left + rng.normal(0.0, 0.01, 3)
         late = np.clip((began - 4.0) / 1.5, 0.0, 1.0)[:, None] if timetable else progress
         tool = np.array((0.5, 0.1, 0.4)) + late * np.array((0.0, 0.3, 0.1)) + 0.0 * left
         turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
-        poses = [np.hstack([positions + rng.normal(0.0, 0.0005, positions.shape), turn]) for positions in (left, right, tool)]
+        poses = [
+            np.hstack([positions + rng.normal(0.0, 0.0005, positions.shape), turn])
+            for positions in (left, right, tool)
+        ]
         out.append(Demonstration((times * 1e9).astype(np.int64), poses[0], poses[1], poses[2]))
     return out
 
@@ -50,7 +58,11 @@ def named(count: int, *, timetable: bool) -> list[Demonstration]:
     out = []
     for take in takes(count, timetable=timetable):
         rows = [
-            {"name": name, "left": take.left[index, :3].tolist(), "right": take.right[index, :3].tolist()}
+            {
+                "name": name,
+                "left": take.left[index, :3].tolist(),
+                "right": take.right[index, :3].tolist(),
+            }
             | {"tool": take.tool[index, :3].tolist()}
             for name, index in (("start", 0), ("end", -1))
         ]
@@ -61,7 +73,9 @@ def named(count: int, *, timetable: bool) -> list[Demonstration]:
 def learned(kind: str) -> tuple[Skill, Demonstration]:
     """A skill of one kind, and a take that it was not learned from."""
     if kind in TASK_KINDS:
-        *demonstrations, asked = (take.demonstration for take in made(kind, people=[0, 1, 2], each=2))
+        *demonstrations, asked = (
+            take.demonstration for take in made(kind, people=[0, 1, 2], each=2)
+        )
         return taught(learn(demonstrations), asked.places), asked
     demonstrations = (named if "between" in kind else takes)(7, timetable="clock" in kind)
     if kind == "mixture":

@@ -25,14 +25,17 @@ from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import ArmSettings, Files, Settings, robot_description
 from thirdhand.settings.network import Network
 
-RATE_HZ, ROS2_DOMAIN = 50, 7
+RATE_HZ = 50
+ROS2_DOMAIN = 7
 
 
 def main(folder: Path, endpoint: str, *cells: str) -> None:
     """Serves the cells; each says its name once it is announced."""
-    skill, skill_worker = shipped_skill(), SkillWorker()
+    skill = shipped_skill()
+    skill_worker = SkillWorker()
     warm_up(Settings(), skill.for_loop(), urdf=robot_description(Settings()))
-    daemons, held = [], contextlib.ExitStack()
+    daemons = []
+    held = contextlib.ExitStack()
     for cell in cells:
         settings = Settings(
             cell=cell,
@@ -45,7 +48,9 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
         more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": start}
         daemons.append(Daemon(settings, skill, skills=recordings(), **more))
     for daemon, cell in zip(daemons, cells, strict=True):
-        say = threading.Thread(target=daemon.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),))
+        say = threading.Thread(
+            target=daemon.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),)
+        )
         say.start()
     sys.stdin.read()
     os._exit(0)

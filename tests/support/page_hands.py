@@ -25,7 +25,15 @@ PALM = (0.1, 1.0, -0.4, 0.0, 0.0, 0.6, 0.8, 0.12, 1.02, -0.5, 0.03, 0.0)
 
 def hands_message(**given: Any) -> bytes:
     """A message of both hands, of now, except for what is given."""
-    values = {"magic": HANDS_MAGIC, "seen": 3, "epoch": 0, "number": 0, "ahead_ms": 0.0, "left": PALM, "right": PALM}
+    values = {
+        "magic": HANDS_MAGIC,
+        "seen": 3,
+        "epoch": 0,
+        "number": 0,
+        "ahead_ms": 0.0,
+        "left": PALM,
+        "right": PALM,
+    }
     values |= {"at_ms": time.time_ns() / 1e6, **given}
     order = ("magic", "seen", "epoch", "number", "at_ms", "ahead_ms")
     return HANDS_LAYOUT.pack(*(values[name] for name in order), *values["left"], *values["right"])
@@ -62,7 +70,12 @@ def page_of_hands(**more: Any) -> Iterator[tuple[HeadsetPage, Heard]]:
         heard = Heard(hearing)
         with Tracker(session) as tracker:
             client = Client(session, timeout_s=1.0)
-            yield HeadsetPage(tracker, client, Latest(session, "thirdhand"), **({"cell": "thirdhand"} | more)), heard
+            yield (
+                HeadsetPage(
+                    tracker, client, Latest(session, "thirdhand"), **({"cell": "thirdhand"} | more)
+                ),
+                heard,
+            )
 
 
 @contextlib.asynccontextmanager

@@ -36,12 +36,18 @@ def database(seed=0, count=30, inputs=4, outputs=3):
     random = np.random.default_rng(seed)
     root = 0.1 * random.normal(size=(count, outputs, outputs))
     covariance = root @ root.swapaxes(1, 2) + 1e-4 * np.eye(outputs)
-    return random.normal(size=(count, inputs)), Gaussians(random.normal(size=(count, outputs)), covariance)
+    return random.normal(size=(count, inputs)), Gaussians(
+        random.normal(size=(count, outputs)), covariance
+    )
 
 
 def skill(seed=0, *, lambda_covariance=None, prior_mean=None, representation="dense", **size):
     inputs, reference = database(seed, **size)
-    options = {"lambda_covariance": lambda_covariance, "prior_mean": prior_mean, "representation": representation}
+    options = {
+        "lambda_covariance": lambda_covariance,
+        "prior_mean": prior_mean,
+        "representation": representation,
+    }
     return KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2.0, **options)
 
 
@@ -66,11 +72,14 @@ def naive(one, queries):
     alpha = np.linalg.solve(big + one.lambda_mean * sigma, right.ravel())
     explained = row @ np.linalg.solve(big + one.lambda_covariance * sigma, row.T)
     covariance = (prior - explained) * len(one.base.inputs) / one.lambda_covariance
-    return (row @ alpha).reshape(-1, outputs) + one.prior_mean, covariance.reshape(2 * (len(queries), outputs))
+    return (row @ alpha).reshape(-1, outputs) + one.prior_mean, covariance.reshape(
+        2 * (len(queries), outputs)
+    )
 
 
 def same_bits(a, b, queries):
-    query, direction = queries[0], np.ones(queries.shape[1])
+    query = queries[0]
+    direction = np.ones(queries.shape[1])
     return all(
         np.array_equal(x, y)
         for x, y in [

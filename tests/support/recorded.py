@@ -32,13 +32,16 @@ def at_ns(tick: int) -> int:
 
 def pose(stamp_ns: int, x: float) -> bytes:
     """A hand's pose."""
-    return cdr.encode_pose(messages.PoseStamped(stamp_ns, "base", (x, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0)))
+    return cdr.encode_pose(
+        messages.PoseStamped(stamp_ns, "base", (x, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0))
+    )
 
 
 def state_after(tick: int) -> Record:
     """A state that can be told from others."""
     state = blank(STATE)
-    state["tick"], state["measured"] = tick, tick / 7
+    state["tick"] = tick
+    state["measured"] = tick / 7
     return state
 
 
@@ -46,25 +49,34 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
     """Ticks with every kind of event, plausible frames of an arm that moves, and timings."""
     random = np.random.default_rng(first)
     for i in range(first, first + count):
-        frame, timing, angle = blank(FRAME), blank(TIMING), i / 500.0
+        frame = blank(FRAME)
+        timing = blank(TIMING)
+        angle = i / 500.0
         hands = (0.7 + 0.1 * np.sin(angle), 0.5 - 0.1 * np.cos(angle))
-        frame["tick"], frame["hand_stamp_ns"] = i, at_ns(i) - 1_000_000
+        frame["tick"] = i
+        frame["hand_stamp_ns"] = at_ns(i) - 1_000_000
         frame["hands"] = [[hands[0], -0.25, 0.2], [hands[1], 0.25, 0.2]]
-        frame["target"] = frame["setpoint"] = frame["tool"] = [0.5 + 0.1 * np.sin(angle), 0.1 * np.cos(angle), 0.4]
+        frame["target"] = frame["setpoint"] = frame["tool"] = [
+            0.5 + 0.1 * np.sin(angle),
+            0.1 * np.cos(angle),
+            0.4,
+        ]
         frame["covariance"] = np.diag([4e-4, 1e-4, 2e-4])
         frame["orientation"] = [0.0, 0.9238795325112867, 0.0, 0.3826834323650898]
         frame["joints"] = (
-            np.array([0, 0.2, 0, 2.2, 0, -0.1, 0]) + 0.2 * np.sin(angle + np.arange(7)) + random.normal(0, 1e-6, 7)
+            np.array([0, 0.2, 0, 2.2, 0, -0.1, 0])
+            + 0.2 * np.sin(angle + np.arange(7))
+            + random.normal(0, 1e-6, 7)
         )
         frame["joint_velocities"] = 0.2 * np.cos(angle + np.arange(7))
         frame["hand_ages"] = [i % 3, i % 2] if i >= 10 else -1
-        frame["mode"], frame["reason"], frame["commanded"] = (1, 0, 1) if i >= 10 else (0, 1, i >= 5)
-        timing["tick"], timing["time_ns"], timing["latency_us"], timing["work_us"] = (
-            i,
-            at_ns(i),
-            800 + i % 7,
-            180 + i % 11,
+        frame["mode"], frame["reason"], frame["commanded"] = (
+            (1, 0, 1) if i >= 10 else (0, 1, i >= 5)
         )
+        timing["tick"] = i
+        timing["time_ns"] = at_ns(i)
+        timing["latency_us"] = 800 + i % 7
+        timing["work_us"] = 180 + i % 11
         inbox = []
         if i >= 10:
             inbox += [
@@ -87,7 +99,9 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
         yield Tick(i, tuple(inbox)), frame, timing
 
 
-def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tuple[Tick, Record, Record]]:
+def write(
+    path: Path, count: int = 300, *, settings: Settings = CELL
+) -> list[tuple[Tick, Record, Record]]:
     """Writes a recording with an initial state and a state every hundred ticks; returns what was
     told.
     """
@@ -97,18 +111,24 @@ def write(path: Path, count: int = 300, *, settings: Settings = CELL) -> list[tu
             state = state_after(tick.index) if tick.index % 100 == 99 else None
             time_ns = at_ns(tick.index)
             outputs = outgoing(frame, time_ns, settings.joints.names)
-            recorder.write(tick, frame, time_ns=time_ns, timing=timing, state=state, outputs=outputs)
+            recorder.write(
+                tick, frame, time_ns=time_ns, timing=timing, state=state, outputs=outputs
+            )
             if tick.index % 50 == 0:
                 recorder.flush()
                 recorder.note("status", f"tick {tick.index}", at_ns(tick.index))
     return entries
 
 
-def tell(one: Scribe, count: int, *, first: int = 0, skill: bytes = SKILL) -> list[tuple[Tick, Record, Record]]:
+def tell(
+    one: Scribe, count: int, *, first: int = 0, skill: bytes = SKILL
+) -> list[tuple[Tick, Record, Record]]:
     """Tells of ticks as the loop does; returns them."""
     entries = list(ticks(count, first=first))
     for tick, frame, timing in entries:
-        one.send(tick, frame, timing, state=lambda index=tick.index: state_after(index), skill=skill)
+        one.send(
+            tick, frame, timing, state=lambda index=tick.index: state_after(index), skill=skill
+        )
     return entries
 
 
@@ -149,7 +169,12 @@ def thin(whole: Path, path: Path, *, spoilt: int | None = None) -> Path:
     """A thin copy of a whole recording, in which the target of one tick may be another."""
     old = Recording.open(whole)
     start, *steps = old.steps()
-    more: dict[str, Any] = {"settings": old.settings, "skill": old.skill, "urdf": old.urdf, "thin": True}
+    more: dict[str, Any] = {
+        "settings": old.settings,
+        "skill": old.skill,
+        "urdf": old.urdf,
+        "thin": True,
+    }
     with Recorder(path, state=start.state, **more) as recorder:
         for tick, step in zip(ticks_in(old), steps, strict=True):
             assert step.frame is not None

@@ -40,11 +40,14 @@ class Cell:
     ) -> None:
         (folder / "soldering.npz").write_bytes(skill.file)
         self.folder = folder
-        self.settings = Settings(cell=next(CELLS), files=Files(state=str(folder / "state")), reach=reach)
+        self.settings = Settings(
+            cell=next(CELLS), files=Files(state=str(folder / "state")), reach=reach
+        )
         self.taken: list[Event] = []
         self.notes: list[str] = []
         self.kept: list[bytes] = []
-        self.running, self.fails = True, False
+        self.running = True
+        self.fails = False
         self.reason = Reason.NO_HANDS
         self.state = start_state(self.settings, skill)
         self._tick = 0
@@ -52,12 +55,20 @@ class Cell:
         self.failures: list[str] = []
         tell = {"status": lambda *, published: requests.encode_json(self.status())}
         tell |= {"moment": lambda: (self.frame(), self.state)}
-        tell |= {"note": self.notes.append, "keep": self.kept.append, "failed": self.failures.append}  # type: ignore[dict-item]
-        self.requests = Queryables(self.settings, skill, skill_worker=skill_worker, skills=folder, **tell)  # type: ignore[arg-type]
+        tell |= {
+            "note": self.notes.append,
+            "keep": self.kept.append,
+            "failed": self.failures.append,
+        }  # type: ignore[dict-item]
+        self.requests = Queryables(
+            self.settings, skill, skill_worker=skill_worker, skills=folder, **tell
+        )  # type: ignore[arg-type]
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
         self.requests.open(near)
-        self._token = near.liveliness().declare_token(channels.presence(self.settings.cell, str(near.zid())))
+        self._token = near.liveliness().declare_token(
+            channels.presence(self.settings.cell, str(near.zid()))
+        )
         self.session = far
         self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
         self.client.wait_until_ready()
@@ -84,12 +95,24 @@ class Cell:
             "hand_limit_m_s": 1.5,
             "scribe": {},
         }
-        words = {"cell": self.settings.cell, "mode": "hold", "reason": "no_hands", "skill": "", "version": ""}
+        words = {
+            "cell": self.settings.cell,
+            "mode": "hold",
+            "reason": "no_hands",
+            "skill": "",
+            "version": "",
+        }
         lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
-        return requests.Status(**words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none)  # type: ignore[arg-type]
+        return requests.Status(
+            **words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none
+        )  # type: ignore[arg-type]
 
     def frame(self) -> dict[str, Any]:
-        unseen = {"hand_ages": np.array((-1, -1)), "stale_ticks": np.array((50, 50)), "hands": np.zeros((2, 3))}
+        unseen = {
+            "hand_ages": np.array((-1, -1)),
+            "stale_ticks": np.array((50, 50)),
+            "hands": np.zeros((2, 3)),
+        }
         return {"tick": self._tick, "mode": self.mode, "reason": self.reason, **unseen}
 
     def _drain(self) -> None:
@@ -119,7 +142,9 @@ class Cell:
     def reply(self, suffix: str, request: Any) -> zenoh.Reply:
         """The only reply to a request; bytes are sent as they are."""
         payload = request if isinstance(request, bytes) else requests.encode_json(request)
-        (reply,) = self.session.get(channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0)
+        (reply,) = self.session.get(
+            channels.key(self.settings.cell, suffix), payload=payload, timeout=10.0
+        )
         return reply
 
     def names(self) -> list[str]:

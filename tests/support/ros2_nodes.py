@@ -23,12 +23,20 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 def typed(kind: str) -> dict[str, str]:
     """What a node knows of a type of messages."""
     text, _ = TYPES.generate_msgdef(kind, ros_version=2)
-    return {"msg_type": kind, "msg_definition": text, "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}"}
+    return {
+        "msg_type": kind,
+        "msg_definition": text,
+        "type_hash": f"RIHS01_{ros2.TYPE_HASHES[kind]}",
+    }
 
 
 def port(router: str, domain: int) -> dict[str, Any]:
     """Where a node finds its domain, given a router's endpoint."""
-    return {"domain_id": domain, "router_ip": "127.0.0.1", "router_port": int(router.rpartition(":")[2])}
+    return {
+        "domain_id": domain,
+        "router_ip": "127.0.0.1",
+        "router_port": int(router.rpartition(":")[2]),
+    }
 
 
 def header(types: dict[str, Any], frame: str = "") -> Any:
@@ -46,7 +54,11 @@ def guarded(
     secrets = make_certificates(folder)
     more = {**NETWORK_BOUNDS, **access_control(cell, (), domain, topics)}
     with contextlib.ExitStack() as closing:
-        listening = open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=more)
+        listening = open_session(
+            listen=["tls/127.0.0.1:0"], certificate=secrets / "daemon", more=more
+        )
         daemon = closing.enter_context(listening)
-        clients = [open_session(connect=endpoints(daemon), certificate=secrets / role) for role in roles]
+        clients = [
+            open_session(connect=endpoints(daemon), certificate=secrets / role) for role in roles
+        ]
         yield daemon, *map(closing.enter_context, clients)

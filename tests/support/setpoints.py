@@ -35,9 +35,11 @@ def driven(
 
     In each step the bounds are looked at from outside.
     """
-    generator, state = Explained(Settings(tool=tool, rate_hz=rate_hz)), blank(STATE)
+    generator = Explained(Settings(tool=tool, rate_hz=rate_hz))
+    state = blank(STATE)
     generator.begin(state, at_rest(targets[0][0]) if start is None else start)
-    out, results = [state["setpoint"].copy()], []
+    out = [state["setpoint"].copy()]
+    results = []
     for target in targets:
         before = state["setpoint"].copy()
         generator.engage(state, target[0])

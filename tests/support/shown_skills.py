@@ -5,7 +5,8 @@ import numpy as np
 
 def driven_by_hands(seed=0, count=4):
     """Two inputs of which only the first matters, on a long way; the second jitters."""
-    random, demonstrations = np.random.default_rng(seed), []
+    random = np.random.default_rng(seed)
+    demonstrations = []
     for _ in range(count):
         t = np.linspace(0, 1, 80)
         s = np.stack([t + 0.01 * random.normal(size=80), 0.3 * random.normal(size=80)], axis=1)
@@ -15,23 +16,35 @@ def driven_by_hands(seed=0, count=4):
 
 
 def over_time(velocity=False):
-    random, t = np.random.default_rng(0), np.linspace(0, 2, 80)
-    paths = [np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2) for _ in range(3)]
-    return [(t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths]
+    random = np.random.default_rng(0)
+    t = np.linspace(0, 2, 80)
+    paths = [
+        np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1) + 0.03 * random.normal(size=2)
+        for _ in range(3)
+    ]
+    return [
+        (t[:, None], np.hstack([p, np.gradient(p, t, axis=0)]) if velocity else p) for p in paths
+    ]
 
 
 def two_hands(seed, demonstrations=6, offset=0.0):
     """Demonstrations: both hands' positions (100, 6) along a curve, a tool (100, 2) that goes with
     them, off by so much in each demonstration.
     """
-    random, t = np.random.default_rng(seed), np.linspace(0, 1, 100)[:, None]
-    phases, sizes = random.uniform(0, 2 * np.pi, (3, 6)), random.uniform(0.3, 1.0, (3, 6))
-    directions, turns, weights = random.normal(size=(6, 6)) / 2, random.uniform(0, 6, 6), random.normal(size=(6, 2))
+    random = np.random.default_rng(seed)
+    t = np.linspace(0, 1, 100)[:, None]
+    phases = random.uniform(0, 2 * np.pi, (3, 6))
+    sizes = random.uniform(0.3, 1.0, (3, 6))
+    directions = random.normal(size=(6, 6)) / 2
+    turns = random.uniform(0, 6, 6)
+    weights = random.normal(size=(6, 2))
     takes = []
     for _ in range(demonstrations):
         shifts = phases + 0.15 * random.normal(size=(3, 6))
         hands = sum(sizes[k] / (k + 1) * np.sin((k + 1) * np.pi * t + shifts[k]) for k in range(3))
-        takes.append((hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2)))
+        takes.append(
+            (hands, np.sin(hands @ directions.T + turns) @ weights + offset * random.normal(size=2))
+        )
     return takes
 
 

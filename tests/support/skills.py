@@ -37,14 +37,19 @@ def turns_of(rate: Vector, at_s: float, lag_s: float) -> Vector:
     """Rows (TURNS, 2, 9) of the filters of hands that turn evenly at `rate` (3,) [rad/s]: each lags
     by as much again.
     """
-    rows = [Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel() for i in range(TURNS)]
+    rows = [
+        Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel()
+        for i in range(TURNS)
+    ]
     return np.stack([rows, rows], axis=1)
 
 
 def file_with(skill: Skill, **arrays: Any) -> bytes:
     """The skill's file with other arrays, and their checksum; None leaves one out."""
     with np.load(io.BytesIO(skill.file), allow_pickle=False) as original:
-        changed = {name: value for name, value in (dict(original) | arrays).items() if value is not None}
+        changed = {
+            name: value for name, value in (dict(original) | arrays).items() if value is not None
+        }
     if "checksum" not in arrays and not any(value.dtype == object for value in changed.values()):
         changed["checksum"] = np.array(checksum(changed))
     out = io.BytesIO()

@@ -37,20 +37,30 @@ def streams_of(take: Demonstration, *, delay_s: float = 0.004) -> Streams:
     """The streams of a take, each sample recorded a moment after its stamp."""
     stamps = START_NS + take.stamps_ns - take.stamps_ns[0]
     logged = stamps + round(1e9 * delay_s)
-    return {name: Stream(stamps.copy(), logged.copy(), np.array(getattr(take, name))) for name in KEYS}
+    return {
+        name: Stream(stamps.copy(), logged.copy(), np.array(getattr(take, name))) for name in KEYS
+    }
 
 
 def write_streams(
-    path: Path, streams: Mapping[str, Stream], cell: str = "cell", *, places: tuple[ViaPoint, ...] = ()
+    path: Path,
+    streams: Mapping[str, Stream],
+    cell: str = "cell",
+    *,
+    places: tuple[ViaPoint, ...] = (),
 ) -> Path:
     """A file of these streams, in the order of recording, which names these places."""
     rows = sorted(
-        (int(stream.logged_ns[i]), name, i) for name, stream in streams.items() for i in range(len(stream.poses))
+        (int(stream.logged_ns[i]), name, i)
+        for name, stream in streams.items()
+        for i in range(len(stream.poses))
     )
     with McapFile(path, joints=0, attached=False) as file:
         for logged_ns, name, i in rows:
             row = streams[name].poses[i].tolist()
-            pose = PoseStamped(int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:]))
+            pose = PoseStamped(
+                int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:])
+            )
             file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
         if places:
             text = encode_json(places).decode()
@@ -74,7 +84,9 @@ def small_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.
     _moved(streams, name, mask, random.uniform(0.06, 0.25) * direction / np.linalg.norm(direction))
 
 
-def lasting_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
+def lasting_jump(
+    streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator
+) -> None:
     """The same, and it stays there to the end."""
     end = np.arange(len(mask)) >= len(mask) - int(mask.sum())
     small_jump(streams, name, end, random)
@@ -88,7 +100,9 @@ def slight_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random
 
 def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
     """The track is elsewhere behind a few samples that are lacking, and returns likewise."""
-    direction, rows, seconds = random.normal(size=3), np.flatnonzero(mask), streams[name].stamps_ns / 1e9
+    direction = random.normal(size=3)
+    rows = np.flatnonzero(mask)
+    seconds = streams[name].stamps_ns / 1e9
     _moved(streams, name, mask, random.uniform(0.1, 0.5) * direction / np.linalg.norm(direction))
     since = seconds[:, None] - seconds[rows[[0, -1]]]
     lacking = ((since >= 0.0) & (since < random.uniform(0.03, 0.09))).any(axis=1)
@@ -99,7 +113,9 @@ def spikes(streams: Streams, name: str, mask: np.ndarray, random: np.random.Gene
     """Each third sample is somewhere else each time."""
     rows = np.flatnonzero(mask)[::3]
     direction = random.normal(size=(len(rows), 3))
-    streams[name].poses[rows, :3] += 0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    streams[name].poses[rows, :3] += (
+        0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    )
 
 
 def nans(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:

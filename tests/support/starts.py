@@ -12,7 +12,8 @@ from thirdhand.settings.config import Settings, robot_description
 
 def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:
     """Postures within the limits in which the arm stands in nothing."""
-    random, separation = np.random.default_rng(seed), Separation(cell, robot_description(cell))
+    random = np.random.default_rng(seed)
+    separation = Separation(cell, robot_description(cell))
     drawn = (random.uniform(cell.joints.lower, cell.joints.upper) for _ in iter(int, 1))
     free = (q for q in drawn if separation.clearance(q, NOBODY)[0] > 0.0)
     return [next(free) for _ in range(count)]

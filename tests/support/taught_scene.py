@@ -36,7 +36,14 @@ def quickly(taught: Sequence[Demonstration]) -> Skill:
 
 def error_m(skill: Skill, held_out: Sequence[Demonstration]) -> float:
     """The mean distance between predicted and demonstrated tool [m]."""
-    return float(np.mean([np.linalg.norm(skill.mean(take.hands) - take.tool[:, :3], axis=1).mean() for take in held_out]))
+    return float(
+        np.mean(
+            [
+                np.linalg.norm(skill.mean(take.hands) - take.tool[:, :3], axis=1).mean()
+                for take in held_out
+            ]
+        )
+    )
 
 
 def deviations(skill: Skill, hands: Vector) -> Vector:

@@ -16,7 +16,8 @@ from thirdhand.core.intake.stage import Intake
 from thirdhand.settings.config import HandSettings, Settings, TrackerSettings
 
 PERIOD_S = 0.002
-LEFT, RIGHT = 0, 1
+LEFT = 0
+RIGHT = 1
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -30,7 +31,9 @@ class Hands:
         rate_hz: int = 500,
         trackers: dict[str, TrackerSettings] | None = None,
     ) -> None:
-        self.settings = Settings(hands=hands or HandSettings(), rate_hz=rate_hz, trackers=trackers or {})
+        self.settings = Settings(
+            hands=hands or HandSettings(), rate_hz=rate_hz, trackers=trackers or {}
+        )
         self.intake = Intake(self.settings)
         self.state: Record = blank(STATE)
         self.intake.begin(self.state)
@@ -68,14 +71,24 @@ class Hands:
         return bool(self.intake.step(copied(self.state), blank(FRAME), 0, []) & ARM_HEARD)
 
     def rejected(self) -> dict[Cause, int]:
-        return {cause: int(self.state["rejected"][cause]) for cause in Cause if self.state["rejected"][cause]}
+        return {
+            cause: int(self.state["rejected"][cause])
+            for cause in Cause
+            if self.state["rejected"][cause]
+        }
 
 
 def follow(
-    hands: Hands, where: Callable[[float], Vector], *, until_s: float, rate_hz: int = 100, noise: Vector | None = None
+    hands: Hands,
+    where: Callable[[float], Vector],
+    *,
+    until_s: float,
+    rate_hz: int = 100,
+    noise: Vector | None = None,
 ) -> Vector:
     """The filter's states (T, 3, 3) at each tick while a hand is sampled at a rate."""
-    states, taken = [], 0
+    states = []
+    taken = 0
     for tick in range(round(until_s / PERIOD_S)):
         if tick:
             hands.advance()

@@ -11,12 +11,16 @@ from thirdhand.settings.config import Settings, load
 
 ARMS = ROOT / "service" / "thirdhand" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
-NEAR_SEAM = math.pi - 0.02  # [rad] of the base's joint at the posture: the task takes it to both sides of pi
+NEAR_SEAM = (
+    math.pi - 0.02
+)  # [rad] of the base's joint at the posture: the task takes it to both sides of pi
 BASE = '<origin xyz="0 0 0.089159"/>'
 # What no command moves: a gripper with <mimic>, a wheel, things that float.
 BEYOND = "".join(
-    f'<link name="{name}"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>'
-    f'<joint name="{name}_joint" type="{kind}"><parent link="{parent}"/><child link="{name}"/>{more}</joint>'
+    f'<link name="{name}"><collision><geometry><sphere '
+    'radius="0.02"/></geometry></collision></link>'
+    f'<joint name="{name}_joint" type="{kind}"><parent link="{parent}"/><child '
+    f'link="{name}"/>{more}</joint>'
     for name, kind, parent, more in (
         ("finger", "prismatic", "tool0", '<limit lower="0" upper="0.04" velocity="1" effort="1"/>'),
         (
@@ -33,7 +37,9 @@ BEYOND = "".join(
 
 
 def _kind(urdf: str, joint: str, kind: str) -> str:
-    return urdf.replace(f'<joint name="{joint}" type="revolute">', f'<joint name="{joint}" type="{kind}">')
+    return urdf.replace(
+        f'<joint name="{joint}" type="revolute">', f'<joint name="{joint}" type="{kind}">'
+    )
 
 
 def continuous_urdf() -> str:
@@ -51,8 +57,10 @@ def sliding_urdf() -> str:
     """The UR5 on a rail across the table, along which it slides by 0.3 m each way."""
     urdf = (ARMS / "ur5.urdf").read_text(encoding="utf-8").replace('"base_link"', '"carriage"')
     rail = (
-        '<link name="base_link"/><joint name="rail_joint" type="prismatic"><parent link="base_link"/>'
-        '<child link="carriage"/><axis xyz="0 1 0"/><limit lower="-0.3" upper="0.3" effort="500" velocity="0.5"/>'
+        '<link name="base_link"/><joint name="rail_joint" type="prismatic"><parent '
+        'link="base_link"/>'
+        '<child link="carriage"/><axis xyz="0 1 0"/><limit lower="-0.3" upper="0.3" effort="500" '
+        'velocity="0.5"/>'
         "</joint>"
     )
     return re.sub(r"(<robot[^>]*>)", lambda found: found[1] + rail, urdf, count=1)
@@ -71,7 +79,9 @@ def cell_in(folder: Path, urdf: str, **changed: tuple[float, ...] | str) -> Sett
 
 def continuous_cell(folder: Path) -> Settings:
     """A cell with `continuous_urdf`."""
-    return cell_in(folder, continuous_urdf(), posture=(NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0))
+    return cell_in(
+        folder, continuous_urdf(), posture=(NEAR_SEAM, -1.676, 2.118, -2.755, -1.287, 0.0)
+    )
 
 
 def sliding_cell(folder: Path) -> Settings:

@@ -9,4 +9,5 @@ from thirdhand.settings.config import WAM, Settings
 
 JOINT_NAMES = Settings().joints.names
 URDF = WAM.read_text(encoding="utf-8")
-FRAME, STATE = frame_layout(len(JOINT_NAMES)), state_layout(len(JOINT_NAMES))
+FRAME = frame_layout(len(JOINT_NAMES))
+STATE = state_layout(len(JOINT_NAMES))

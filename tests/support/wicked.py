@@ -18,7 +18,9 @@ def wicked_skill() -> bytes:
     with np.load(RECORDINGS / "soldering.npz", allow_pickle=False) as archive:
         arrays = dict(archive)
     figures = msgspec.json.decode(str(arrays["figures"]))
-    figures["demonstrations"] = [{"name": WICKED, "error_mm": 1.0, "worst_mm": 2.0, "within_95": 95.0}]
+    figures["demonstrations"] = [
+        {"name": WICKED, "error_mm": 1.0, "worst_mm": 2.0, "within_95": 95.0}
+    ]
     figures["warnings"] = [WICKED]
     arrays |= {"name": np.array(WICKED), "figures": np.array(msgspec.json.encode(figures).decode())}
     arrays["checksum"] = np.array(checksum(arrays))

@@ -27,7 +27,8 @@ from thirdhand.workbench.trackers.hand_message import PING, PING_MAGIC
 from thirdhand.workbench.trackers.hands_page import WORKER, HeadsetPage
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 
-NAN_PALM, NO_ROTATION = (math.nan, *PALM[1:]), (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
+NAN_PALM = (math.nan, *PALM[1:])
+NO_ROTATION = (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
 DAY_MS = 86_400_000.0
 REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refused
     "too short": (lambda: hands_message()[:-1], "119 bytes, 120 needed"),
@@ -36,12 +37,24 @@ REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refu
     "no hand": (lambda: hands_message(seen=0), "not a message of hands"),
     "a third hand": (lambda: hands_message(seen=5), "not a message of hands"),
     "NaN": (lambda: hands_message(left=NAN_PALM), "left hand: a number that is not finite"),
-    "infinity": (lambda: hands_message(right=(math.inf, *PALM[1:])), "right hand: a number that is not finite"),
+    "infinity": (
+        lambda: hands_message(right=(math.inf, *PALM[1:])),
+        "right hand: a number that is not finite",
+    ),
     "no rotation": (lambda: hands_message(left=NO_ROTATION), "left hand: a quaternion of norm 0.5"),
-    "yesterday": (lambda: hands_message(at_ms=time.time() * 1e3 - DAY_MS), "hands of 8.64e+04 s ago: the page's clock"),
-    "far future": (lambda: hands_message(at_ms=time.time() * 1e3 + DAY_MS), "s ahead: the page's clock is wrong"),
+    "yesterday": (
+        lambda: hands_message(at_ms=time.time() * 1e3 - DAY_MS),
+        "hands of 8.64e+04 s ago: the page's clock",
+    ),
+    "far future": (
+        lambda: hands_message(at_ms=time.time() * 1e3 + DAY_MS),
+        "s ahead: the page's clock is wrong",
+    ),
     "no time": (lambda: hands_message(at_ms=math.nan), "hands of no time"),
-    "predicted for tomorrow": (lambda: hands_message(ahead_ms=DAY_MS), "ms ahead, 0 to 200 accepted"),
+    "predicted for tomorrow": (
+        lambda: hands_message(ahead_ms=DAY_MS),
+        "ms ahead, 0 to 200 accepted",
+    ),
     "predicted for NaN": (lambda: hands_message(ahead_ms=math.nan), "predicted nan ms ahead"),
     "text that is no order": (
         lambda: "open",
@@ -108,7 +121,10 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
         async with serving_page(page) as address, opened(page, address) as socket:
             await socket.send_bytes(PING.pack(PING_MAGIC, 12.5))
             while (answer := await socket.receive(10)).type != aiohttp.WSMsgType.BINARY:
-                assert json.loads(answer.data) == {"status": {}, "objects": []}  # there is no daemon
+                assert json.loads(answer.data) == {
+                    "status": {},
+                    "objects": [],
+                }  # there is no daemon
             magic, sent, server_ms = struct.unpack("<I4xdd", answer.data)
             assert (magic, sent) == (PING_MAGIC, 12.5)
             assert abs(server_ms - time.time() * 1e3) < 5000
@@ -135,7 +151,9 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
             for name, (bad, why) in REFUSED.items():
                 async with opened(page, address) as socket:
                     sent = bad()
-                    await (socket.send_str(sent) if isinstance(sent, str) else socket.send_bytes(sent))
+                    await (
+                        socket.send_str(sent) if isinstance(sent, str) else socket.send_bytes(sent)
+                    )
                     code, text = await reason(socket)
                     assert (code, why in text) == (4400 if why else 1009, True), (name, code, text)
                 await go_on()
@@ -143,9 +161,15 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
                 await other.send_bytes(hands_message())
                 assert await reason(other) == (4409, TAKEN)
             for token in ("", "guessed", "gü\udcff"):
-                async with opened(page, address, token=token.encode(errors="replace").decode()) as socket:
+                async with opened(
+                    page, address, token=token.encode(errors="replace").decode()
+                ) as socket:
                     assert await reason(socket) == (4403, NO_TOKEN)
-            for headers in ({"Origin": "https://elsewhere.example"}, {"Origin": "null"}, {"Host": "rebound.example"}):
+            for headers in (
+                {"Origin": "https://elsewhere.example"},
+                {"Origin": "null"},
+                {"Host": "rebound.example"},
+            ):
                 async with opened(page, address, headers=headers) as socket:
                     assert await reason(socket) == (4403, FOREIGN)
             await go_on()
@@ -155,7 +179,9 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
         asyncio.run(scenario())
 
 
-def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
 
@@ -178,7 +204,10 @@ def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(monkeyp
 
 def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
     async def scenario() -> None:
-        async with serving_page(page) as address, aiohttp.ClientSession(f"http://{address}") as session:
+        async with (
+            serving_page(page) as address,
+            aiohttp.ClientSession(f"http://{address}") as session,
+        ):
             for part in ("/", f"/{WORKER}"):
                 async with session.get(part) as answer:
                     assert (answer.status, await answer.text()) == (403, NO_TOKEN)
@@ -189,7 +218,10 @@ def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
                     assert "__" not in text
                     assert "https:" not in text.replace('"https:"', "")
                     policy = answer.headers["Content-Security-Policy"].split("; ")
-                    assert policy[:2] == ["default-src 'none'", f"connect-src 'self' ws://{address}"]
+                    assert policy[:2] == [
+                        "default-src 'none'",
+                        f"connect-src 'self' ws://{address}",
+                    ]
             async with session.get("/hands", params={"token": page.server.token}) as answer:
                 assert answer.status == 426
             for part in ("/", f"/{WORKER}"):
@@ -216,7 +248,9 @@ def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: P
                     await socket.send_bytes(hands_message())
                     await heard.until("left", 1)
                     await socket.close()
-            async with opened(page, address, ssl=trusted, headers={"Host": "rebound.example"}) as socket:
+            async with opened(
+                page, address, ssl=trusted, headers={"Host": "rebound.example"}
+            ) as socket:
                 assert await reason(socket) == (4403, FOREIGN)
             with pytest.raises(aiohttp.ClientError):  # HTTP where HTTPS is spoken
                 async with aiohttp.ClientSession() as session, session.get(f"http://{address}/"):

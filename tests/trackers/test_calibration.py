@@ -52,7 +52,8 @@ from thirdhand.workbench.trackers.calibration.solver import (
 )
 from thirdhand_sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
 
-SECONDS, SEEDS = 40.0, range(8)
+SECONDS = 40.0
+SEEDS = range(8)
 CORNERS = bench_corners(Settings())
 
 
@@ -71,12 +72,16 @@ def held_by(kind: str, *, arm: str = "wam", seed: int = 0, rate_hz: float = 50) 
 
 @pytest.mark.parametrize("arm", ["wam", "franka", "ur5"])
 @pytest.mark.parametrize(
-    ("kind", "median_mm", "worst_mm"), [("mocap", 0.6, 1.2), ("headset", 10, 16), ("camera", 35, 55)]
+    ("kind", "median_mm", "worst_mm"),
+    [("mocap", 0.6, 1.2), ("headset", 10, 16), ("camera", 35, 55)],
 )
 @pytest.mark.one_case
-def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: float, worst_mm: float) -> None:
+def test_a_held_tool_shows_where_the_tracker_is(
+    arm: str, kind: str, median_mm: float, worst_mm: float
+) -> None:
     """And how accurately it does: errors are about as large as they are expected to be."""
-    errors, shares = [], []
+    errors = []
+    shares = []
     for seed in SEEDS:
         tool = held_by(kind, arm=arm, seed=seed)
         calibration = solve_held(tool, bench_corners(cell_of(arm)))
@@ -84,10 +89,15 @@ def test_a_held_tool_shows_where_the_tracker_is(arm: str, kind: str, median_mm: 
             solve_held(tool._replace(hand=tool.hand * (1, 1, -1)), bench_corners(cell_of(arm)))
         errors.append(1e3 * error_m(calibration))
         corners = np.array(calibration.corners)
-        off_m = np.linalg.norm(calibration.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1)
+        off_m = np.linalg.norm(
+            calibration.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1
+        )
         shares.append(np.square(off_m / np.array(calibration.corner_std_m)).mean())
         assert np.linalg.norm(np.array(calibration.hand_in_tool) - GRIP) < 1e-3 * worst_mm
-        assert abs(calibration.delay_s - KINDS[kind].delay_s) < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
+        assert (
+            abs(calibration.delay_s - KINDS[kind].delay_s)
+            < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
+        )
         assert calibration.outliers < 5
         assert calibration.condition < 20
     assert np.median(errors) < median_mm, errors
@@ -113,7 +123,10 @@ def spoilt(held: HeldTool, how: str) -> HeldTool:
 @pytest.mark.parametrize("how", ["outliers", "lost samples", "slow joints"])
 @pytest.mark.one_case
 def test_spoilt_samples_cost_little(how: str) -> None:
-    errors = [1e3 * error_m(solve_held(spoilt(held_by("headset", seed=seed), how), CORNERS)) for seed in SEEDS]
+    errors = [
+        1e3 * error_m(solve_held(spoilt(held_by("headset", seed=seed), how), CORNERS))
+        for seed in SEEDS
+    ]
     assert np.median(errors) < 10, errors
     calibration = solve_held(spoilt(held_by("mocap"), how), CORNERS)
     assert 1e3 * error_m(calibration) < 1.5
@@ -134,39 +147,53 @@ def never_turned(held: HeldTool) -> HeldTool:
 REFUSED: dict[str, tuple[Callable[[HeldTool], HeldTool], str]] = {
     "a hand that never turned": (
         never_turned,
-        r"the positions do not determine the tracker's pose: their condition number is \d+, at most 1000 accepted\. "
-        r"The tool turned by 0° and 0°\. To determine it, turn the wrist while you lead the tool, about two axes",
+        r"the positions do not determine the tracker's pose: their condition number is \d+, at "
+        r"most 1000 accepted\. "
+        r"The tool turned by 0° and 0°\. To determine it, turn the wrist while you lead the tool, "
+        r"about two axes",
     ),
     "too little spread": (
-        lambda held: held._replace(tool=held.tool.mean(axis=0) + 0.1 * (held.tool - held.tool.mean(axis=0))),
-        r"the positions extend over \d+ x \d+ x \d cm; 5 cm or more needed in every direction\. Lead the tool farther "
+        lambda held: held._replace(
+            tool=held.tool.mean(axis=0) + 0.1 * (held.tool - held.tool.mean(axis=0))
+        ),
+        r"the positions extend over \d+ x \d+ x \d cm; 5 cm or more needed in every direction\. "
+        r"Lead the tool farther "
         r"apart, above all along \(",
     ),
     "millimetres": (
         lambda held: held._replace(hand=1e3 * held.hand),
-        r'the hand moves \d+ times as far as the tool: the tracker looks to publish mm\. Set \[hands\] unit = "mm"',
+        r"the hand moves \d+ times as far as the tool: the tracker looks to publish mm\. Set "
+        r'\[hands\] unit = "mm"',
     ),
     "metres taken for millimetres": (
         lambda held: held._replace(hand=1e-3 * held.hand),
-        r"the hand moves 0\.00\d+ times as far as the tool\. Let it publish metres, or correct \[hands\] unit",
+        r"the hand moves 0\.00\d+ times as far as the tool\. Let it publish metres, or correct "
+        r"\[hands\] unit",
     ),
-    "feet": (lambda held: held._replace(hand=held.hand / 0.3048), r"looks to publish feet\. Let it publish metres"),
+    "feet": (
+        lambda held: held._replace(hand=held.hand / 0.3048),
+        r"looks to publish feet\. Let it publish metres",
+    ),
     "mirrored axes": (
         lambda held: held._replace(hand=held.hand * [1, 1, -1]),
-        r"the tracker's axes are mirrored \(left-handed\): the residual is \d+ mm, and \d+ mm with one axis reversed\. "
+        r"the tracker's axes are mirrored \(left-handed\): the residual is \d+ mm, and \d+ mm with "
+        r"one axis reversed\. "
         r"base_from_tracker cannot express that: reverse one axis in the tracker's program",
     ),
     "a free hand": (
         lambda held: held._replace(hand=held.hand[::-1].copy()),
-        r"the hand does not move with the tool: they differ by \d+ mm while the tool moves by \d+ mm\. Hold ",
+        r"the hand does not move with the tool: they differ by \d+ mm while the tool moves by \d+ "
+        r"mm\. Hold ",
     ),
     "clocks that differ": (
         lambda held: held._replace(hand_s=held.hand_s + 0.7),
-        r"the stamps of hand and arm differ by 0\.5 s or more: synchronise the clocks|does not move with the tool",
+        r"the stamps of hand and arm differ by 0\.5 s or more: synchronise the clocks|does not "
+        r"move with the tool",
     ),
     "few samples": (
         lambda held: held._replace(hand_s=held.hand_s[:50], hand=held.hand[:50]),
-        r"50 samples of the hand and 4000 of the arm in the same time; 100 of each needed: lead the tool for longer",
+        r"50 samples of the hand and 4000 of the arm in the same time; 100 of each needed: lead "
+        r"the tool for longer",
     ),
 }
 
@@ -186,7 +213,8 @@ def test_a_single_position_far_away_costs_nothing(far_m: float) -> None:
     far = good.hand.copy()
     far[len(far) // 2, 1] = far_m
     result, expected = (
-        solved(led_of(good._replace(hand=hand), "left"), Settings(), CORNERS, "left") for hand in (far, good.hand)
+        solved(led_of(good._replace(hand=hand), "left"), Settings(), CORNERS, "left")
+        for hand in (far, good.hand)
     )
     assert error_m(result.calibration) < 1.2 * error_m(expected.calibration) + 1e-4
     assert any("1 of " in remark and "far from all others" in remark for remark in result.remarks)
@@ -196,8 +224,15 @@ def test_a_single_position_far_away_costs_nothing(far_m: float) -> None:
 @pytest.mark.parametrize("far_m", [1e20, 1e300, -1e308])
 def test_a_hand_far_away_is_refused(far_m: float) -> None:
     good = held_by("mocap")
-    with pytest.raises(CalibrationError, match=r"of the hand and .* of the arm|does not move with the tool"):
-        solved(led_of(good._replace(hand=np.full_like(good.hand, far_m)), "left"), Settings(), CORNERS, "left")
+    with pytest.raises(
+        CalibrationError, match=r"of the hand and .* of the arm|does not move with the tool"
+    ):
+        solved(
+            led_of(good._replace(hand=np.full_like(good.hand, far_m)), "left"),
+            Settings(),
+            CORNERS,
+            "left",
+        )
 
 
 def test_points_that_show_nothing_are_refused() -> None:
@@ -205,7 +240,8 @@ def test_points_that_show_nothing_are_refused() -> None:
     with pytest.raises(CalibrationError, match="3 points given; 4 or more needed, 8 recommended"):
         solve_points(hand[:3], base[:3], CORNERS)
     with pytest.raises(
-        CalibrationError, match=r"extend over \d+ x \d+ x 0 cm; 5 cm or more needed .* along \(0\.0, 0\.0, 1"
+        CalibrationError,
+        match=r"extend over \d+ x \d+ x 0 cm; 5 cm or more needed .* along \(0\.0, 0\.0, 1",
     ):
         solve_points(hand, base * [1, 1, 0], CORNERS)
     with pytest.raises(CalibrationError, match="mirrored"):
@@ -215,7 +251,9 @@ def test_points_that_show_nothing_are_refused() -> None:
 @pytest.mark.parametrize("missed_m", [0.0, 0.05, 0.3])
 @pytest.mark.parametrize("noise_m", [0.001, 0.003, 0.008])
 @pytest.mark.one_case
-def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(noise_m: float, missed_m: float) -> None:
+def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(
+    noise_m: float, missed_m: float
+) -> None:
     """Points in the plane of the table and one to three above it, as the page asks for, of which
     one may be missed. No left-handed tracker is taken for a right-handed one.
     """
@@ -239,7 +277,9 @@ def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(noise_m: flo
         except CalibrationError:
             continue
         accepted += 1
-        off_m = np.linalg.norm(calibration.mapped(turn.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1)
+        off_m = np.linalg.norm(
+            calibration.mapped(turn.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1
+        )
         assert np.sqrt(np.square(off_m).mean()) < 2.0 * calibration.std_m
     assert accepted >= (25 if missed_m == 0.3 else 70)
 
@@ -257,10 +297,17 @@ def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
         return Track(name, "", stamps, stamps + 3_000_000, poses, "mocap")
 
     def of_hand(name: str, held: HeldTool) -> Track:
-        return track(f"hands/{name}", held.hand_s, np.hstack([held.hand, np.tile([0.0, 0, 0, 1], (len(held.hand), 1))]))
+        return track(
+            f"hands/{name}",
+            held.hand_s,
+            np.hstack([held.hand, np.tile([0.0, 0, 0, 1], (len(held.hand), 1))]),
+        )
 
     tool = track("tool", held.tool_s, np.hstack([held.tool, held.turn]))._replace(frame="base")
-    return LedTracks({side: of_hand(side, held), **{name: of_hand(name, hand) for name, hand in hands.items()}}, tool)
+    return LedTracks(
+        {side: of_hand(side, held), **{name: of_hand(name, hand) for name, hand in hands.items()}},
+        tool,
+    )
 
 
 def test_of_two_hands_one_must_be_given_and_an_exchange_is_named() -> None:
@@ -269,38 +316,48 @@ def test_of_two_hands_one_must_be_given_and_an_exchange_is_named() -> None:
     streams = led_of(held, "right", left=free)
     assert solved(streams, Settings(), CORNERS, "right").frame == "mocap"
     assert solved(led_of(held), Settings(), CORNERS, None).side == "right"
-    with pytest.raises(CalibrationError, match="both hands arrive: give the one that is at the tool, by --hand"):
+    with pytest.raises(
+        CalibrationError, match="both hands arrive: give the one that is at the tool, by --hand"
+    ):
         solved(streams, Settings(), CORNERS, None)
     with pytest.raises(
-        CalibrationError, match=r"does not move .*\. hands/right moves with the tool, with a residual of 1 mm"
+        CalibrationError,
+        match=r"does not move .*\. hands/right moves with the tool, with a residual of 1 mm",
     ):
         solved(streams, Settings(), CORNERS, "left")
-    with pytest.raises(CalibrationError, match="hands/left is needed, and nothing arrives there; right arrives"):
+    with pytest.raises(
+        CalibrationError, match="hands/left is needed, and nothing arrives there; right arrives"
+    ):
         solved(led_of(held), Settings(), CORNERS, "left")
     with pytest.raises(CalibrationError, match="no hand arrives"):
         solved(streams._replace(hands={}), Settings(), CORNERS, None)
 
 
 def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
-    held, tracker = held_by("mocap"), HandSettings(frame="mocap")
+    held = held_by("mocap")
+    tracker = HandSettings(frame="mocap")
     streams = led_of(held)
-    hand, tool = streams.hands["right"], streams.tool
+    hand = streams.hands["right"]
+    tool = streams.tool
     poses = hand.poses.copy()
     poses[::7, 1] = np.nan
     clean, remarks = held_tool(hand._replace(poses=poses), tool, tracker)
     assert remarks == [
-        f"{len(poses[::7])} of {len(poses)} positions of hands/right are not finite, or far from all "
-        "others, and not used"
+        f"{len(poses[::7])} of {len(poses)} positions of hands/right are not finite, or far from "
+        "all others, and not used"
     ]
     assert 1e3 * error_m(solve_held(clean, CORNERS)) < 1.5
     gap = (held.tool_s < 10) | (held.tool_s > 14)
     clean, _ = held_tool(hand, tool.at(gap), tracker)
     assert ((clean.hand_s < 10.1) | (clean.hand_s > 13.9)).all()
-    clean, remarks = held_tool(hand._replace(stamps_ns=hand.stamps_ns - 3600 * 10**9), tool, tracker)
+    clean, remarks = held_tool(
+        hand._replace(stamps_ns=hand.stamps_ns - 3600 * 10**9), tool, tracker
+    )
     assert remarks == ["the stamps of hands/right are of another clock: times of arrival are used"]
     assert 1e3 * error_m(solve_held(clean, CORNERS)) < 1.5
     with pytest.raises(
-        CalibrationError, match=r"hands/right is in frame 'base', and \[hands\] frame is 'mocap': its pub"
+        CalibrationError,
+        match=r"hands/right is in frame 'base', and \[hands\] frame is 'mocap': its pub",
     ):
         held_tool(hand._replace(frame="base"), tool, tracker)
     with pytest.raises(CalibrationError, match="no joints/state arrived"):
@@ -308,7 +365,9 @@ def test_nan_gaps_other_clocks_and_mapped_hands_are_noticed() -> None:
     nothing = tool._replace(poses=np.full_like(tool.poses, np.nan))
     with pytest.raises(CalibrationError, match="no joints/state arrived"):
         held_tool(hand, nothing, tracker)
-    scaled, _ = held_tool(hand._replace(poses=1e3 * hand.poses), tool, HandSettings(frame="mocap", unit="mm"))
+    scaled, _ = held_tool(
+        hand._replace(poses=1e3 * hand.poses), tool, HandSettings(frame="mocap", unit="mm")
+    )
     assert 1e3 * error_m(solve_held(scaled, CORNERS)) < 1.5
     mirrored = hand.poses * (1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0)
     settings = HandSettings(frame="mocap", axes="left-handed")
@@ -330,7 +389,9 @@ FOUND = Calibration(
     outliers=3,
     remedy="",
 )
-RECORD = CalibrationRecord(date="2026-01-01", method="held", hand="right", frame="webxr", calibration=FOUND)
+RECORD = CalibrationRecord(
+    date="2026-01-01", method="held", hand="right", frame="webxr", calibration=FOUND
+)
 KEPT = '# my cell\ncell = "lab"   # its name\n\n[tool]\nmax_speed = 0.3  # [m/s]\n'
 FILES = {
     "a table with comments": (
@@ -341,27 +402,40 @@ FILES = {
     ),
     "no table": (KEPT, ["[hands]"]),
     "an inline table": ('hands = { unit = "cm" }  # short\n' + KEPT, ["# short", 'unit = "cm"']),
-    "dotted keys": ('hands.unit = "cm"\nhands.frame = "x"\n' + KEPT, ['hands.unit = "cm"', 'hands.frame = "webxr"']),
-    "several lines": (KEPT + "[hands]\nbase_from_tracker = [\n  0, 0, 0,  # position\n  0, 0, 0, 1,\n]\n", []),
+    "dotted keys": (
+        'hands.unit = "cm"\nhands.frame = "x"\n' + KEPT,
+        ['hands.unit = "cm"', 'hands.frame = "webxr"'],
+    ),
+    "several lines": (
+        KEPT + "[hands]\nbase_from_tracker = [\n  0, 0, 0,  # position\n  0, 0, 0, 1,\n]\n",
+        [],
+    ),
     "an empty file": ("", ["[hands]"]),
 }
 
 
 TRACKERS = {
     "a table": "[trackers.mocap]  # ours\n",
-    "a table between others": "[trackers.a]\n[tool]\nradius = 0.03\n[trackers.mocap]  # ours\n[trackers.b]\n",
+    "a table between others": "[trackers.a]\n[tool]\nradius = 0.03\n[trackers.mocap]  # "
+    "ours\n[trackers.b]\n",
     "an inline table": "trackers = { mocap = {} }  # ours\n",
     "dotted keys": 'trackers.mocap.unit = "mm"  # ours\n',
     "a name with a slash": '[hands]\nframe = "webxr"\n[trackers."rig/1.b"]  # ours\n',
 }
 CHANGED = [(*file, "") for file in FILES.values()]
-CHANGED += [(text, ["# ours"], "rig/1.b" if "rig" in text else "mocap") for text in TRACKERS.values()]
+CHANGED += [
+    (text, ["# ours"], "rig/1.b" if "rig" in text else "mocap") for text in TRACKERS.values()
+]
 
 
 @pytest.mark.parametrize(
-    ("text", "words", "tracker"), CHANGED, ids=[*FILES, *(f"{name} of a tracker" for name in TRACKERS)]
+    ("text", "words", "tracker"),
+    CHANGED,
+    ids=[*FILES, *(f"{name} of a tracker" for name in TRACKERS)],
 )
-def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], tracker: str, tmp_path: Path) -> None:
+def test_the_settings_are_changed_and_nothing_else(
+    text: str, words: list[str], tracker: str, tmp_path: Path
+) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(text)
     path.chmod(0o640)
@@ -373,11 +447,15 @@ def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], 
     backup = write(link, values, record, tracker)
     after = load(path)
     changed = path.read_text()
-    mapping, mapping_before = (settings.trackers[tracker] if tracker else settings.hands for settings in (after, before))
+    mapping, mapping_before = (
+        settings.trackers[tracker] if tracker else settings.hands for settings in (after, before)
+    )
     assert mapping.base_from_tracker == FOUND.base_from_tracker
     restored = msgspec.structs.replace(mapping, base_from_tracker=mapping_before.base_from_tracker)
     if tracker:
-        assert msgspec.structs.replace(after, trackers=after.trackers | {tracker: restored}) == before
+        assert (
+            msgspec.structs.replace(after, trackers=after.trackers | {tracker: restored}) == before
+        )
         with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist"):
             recorded(path, after)
         table = {"trackers": {tracker: {"base_from_tracker": list(FOUND.base_from_tracker)}}}
@@ -386,8 +464,16 @@ def test_the_settings_are_changed_and_nothing_else(text: str, words: list[str], 
         assert after.hands.frame == "webxr"
         restored = msgspec.structs.replace(restored, frame=before.hands.frame)
         assert msgspec.structs.replace(after, hands=restored) == before
-        assert [line for line in text.splitlines() if "#" in line and "hands" not in line and "frame" not in line
-                and "position" not in line and "eye" not in line and line not in changed] == []  # fmt: skip
+        assert [
+            line
+            for line in text.splitlines()
+            if "#" in line
+            and "hands" not in line
+            and "frame" not in line
+            and "position" not in line
+            and "eye" not in line
+            and line not in changed
+        ] == []
     assert [word for word in words if word not in changed] == []
     assert backup.read_text() == text
     assert path.stat().st_mode & 0o777 == 0o640
@@ -403,8 +489,13 @@ def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path
     values = hand_settings(FOUND, "webxr") | {"unit": "miles"}
     with pytest.raises(Exception, match=r"\[hands\] unit: 'miles' given"):
         write(path, values, RECORD)
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("cell.toml", "rate_hz = 200\n")]
-    with pytest.raises(CalibrationError, match=r"cell\.calibration\.json does not exist.*thirdhand calibrate --held"):
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [
+        ("cell.toml", "rate_hz = 200\n")
+    ]
+    with pytest.raises(
+        CalibrationError,
+        match=r"cell\.calibration\.json does not exist.*thirdhand calibrate --held",
+    ):
         recorded(path, load(path))
     record_path(path).write_text('{"date": 3}')
     with pytest.raises(CalibrationError, match=r"cell\.calibration\.json cannot be read: .*"):
@@ -426,7 +517,9 @@ def changed_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another program writes the file after it was read."""
     real = cell_file.tomlkit.dumps
     path.write_text("rate_hz = 200\n")
-    monkeypatch.setattr(cell_file.tomlkit, "dumps", lambda one: (path.write_text("rate_hz = 250\n"), real(one))[1])
+    monkeypatch.setattr(
+        cell_file.tomlkit, "dumps", lambda one: (path.write_text("rate_hz = 250\n"), real(one))[1]
+    )
 
 
 NOT_WRITTEN: dict[str, tuple[Callable[[Path, pytest.MonkeyPatch], object], str]] = {
@@ -434,7 +527,10 @@ NOT_WRITTEN: dict[str, tuple[Callable[[Path, pytest.MonkeyPatch], object], str]]
     "read-only": (lambda path, _: (path.touch(), path.chmod(0o444)), "cell.toml cannot be written"),
     "a folder": (lambda path, _: path.mkdir(), "cell.toml cannot be written"),
     "a pipe": (lambda path, _: os.mkfifo(path), "cell.toml cannot be written"),
-    "a link to nothing": (lambda path, _: path.symlink_to("nothing.toml"), "cannot read configuration .*cell.toml"),
+    "a link to nothing": (
+        lambda path, _: path.symlink_to("nothing.toml"),
+        "cannot read configuration .*cell.toml",
+    ),
     "a link to itself": (lambda path, _: path.symlink_to("cell.toml"), "cannot read .*cell.toml"),
     "a full disk": (
         lambda path, patch: (path.touch(), patch.setattr(cell_file.os, "fsync", no_room)),
@@ -457,13 +553,19 @@ def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
     path = tmp_path / "cell.toml"
     prepare(path, monkeypatch)
     before = path.read_text() if path.is_file() else ""
-    with pytest.raises(CalibrationError, match=rf"(?s){words}.* Write into .*base_from_tracker = \[1.2, -0.1"):
+    with pytest.raises(
+        CalibrationError, match=rf"(?s){words}.* Write into .*base_from_tracker = \[1.2, -0.1"
+    ):
         write(path, hand_settings(FOUND, "webxr"), RECORD)
     if path.is_file():
         assert path.read_text().replace("250", "200") == before
     assert not list(tmp_path.glob(".*"))
-    if path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222:  # said before the arm is led
-        done = told("calibrate", "--held", "--config", str(path), "--from", str(tmp_path / "none.mcap"))
+    if (
+        path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222
+    ):  # said before the arm is led
+        done = told(
+            "calibrate", "--held", "--config", str(path), "--from", str(tmp_path / "none.mcap")
+        )
         assert done.returncode == 1
         assert re.search(words, done.stderr)
 
@@ -471,7 +573,9 @@ def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
 # --- the command ----------------------------------------------------------------------------------
 
 
-def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings, frame: str = "mocap") -> None:
+def recording(
+    path: Path, held: HeldTool, joints: np.ndarray, settings: Settings, frame: str = "mocap"
+) -> None:
     """A recording of both hands, of which the left one holds the tool, and of joint states. The
     right one is in a frame of its own.
     """
@@ -479,9 +583,19 @@ def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings
     for at_s, hand in zip(held.hand_s, held.hand, strict=True):
         stamp = BEGIN_NS + int(1e9 * at_s)
         for side, position in (("left", hand), ("right", (0.1, 0.2, 0.3))):
-            pose = PoseStamped(stamp, "mocap" if side == "left" else frame, tuple(map(float, position)), (0.0, 0.0, 0.0, 1.0))
+            pose = PoseStamped(
+                stamp,
+                "mocap" if side == "left" else frame,
+                tuple(map(float, position)),
+                (0.0, 0.0, 0.0, 1.0),
+            )
             messages.append(
-                (stamp + 2_000_000, f"hands/{side}", "geometry_msgs/msg/PoseStamped", cdr.encode_pose(pose))
+                (
+                    stamp + 2_000_000,
+                    f"hands/{side}",
+                    "geometry_msgs/msg/PoseStamped",
+                    cdr.encode_pose(pose),
+                )
             )
     for at_s, q in zip(held.tool_s, joints, strict=True):
         stamp = BEGIN_NS + int(1e9 * at_s)
@@ -493,12 +607,23 @@ def recording(path: Path, held: HeldTool, joints: np.ndarray, settings: Settings
 
 
 def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
-    settings, arm = cell_of("ur5"), path_of("ur5", 0)
+    settings = cell_of("ur5")
+    arm = path_of("ur5", 0)
     recording(tmp_path / "led.mcap", held_by("mocap", arm="ur5"), arm.joints, settings)
     urdf = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
-    text = (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
+    text = (
+        (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml")
+        .read_text()
+        .replace('"ur5.urdf"', f'"{urdf}"')
+    )
     (tmp_path / "cell.toml").write_text(text)
-    file = ["calibrate", "--from", str(tmp_path / "led.mcap"), "--config", str(tmp_path / "cell.toml")]
+    file = [
+        "calibrate",
+        "--from",
+        str(tmp_path / "led.mcap"),
+        "--config",
+        str(tmp_path / "cell.toml"),
+    ]
     assert_refused(1, "both hands arrive: give the one that is at the tool", *file)
     cell = [*file, "--hand", "left"]
     done = succeeded(*cell)
@@ -511,49 +636,79 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     true = (*ORIGIN, *TURN.as_quat())
     np.testing.assert_allclose(after.hands.base_from_tracker, true, atol=0.002)
     done = told(*cell, "--check")
-    assert (done.returncode, done.stdout) == (0, "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"), (
-        done.stderr
-    )
+    assert (done.returncode, done.stdout) == (
+        0,
+        "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n",
+    ), done.stderr
     moved = text.replace(
-        "[joints]", f"[hands]\nframe = 'mocap'\nbase_from_tracker = {[true[0] + 0.04, *map(float, true[1:])]}\n[joints]"
+        "[joints]",
+        "[hands]\nframe = 'mocap'\nbase_from_tracker = "
+        f"{[true[0] + 0.04, *map(float, true[1:])]}\n[joints]",
     )
     (tmp_path / "cell.toml").write_text(moved.replace("np.float64(1.44)", "1.44"))
     done = told(*cell, "--check")
     assert done.returncode == 1
-    assert "hand at the tool: 40 mm (95 %: 41 mm); up to 11 mm accepted. Does the hand hold the tool" in done.stdout
+    assert (
+        "hand at the tool: 40 mm (95 %: 41 mm); up to 11 mm accepted. Does the hand hold the tool"
+        in done.stdout
+    )
     for more, code, words in (
         (("--accept", "0.1"), 1, "not accurate enough: 0."),
-        (("--hand", "right"), 1, "hands/left moves with the tool, with a residual of 1 mm: if the left hand holds it"),
+        (
+            ("--hand", "right"),
+            1,
+            "hands/left moves with the tool, with a residual of 1 mm: if the left hand holds it",
+        ),
         (("--at", "0", "0", "0"), 2, "points are touched in a running cell: --from needs no --at"),
     ):
         assert_refused(code, words, *cell, *more)
     assert load(tmp_path / "cell.toml").hands.base_from_tracker[0] == pytest.approx(1.44)
     words = "has no joints/state of the joints"
     assert_refused(
-        1, f"{words} wam/base_yaw_joint", "calibrate", "--from", str(tmp_path / "led.mcap"), "--config", "wam"
+        1,
+        f"{words} wam/base_yaw_joint",
+        "calibrate",
+        "--from",
+        str(tmp_path / "led.mcap"),
+        "--config",
+        "wam",
     )
     words = "hands/left (geometry_msgs/msg/PoseStamped), "
-    assert_refused(1, words, "calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap"))
+    assert_refused(
+        1, words, "calibrate", "--from", str(ROOT / "recordings" / "demonstration-1.mcap")
+    )
 
 
-def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(tmp_path: Path) -> None:
-    cell, led = tmp_path / "cell.toml", str(tmp_path / "led.mcap")
+def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(
+    tmp_path: Path,
+) -> None:
+    cell = tmp_path / "cell.toml"
+    led = str(tmp_path / "led.mcap")
     text = '[hands]\nframe = "webxr"\n[trackers.mocap]  # beside it\n'
     cell.write_text(text)
-    recording(tmp_path / "led.mcap", held_by("mocap"), path_of("wam", 0).joints, Settings(), "webxr")
+    recording(
+        tmp_path / "led.mcap", held_by("mocap"), path_of("wam", 0).joints, Settings(), "webxr"
+    )
     command = ["calibrate", "--from", led, "--config", str(cell)]
     done = succeeded(*command, "--hand", "left")
     assert "\n[trackers.mocap]\nbase_from_tracker = [" in done.stdout
-    np.testing.assert_allclose(load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002)
+    np.testing.assert_allclose(
+        load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002
+    )
     assert load(cell).hands == HandSettings(frame="webxr")
     assert record_path(cell, "mocap").exists()
     done = told(*command, "--check")
-    assert (done.returncode, done.stdout) == (0, "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"), (
-        done.stderr
+    assert (done.returncode, done.stdout) == (
+        0,
+        "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n",
+    ), done.stderr
+    assert_refused(
+        1, "cell.calibration.json does not exist", *command, "--check", "--hand", "right"
     )
-    assert_refused(1, "cell.calibration.json does not exist", *command, "--check", "--hand", "right")
     cell.write_text(text.replace("mocap", "optitrack"))
-    assert_refused(1, "hands/left is in frame 'mocap', which has no table", *command, "--hand", "left")
+    assert_refused(
+        1, "hands/left is in frame 'mocap', which has no table", *command, "--hand", "left"
+    )
     assert load(cell).hands == HandSettings(frame="webxr")
 
 
@@ -565,13 +720,17 @@ class LedCell:
 
     def __init__(self, endpoint: str, settings: Settings, arm: LedArm) -> None:
         self.touched: tuple[float, float, float] | None = None
-        self._session, self._settings, self._arm = open_session(connect=[endpoint], timeout_s=30), settings, arm
+        self._session = open_session(connect=[endpoint], timeout_s=30)
+        self._settings = settings
+        self._arm = arm
         self._hands = arm.tool + Rotation.from_quat(arm.turn).apply(GRIP)
         self._end, self._thread = threading.Event(), threading.Thread(target=self._publish)
         self._thread.start()
 
     def _publish(self) -> None:
-        random, begun_ns, names = np.random.default_rng(0), time.time_ns(), self._settings.joints.names
+        random = np.random.default_rng(0)
+        begun_ns = time.time_ns()
+        names = self._settings.joints.names
         while not self._end.wait(0.01):
             now_ns = time.time_ns()
             k = int((now_ns - begun_ns) / 1e7) % len(self._arm.times_s)
@@ -579,7 +738,9 @@ class LedCell:
             self._session.put("thirdhand/joints/state", cdr.encode_joints(state))
             position = self._hands[k] if self.touched is None else np.array(self.touched)
             tracked = TURN.inv().apply(position - ORIGIN) + 0.001 * random.normal(size=3)
-            pose = PoseStamped(now_ns + 35_000_000, "webxr", tuple(tracked.tolist()), (0.0, 0.0, 0.0, 1.0))
+            pose = PoseStamped(
+                now_ns + 35_000_000, "webxr", tuple(tracked.tolist()), (0.0, 0.0, 0.0, 1.0)
+            )
             self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
 
     def __enter__(self) -> LedCell:
@@ -607,7 +768,14 @@ def press_enter(process: subprocess.Popen[str]) -> None:
 
 
 LIVE = '# my cell\n[network]\nlisten = ["tcp/127.0.0.1:0"]\n[arm]\nsource = "assumed"\n'
-POINTS = ((0.5, -0.3, 0.05), (0.5, 0.3, 0.05), (0.9, 0.3, 0.1), (0.9, -0.3, 0.1), (0.7, 0.0, 0.4), (0.5, 0.0, 0.3))
+POINTS = (
+    (0.5, -0.3, 0.05),
+    (0.5, 0.3, 0.05),
+    (0.9, 0.3, 0.1),
+    (0.9, -0.3, 0.1),
+    (0.7, 0.0, 0.4),
+    (0.5, 0.0, 0.3),
+)
 
 
 @pytest.mark.timeout(600)
@@ -615,8 +783,12 @@ POINTS = ((0.5, -0.3, 0.05), (0.5, 0.3, 0.05), (0.9, 0.3, 0.1), (0.9, -0.3, 0.1)
 def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
     cell = tmp_path / "my.toml"
     cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
-    arm, true = path_of("wam", 1), (*ORIGIN, *TURN.as_quat())
-    with serving(tmp_path, "--config", str(cell)) as daemon, LedCell(daemon.endpoint, Settings(), arm) as hand:
+    arm = path_of("wam", 1)
+    true = (*ORIGIN, *TURN.as_quat())
+    with (
+        serving(tmp_path, "--config", str(cell)) as daemon,
+        LedCell(daemon.endpoint, Settings(), arm) as hand,
+    ):
         points = ["--config", str(cell), "--connect", daemon.endpoint]
         for point in POINTS:
             points += ["--at", *map(str, point)]
@@ -646,5 +818,8 @@ def test_a_point_that_decides_the_sense_of_an_axis_is_no_outlier() -> None:
     base[-1, 2] -= 0.2
     hand = TURN.inv().apply(base - ORIGIN) + np.random.default_rng(0).normal(0.0, 0.002, base.shape)
     base[-1, 2] += 0.2
-    with pytest.raises(CalibrationError, match=r"point 8 does not fit the others.*Touch it again, and two more points"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"point 8 does not fit the others.*Touch it again, and two more points",
+    ):
         solve_points(hand, base, CORNERS)

@@ -11,9 +11,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from thirdhand.workbench.trackers.camera import CameraError, HandCamera, pictures
-from thirdhand.workbench.trackers.palm import AVERAGE_PALM, PALM, PALM_CORNERS, Array, Lens, palm_pose
+from thirdhand.workbench.trackers.palm import (
+    AVERAGE_PALM,
+    PALM,
+    PALM_CORNERS,
+    Array,
+    Lens,
+    palm_pose,
+)
 
-LENS, LENGTH_M = Lens(600.0, 640, 480), 0.18
+LENS = Lens(600.0, 640, 480)
+LENGTH_M = 0.18
 HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None
 
 
@@ -29,7 +37,9 @@ def seen(turn: Rotation, centre: Array, length: float = LENGTH_M) -> tuple[Array
 def drawn(seed: int) -> tuple[Rotation, Array]:
     rng = np.random.default_rng(seed)
     facing = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T)
-    return Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * facing, rng.uniform([-0.2, -0.1, 0.35], [0.2, 0.1, 0.9])
+    return Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * facing, rng.uniform(
+        [-0.2, -0.1, 0.35], [0.2, 0.1, 0.9]
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -37,7 +47,8 @@ def test_a_palm_is_where_it_was_seen(seed: int) -> None:
     turn, centre = drawn(seed)
     picture, shape, position = seen(turn, centre)
     rough = Rotation.from_rotvec(np.random.default_rng(seed).uniform(-0.3, 0.3, 3)).apply(shape)
-    ahead, thumb = (position - centre) / np.linalg.norm(position - centre), turn.apply([0.0, 1.0, 0.0])
+    ahead = (position - centre) / np.linalg.norm(position - centre)
+    thumb = turn.apply([0.0, 1.0, 0.0])
     for side, right in (("right", -thumb), ("left", thumb)):
         pose = palm_pose(side, picture, rough, LENS, LENGTH_M)
         assert pose is not None
@@ -50,14 +61,19 @@ def test_a_palm_is_where_it_was_seen(seed: int) -> None:
 
 @pytest.mark.parametrize(
     "spoil",
-    [lambda picture: np.full_like(picture, 0.5), lambda picture: np.random.default_rng(0).random(picture.shape)],
+    [
+        lambda picture: np.full_like(picture, 0.5),
+        lambda picture: np.random.default_rng(0).random(picture.shape),
+    ],
 )
 def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) -> None:
     picture, shape, _ = seen(*drawn(2))
     assert palm_pose("left", spoil(picture), shape, LENS, LENGTH_M) is None
 
 
-@pytest.mark.skipif(not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'")
+@pytest.mark.skipif(
+    not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'"
+)
 def test_a_camera_that_is_not_there_and_a_file_that_is_no_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="no camera 63"):
         next(pictures("63"))

@@ -43,7 +43,10 @@ MOVING = """path = t => {
 STILL = """path = () => ({left: {position: [-.25, 1, -.4], quaternion: [0, 0, 0, 1]},
                           right: {position: [.25, 1, -.4], quaternion: [0, 0, 0, 1]}})"""
 # In front of a bench of 0.75 m; the browser of a busy machine draws few pictures.
-CELL = '[hands]\nframe = "webxr"\nbase_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, 0.5]\nstale_ms = 1000.0\n'
+CELL = (
+    '[hands]\nframe = "webxr"\nbase_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, '
+    "0.5]\nstale_ms = 1000.0\n"
+)
 
 
 @pytest.fixture
@@ -58,11 +61,19 @@ def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Arra
     their stamps [s].
     """
     rows = np.array(
-        [[row[0], *row[2:]] for row in json.loads(tab.ask("JSON.stringify(truth)")) if row[1] == side], dtype=float
+        [
+            [row[0], *row[2:]]
+            for row in json.loads(tab.ask("JSON.stringify(truth)"))
+            if row[1] == side
+        ],
+        dtype=float,
     )
-    offset_m, axes = headset.palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
+    offset_m, axes = headset.palm_in_hand(
+        json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side
+    )
     turns = Rotation.from_quat(rows[:, 4:8])
-    places, palms = rows[:, 1:4] + turns.apply(offset_m), turns * Rotation.from_matrix(axes)
+    places = rows[:, 1:4] + turns.apply(offset_m)
+    palms = turns * Rotation.from_matrix(axes)
     errors = []
     for pose in heard:
         distances_m = np.linalg.norm(places - pose.position, axis=1)
@@ -97,10 +108,16 @@ def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_ri
             send_more(tab, 150)
             bound_ms = tab.ask("link.clock_ms")
             for side, poses in heard.poses.items():
-                precise = [pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS]
+                precise = [
+                    pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS
+                ]
                 off_m, off_rad, late_s = compared(tab, precise, side)
                 errors = np.array([1e3 * off_m.max(), np.degrees(off_rad.max())])
-                figures = [*errors.tolist(), *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(), bound_ms]
+                figures = [
+                    *errors.tolist(),
+                    *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(),
+                    bound_ms,
+                ]
                 record_property(f"{side}: mm, degrees, stamp's error and its bound in ms", figures)
                 assert len(precise) > 100
                 assert {pose.frame_id for pose in precise} == {"webxr"}
@@ -117,7 +134,10 @@ def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
 ) -> None:
     session, endpoint = hearing
     heard = Heard(session)
-    with headset.serving_hands(endpoint, tmp_path) as served, headset.worn(served.url, tmp_path) as tab:
+    with (
+        headset.serving_hands(endpoint, tmp_path) as served,
+        headset.worn(served.url, tmp_path) as tab,
+    ):
         tab.ask(STILL)
         until(lambda: heard.poses["left"] and heard.poses["right"], within_s=TIMEOUT_S)
         tab.ask("device.hands.left.connected = false")
@@ -143,7 +163,8 @@ class Stalling:
     def __init__(self, to: int) -> None:
         self.flows = threading.Event()
         self.flows.set()
-        self._to, self._listener = to, socket.create_server(("127.0.0.1", 0))
+        self._to = to
+        self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -202,12 +223,16 @@ def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
 
 
 @pytest.mark.thorough
-def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_there(tmp_path: Path) -> None:
+def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_there(
+    tmp_path: Path,
+) -> None:
     at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up
     one_raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]", 1)
     with (
-        serving(tmp_path, "--joints", "assumed", "--rate", "100", network=LISTENING + CELL) as daemon,
+        serving(
+            tmp_path, "--joints", "assumed", "--rate", "100", network=LISTENING + CELL
+        ) as daemon,
         headset.serving_hands(daemon.endpoint, tmp_path) as served,
         headset.worn(served.url, tmp_path, without=("anchors",)) as tab,
     ):
@@ -247,6 +272,8 @@ def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_
         tab.ask("document.getElementById('resume').click()")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
         tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")
-        status = daemon.until(lambda now: now["reason"] == "stale_hand", TIMEOUT_S)  # the move alone may be a reason
+        status = daemon.until(
+            lambda now: now["reason"] == "stale_hand", TIMEOUT_S
+        )  # the move alone may be a reason
         assert status["rejected"]["wrong_frame"] > 0
         assert tab.ask("document.getElementById('frame').textContent") == "webxr1, not calibrated"

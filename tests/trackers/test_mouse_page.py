@@ -31,12 +31,16 @@ from thirdhand_sim.scene import HAND_ORIENTATION
 
 TIMEOUT_S = 90
 MAX_SPEED_M_S = 0.6
-pytestmark = pytest.mark.skipif(chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium")
+pytestmark = pytest.mark.skipif(
+    chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium"
+)
 
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with serving(tmp_path_factory.mktemp("cell"), "--joints", "assumed", "--rate", "100") as running:
+    with serving(
+        tmp_path_factory.mktemp("cell"), "--joints", "assumed", "--rate", "100"
+    ) as running:
         yield running
 
 
@@ -48,7 +52,9 @@ def url(daemon: Daemon) -> Iterator[str]:
         yield server.stdout.readline().strip()
         server.terminate()
         assert server.wait(TIMEOUT_S) == 0
-        assert re.search(r"\d+ messages with hands published, \d+ lost, 0 too late", server.stderr.read())
+        assert re.search(
+            r"\d+ messages with hands published, \d+ lost, 0 too late", server.stderr.read()
+        )
 
 
 @contextlib.contextmanager
@@ -63,8 +69,13 @@ def person_at(
         yield Person(tab)
 
 
-def until_arrived(received: Heard, side: str, to: tuple[float, float, float], within_m: float) -> None:
-    until(lambda: math.dist(received.poses[side][-1].position, to) <= within_m, f"the {side} hand is not at {to}")
+def until_arrived(
+    received: Heard, side: str, to: tuple[float, float, float], within_m: float
+) -> None:
+    until(
+        lambda: math.dist(received.poses[side][-1].position, to) <= within_m,
+        f"the {side} hand is not at {to}",
+    )
 
 
 @pytest.mark.thorough
@@ -76,9 +87,13 @@ def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_dr
         status = daemon.until(lambda status: status["mode"] == "follow")
         assert list(status["hands_at_m"]) == ["start", "handover", "glass", "soldering"]
         for i, side in enumerate(("left", "right")):
-            assert math.dist(received.poses[side][-1].position, status["hands_at_m"]["start"][i]) < 1e-3
+            assert (
+                math.dist(received.poses[side][-1].position, status["hands_at_m"]["start"][i])
+                < 1e-3
+            )
         goal = tuple(status["hands_at_m"]["handover"][0])
-        resting, begun = received.poses["right"][-1].position, len(received.poses["left"])
+        resting = received.poses["right"][-1].position
+        begun = len(received.poses["left"])
         person.drag("left", goal)
         person.arrive("left", goal)
         person.arrive("left", person.hand("left", "aim"), within_m=1e-4)
@@ -89,13 +104,19 @@ def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_dr
         assert (newest.frame_id, newest.orientation) == (BASE, HAND_ORIENTATION)
         assert abs(time.time_ns() - newest.stamp_ns) < 1e9
         # The mouse jumped through the bench within half a second; the hand did not.
-        path = np.array([[pose.stamp_ns / 1e9, *pose.position] for pose in received.poses["left"][begun:]])
+        path = np.array(
+            [[pose.stamp_ns / 1e9, *pose.position] for pose in received.poses["left"][begun:]]
+        )
         steps = np.diff(path, axis=0)
         moved = np.linalg.norm(steps[:, 1:], axis=1)
         assert moved.max() <= MAX_SPEED_M_S * 0.05 + 1e-6  # the page's longest step is 50 ms
         assert moved.sum() / (steps[:, 0].sum()) <= MAX_SPEED_M_S
         assert np.all(steps[:, 0] > 0)
-        daemon.until(lambda status: status["mode"] == "follow" and math.dist(status["hands_m"]["left"], goal) < 0.02)
+        daemon.until(
+            lambda status: (
+                status["mode"] == "follow" and math.dist(status["hands_m"]["left"], goal) < 0.02
+            )
+        )
         person.tab.ask("at('hold').click()")
         daemon.until(lambda status: status["reason"] == "operator")
         person.tab.until("at('mode').textContent.startsWith('hold')")
@@ -154,7 +175,9 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         halfway = tuple(np.mean([first, second], axis=0).tolist())
         person.drag("left", halfway)
         person.arrive("left", halfway)
-        daemon.until(lambda status: status["mode"] == "follow" and "engaging" not in status["flags"])
+        daemon.until(
+            lambda status: status["mode"] == "follow" and "engaging" not in status["flags"]
+        )
         assert tab.ask("at('correcting').hidden")
         tab.ask("at('hold').click()")
         tab.until("!at('correcting').hidden && at('correct').disabled && !!tool")
@@ -172,11 +195,15 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         assert math.dist(point.tool, goal) < 1e-3
         assert math.dist(point.left, halfway) < 5e-3
         tab.ask("at('resume').click()")
-        daemon.until(lambda status: status["mode"] == "follow" and math.dist(status["tool_m"], goal) < 5e-3)
+        daemon.until(
+            lambda status: status["mode"] == "follow" and math.dist(status["tool_m"], goal) < 5e-3
+        )
         tab.until("at('correcting').hidden && dragged === null")
         tab.ask("at('hold').click()")
         tab.until("!at('correcting').hidden")
-        assert pressed(tab, "undo").startswith("correction-1 undone: it no longer moves the tool by ")
+        assert pressed(tab, "undo").startswith(
+            "correction-1 undone: it no longer moves the tool by "
+        )
         assert daemon.client.places() == ()
         assert pressed(tab, "undo") == "correct was NOT carried out: no correction is in force"
         tab.ask("at('resume').click()")
@@ -193,7 +220,8 @@ def test_a_hidden_page_sends_nothing_and_its_hands_wait_where_they_were(
         person.tab.until("document.hidden")
         held = daemon.until(lambda status: status["mode"] == "hold")
         assert held["reason"] in ("stale_hand", "no_hands")
-        before, count = received.poses["left"][-1].position, len(received.poses["left"])
+        before = received.poses["left"][-1].position
+        count = len(received.poses["left"])
         time.sleep(0.5)
         assert len(received.poses["left"]) == count
         person.tab.uncover()

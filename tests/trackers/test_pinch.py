@@ -9,10 +9,15 @@ import pytest
 from thirdhand.client import Watch, endpoints, open_session
 from thirdhand.workbench.trackers.pinch import Pinches
 
-LEFT_M = {  # distance of thumb and index tip of the left hand, None where it is not seen: whether the clutch is pressed
+# distance of thumb and index tip of the left hand, None where it is not seen: whether the clutch is
+# pressed
+LEFT_M = {
     "parted": ([0.09], [False]),
     "pinched": ([0.09, 0.03, 0.019], [False, False, True]),
-    "held between the two distances": ([0.01, 0.03, 0.039, 0.041, 0.03], [True, True, True, False, False]),
+    "held between the two distances": (
+        [0.01, 0.03, 0.039, 0.041, 0.03],
+        [True, True, True, False, False],
+    ),
     "out of sight": ([0.01, None, 0.03, 0.01], [True, False, False, True]),
 }
 CLOSURES = [(0.10, 0.0), (0.08, 0.0), (0.05, 0.5), (0.02, 1.0), (0.0, 1.0)]

@@ -28,12 +28,20 @@ from thirdhand.settings.config import HandSettings, Settings, ToolSettings, robo
 from thirdhand.workbench.takes.demonstration_files import demonstration_paths, summary, table, uncut
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
 from thirdhand.workbench.takes.pose_streams import PoseRecording, PoseTopic
-from thirdhand.workbench.trackers.capture import JOINT_STATES, Capture, CaptureError, Sample, capture
+from thirdhand.workbench.trackers.capture import (
+    JOINT_STATES,
+    Capture,
+    CaptureError,
+    Sample,
+    capture,
+)
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import perform
 
 SETTINGS = Settings(
-    hands=HandSettings(unit="mm", frame="tracker", base_from_tracker=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    hands=HandSettings(
+        unit="mm", frame="tracker", base_from_tracker=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    )
 )
 NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s": 9.0}
 
@@ -41,7 +49,10 @@ NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s"
 @pytest.fixture(scope="module")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """One that hears, and one that is connected to it and publishes."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as hearing, open_session(connect=endpoints(hearing)) as sender:
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
+        open_session(connect=endpoints(hearing)) as sender,
+    ):
         yield hearing, sender
 
 
@@ -59,20 +70,27 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
     hearing, sender = sessions
-    taken, joints = Capture(hearing, "bench", SETTINGS), np.array(SETTINGS.arm.posture)
+    taken = Capture(hearing, "bench", SETTINGS)
+    joints = np.array(SETTINGS.arm.posture)
     publishers = {key: sender.declare_publisher(f"bench/{key}") for key in taken.samples}
     until(lambda: all(publisher.matching_status.matching for publisher in publishers.values()))
     sent = []
     for i in range(30):
         stamp = 10**18 + i * 10_000_000
         for side, y in (("left", -300.0), ("right", 300.0)):
-            sent.append(cdr.encode_pose(PoseStamped(stamp, "tracker", (10.0 * i, y, 0.0), (0.0, 0.0, 0.0, 1.0))))
+            sent.append(
+                cdr.encode_pose(
+                    PoseStamped(stamp, "tracker", (10.0 * i, y, 0.0), (0.0, 0.0, 0.0, 1.0))
+                )
+            )
             publishers[f"hands/{side}"].put(sent[-1])
         state = JointState(stamp, SETTINGS.joints.names, tuple((joints + 0.01 * i).tolist()), ())
         publishers[JOINT_STATES].put(cdr.encode_joints(state))
         heard(taken, 3 * (i + 1))
     publishers["hands/left"].put(b"no pose")
-    publishers["hands/left"].put(cdr.encode_pose(PoseStamped(0, "", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
+    publishers["hands/left"].put(
+        cdr.encode_pose(PoseStamped(0, "", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    )
     heard(taken, 92)
     taken.close()
     assert taken.malformed == {"hands/left": 2}
@@ -80,20 +98,26 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     taken.write(path)
     assert list(tmp_path.iterdir()) == [path]
     assert sorted(cdr.encode_pose(pose) for *_, pose in hand_samples(path)) == sorted(sent)
-    got, arm = read_demonstration(path), Arm(SETTINGS, robot_description(SETTINGS))
+    got = read_demonstration(path)
+    arm = Arm(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
     assert PoseRecording(path).settings == SETTINGS
-    longer = Settings(tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands)
+    longer = Settings(
+        tool=ToolSettings(plate_from_tool=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)), hands=SETTINGS.hands
+    )
     of_joints = {"tool": PoseTopic("bench/joints/state")}
     np.testing.assert_array_equal(read_demonstration(path, settings=longer).tool, got.tool)
     moved = read_demonstration(path, settings=longer, topics=of_joints).tool - got.tool
     np.testing.assert_allclose(np.linalg.norm(moved[:, :3], axis=1), 0.1)
 
 
-def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path) -> None:
+def test_what_is_not_heard_is_named(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
     with pytest.raises(
-        CaptureError, match=r"not received: hands/left, hands/right, tool/pose or joints/state\. Are tracker"
+        CaptureError,
+        match=r"not received: hands/left, hands/right, tool/pose or joints/state\. Are tracker",
     ):
         capture(sessions[0], "bench", SETTINGS, wait_s=0.0, **NOTHING)  # type: ignore[arg-type]
     empty = Capture(sessions[0], "bench", SETTINGS)
@@ -103,12 +127,16 @@ def test_what_is_not_heard_is_named(sessions: tuple[zenoh.Session, zenoh.Session
     assert list(tmp_path.iterdir()) == []
 
 
-def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event) -> None:
+def put_until(
+    told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event
+) -> None:
     """Publishes positions by key, ever again."""
     publishers = {key: told.declare_publisher(key) for key in poses}
     for i in range(2000):
         for key, position in poses.items():
-            publishers[key].put(cdr.encode_pose(PoseStamped(i + 1, "base", position, (0.0, 0.0, 0.0, 1.0))))
+            publishers[key].put(
+                cdr.encode_pose(PoseStamped(i + 1, "base", position, (0.0, 0.0, 0.0, 1.0)))
+            )
         if over.wait(0.01):
             break
 
@@ -117,15 +145,25 @@ def put_until(told: zenoh.Session, poses: dict[str, tuple[float, float, float]],
     ("poses", "wait_s", "words"),
     [
         (
-            {"bench/hands/left": (980.0, -320.0, 60.0), "bench/hands/right": (0, 0, 1), "bench/tool/pose": (0, 0, 1)},
+            {
+                "bench/hands/left": (980.0, -320.0, 60.0),
+                "bench/hands/right": (0, 0, 1),
+                "bench/tool/pose": (0, 0, 1),
+            },
             20.0,
-            r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at most 5 m from the "
+            r"^hands/left is at \(980, -320, 60\), which looks like mm; \[hands\] unit is 'm', at "
+            r"most 5 m from the "
             r"base plate accepted: set \[hands\] unit .*--config\)\. Nothing was recorded",
         ),
         (
-            {"thirdhand/hands/Left": (0, 0, 1), "bench7/hands/left": (0, 0, 1), "bench/hands/right": (0, 0, 1)},
+            {
+                "thirdhand/hands/Left": (0, 0, 1),
+                "bench7/hands/left": (0, 0, 1),
+                "bench/hands/right": (0, 0, 1),
+            },
             1.0,
-            r"not received: hands/left, tool.*; received instead: bench7/hands/left, thirdhand/hands/Left\. Are",
+            r"not received: hands/left, tool.*; received instead: bench7/hands/left, "
+            r"thirdhand/hands/Left\. Are",
         ),
     ],
 )
@@ -147,18 +185,24 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
     """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
-    taken, path = (
-        Capture(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker"))),
-        tmp_path / "a.mcap",
-    )
+    taken = Capture(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker")))
+    path = tmp_path / "a.mcap"
     taken.close()
 
     def told(tool: tuple[str, float]) -> None:
-        for key, frame, scale in (("hands/left", "tracker", 1e3), ("hands/right", "", 1e3), ("tool/pose", *tool)):
+        for key, frame, scale in (
+            ("hands/left", "tracker", 1e3),
+            ("hands/right", "", 1e3),
+            ("tool/pose", *tool),
+        ):
             taken.samples[key] = [
                 Sample(
                     10**18 + i * 10**7,
-                    cdr.encode_pose(PoseStamped(10**18 + i * 10**7, frame, (0.3 * scale, 0.0, 0.0), (0, 0, 0, 1.0))),
+                    cdr.encode_pose(
+                        PoseStamped(
+                            10**18 + i * 10**7, frame, (0.3 * scale, 0.0, 0.0), (0, 0, 0, 1.0)
+                        )
+                    ),
                     np.zeros(3),
                 )
                 for i in range(9)
@@ -169,7 +213,10 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     taken.check()
     report = summary(path)
     assert report.demonstration.tool[0, :3].tolist() == pytest.approx([0.3, 0.0, 0.0])
-    assert [line.split(":")[0] for line in report.remarks if "of motion" in line] == ["hands", "tool"]
+    assert [line.split(":")[0] for line in report.remarks if "of motion" in line] == [
+        "hands",
+        "tool",
+    ]
     told(("base", 1e3))
     words = (
         r"at \(300, 0, 0\), which looks like mm; tool/pose in frame 'base' is always in metres, "
@@ -177,10 +224,13 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
     )
     with pytest.raises(CaptureError, match=f"tool/pose is {words}"):
         taken.check()
-    with pytest.raises(RecordingError, match=f"all 9 poses on tool/pose are too far away; the first is {words}"):
+    with pytest.raises(
+        RecordingError, match=f"all 9 poses on tool/pose are too far away; the first is {words}"
+    ):
         read_demonstration(path)
     with pytest.raises(
-        RecordingError, match=r"all 9 poses on hands/left are too far away; .* \[hands\] unit is 'm', at most"
+        RecordingError,
+        match=r"all 9 poses on hands/left are too far away; .* \[hands\] unit is 'm', at most",
     ):
         read_demonstration(path, settings=Settings(hands=HandSettings(frame="tracker")))
 
@@ -195,7 +245,10 @@ def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begin
         pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
         taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
         if refused:
-            words = rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing was recorded"
+            words = (
+                rf"{key} is in frame 'camera': 'base' needed, or a configuration .*\. Nothing was "
+                r"recorded"
+            )
             with pytest.raises(CaptureError, match=words):
                 taken.check()
         else:
@@ -205,21 +258,32 @@ def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begin
 def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
     """A sample each 10 ms up to now, at places (N,) along one axis [m]."""
     times = end_ns - np.arange(len(way))[::-1] * 10_000_000
-    return [Sample(int(at_ns), b"", np.array([x, 0.0, 0.0])) for at_ns, x in zip(times, way, strict=True)]
+    return [
+        Sample(int(at_ns), b"", np.array([x, 0.0, 0.0]))
+        for at_ns, x in zip(times, way, strict=True)
+    ]
 
 
-def test_rest_after_motion_is_the_end_and_is_left_out(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
-    taken, now_ns = Capture(sessions[0], "bench", SETTINGS), time.time_ns()
+def test_rest_after_motion_is_the_end_and_is_left_out(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+) -> None:
+    taken = Capture(sessions[0], "bench", SETTINGS)
+    now_ns = time.time_ns()
     taken.close()
     noise = 0.002 * np.random.default_rng(0).standard_normal(400)
-    pause, motion = np.zeros(100), np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
+    pause = np.zeros(100)
+    motion = np.concatenate([np.zeros(100), np.linspace(0, 0.5, 150), np.full(150, 0.5)])
     for path, over in ((np.tile(pause, 4), False), (motion[:300], False), (motion, True)):
-        taken.samples |= {key: samples_of(noise[: len(path)], now_ns) for key in ("hands/left", "hands/right")}
+        taken.samples |= {
+            key: samples_of(noise[: len(path)], now_ns) for key in ("hands/left", "hands/right")
+        }
         taken.samples["tool/pose"] = samples_of(path, now_ns)
         assert taken.is_over(1.0) is over
     start_ns, end_ns = taken.span_of_motion()
     expected_ns = now_ns - np.array([(400 - 100 - 5 + 30) * 10**7, (150 + 5 - 30) * 10**7])
-    np.testing.assert_allclose(np.array([start_ns, end_ns]) - now_ns, expected_ns - now_ns, atol=6e7)
+    np.testing.assert_allclose(
+        np.array([start_ns, end_ns]) - now_ns, expected_ns - now_ns, atol=6e7
+    )
     assert taken.keep_motion() == pytest.approx((0.75, 1.25), abs=0.06)
     assert 190 < len(taken.samples["tool/pose"]) < 220
 
@@ -240,8 +304,14 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
     captured = capsys.readouterr()
-    assert "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand" in captured.err
-    assert "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after" in captured.err
+    assert (
+        "waiting for hands/left, hands/right, tool/pose or joints/state of cell thirdhand"
+        in captured.err
+    )
+    assert (
+        "recording; it ends once hands and tool stay within 15 mm (joints 0.02 rad) for 0.5 s after"
+        in captured.err
+    )
     assert "ended by rest: hands and tool stay within 15 mm" in captured.err
     assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s after it", captured.err)
     report = summary(path)
@@ -258,7 +328,8 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert main(["record", "take-1", "--trim", "0.3", "0.9", *folder]) == 0
     assert summary(path).lasts_s == pytest.approx(0.6, abs=0.1)
     assert re.search(
-        r"\d\.\d s cut to 0\.\d s; the uncut take is kept as .*take-1\.mcap\.uncut", capsys.readouterr().err
+        r"\d\.\d s cut to 0\.\d s; the uncut take is kept as .*take-1\.mcap\.uncut",
+        capsys.readouterr().err,
     )
     assert uncut(path).read_bytes() == whole
     assert demonstration_paths(path.parent) == [path]
@@ -288,13 +359,20 @@ def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     for i in range(20):
         for key in ("hands/left", "hands/right", "tool/pose"):
             position = (0.01 * i, 0.0, 0.5)
-            sender.put(f"alone/{key}", cdr.encode_pose(PoseStamped(10**18 + i * 10**7, "base", position, (0.0, 0.0, 0.0, 1.0))))
+            sender.put(
+                f"alone/{key}",
+                cdr.encode_pose(
+                    PoseStamped(10**18 + i * 10**7, "base", position, (0.0, 0.0, 0.0, 1.0))
+                ),
+            )
         heard(taken, 2 * (i + 1))
     taken.close()
     taken.write(tmp_path / "a.mcap")
     got = read_demonstration(tmp_path / "a.mcap")
     assert got.conducts == who
-    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(PoseRecording(tmp_path / "a.mcap").topics)
+    assert "hands/" + ("right" if who == "left" else "left") not in " ".join(
+        PoseRecording(tmp_path / "a.mcap").topics
+    )
     np.testing.assert_array_equal(got.left, got.right)
     lines = table(summary(tmp_path / "a.mcap")).splitlines()
     assert any(f"the {who} hand leads alone" in line for line in lines)

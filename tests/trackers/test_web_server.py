@@ -25,10 +25,18 @@ from thirdhand.workbench.trackers.pinch import Pinches
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 from trackers.test_browser_hands import opened, reason
 
-REFUSED: dict[str, tuple[bytes, str]] = {  # a request, with HOST for the header, and the answer to it
-    "a body without end": (b"POST / HTTP/1.1\r\nHOSTContent-Length: 99999999\r\n\r\n" + b"a" * 9000, "4096 bytes"),
+REFUSED: dict[
+    str, tuple[bytes, str]
+] = {  # a request, with HOST for the header, and the answer to it
+    "a body without end": (
+        b"POST / HTTP/1.1\r\nHOSTContent-Length: 99999999\r\n\r\n" + b"a" * 9000,
+        "4096 bytes",
+    ),
     "a folder above": (b"GET /../../../etc/passwd HTTP/1.1\r\nHOST\r\n", "There is no such page"),
-    "a coded folder above": (b"GET /%2e%2e/%2e%2e/etc/passwd HTTP/1.1\r\nHOST\r\n", "There is no such page"),
+    "a coded folder above": (
+        b"GET /%2e%2e/%2e%2e/etc/passwd HTTP/1.1\r\nHOST\r\n",
+        "There is no such page",
+    ),
     "a host behind a name": (b"GET / HTTP/1.1\r\nHost: other@127.0.0.1\r\n\r\n", FOREIGN),
     "half a token": (b"GET /?token=%ED%A0%80 HTTP/1.1\r\nHOST\r\n", browser_hands.NO_TOKEN),
 }
@@ -81,7 +89,9 @@ def test_silent_connections_take_no_more_than_their_share(
         asyncio.run(scenario())
 
 
-@pytest.mark.parametrize("cell", ["x`+alert(1)+`", "</title><script>", 'x"y', "${alert(1)}", "__TOKEN__"])
+@pytest.mark.parametrize(
+    "cell", ["x`+alert(1)+`", "</title><script>", 'x"y', "${alert(1)}", "__TOKEN__"]
+)
 def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
     async def scenario() -> None:
         async with serving_page(page) as address, aiohttp.ClientSession() as session:
@@ -94,7 +104,9 @@ def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
         asyncio.run(scenario())
 
 
-def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     orders: list[str] = []
     slow = threading.Event()
 
@@ -111,7 +123,11 @@ def test_a_hold_is_carried_out_while_a_page_waits_for_another_answer(monkeypatch
             received |= {message["answer"]} if "answer" in message else set()
 
     async def scenario() -> None:
-        async with serving_page(page) as address, opened(page, address) as first, opened(page, address) as second:
+        async with (
+            serving_page(page) as address,
+            opened(page, address) as first,
+            opened(page, address) as second,
+        ):
             for socket in (first, second):
                 for name in ("resume", "reset", "hold", "resume", "hold"):
                     await socket.send_str(name)
@@ -134,7 +150,9 @@ def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyP
     """Between the two distances, a hand keeps the clutch pressed only if it has pinched itself."""
     monkeypatch.setattr(browser_hands, "MAX_PINCH_GAP_S", 0.5)
     pressed: list[bool] = []
-    pinched, between = 0.01, 0.03  # [m]
+    # [m]
+    pinched = 0.01
+    between = 0.03
 
     async def says(value: bool, socket: Any = None, apart_m: float = 0.0) -> None:
         """The first thing that is heard next; a message is sent again if it was dropped."""
@@ -159,7 +177,10 @@ def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyP
             async with opened(page, address) as second:
                 await says(False, second, between)
                 await second.send_bytes(hands_message(left=(*PALM[:10], -1.0, 0.0)))
-                assert await reason(second) == (4400, "Refused: left hand: a distance of -1 m, 0 or more accepted")
+                assert await reason(second) == (
+                    4400,
+                    "Refused: left hand: a distance of -1 m, 0 or more accepted",
+                )
 
     def hear(sample: zenoh.Sample) -> None:
         pressed.append(cdr.decode_bool(sample.payload.to_bytes()))
@@ -184,7 +205,11 @@ STATUS: dict[str, Any] = {
 STRANGE: dict[str, bytes] = {  # anybody may publish a status in an open network
     "no JSON": b"\xff" * 100,
     "another type": b"[" * 10_000,
-    "an address without end": json.dumps(STATUS | {"scribe": {"live": "rerun+http://[x/"}}).encode(),
-    "a port that is none": json.dumps(STATUS | {"scribe": {"live": "rerun+http://x:999999"}}).encode(),
+    "an address without end": json.dumps(
+        STATUS | {"scribe": {"live": "rerun+http://[x/"}}
+    ).encode(),
+    "a port that is none": json.dumps(
+        STATUS | {"scribe": {"live": "rerun+http://x:999999"}}
+    ).encode(),
     "a long text": json.dumps(STATUS | {"because": "x" * 1_000_000}).encode(),
 }

@@ -71,12 +71,16 @@ class LeadingHand:
     """An arm that is led in real time, and the right hand, which holds its tool; a context."""
 
     def __init__(self, session: zenoh.Session, tab: Tab, arm: LedArm) -> None:
-        self._session, self._arm, self._end = session, arm, threading.Event()
+        self._session = session
+        self._arm = arm
+        self._end = threading.Event()
         self._begun_ns = time.time_ns()
         turns = Rotation.from_quat(arm.turn)
         rows = np.hstack([in_tracker(arm.tool + turns.apply(GRIP)), (TURN.inv() * turns).as_quat()])
         step = round(ROW_MS / 10)  # the arm has 100 rows a second
-        tab.ask(f"rows = {json.dumps(rows[::step].round(6).tolist())}; begunMs = {self._begun_ns / 1e6}")
+        tab.ask(
+            f"rows = {json.dumps(rows[::step].round(6).tolist())}; begunMs = {self._begun_ns / 1e6}"
+        )
         self._tab, self._thread = tab, threading.Thread(target=self._publish)
         self._thread.start()
 
@@ -107,8 +111,13 @@ def begin(tab: Tab, scene: Scene) -> None:
 def go(tab: Tab, places: dict[str, tuple[float, float, float]]) -> None:
     """Let palms go to places [m] in frame `base`."""
     for side, place in places.items():
-        palm, _ = headset.palm_in_hand(json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side)
-        tab.ask(f"goals = {{...goals, {side}: {json.dumps((in_tracker(np.array(place)) - palm).tolist())}}}")
+        palm, _ = headset.palm_in_hand(
+            json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side
+        )
+        tab.ask(
+            f"goals = {{...goals, {side}: "
+            f"{json.dumps((in_tracker(np.array(place)) - palm).tolist())}}}"
+        )
 
 
 def pinch(tab: Tab, value: float) -> None:
@@ -116,7 +125,9 @@ def pinch(tab: Tab, value: float) -> None:
 
 
 def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> None:
-    scene, cell, records = Scene(), tmp_path / "my.toml", tmp_path / "records"
+    scene = Scene()
+    cell = tmp_path / "my.toml"
+    records = tmp_path / "records"
     cell.write_text(CELL + f'[files]\nstate = "{tmp_path / "state"}"\n')
     serve = ("--config", str(cell), "--joints", "state", "--record", str(records))
     with serving(tmp_path, *serve) as daemon:
@@ -126,14 +137,29 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
         ):
             begin(tab, scene)
             with LeadingHand(daemon.session, tab, led(Settings(), 60.0, np.random.default_rng(2))):
-                done = told("calibrate", "--config", str(cell), "--hand", "right", "--connect", daemon.endpoint)
+                done = told(
+                    "calibrate",
+                    "--config",
+                    str(cell),
+                    "--hand",
+                    "right",
+                    "--connect",
+                    daemon.endpoint,
+                )
         assert done.returncode == 0, done.stdout + done.stderr
         assert daemon.end() == 0
     hands = load(cell).hands
     assert hands.frame == "webxr"
-    mapped_m = Rotation.from_quat(hands.base_from_tracker[3:]).apply(in_tracker(BENCH)) + hands.base_from_tracker[:3]
+    mapped_m = (
+        Rotation.from_quat(hands.base_from_tracker[3:]).apply(in_tracker(BENCH))
+        + hands.base_from_tracker[:3]
+    )
     off_m = np.linalg.norm(mapped_m - BENCH, axis=1)
-    print(done.stdout, f"mapped positions are off by {1e3 * off_m.mean():.1f} mm, at most {1e3 * off_m.max():.1f} mm")
+    print(
+        done.stdout,
+        f"mapped positions are off by {1e3 * off_m.mean():.1f} mm, at most {1e3 * off_m.max():.1f} "
+        "mm",
+    )
     assert off_m.mean() < 0.01
 
     with (
@@ -144,9 +170,20 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
     ):
         daemon.client.add(scene.via_points())
         begin(tab, scene)
-        command = ["--connect", daemon.endpoint, "--arm", str(cell), "--tracked-hands", str(TIMEOUT_S), "--once"]
+        command = [
+            "--connect",
+            daemon.endpoint,
+            "--arm",
+            str(cell),
+            "--tracked-hands",
+            str(TIMEOUT_S),
+            "--once",
+        ]
         bench = subprocess.Popen(
-            [sys.executable, "-m", "thirdhand_sim", *command], stdout=subprocess.PIPE, text=True, cwd=ROOT
+            [sys.executable, "-m", "thirdhand_sim", *command],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
         )
         with bench:
             daemon.until(lambda now: now["reason"] == "clutch", TIMEOUT_S)
@@ -159,14 +196,20 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
                     go(tab, {name.split()[0]: position for name, position in places.items()})
                     if earlier and len(new) == 2 and "left hand: lay the board here" in new:
                         pinch(tab, 0.0)
-                        daemon.until(lambda now: (now["mode"], now["reason"]) == ("hold", "clutch"), TIMEOUT_S)
+                        daemon.until(
+                            lambda now: (now["mode"], now["reason"]) == ("hold", "clutch"),
+                            TIMEOUT_S,
+                        )
                         pinch(tab, 1.0)
                     earlier |= new
             assert bench.stdout is not None
             report = json.loads(bench.stdout.read())
         assert report["success"], report
         tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")
-        daemon.until(lambda now: now["rejected"].get("wrong_frame", 0) > 0 and now["mode"] != "follow", TIMEOUT_S)
+        daemon.until(
+            lambda now: now["rejected"].get("wrong_frame", 0) > 0 and now["mode"] != "follow",
+            TIMEOUT_S,
+        )
         assert tab.ask("document.getElementById('frame').textContent") == "webxr1, not calibrated"
         assert daemon.end() == 0
 

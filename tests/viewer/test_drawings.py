@@ -32,11 +32,14 @@ def viewer(**where: Any) -> Viewer:
 
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
-def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(tmp_path: Path) -> None:
+def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(
+    tmp_path: Path,
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(600):
         if tick.index >= 400:
-            frame["mode"], frame["reason"] = Mode.FAULT, Reason.ARM_SILENT
+            frame["mode"] = Mode.FAULT
+            frame["reason"] = Reason.ARM_SILENT
         view.add(frame, at_ns(tick.index), timing)
     view.close()
     assert last_followed(tmp_path / "a.rrd", 599 * 2_000_000) == 400 * 2_000_000 - 1
@@ -45,7 +48,11 @@ def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followe
     corners = []
     for name in ("a.png", "b.png"):
         with Image.open(tmp_path / name) as picture:
-            corners.append(np.asarray(picture.crop((picture.width - 200, 0, picture.width, 28)).convert("L"), int))
+            corners.append(
+                np.asarray(
+                    picture.crop((picture.width - 200, 0, picture.width, 28)).convert("L"), int
+                )
+            )
     assert all((corner > 128).sum() > 50 for corner in corners)  # the time stands there
     assert (corners[0] != corners[1]).any()
 
@@ -55,10 +62,14 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
 ) -> None:
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
-    (tmp_path / "arm.urdf").write_text(shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(
+        shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8"
+    )
     package = tmp_path / "packages" / "wam_description"
     (package / "meshes").mkdir(parents=True)
-    (package / "package.xml").write_text("<package><name>wam_description</name></package>", encoding="utf-8")
+    (package / "package.xml").write_text(
+        "<package><name>wam_description</name></package>", encoding="utf-8"
+    )
     corner = "".join(f"  vertex {x} {y} 0\n" for x, y in ((0, 0), (1, 0), (0, 1)))
     solid = f"solid a\nfacet normal 0 0 1\n outer loop\n{corner} endloop\nendfacet\nendsolid a\n"
     (package / "meshes" / "link.stl").write_text(solid, encoding="utf-8")
@@ -79,12 +90,20 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
             view.add(frame, at_ns(tick.index), timing)
         view.close()
         rows = drawn(tmp_path / "a.rrd")
-        radii = [len(values(rows[path], "Capsules3D:radii")[0]) for path in rows if path.startswith("/arm/capsules/")]
-        assert sum(radii) == (len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0)
+        radii = [
+            len(values(rows[path], "Capsules3D:radii")[0])
+            for path in rows
+            if path.startswith("/arm/capsules/")
+        ]
+        assert sum(radii) == (
+            len(body_of(Settings(), WAM.read_text(encoding="utf-8")).capsules) if is_drawn else 0
+        )
         texts = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
         assert len(texts) == is_drawn
         assert re.search(words, "".join(texts))
-        assert "WARN" not in "".join(capfd.readouterr())  # of a library: once, in the log, is enough
+        assert "WARN" not in "".join(
+            capfd.readouterr()
+        )  # of a library: once, in the log, is enough
 
 
 def test_without_vulkan_one_line_tells_what_a_picture_needs(
@@ -101,14 +120,18 @@ def test_without_vulkan_one_line_tells_what_a_picture_needs(
 
 
 def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
-    thing = SceneObject(WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1))
+    thing = SceneObject(
+        WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1)
+    )
     view = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
     for tick, frame, timing in ticks(30):
         view.add(frame, at_ns(tick.index), timing)
         if tick.index == 10:
             view.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
             view.note("log", f"rejected: {WICKED}", at_ns(tick.index))
-            view.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index))
+            view.note(
+                "requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index)
+            )
     view.close()
     rows = drawn(tmp_path / "a.rrd")
     (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))

@@ -23,15 +23,20 @@ from thirdhand.viewer.stream import Viewer, rerun_program
 
 pytestmark = pytest.mark.thorough
 
-TIMES_REAL, SCENE_S = 4, 48  # of 500 ticks
+# of 500 ticks
+TIMES_REAL = 4
+SCENE_S = 48
 BOUND_MB = 100.0
 TIMEOUT_S = 60.0
-STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"  # the path at which browsers request the stream
+# the path at which browsers request the stream
+STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 
 
 def resident_mb() -> float:
     """What this process holds in memory [MB]."""
-    (line,) = (row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmRSS"))
+    (line,) = (
+        row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmRSS")
+    )
     return int(line.split()[1]) / 1000
 
 
@@ -46,7 +51,8 @@ class Fed:
         while not self.view.url:
             assert time.monotonic() < until
             time.sleep(0.01)
-        self.url, self._ticks = self.view.url, ticks(1_000_000)
+        self.url = self.view.url
+        self._ticks = ticks(1_000_000)
 
     def feed(self, scene_s: float) -> None:
         """Adds so much of the scene [s], in a quarter of the time."""
@@ -61,7 +67,9 @@ class Fed:
 @contextlib.contextmanager
 def browser(url: str) -> Iterator[None]:
     """A page that asked for the stream and reads nothing."""
-    connection = http.client.HTTPConnection(urlsplit(url.removeprefix("rerun+")).netloc, timeout=TIMEOUT_S)
+    connection = http.client.HTTPConnection(
+        urlsplit(url.removeprefix("rerun+")).netloc, timeout=TIMEOUT_S
+    )
     kind = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
     connection.request("POST", STREAM, bytes(5), kind)
     with contextlib.closing(connection):
@@ -72,7 +80,9 @@ def browser(url: str) -> Iterator[None]:
 def program(url: str, file: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Rerun's program, which saves what it receives."""
     quiet = subprocess.DEVNULL
-    with subprocess.Popen([str(rerun_program()), "--save", str(file), url], stdout=quiet, stderr=quiet) as viewer:
+    with subprocess.Popen(
+        [str(rerun_program()), "--save", str(file), url], stdout=quiet, stderr=quiet
+    ) as viewer:
         try:
             yield viewer
         finally:
@@ -92,7 +102,9 @@ def stopped(url: str, file: Path) -> Iterator[None]:
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still written
-def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_see_what_is_new(tmp_path: Path) -> None:
+def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_see_what_is_new(
+    tmp_path: Path,
+) -> None:
     fed = Fed()
     fed.feed(4.0)
     with browser(fed.url), stopped(fed.url, tmp_path / "stopped.rrd"):
@@ -107,7 +119,9 @@ def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_
             assert viewer.poll() is None
             assert time.monotonic() < until
             fed.feed(4.0)
-            with contextlib.suppress(OSError, KeyError, RuntimeError):  # before it has anything, or within a message
+            with contextlib.suppress(
+                OSError, KeyError, RuntimeError
+            ):  # before it has anything, or within a message
                 newest_tick = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
     fed.view.close()
     assert fed.view.problems == []

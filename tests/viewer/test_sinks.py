@@ -42,9 +42,13 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
     rows = drawn(tmp_path / "a.rrd")
     position = [row for row in rows["/joints/position"] if "tick" in row]
     assert [row["tick"] for row in position] == list(range(1200))
-    assert [row["Scalars:scalars"] for row in position] == [frame["joints"].tolist() for _, frame, _ in entries]
+    assert [row["Scalars:scalars"] for row in position] == [
+        frame["joints"].tolist() for _, frame, _ in entries
+    ]
     assert np.datetime64(position[-1]["time"], "ns") == np.datetime64(at_ns(1199), "ns")
-    names = next(row["SeriesLines:names"] for row in rows["/joints/position"] if row.get("SeriesLines:names"))
+    names = next(
+        row["SeriesLines:names"] for row in rows["/joints/position"] if row.get("SeriesLines:names")
+    )
     assert len(names) == len(JOINT_NAMES)
     work = [row["Scalars:scalars"][0] for row in rows["/timing/work"] if "tick" in row]
     assert work == pytest.approx([timing["work_us"] for *_, timing in entries])
@@ -58,16 +62,25 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
     view.log("handover taught", "INFO", at_ns(300))
     view.close()
     rows = drawn(tmp_path / "a.rrd")
-    by_path = {path: [row["tick"] for row in table if row.get("tick") is not None] for path, table in rows.items()}
+    by_path = {
+        path: [row["tick"] for row in table if row.get("tick") is not None]
+        for path, table in rows.items()
+    }
     every = list(range(0, 600, 5))
     assert by_path["/scene/tool"] == by_path["/arm/joints/3"] == every
-    assert by_path["/scene/left_hand"] == by_path["/scene/target"] == [tick for tick in every if tick >= 10]
-    assert len(by_path["/scene/tool_trail"]) == 600 // 25 - 1
-    assert [row["Points3D:positions"][0] for row in rows["/scene/left_hand"] if "tick" in row][-1] == pytest.approx(
-        entries[595][1]["hands"][0]
+    assert (
+        by_path["/scene/left_hand"]
+        == by_path["/scene/target"]
+        == [tick for tick in every if tick >= 10]
     )
+    assert len(by_path["/scene/tool_trail"]) == 600 // 25 - 1
+    assert [row["Points3D:positions"][0] for row in rows["/scene/left_hand"] if "tick" in row][
+        -1
+    ] == pytest.approx(entries[595][1]["hands"][0])
     half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
-    assert sorted(half) == pytest.approx(sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4)
+    assert sorted(half) == pytest.approx(
+        sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4
+    )
     assert [row["StateChange:state"] for row in rows["/mode"] if row.get("tick") is not None] == [
         ["hold"],
         ["follow"],
@@ -82,7 +95,9 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
     assert not [path for path in rows if "collision" in path]
 
 
-def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(tmp_path: Path) -> None:
+def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(
+    tmp_path: Path,
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(300):
         view.add(frame, at_ns(tick.index), timing)
@@ -96,7 +111,9 @@ def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(t
     assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
 
 
-def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(tmp_path: Path) -> None:
+def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(
+    tmp_path: Path,
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(900):
         if 300 <= tick.index < 600:  # away, and then back elsewhere
@@ -105,10 +122,15 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
             frame["hands"][0] += 0.5
         view.add(frame, at_ns(tick.index), timing)
     view.close()
-    strips = [batch[0] for batch in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")]
+    strips = [
+        batch[0]
+        for batch in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")
+    ]
     corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
     assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
-    steps = [np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips]
+    steps = [
+        np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips
+    ]
     assert max(step.max() for step in steps if len(step)) < 0.1
     assert any(len(strip) == 0 for strip in strips)
 
@@ -118,18 +140,35 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     for tick, frame, timing in ticks(100):
         frame["commanded"] = 1
         measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
-        view.add(frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(measured)), ("hold", b"")])
+        view.add(
+            frame,
+            at_ns(tick.index),
+            timing,
+            [("joints/state", cdr.encode_joints(measured)), ("hold", b"")],
+        )
     view.close()
     rows = drawn(tmp_path / "a.rrd")
-    assert len(values(rows["/measured/joints/3"], "tick")) == len(values(rows["/arm/joints/3"], "tick")) == 20
-    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(np.full(100, 0.02))
-    assert {path.rsplit("/", 1)[1] for path in rows if path.startswith("/measured/wam/visual_geometries/palm")}
+    assert (
+        len(values(rows["/measured/joints/3"], "tick"))
+        == len(values(rows["/arm/joints/3"], "tick"))
+        == 20
+    )
+    assert np.ravel(values(rows["/joints/error"], "Scalars:scalars")) == pytest.approx(
+        np.full(100, 0.02)
+    )
+    assert {
+        path.rsplit("/", 1)[1]
+        for path in rows
+        if path.startswith("/measured/wam/visual_geometries/palm")
+    }
 
 
 def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
     tmp_path: Path, skill: Skill
 ) -> None:
-    place = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
+    place = ViaPoint(
+        "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
+    )
     view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
     entries = list(ticks(40))
     for tick, frame, timing in entries[:20]:
@@ -142,30 +181,41 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
     assert len(lines) >= 5
     assert all(len(line) > 50 for line in lines)
-    before, after = (rows["/skill/places/tool"][index].get("Points3D:labels") or [] for index in (0, -1))
+    before, after = (
+        rows["/skill/places/tool"][index].get("Points3D:labels") or [] for index in (0, -1)
+    )
     assert "vise" not in before
     assert "vise" in after
-    half = dict(zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True))
+    half = dict(
+        zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True)
+    )
     assert half["vise"] == pytest.approx([0.03] * 3)
     assert "vise" in values(rows["/about/skill"], "TextDocument:text")[-1][0]
     (gate,) = set(np.ravel(values(rows["/deviation/gate"], "Scalars:scalars")))
     assert gate == pytest.approx(1000 * skill.threshold)
 
 
-def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Path, skill: Skill) -> None:
+def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(
+    tmp_path: Path, skill: Skill
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
     turned = Rotation.from_euler("x", 3, degrees=True)
     for tick, original, timing in ticks(200):
         frame = original.copy()
         if tick.index >= 100:
-            frame["closure"], frame["gripper"] = 0.7, CLOSED
+            frame["closure"] = 0.7
+            frame["gripper"] = CLOSED
             frame["orientation_covariance"] = np.radians(2.0) ** 2 * np.eye(3)
-            frame["tool_orientation"] = (Rotation.from_quat(frame["orientation"]) * turned).as_quat()
+            frame["tool_orientation"] = (
+                Rotation.from_quat(frame["orientation"]) * turned
+            ).as_quat()
         view.add(frame, at_ns(tick.index), timing)
     view.close()
     rows = drawn(tmp_path / "a.rrd")
     curves = {
-        path: np.ravel(values(rows[path], "Scalars:scalars")) for path in rows if path.startswith(("/turn", "/grip"))
+        path: np.ravel(values(rows[path], "Scalars:scalars"))
+        for path in rows
+        if path.startswith(("/turn", "/grip"))
     }
     assert curves["/turn/target"][-50:] == pytest.approx(3.0, abs=1e-6)
     assert curves["/turn/std"] == pytest.approx([2.0] * 100)
@@ -173,20 +223,38 @@ def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(tmp_path: Pat
     assert curves["/gripper/commanded"] == pytest.approx([100.0] * 100)
 
 
-def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(tmp_path: Path) -> None:
+def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(
+    tmp_path: Path,
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
     for tick, frame, timing in ticks(30):
         view.add(frame, at_ns(tick.index), timing)
     view.close()
     rows = drawn(tmp_path / "a.rrd")
     assert len(values(rows["/joints/position"], "tick")) == 30
-    assert any(text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT))
+    assert any(
+        text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT)
+    )
 
 
 def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
-    board = SceneObject("board", "box", "tool_plate", (0, 0, 0.05), (0, 0, 0, 1), (0.08, 0.05, 0.002), (0, 0.5, 0, 1))
+    board = SceneObject(
+        "board",
+        "box",
+        "tool_plate",
+        (0, 0, 0.05),
+        (0, 0, 0, 1),
+        (0.08, 0.05, 0.002),
+        (0, 0.5, 0, 1),
+    )
     glass = SceneObject(
-        "glass", "cylinder", "base", (0.5, 0.38, 0.16), (0, 0, 0, 1), (0.1, 0.1, 0.006), (0.7, 0.7, 0.7, 1)
+        "glass",
+        "cylinder",
+        "base",
+        (0.5, 0.38, 0.16),
+        (0, 0, 0, 1),
+        (0.1, 0.1, 0.006),
+        (0.7, 0.7, 0.7, 1),
     )
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(60):
@@ -197,13 +265,19 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
     view.note("requests", 'via_points {"op": "clear"}', at_ns(50))
     view.close()
     rows = drawn(tmp_path / "a.rrd")
-    assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {"tool_plate"}
-    assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx([0.04, 0.025, 0.001])
+    assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {
+        "tool_plate"
+    }
+    assert values(rows["/scene/things/board"], "Boxes3D:half_sizes")[0][0] == pytest.approx(
+        [0.04, 0.025, 0.001]
+    )
     assert values(rows["/scene/things/glass"], "Cylinders3D:radii")[0] == pytest.approx([0.05])
     assert values(rows["/scene/things/glass"], "Clear:is_recursive") == [[True]]
     for name, over in (("board", (0, 0, -0.01)), ("glass", (0.5, 0.38, 0.22))):
         assert values(rows[f"/scene/things/{name}/name"], "Points3D:labels")[0] == [name]
-        assert values(rows[f"/scene/things/{name}/name"], "Points3D:positions")[0][0] == pytest.approx(over)
+        assert values(rows[f"/scene/things/{name}/name"], "Points3D:positions")[0][
+            0
+        ] == pytest.approx(over)
     assert ["All via-points were removed."] in values(rows["/log"], "TextLog:text")
 
 
@@ -213,7 +287,10 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
         ('via_points {"op": "add", "points": [{"name": "a"}, {"name": "b"}]}', "Taught: a and b."),
         ('via_points {"op": "remove", "names": ["a"]}', "Removed: a."),
         ('skill {"name": "soldering"}', "Skill soldering is in force."),
-        ("via_points refused: $.points[0].left: 2 numbers", "Teaching was refused: points, entry 1, left: 2 numbers"),
+        (
+            "via_points refused: $.points[0].left: 2 numbers",
+            "Teaching was refused: points, entry 1, left: 2 numbers",
+        ),
         ("hold {}", "The operator stopped the arm, which holds until it is resumed."),
         ("reset failed: OSError()", "A request to reset failed: OSError()"),
         ("3 ticks before tick 7 are not recorded", "3 ticks before tick 7 are not recorded"),
@@ -237,7 +314,10 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
         view.add(frame, at_ns(tick.index), timing)
     with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         assert connection.getpeername()[0] == "127.0.0.1"
-    with pytest.raises(OSError, match="refused"), socket.create_connection(("127.0.0.2", port), timeout=5):
+    with (
+        pytest.raises(OSError, match="refused"),
+        socket.create_connection(("127.0.0.2", port), timeout=5),
+    ):
         pass
     view.close()
 
@@ -247,7 +327,10 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
     [
         (["a.rrd", "--screenshot", "."], "is a folder; the name of a file needed"),
         (["a.rrd", "--screenshot", "a.jpg"], r"a name that ends in \.png needed"),
-        (["a.rrd", "--screenshot", "a.png", "--time", "-1"], "from 0 on, together with --screenshot"),
+        (
+            ["a.rrd", "--screenshot", "a.png", "--time", "-1"],
+            "from 0 on, together with --screenshot",
+        ),
         (["a.rrd", "--time", "3"], "together with --screenshot, needed"),
         (["a.rrd", "--web"], "thirdhand view live --web"),
         (["live", "a.rrd"], "live and 1 files given; either live or files needed"),
@@ -273,12 +356,17 @@ def test_what_cannot_be_shown_is_said_in_words(
     assert len(stderr.splitlines()) == 1
 
 
-def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(tmp_path: Path) -> None:
+def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(
+    tmp_path: Path,
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(100):
         measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
         view.add(
-            frame, at_ns(tick.index), timing, [("joints/state", cdr.encode_joints(measured))] if tick.index > 50 else []
+            frame,
+            at_ns(tick.index),
+            timing,
+            [("joints/state", cdr.encode_joints(measured))] if tick.index > 50 else [],
         )
     view.close()
     rows = drawn(tmp_path / "a.rrd")
@@ -290,7 +378,9 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
 
 
 @pytest.mark.parametrize("conducts", [1])
-def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path, conducts: int) -> None:
+def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(
+    tmp_path: Path, conducts: int
+) -> None:
     view = viewer(rrd=tmp_path / "a.rrd")
     for tick, frame, timing in ticks(200):
         frame["hand_ages"][1 - conducts] = -1
@@ -303,7 +393,9 @@ def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(tmp_path: Path
     assert values(rows["/scene/target"], "tick") == followed[::5]
     for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
         assert values(rows[path], "tick") == followed
-        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(np.full(190, expected)), path
+        assert np.ravel(values(rows[path], "Scalars:scalars")) == pytest.approx(
+            np.full(190, expected)
+        ), path
     ages = np.array(values(rows["/age"], "Scalars:scalars"))
     assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
     assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there

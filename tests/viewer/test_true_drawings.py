@@ -25,7 +25,11 @@ from thirdhand.skills.skill_file import with_file
 from thirdhand.workbench.cli.view import convert
 
 VISE = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
-MEASURED_AT, TAUGHT_AT, LATE_AT, HELD_AT = 55, 155, 205, 255  # between whole frames
+# between whole frames
+MEASURED_AT = 55
+TAUGHT_AT = 155
+LATE_AT = 205
+HELD_AT = 255
 
 
 def log_of(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
@@ -33,9 +37,13 @@ def log_of(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
     return {row[TEXT][0]: row["seconds"].total_seconds() for row in rows["/log"] if row.get(TEXT)}
 
 
-def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(tmp_path: Path, skill: Skill) -> None:
+def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(
+    tmp_path: Path, skill: Skill
+) -> None:
     taught = with_file(replace(skill, via_points=(VISE,))).file
-    with Recorder(tmp_path / "a.mcap", settings=Settings(), skill=skill.file, thin=True) as recorder:
+    with Recorder(
+        tmp_path / "a.mcap", settings=Settings(), skill=skill.file, thin=True
+    ) as recorder:
         recorder.note("log", "before the first tick", at_ns(0) - 3_000_000_000)
         for tick, frame, timing in ticks(400):
             inbox = []
@@ -45,12 +53,17 @@ def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(tmp_pat
             if tick.index == TAUGHT_AT:
                 inbox = [Event("skill", taught, None)]
             if tick.index == HELD_AT:
-                frame["mode"], frame["reason"] = Mode.HOLD, Reason.OPERATOR
+                frame["mode"] = Mode.HOLD
+                frame["reason"] = Reason.OPERATOR
             timing["lateness_us"] = 3000 if tick.index == LATE_AT else 10
-            recorder.write(Tick(tick.index, tuple(inbox)), frame, time_ns=at_ns(tick.index), timing=timing)
+            recorder.write(
+                Tick(tick.index, tuple(inbox)), frame, time_ns=at_ns(tick.index), timing=timing
+            )
         recorder.note("requests", 'via_points {"op": "clear"}', at_ns(450))
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 400
-    whole = [step.tick for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None]
+    whole = [
+        step.tick for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None
+    ]
     rows = drawn(tmp_path / "a.rrd")
     assert values(rows["/joints/position"], "tick") == whole
     assert {0, HELD_AT, HELD_AT + 1} < set(whole)
@@ -62,12 +75,16 @@ def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(tmp_pat
     assert [tick for tick in values(rows["/joints/error"], "tick") if tick > MEASURED_AT] == [
         tick for tick in whole if tick > MEASURED_AT
     ]
-    late = dict(zip(whole, np.ravel(values(rows["/timing/lateness"], "Scalars:scalars")), strict=True))
+    late = dict(
+        zip(whole, np.ravel(values(rows["/timing/lateness"], "Scalars:scalars")), strict=True)
+    )
     assert max(late, key=lambda tick: late[tick]) == 220  # the next whole frame
     assert any("vise" in labels for labels in values(rows["/skill/places/tool"], "Points3D:labels"))
 
 
-@pytest.mark.parametrize(("lost", "pause_ticks", "is_broken"), [(5, 5, True), (0, 500, True), (0, 3, False)])
+@pytest.mark.parametrize(
+    ("lost", "pause_ticks", "is_broken"), [(5, 5, True), (0, 500, True), (0, 3, False)]
+)
 def test_curves_and_trails_are_interrupted_where_frames_are_missing(
     tmp_path: Path, lost: int, pause_ticks: int, is_broken: bool
 ) -> None:
@@ -78,20 +95,40 @@ def test_curves_and_trails_are_interrupted_where_frames_are_missing(
         for number, (source, frame, timing) in enumerate(ticks(400)):
             index = source.index + pause_ticks * (number >= 203)
             frame["tick"] = timing["tick"] = index
-            recorder.write(Tick(index), frame, time_ns=at_ns(index), timing=timing, lost=lost * (number == 203))
+            recorder.write(
+                Tick(index), frame, time_ns=at_ns(index), timing=timing, lost=lost * (number == 203)
+            )
     convert(tmp_path / "a.mcap", tmp_path / "a.rrd")
     rows = drawn(tmp_path / "a.rrd")
-    for path in ("/joints/position", "/speed/left", "/error/target", "/timing/work", "/deviation/target"):
-        curve = sorted((row["tick"], np.isnan(row["Scalars:scalars"]).any()) for row in rows[path] if "tick" in row)
+    for path in (
+        "/joints/position",
+        "/speed/left",
+        "/error/target",
+        "/timing/work",
+        "/deviation/target",
+    ):
+        curve = sorted(
+            (row["tick"], np.isnan(row["Scalars:scalars"]).any())
+            for row in rows[path]
+            if "tick" in row
+        )
         breaks = [tick for tick, is_break in curve if is_break]
         assert breaks == [201] * is_broken, path  # after the last frame before the gap
-    trails = {row["tick"]: len(row["LineStrips3D:strips"][0]) for row in rows["/scene/left_trail"] if "tick" in row}
+    trails = {
+        row["tick"]: len(row["LineStrips3D:strips"][0])
+        for row in rows["/scene/left_trail"]
+        if "tick" in row
+    }
     after = min(tick for tick in trails if tick > 210)
     assert (trails[after] == 1) == is_broken
-    assert (f"gap after tick 202, before tick 208: {lost} ticks not recorded" in log_of(rows)) == bool(lost)
+    assert (
+        f"gap after tick 202, before tick 208: {lost} ticks not recorded" in log_of(rows)
+    ) == bool(lost)
 
 
-def test_a_recording_that_cannot_be_read_to_its_end_leaves_no_part_of_a_drawing(tmp_path: Path) -> None:
+def test_a_recording_that_cannot_be_read_to_its_end_leaves_no_part_of_a_drawing(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path, settings=Settings(), skill=SKILL) as recorder:
         for tick, frame, timing in ticks(40):

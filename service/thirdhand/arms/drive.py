@@ -77,14 +77,21 @@ def follow(
     Raises DriveError, also if commands arrive too slowly to be followed, and UnreachableError if no
     command arrives within `wait_s` [s].
     """
-    playback = Playback(drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits)
-    passed_s, told_s, following, refused = 0.0, 0.0, False, 0
+    playback = Playback(
+        drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits
+    )
+    passed_s = 0.0
+    told_s = 0.0
+    following = False
+    refused = 0
     with Follower(session, drive.limits.names, cell) as follower, drive:
         while True:
             measured = drive.read()
             passed_s += measured.elapsed_s
             if passed_s - told_s >= 0.9 * max(playback.tick_s, SHORTEST_TICK_S):
-                follower.tell(playback.in_turn(measured.position).tolist(), measured.velocity.tolist())
+                follower.tell(
+                    playback.in_turn(measured.position).tolist(), measured.velocity.tolist()
+                )
                 told_s = passed_s
             stopping = stop.is_set()
             moved = playback.step(
@@ -96,16 +103,24 @@ def follow(
             if stopping and not playback.following and not moved.velocity.any():
                 return playback
             if following != playback.following:
-                following, wait_s = not following, float("inf")
-                say("commands arrive, the arm follows" if following else "no commands arrive, the arm brakes")
+                following = not following
+                wait_s = float("inf")
+                say(
+                    "commands arrive, the arm follows"
+                    if following
+                    else "no commands arrive, the arm brakes"
+                )
             if (reason := playback.too_slow) and not moved.velocity.any():
                 raise DriveError(f"the daemon of cell {cell}: {reason}")
             if playback.refused and not refused:
                 say(f"command refused: {playback.reason}")
             refused = playback.refused
             if passed_s > wait_s:
-                others = f"; {follower.rejected} were for another arm: {follower.reason}" * (follower.rejected > 0)
+                others = f"; {follower.rejected} were for another arm: {follower.reason}" * (
+                    follower.rejected > 0
+                )
                 raise UnreachableError(
-                    f"no command arrived on {key(cell, 'joints/command')} within {wait_s:g} s{others}: is the daemon "
-                    "running in this cell? `thirdhand doctor` shows what it waits for"
+                    f"no command arrived on {key(cell, 'joints/command')} within {wait_s:g} "
+                    f"s{others}: is the daemon running in this cell? `thirdhand doctor` shows what "
+                    "it waits for"
                 )

@@ -18,11 +18,15 @@ from thirdhand.settings.config import JointSettings, Settings
 
 FRANKA_PERIOD_S = 0.001
 # [rad/s², rad/s³] The robot allows 10 and 5000, but extrapolates over lost packets by itself.
-ACCELERATION, JERK = 9.0, 4000.0
+ACCELERATION = 9.0
+JERK = 4000.0
 CATCH_UP_RATIO = 1.1  # drive speed / commanded speed: the playback makes up for delays
-BRAKE = 5.0  # [rad/s²] assumed deceleration toward a joint's end, below ACCELERATION to follow the falling limit
+# [rad/s²] assumed deceleration toward a joint's end, below ACCELERATION to follow the falling limit
+BRAKE = 5.0
 LIMIT_LOOKAHEAD_S = 0.01  # the speed limit is evaluated at position + 0.01 s * velocity
-LIMIT_MARGIN_RADPS = 0.03  # the speed remains below the robot's limit by this, for the jerk of a braking
+LIMIT_MARGIN_RADPS = (
+    0.03  # the speed remains below the robot's limit by this, for the jerk of a braking
+)
 # https://frankarobotics.github.io/docs, "Limits for Franka Research 3": the largest velocity is
 # min(MAX_VELOCITY, sqrt(TWICE * distance) - OFFSET) [rad/s], for the distance [rad] to a joint's
 # end.
@@ -35,10 +39,13 @@ TWICE = np.array((12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0))
 
 def speed_limits(position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
     """Lowest and highest velocity (7,) [rad/s], within the robot's limits at this position."""
-    ahead_rad, twice = position + LIMIT_LOOKAHEAD_S * velocity, np.minimum(TWICE, 2.0 * BRAKE)
+    ahead_rad = position + LIMIT_LOOKAHEAD_S * velocity
+    twice = np.minimum(TWICE, 2.0 * BRAKE)
     up = np.sqrt(twice * np.maximum(UPPER_RAD - ahead_rad, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
     down = np.sqrt(twice * np.maximum(ahead_rad - LOWER_RAD, 0.0)) - OFFSET - LIMIT_MARGIN_RADPS
-    return -np.clip(down, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS), np.clip(up, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS)
+    return -np.clip(down, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS), np.clip(
+        up, 0.0, MAX_VELOCITY - LIMIT_MARGIN_RADPS
+    )
 
 
 ROBOT_SPEED_LIMITS: SpeedLimits | None = speed_limits
@@ -48,18 +55,24 @@ def limits_of(joints: JointSettings) -> JointSettings:
     """The limits of the playback for a Franka whose commands have these limits. Raises
     DriveError.
     """
-    least, most = LOWER_RAD - 0.2, UPPER_RAD + 0.2
+    least = LOWER_RAD - 0.2
+    most = UPPER_RAD + 0.2
     if len(joints.names) != len(LOWER_RAD):
-        raise DriveError(f"a Franka has 7 joints, {len(joints.names)} are configured: give --config with its own URDF")
+        raise DriveError(
+            f"a Franka has 7 joints, {len(joints.names)} are configured: give --config with its "
+            "own URDF"
+        )
     if (np.array(joints.lower) < least).any() or (np.array(joints.upper) > most).any():
         raise DriveError(
-            f"a Franka's joints move from {least.tolist()} to {most.tolist()} rad, the configured ones farther: "
-            "give --config with its own URDF"
+            f"a Franka's joints move from {least.tolist()} to {most.tolist()} rad, the configured "
+            "ones farther: give --config with its own URDF"
         )
     return msgspec.structs.replace(
         joints,
         velocity=tuple(
-            np.minimum(CATCH_UP_RATIO * np.array(joints.velocity), MAX_VELOCITY - LIMIT_MARGIN_RADPS).tolist()
+            np.minimum(
+                CATCH_UP_RATIO * np.array(joints.velocity), MAX_VELOCITY - LIMIT_MARGIN_RADPS
+            ).tolist()
         ),
         acceleration=(ACCELERATION,) * len(LOWER_RAD),
         jerk=(JERK,) * len(LOWER_RAD),
@@ -75,21 +88,25 @@ class FrankaArm:
     takes_velocity: bool = True
 
     def __init__(self, settings: Settings, address: str) -> None:
-        self.limits, self.speed_limits = limits_of(settings.joints), ROBOT_SPEED_LIMITS
+        self.limits = limits_of(settings.joints)
+        self.speed_limits = ROBOT_SPEED_LIMITS
         try:
             import pylibfranka
         except ImportError as error:
             raise DriveError(
-                f"pylibfranka cannot be imported ({error}): pip install 'thirdhand[franka]', under Python 3.11 or 3.12"
+                f"pylibfranka cannot be imported ({error}): pip install 'thirdhand[franka]', under "
+                "Python 3.11 or 3.12"
             ) from None
-        self._library, self._address = pylibfranka, address
+        self._library = pylibfranka
+        self._address = address
         self._control: Any = None
         try:  # the caller requests real-time scheduling for the loop
             self._robot = pylibfranka.Robot(address, pylibfranka.RealtimeConfig.kIgnore)
             self._state = self._robot.read_once()
         except RuntimeError as error:  # the library's exceptions have no other common base
             raise DriveError(
-                f"no Franka at {address}: {error}. Is it on, is FCI active in Desk, and is --robot its address?"
+                f"no Franka at {address}: {error}. Is it on, is FCI active in Desk, and is --robot "
+                "its address?"
             ) from None
 
     def __enter__(self) -> FrankaArm:
@@ -120,5 +137,6 @@ class FrankaArm:
             return what()
         except RuntimeError as error:
             raise DriveError(
-                f"the Franka at {self._address} stopped: {error}. Look at Desk, free and unlock it, then restart"
+                f"the Franka at {self._address} stopped: {error}. Look at Desk, free and unlock "
+                "it, then restart"
             ) from None

@@ -21,26 +21,34 @@ from thirdhand.core.intake.arm_samples import in_turn
 from thirdhand.core.limiter.stage import Limited, Limiter
 from thirdhand.settings.config import RATES_HZ, JointSettings
 
-REJOIN_AFTER_S = 0.1  # a new sequence begins after this silence, or at a tick number this far from the last
-REJOIN_RAD, REJOIN_RADPS = 0.05, 0.05  # a new sequence must begin within this of the standing arm
+REJOIN_AFTER_S = (
+    0.1  # a new sequence begins after this silence, or at a tick number this far from the last
+)
+# a new sequence must begin within this of the standing arm
+REJOIN_RAD = 0.05
+REJOIN_RADPS = 0.05
 TICK_RANGE_S = (
     0.9 / RATES_HZ[1],
     1.1 / RATES_HZ[0],
 )  # a difference of stamps per tick outside shows that a clock was set
 TICK_SAMPLES = 15  # the length of a tick is the mean over these samples
 TICK_OUTLIER = 0.1  # samples that differ from their median by a larger share are left out
-MAX_DELAY_S = BRAKE_AFTER_S  # with a longer delay the arm would brake before the newest command is played
+MAX_DELAY_S = (
+    BRAKE_AFTER_S  # with a longer delay the arm would brake before the newest command is played
+)
 POSITION_GAIN_HZ = 8.0  # velocity += 8 / s * position error
 MAX_CORRECTION_RADPS = 0.25  # limit of that correction, for the error after a pause
 VELOCITY_GAIN = 30.0  # [1/s] max. gain: acceleration += gain * velocity error
-SETTLED_RADPS = 1.0  # gain <= sqrt(max. jerk / 1 rad/s): an error below 1 rad/s is corrected within the jerk limit
+# gain <= sqrt(max. jerk / 1 rad/s): an error below 1 rad/s is corrected within the jerk limit
+SETTLED_RADPS = 1.0
 JERK_SHARE = 0.999  # share of the jerk limit that is used, because of rounding
 CATCH_UP_S = 0.1  # the delay approaches the needed delay with this time constant
 MAX_CATCH_UP_SHARE = 0.05  # approaching it changes the speed by at most this share
 DELAY_DECAY = 0.005  # [s/s] the delay shrinks at this rate while commands arrive evenly
 MAX_ELAPSED_S = 0.1  # a longer time between two steps is a clock that was set, and is ignored
 CLOCK_SHARE = 0.02  # each step makes up this share of the loop's lateness
-LOOP_PAUSE_S = 0.005  # a larger lateness is a pause of the loop, made up at once: it shows nothing about the network
+# a larger lateness is a pause of the loop, made up at once: it shows nothing about the network
+LOOP_PAUSE_S = 0.005
 EXTRAPOLATED_S = 0.004  # beyond the newest command the acceleration is held for this time
 MIN_TIMED_RADPS = 0.01  # a slower motion does not show its duration
 LIMIT_TOLERANCE = 1e-6  # [rad, rad/s] commands may exceed limits by rounding
@@ -76,15 +84,23 @@ class Playback:
         period_s: float,
         speed_limits: SpeedLimits | None = None,
     ) -> None:
-        self.refused, self.reason = 0, ""  # number of refused commands, and the reason of the last one
+        # number of refused commands, and the reason of the last one
+        self.refused = 0
+        self.reason = ""
         self.tick_s = 0.0  # measured period of the commands; 0: not known yet
-        self._period_s, self._speed_limits, self._limits = period_s, speed_limits, limits
-        self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
-        self._max_velocity, max_jerk = np.array(limits.velocity), np.array(limits.jerk)
+        self._period_s = period_s
+        self._speed_limits = speed_limits
+        self._limits = limits
+        self._lower = np.array(limits.lower)
+        self._upper = np.array(limits.upper)
+        self._max_velocity = np.array(limits.velocity)
+        max_jerk = np.array(limits.jerk)
         self._parameters = parameters(
             period_s=period_s,
             max_acceleration=np.array(limits.acceleration),
-            max_change=JERK_SHARE * period_s * max_jerk,  # [rad/s²] change of acceleration in a period
+            max_change=JERK_SHARE
+            * period_s
+            * max_jerk,  # [rad/s²] change of acceleration in a period
             velocity_gain=np.minimum(VELOCITY_GAIN, np.sqrt(max_jerk / SETTLED_RADPS)),
         )
         self._limiter = Limiter(limits, period_s)
@@ -93,8 +109,12 @@ class Playback:
         self._knots: deque[Knot] = deque()
         self._newest: Knot | None = None  # newest command of the present sequence
         self._newest_stamp_ns = 0
-        self._lengths_s: deque[float] = deque(maxlen=TICK_SAMPLES)  # lengths of ticks in the present sequence
-        self._now = self._heard = 0.0  # [s] time by counting steps, and the time at which the newest command arrived
+        self._lengths_s: deque[float] = deque(
+            maxlen=TICK_SAMPLES
+        )  # lengths of ticks in the present sequence
+        self._now = self._heard = (
+            0.0  # [s] time by counting steps, and the time at which the newest command arrived
+        )
         self._lateness_s = 0.0  # time of the drive's clock that is not made up yet
         self._offset = self._needed = 0.0
         knots = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
@@ -103,7 +123,9 @@ class Playback:
         self._knots.clear()
         self._moved()
         self._paused = False  # True if the loop paused before this step
-        self._offset = self._needed = 0.0  # [s] present and needed delay from the motion's time to the time of writing
+        self._offset = self._needed = (
+            0.0  # [s] present and needed delay from the motion's time to the time of writing
+        )
 
     @property
     def following(self) -> bool:
@@ -149,12 +171,17 @@ class Playback:
             self._lateness_s += elapsed_s - self._period_s
         self._paused = self._lateness_s > LOOP_PAUSE_S
         most = 0.1 * self._period_s
-        made_up = self._lateness_s if self._paused else min(max(CLOCK_SHARE * self._lateness_s, -most), most)
+        made_up = (
+            self._lateness_s
+            if self._paused
+            else min(max(CLOCK_SHARE * self._lateness_s, -most), most)
+        )
         self._lateness_s -= made_up
         self._now += self._period_s + made_up
         for command in commands:
             if reason := self._take(command):
-                self.refused, self.reason = self.refused + 1, reason
+                self.refused = self.refused + 1
+                self.reason = reason
         if self._paused and self._newest is not None and self._heard == self._now:
             self._needed = max(self._needed, self._now - self._newest.time_s)
         if self._now - self._heard > BRAKE_AFTER_S:
@@ -166,56 +193,89 @@ class Playback:
     def _moved(self) -> Limited:
         """The joints one period later."""
         q, dq, ddq = self._state
-        return self._limiter.step(q, dq, ddq, self._wanted()) if self.following else self._limiter.stop(q, dq, ddq)
+        return (
+            self._limiter.step(q, dq, ddq, self._wanted())
+            if self.following
+            else self._limiter.stop(q, dq, ddq)
+        )
 
     def _take(self, command: Command) -> str:
         """Queue a command; returns the reason if it is refused, else an empty text."""
-        position, velocity = np.array(command.position), np.array(command.velocity)
-        arm_position, last = self._state[0], self._newest
+        position = np.array(command.position)
+        velocity = np.array(command.velocity)
+        arm_position = self._state[0]
+        last = self._newest
         if not position.shape == velocity.shape == arm_position.shape:
             return f"{len(command.position)} joints, {len(arm_position)} needed"
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             return "a joint that is not finite"
-        outside = np.maximum(np.minimum(self._lower, arm_position) - position, position - np.maximum(self._upper, arm_position))
+        outside = np.maximum(
+            np.minimum(self._lower, arm_position) - position,
+            position - np.maximum(self._upper, arm_position),
+        )
         if outside.max() > LIMIT_TOLERANCE:
-            return f"joint {outside.argmax() + 1} outside its limits: {position[outside.argmax()]:.3f} rad"
+            return (
+                f"joint {outside.argmax() + 1} outside its limits: "
+                f"{position[outside.argmax()]:.3f} rad"
+            )
         if (fast := np.abs(velocity) - self._max_velocity).max() > LIMIT_TOLERANCE:
-            return f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} rad/s"
+            return (
+                f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} "
+                "rad/s"
+            )
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
         ticks = 0 if last is None else tick - last.tick
         if last is None or max(self._now - self._heard, abs(ticks) * self.tick_s) > REJOIN_AFTER_S:
             deviation_rad = (np.abs(position - arm_position) / np.array(self._limits.per_rad)).max()
-            if self._state[1:].any() or deviation_rad > REJOIN_RAD or np.abs(velocity).max() > REJOIN_RADPS:
-                return f"a new sequence that does not begin where the arm stands: {deviation_rad:.3f} rad off, or moving"
+            if (
+                self._state[1:].any()
+                or deviation_rad > REJOIN_RAD
+                or np.abs(velocity).max() > REJOIN_RADPS
+            ):
+                return (
+                    f"a new sequence that does not begin where the arm stands: {deviation_rad:.3f} "
+                    "rad off, or moving"
+                )
             self._knots.clear()
             self._lengths_s.clear()
             time_s = self._now
         elif ticks <= 0:
             return ""  # a late or repeated command is ignored
         else:
-            lengths_s, since_s = self._lengths_s.copy(), (command.stamp_ns - self._newest_stamp_ns) * 1e-9
+            lengths_s = self._lengths_s.copy()
+            since_s = (command.stamp_ns - self._newest_stamp_ns) * 1e-9
             if TICK_RANGE_S[0] <= since_s / ticks <= TICK_RANGE_S[1]:
                 lengths_s.append(since_s / ticks)
             if not (tick_s := _mean_length(lengths_s) if lengths_s else self.tick_s):
                 return (
-                    f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after the command before, "
-                    f"{1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a tick needed"
+                    f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after "
+                    f"the command before, {1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a "
+                    "tick needed"
                 )
-            if (np.abs(position - last.values[0]) > self._max_velocity * ticks * tick_s + LIMIT_TOLERANCE).any():
+            if (
+                np.abs(position - last.values[0])
+                > self._max_velocity * ticks * tick_s + LIMIT_TOLERANCE
+            ).any():
                 return "a jump from the command before"
-            self.tick_s, self._lengths_s = tick_s, lengths_s
+            self.tick_s = tick_s
+            self._lengths_s = lengths_s
             time_s = last.time_s + tick_s * _steps(last, position, velocity, ticks, tick_s)
         latest = self._now - time_s + MAX_DELAY_S
-        if self._knots:  # the segment to this command is known only now, but was needed at its begin
+        if (
+            self._knots
+        ):  # the segment to this command is known only now, but was needed at its begin
             begins_s = self._knots[-1].time_s
-            if time_s - begins_s < 2.5 * self.tick_s:  # a single lost command does not increase the delay
+            if (
+                time_s - begins_s < 2.5 * self.tick_s
+            ):  # a single lost command does not increase the delay
                 begins_s = time_s - self.tick_s
             needed = self._needed if self._paused else self._now - begins_s
             self._needed = min(max(self._needed, needed), latest)
             self._offset = min(self._offset, latest)
         else:
             self._needed = self._offset = self._now - time_s
-        self._newest, self._heard = Knot(tick, time_s, np.stack((position, velocity))), self._now
+        self._newest = Knot(tick, time_s, np.stack((position, velocity)))
+        self._heard = self._now
         self._newest_stamp_ns = command.stamp_ns
         if reason := no_room_to_brake(self.tick_s):
             self._knots.clear()
@@ -225,13 +285,16 @@ class Playback:
 
     def _wanted(self) -> Vector:
         """Target velocities (J,) [rad/s] for this period."""
-        slower = min(max((self._needed - self._offset) / CATCH_UP_S, -MAX_CATCH_UP_SHARE), MAX_CATCH_UP_SHARE)
+        slower = min(
+            max((self._needed - self._offset) / CATCH_UP_S, -MAX_CATCH_UP_SHARE), MAX_CATCH_UP_SHARE
+        )
         self._offset += slower * self._period_s
         self._needed -= DELAY_DECAY * self._period_s
         playhead_s = self._now - self._offset
         while len(self._knots) > 2 and self._knots[1].time_s <= playhead_s:
             self._knots.popleft()
-        first, second = self._knots[0], self._knots[1]
+        first = self._knots[0]
+        second = self._knots[1]
         span = np.array((first.time_s, second.time_s, playhead_s, slower))
         velocities: Vector = np.empty_like(self._state[1])
         _aim(self._state, first.values, second.values, span, self._parameters, velocities)
@@ -257,7 +320,9 @@ def _steps(last: Knot, position: Vector, velocity: Vector, ticks: int, tick_s: f
 
 
 @compiled
-def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters: Records, wanted: Vector) -> None:
+def _aim(
+    state: Vector, first: Vector, second: Vector, span: Vector, parameters: Records, wanted: Vector
+) -> None:
     """Write into `wanted` (J,) [rad/s] the joints' target velocities after this period.
 
     The target moves on the cubic Hermite curve between two commands (2, J): with u = t / T, the
@@ -272,13 +337,18 @@ def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters:
     playhead.
     """
     config = parameters[0]
-    lasts_s, playhead_s = span[1] - span[0], span[2] - span[0]
+    lasts_s = span[1] - span[0]
+    playhead_s = span[2] - span[0]
     inside_s = min(max(playhead_s, 0.0), lasts_s)
-    beyond_s, u = playhead_s - inside_s, inside_s / lasts_s
+    beyond_s = playhead_s - inside_s
+    u = inside_s / lasts_s
     held_s = min(max(beyond_s, -EXTRAPOLATED_S), EXTRAPOLATED_S)
     for i in range(len(wanted)):
-        begin, end, distance = lasts_s * first[1, i], lasts_s * second[1, i], second[0, i] - first[0, i]
-        bend, twist = 3.0 * distance - 2.0 * begin - end, begin + end - 2.0 * distance
+        begin = lasts_s * first[1, i]
+        end = lasts_s * second[1, i]
+        distance = second[0, i] - first[0, i]
+        bend = 3.0 * distance - 2.0 * begin - end
+        twist = begin + end - 2.0 * distance
         position = first[0, i] + u * (begin + u * (bend + u * twist))
         velocity = (begin + u * (2.0 * bend + u * 3.0 * twist)) / lasts_s
         acceleration = (2.0 * bend + u * 6.0 * twist) / lasts_s**2
@@ -288,7 +358,11 @@ def _aim(state: Vector, first: Vector, second: Vector, span: Vector, parameters:
             acceleration = 0.0
         error = position - state[0, i] - velocity * config.period_s
         velocity += min(max(POSITION_GAIN_HZ * error, -MAX_CORRECTION_RADPS), MAX_CORRECTION_RADPS)
-        acceleration += config.velocity_gain[i] * (velocity - acceleration * config.period_s - state[1, i])
+        acceleration += config.velocity_gain[i] * (
+            velocity - acceleration * config.period_s - state[1, i]
+        )
         change = min(max(acceleration - state[2, i], -config.max_change[i]), config.max_change[i])
-        acceleration = min(max(state[2, i] + change, -config.max_acceleration[i]), config.max_acceleration[i])
+        acceleration = min(
+            max(state[2, i] + change, -config.max_acceleration[i]), config.max_acceleration[i]
+        )
         wanted[i] = state[1, i] + config.period_s * acceleration

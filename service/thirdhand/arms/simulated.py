@@ -24,7 +24,8 @@ class SimulatedArm:
 
     def __init__(self, settings: Settings) -> None:
         self.limits = settings.joints
-        self.position, self.velocity = np.array(settings.arm.posture), np.zeros(len(settings.joints.names))
+        self.position = np.array(settings.arm.posture)
+        self.velocity = np.zeros(len(settings.joints.names))
 
     def __enter__(self) -> SimulatedArm:
         self._read_s = time.monotonic()
@@ -38,10 +39,12 @@ class SimulatedArm:
         return self.position
 
     def read(self) -> Measured:
-        before, due_s = self._read_s, self._read_s + SIMULATED_PERIOD_S
+        before = self._read_s
+        due_s = self._read_s + SIMULATED_PERIOD_S
         time.sleep(max(due_s - time.monotonic(), 0.0))
         self._read_s = max(due_s, time.monotonic() - MAX_BEHIND_S)
         return Measured(self.position, self.velocity, self._read_s - before)
 
     def write(self, position: Vector, velocity: Vector) -> None:
-        self.position, self.velocity = position, velocity
+        self.position = position
+        self.velocity = velocity

@@ -13,7 +13,9 @@ from thirdhand.core.frame import Vector
 LAG_RANGE_S = (-0.02, 0.5)  # lags that are searched; commands arrive up to one period late
 LAG_STEPS_S = (0.004, 0.0002)  # coarse and fine step of the search
 LAG_TRAVEL_RAD = 0.03  # a joint shows the lag once it was commanded to travel this far
-LEAST_SPREAD_RAD = 0.003  # standard deviation of the commands that are compared; below it they show no lag
+LEAST_SPREAD_RAD = (
+    0.003  # standard deviation of the commands that are compared; below it they show no lag
+)
 LAG_STD_S = 0.003  # largest standard deviation of a lag that is reported
 MAX_RESIDUAL_SHARE = 0.2  # largest error that remains / standard deviation of the commands
 MAX_COMMAND_GAP_S = 0.05  # states are not compared where commands paused for longer
@@ -44,7 +46,9 @@ def lag(commanded: Mapping[str, Samples], measured: Mapping[str, Samples]) -> La
     pairs = [
         (*_columns(commanded[name]), *_columns(states))
         for name, states in measured.items()
-        if name in commanded and len(states) >= LEAST_STATES and len(commanded[name]) >= LEAST_STATES
+        if name in commanded
+        and len(states) >= LEAST_STATES
+        and len(commanded[name]) >= LEAST_STATES
     ]
     moving = [pair for pair in pairs if np.ptp(pair[1]) > LAG_TRAVEL_RAD]
     estimate: Lag | None = None
@@ -52,8 +56,13 @@ def lag(commanded: Mapping[str, Samples], measured: Mapping[str, Samples]) -> La
     for step_s in LAG_STEPS_S if moving else ():
         candidates = [_at(float(tau), moving) for tau in np.arange(low, high + step_s / 2, step_s)]
         estimate = min(candidates, key=lambda one: one.error_rad)
-        low, high = estimate.lag_s - step_s, estimate.lag_s + step_s
-    if estimate is None or estimate.std_s > LAG_STD_S or estimate.residual_share > MAX_RESIDUAL_SHARE:
+        low = estimate.lag_s - step_s
+        high = estimate.lag_s + step_s
+    if (
+        estimate is None
+        or estimate.std_s > LAG_STD_S
+        or estimate.residual_share > MAX_RESIDUAL_SHARE
+    ):
         return None
     return estimate if LAG_RANGE_S[0] < estimate.lag_s < LAG_RANGE_S[1] else None
 
@@ -69,9 +78,14 @@ def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -
     """The error that remains with an assumed lag [s]. The states within the range of all lags are
     compared, so that each lag is judged by the same ones.
     """
-    squares, speeds, spread, count = 0.0, 0.0, 0.0, 0
+    squares = 0.0
+    speeds = 0.0
+    spread = 0.0
+    count = 0
     for command_times, commands, times, positions in joints:
-        inside = (times - LAG_RANGE_S[1] >= command_times[0]) & (times - LAG_RANGE_S[0] <= command_times[-1])
+        inside = (times - LAG_RANGE_S[1] >= command_times[0]) & (
+            times - LAG_RANGE_S[0] <= command_times[-1]
+        )
         after = np.clip(np.searchsorted(command_times, times), 1, len(command_times) - 1)
         inside &= command_times[after] - command_times[after - 1] < MAX_COMMAND_GAP_S
         delayed_times = times[inside] - lag_s
@@ -84,7 +98,9 @@ def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -
         velocity = np.interp(delayed_times, command_times, np.gradient(commands, command_times))
         speeds += float(np.sum((velocity - velocity.mean()) ** 2))
         count += len(delayed_times)
-    if not speeds or spread < count * LEAST_SPREAD_RAD**2:  # the motion was outside of the compared times
+    if (
+        not speeds or spread < count * LEAST_SPREAD_RAD**2
+    ):  # the motion was outside of the compared times
         return Lag(lag_s, math.inf, math.inf, math.inf)
     error = math.sqrt(squares / count)
     return Lag(lag_s, error / math.sqrt(speeds), error, math.sqrt(squares / spread))

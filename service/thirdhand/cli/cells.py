@@ -39,7 +39,9 @@ def cells(args: argparse.Namespace) -> int:
         print(msgspec.json.format(_as_json(served)).decode())
     elif served:
         console = Console(highlight=False)
-        (console if console.is_terminal else Console(width=MOST_LETTERS)).print(_table(row(cell) for cell in served))
+        (console if console.is_terminal else Console(width=MOST_LETTERS)).print(
+            _table(row(cell) for cell in served)
+        )
     if not served:
         print("thirdhand status: no daemon is alive on this network", file=sys.stderr)
     return 0 if served else 1
@@ -50,13 +52,18 @@ def _watch(session: zenoh.Session, args: argparse.Namespace) -> None:
     latest_cells: dict[tuple[str, str], tuple[Cell, float]] = {}
     printed: dict[tuple[str, str], str] = {}
     draws = sys.stdout.isatty() and not args.json
-    with interrupt.clean_up_first(), Live(auto_refresh=False) if draws else contextlib.nullcontext() as live:
+    with (
+        interrupt.clean_up_first(),
+        Live(auto_refresh=False) if draws else contextlib.nullcontext() as live,
+    ):
         while True:
             begun_s = time.monotonic()
             served = served_cells(session, timeout_s=WATCH_S)
             now_s = time.monotonic()
             latest_cells |= {(cell.name, cell.session): (cell, now_s) for cell in served}
-            rows = {key: row(cell, now_s - at_s) for key, (cell, at_s) in sorted(latest_cells.items())}
+            rows = {
+                key: row(cell, now_s - at_s) for key, (cell, at_s) in sorted(latest_cells.items())
+            }
             if args.json:
                 print(_as_json(served).decode(), flush=True)
             elif live is not None:
@@ -77,20 +84,25 @@ def _as_json(served: Iterable[Cell]) -> bytes:
 def _table(rows: Iterable[tuple[str, ...]]) -> Table:
     table = Table(*HEADS, box=None, pad_edge=False)
     for name, mode, *others in rows:
-        table.add_row(name, Text(mode, style=MODE_STYLES.get(mode.split(" ")[0], "dim")), *map(Text, others))
+        table.add_row(
+            name, Text(mode, style=MODE_STYLES.get(mode.split(" ")[0], "dim")), *map(Text, others)
+        )
     return table
 
 
 def row(cell: Cell, silent_s: float = 0.0) -> tuple[str, ...]:
     """The texts of HEADS for a cell that was seen `silent_s` ago [s]."""
-    now, none = cell.status, ("",) * (len(HEADS) - 3)
+    now = cell.status
+    none = ("",) * (len(HEADS) - 3)
     if silent_s > DISAPPEARED_S:
         return cell.name, f"gone for {silent_s:.0f} s", *none, ""
     if now is None:
         return cell.name, "no status", *none, "it is starting, is busy, or denies access"
     timing = f"{now.rate_hz:.2f}", f"{now.lateness_us.p99:.0f}", f"{now.missed}"
     hands = ", ".join(now.hand_age_ms) or "no hands"
-    limits = f"tool {now.tool_limits[ANY_DIRECTION].text}" if ANY_DIRECTION in now.tool_limits else ""
+    limits = (
+        f"tool {now.tool_limits[ANY_DIRECTION].text}" if ANY_DIRECTION in now.tool_limits else ""
+    )
     bound = f"now limited by {now.binding}" if now.binding else ""
     notes = ", ".join(filter(None, (limits, bound)))
     return cell.name, in_brief(now.mode, now.reason), *timing, hands, now.skill, now.version, notes

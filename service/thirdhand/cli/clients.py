@@ -64,12 +64,16 @@ def _add(args: argparse.Namespace) -> Any:
         args.left = args.right = args.left or args.right  # the skill ignores the other hand
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError(
-            "NAME with --here, or NAME with --left, --right and --tool, or --file needed; for a skill of one hand, "
-            "its option suffices"
+            "NAME with --here, or NAME with --left, --right and --tool, or --file needed; for a "
+            "skill of one hand, its option suffices"
         )
     fields = ("left", "right", "tool", "std", "radius", "follow", "orientation", "gripper")
     point = {"name": args.name, **{name: getattr(args, name) for name in fields}}
-    return {"op": "add", "points": [point], **({} if args.tolerance is None else {"tolerance": args.tolerance})}
+    return {
+        "op": "add",
+        "points": [point],
+        **({} if args.tolerance is None else {"tolerance": args.tolerance}),
+    }
 
 
 def segment(args: argparse.Namespace) -> int:
@@ -90,7 +94,10 @@ def correct(args: argparse.Namespace) -> int:
         raise UsageError("--undo accepts no other option")
     reply = ask(args, "correct", request)
     correction = msgspec.convert(reply["correction"], Correction)
-    print(f"{correction.name} {'undone' if correction.undone else 'in force'} since tick {reply['tick']}: {correction.text}")
+    print(
+        f"{correction.name} {'undone' if correction.undone else 'in force'} since tick "
+        f"{reply['tick']}: {correction.text}"
+    )
     print("Then `thirdhand resume`: the tool approaches its target at [tool] engage_speed.")
     if note := reply.get("note"):
         print(note[0].upper() + note[1:])
@@ -103,7 +110,10 @@ def hold(args: argparse.Namespace) -> int:
     """Send hold, resume or reset and print the resulting mode; exit code 0."""
     reply = ask(args, args.command)
     mode, reason, note = (reply.get(name, "") for name in ("mode", "reason", "note"))
-    print(f"{args.command} in force since tick {reply['tick']}: {in_brief(mode, reason)}{f'; {note}' if note else ''}")
+    print(
+        f"{args.command} in force since tick {reply['tick']}: "
+        f"{in_brief(mode, reason)}{f'; {note}' if note else ''}"
+    )
     if (mode == "fault" or (args.command == "resume" and mode == "hold")) and what_to_do(reason):
         print(f"What to do: {what_to_do(reason)}")
     return 0

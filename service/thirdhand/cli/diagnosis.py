@@ -14,14 +14,23 @@ import msgspec
 from thirdhand.cli.status import AHEAD_MS, disk, hours_until_full
 from thirdhand.contract.channels import BY_KEY, key
 from thirdhand.contract.evidence import Evidence, explained, lasting, unit_advice
-from thirdhand.contract.incidents import SOURCE_NAMES, Condition, in_brief, input_name, what_to_do, word
+from thirdhand.contract.incidents import (
+    SOURCE_NAMES,
+    Condition,
+    in_brief,
+    input_name,
+    what_to_do,
+    word,
+)
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.records import SIDES, Cause, Reason
 from thirdhand.contract.requests import Source, Status
 from thirdhand.contract.ros2 import NO_TYPE_HASH
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
-LATE_MS = 100.0  # a stamp older than this at its arrival shows that clocks differ, or a slow network
+LATE_MS = (
+    100.0  # a stamp older than this at its arrival shows that clocks differ, or a slow network
+)
 LEAST_RATE_SHARE = 0.9  # smallest accepted rate / least rate of the key
 REJECTED_SHARE = 0.05  # a larger share of rejected samples is no accident
 SCATTER_MM = 8.0  # a tracker that sees a hand well scatters less, on each axis
@@ -30,14 +39,20 @@ FREE_MB = 2000.0  # least free space
 DISK_LASTS_H = 1.0  # least time until the disk is full
 MISSED_SHARE = 0.01  # largest share of missed deadlines
 LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
-MAX_BELOW_TABLE_M = 0.03  # a hand that is farther below the table top shows that the calibration is off
+MAX_BELOW_TABLE_M = (
+    0.03  # a hand that is farther below the table top shows that the calibration is off
+)
 OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
 COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
 LATE_ARM_MS = 30.0  # largest lag of an arm, with the delay of its driver's playback
 BOUND_SHARE = 0.1  # a limit that binds in a larger share of the statuses is noted
 MOVED_SHARE = 0.1  # a joint that moved less than this share of it has not moved
-OFF_TARGET_M, OFF_TARGET_S = 0.05, 1.5  # a tool that is farther away for longer does not only lag
-LEVEL_M, RAISED_M = 0.03, 0.10  # if z spans less than the first and y more than the second, y is the height
+# a tool that is farther away for longer does not only lag
+OFF_TARGET_M = 0.05
+OFF_TARGET_S = 1.5
+# if z spans less than the first and y more than the second, y is the height
+LEVEL_M = 0.03
+RAISED_M = 0.10
 Y_UP = (0.0, 0.0, 0.0, 0.7071, 0.0, 0.0, 0.7071)  # base_from_tracker of a tracker whose y points up
 MACHINE = "machine"
 LEVELS = ("wrong", "note", "ok")
@@ -87,7 +102,10 @@ def findings(
     """
     results = list(_in_order_of_cause(seen, own_ns, own_version, published, travels or {}, lag_ms))
     if any(finding.level == "wrong" for finding in results):  # a busy machine may be the cause
-        results = [wrong(*msgspec.structs.astuple(finding)[1:]) if finding.what == MACHINE else finding for finding in results]
+        results = [
+            wrong(*msgspec.structs.astuple(finding)[1:]) if finding.what == MACHINE else finding
+            for finding in results
+        ]
     return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
 
@@ -99,19 +117,40 @@ def _in_order_of_cause(
     travels: Mapping[str, tuple[float, float]],
     lag_ms: float | None,
 ) -> Iterator[Finding]:
-    before, now = seen[0], seen[-1]
-    listens = f"listens on {', '.join(now.endpoints)}" if now.endpoints else "listens nowhere, it connects"
-    actual, expected = f"version {now.version}, {listens}", f"version {own_version}, as here"
-    yield judged(now.version == own_version, "daemon", actual, expected, what_to_do(Condition.VERSIONS_DIFFER))
+    before = seen[0]
+    now = seen[-1]
+    listens = (
+        f"listens on {', '.join(now.endpoints)}"
+        if now.endpoints
+        else "listens nowhere, it connects"
+    )
+    actual = f"version {now.version}, {listens}"
+    expected = f"version {own_version}, as here"
+    yield judged(
+        now.version == own_version,
+        "daemon",
+        actual,
+        expected,
+        what_to_do(Condition.VERSIONS_DIFFER),
+    )
     if now.tick < 0:
         yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
         return
     yield from _machine(before, now)
     for name in now.sources:
         yield from _source(before, now, name, published)
-    if of_humble := [key_expr for key_expr in published if key_expr.endswith(f"/{NO_TYPE_HASH}")][:MOST_OTHER_KEYS]:
-        actual, advice = f"Humble publishes {', '.join(of_humble)}", what_to_do(Condition.HUMBLE)
-        yield Finding("note", "ROS 2", actual, "keys with the hash of their type, as of Iron and later", advice)
+    if of_humble := [key_expr for key_expr in published if key_expr.endswith(f"/{NO_TYPE_HASH}")][
+        :MOST_OTHER_KEYS
+    ]:
+        actual = f"Humble publishes {', '.join(of_humble)}"
+        advice = what_to_do(Condition.HUMBLE)
+        yield Finding(
+            "note",
+            "ROS 2",
+            actual,
+            "keys with the hash of their type, as of Iron and later",
+            advice,
+        )
     for name in now.streams:
         yield from _rejected(before, now, name)
     yield _driver(before, now)
@@ -125,7 +164,9 @@ def _in_order_of_cause(
     yield from _privileges_and_recording(now)
     apart_s = (own_ns - now.time_ns) / 1e9
     if abs(apart_s) > OWN_CLOCK_S:
-        actual = f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
+        actual = (
+            f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
+        )
         advice = what_to_do(Condition.CLOCKS_DIFFER)
         yield Finding("note", "clock here", actual, f"within {OWN_CLOCK_S:g} s", advice)
 
@@ -146,17 +187,29 @@ def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
     }
     if still:
         name = max(still, key=lambda joint: still[joint])
-        actual = f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since commands began"
-        yield wrong("arm's drives", actual, "joints that follow their commands", what_to_do(Condition.DRIVES_OFF))
+        actual = (
+            f"{name} was commanded to move by {still[name]:.2f} rad, but has not moved since "
+            "commands began"
+        )
+        yield wrong(
+            "arm's drives",
+            actual,
+            "joints that follow their commands",
+            what_to_do(Condition.DRIVES_OFF),
+        )
 
 
 def _lag(lag_ms: float | None) -> Finding:
     subject = "arm's lag"
     if lag_ms is None:
         return Finding(
-            "ok", subject, "not measured, because the arm did not follow a motion evenly: move the hands meanwhile"
+            "ok",
+            subject,
+            "not measured, because the arm did not follow a motion evenly: "
+            "move the hands meanwhile",
         )
-    actual, expected = f"the arm follows its commands {lag_ms:.0f} ms late", f"up to {LATE_ARM_MS:.0f} ms"
+    actual = f"the arm follows its commands {lag_ms:.0f} ms late"
+    expected = f"up to {LATE_ARM_MS:.0f} ms"
     level = "ok" if lag_ms <= LATE_ARM_MS else "note"
     return Finding(level, subject, actual, expected, what_to_do(Condition.ARM_LATE))
 
@@ -164,12 +217,19 @@ def _lag(lag_ms: float | None) -> Finding:
 def _limits(seen: Sequence[Status]) -> Iterator[Finding]:
     """Limits of the tool where the task is, and the one that binds most often."""
     if limits := seen[-1].tool_limits:
-        yield Finding("ok", "tool's limits", "; ".join(f"{where} {limit.text}" for where, limit in limits.items()))
+        yield Finding(
+            "ok",
+            "tool's limits",
+            "; ".join(f"{where} {limit.text}" for where, limit in limits.items()),
+        )
     bound = Counter(status.binding for status in seen if status.binding)
     name, count = bound.most_common(1)[0] if bound else ("", 0)
     if count > BOUND_SHARE * len(seen):
-        actual, expected = f"{name}, in {count / len(seen):.0%} of the time", f"in less than {BOUND_SHARE:.0%}"
-        yield Finding("note", "limit that binds", actual, expected, what_to_do(Condition.LIMIT_BINDS))
+        actual = f"{name}, in {count / len(seen):.0%} of the time"
+        expected = f"in less than {BOUND_SHARE:.0%}"
+        yield Finding(
+            "note", "limit that binds", actual, expected, what_to_do(Condition.LIMIT_BINDS)
+        )
 
 
 def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
@@ -179,16 +239,20 @@ def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
         for status in seen
         if status.mode == "follow" and status.tool_m is not None and status.target_m is not None
     ]
-    lasts_s, flags = (seen[-1].time_ns - seen[0].time_ns) / 1e9, seen[-1].flags
+    lasts_s = (seen[-1].time_ns - seen[0].time_ns) / 1e9
+    flags = seen[-1].flags
     if len(distances_m) == len(seen) and lasts_s > OFF_TARGET_S and min(distances_m) > OFF_TARGET_M:
         actual = f"{100 * min(distances_m):.0f} cm or more from its target for {lasts_s:.1f} s"
         advice = "; ".join(map(what_to_do, flags)) or what_to_do(Condition.OFF_TARGET)
         level = "note" if flags else "wrong"
-        yield Finding(level, "tool", actual, f"within {100 * OFF_TARGET_M:.0f} cm once the hands rest", advice)
+        yield Finding(
+            level, "tool", actual, f"within {100 * OFF_TARGET_M:.0f} cm once the hands rest", advice
+        )
 
 
 def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
-    source, subject = now.sources[name], SOURCE_NAMES[name]
+    source = now.sources[name]
+    subject = SOURCE_NAMES[name]
     least, most = map(int, re.findall(r"\d+", BY_KEY[KEYS[name]].rate))
     expected = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
         f"joints {', '.join(now.joints)}"
@@ -199,51 +263,88 @@ def _source(before: Status, now: Status, name: str, published: Sequence[str]) ->
         yield Finding("ok", subject, "nothing arrives; the skill does not need it")
         return
     if not source.rate_hz:
-        actual = "nothing arrives" if source.age_ms is None else f"nothing arrived for {source.age_ms / 1000:.1f} s"
+        actual = (
+            "nothing arrives"
+            if source.age_ms is None
+            else f"nothing arrived for {source.age_ms / 1000:.1f} s"
+        )
         group = KEYS[name].rpartition("/")[0]
         ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
         ours |= {key_expr for key_expr in published if key_expr.endswith(NO_TYPE_HASH)}
-        others = [key_expr for key_expr in published if f"/{group}/" in key_expr and key_expr not in ours][:MOST_OTHER_KEYS]
+        others = [
+            key_expr for key_expr in published if f"/{group}/" in key_expr and key_expr not in ours
+        ][:MOST_OTHER_KEYS]
         actual += f", but on {', '.join(others)}" if others else ""
         advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)
         advice += f" ({', '.join(now.endpoints)})" if now.endpoints else ""
-        rename = f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}; or " if others else ""
+        rename = (
+            f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}; or "
+            if others
+            else ""
+        )
         yield wrong(subject, actual, expected, rename + advice)
         return
-    actual = f"{source.rate_hz:.0f} Hz, " + ("none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old")
+    actual = f"{source.rate_hz:.0f} Hz, " + (
+        "none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old"
+    )
     actual += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
     is_fine = source.fresh and source.rate_hz >= LEAST_RATE_SHARE * least
-    advice = "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
+    advice = (
+        "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
+    )
     rejected = list(_rejected(before, now, name))
     yield from rejected
     if not source.fresh and any(finding.level == "wrong" for finding in rejected):
         return  # all of its samples are rejected; the reason is found above
     yield judged(is_fine, subject, actual, expected, advice or what_to_do(Condition.RATE_LOW))
     if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
-        order = "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
-        actual = f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be measured"
+        order = (
+            "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
+        )
+        actual = (
+            f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be "
+            "measured"
+        )
         level = "note" if name == "arm" else "wrong"  # no latency is computed from the arm's stamps
         advice = what_to_do(Condition.CLOCKS_DIFFER)
-        yield Finding(level, f"{subject}'s clock", actual, f"less than {LATE_MS / 1000:g} s", advice)
+        yield Finding(
+            level, f"{subject}'s clock", actual, f"less than {LATE_MS / 1000:g} s", advice
+        )
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
-    source, subject = now.inputs[name], input_name(name)
+    source = now.inputs[name]
+    subject = input_name(name)
     seconds = max((now.time_ns - before.time_ns) / 1e9, 0.1)
-    earlier, arriving_hz = before.inputs.get(name, Source()).rejected, max(source.rate_hz, 1.0)
-    rates = {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()}
-    share = max(source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz)
+    earlier = before.inputs.get(name, Source()).rejected
+    arriving_hz = max(source.rate_hz, 1.0)
+    rates = {
+        cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()
+    }
+    share = max(
+        source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz
+    )
     for cause, rate in rates.items():
-        if rate and not (name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")):  # found below
+        if rate and not (
+            name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")
+        ):  # found below
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
-            advice = (_unit_advice(source) or source.advice if cause == source.cause else "") or what_to_do(cause)
-            yield Finding(level, subject, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice)
+            advice = (
+                _unit_advice(source) or source.advice if cause == source.cause else ""
+            ) or what_to_do(cause)
+            yield Finding(
+                level, subject, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice
+            )
     if share > REJECTED_SHARE and name == "arm":
-        evidence = Evidence({name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE)
+        evidence = Evidence(
+            {name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE
+        )
         explanation = explained(Reason.TWO_SOURCES, evidence)
         expected = f"one publisher of {key(now.cell, KEYS[name])}"
-        yield wrong(subject, explanation.why.removeprefix(f"{subject}, "), expected, explanation.what_to_do)
+        yield wrong(
+            subject, explanation.why.removeprefix(f"{subject}, "), expected, explanation.what_to_do
+        )
     if source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM:
         found_mm = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis"
         yield wrong(subject, found_mm, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
@@ -259,17 +360,21 @@ def _unit_advice(source: Source) -> str:
 def _driver(before: Status, now: Status) -> Finding:
     if "arm" not in now.sources:
         return Finding("note", "arm", "assumed, not measured", "", what_to_do(Condition.NO_ARM))
-    commands, heard = key(now.cell, "joints/command"), before.command_heard and now.command_heard
+    commands = key(now.cell, "joints/command")
+    heard = before.command_heard and now.command_heard
     actual = f"{'somebody' if heard else 'nobody'} listens to {commands}"
     return judged(heard, "arm's driver", actual, "a driver", what_to_do(Condition.NO_DRIVER))
 
 
 def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
-    now, boxes = seen[-1], seen[-1].demonstrated_m
+    now = seen[-1]
+    boxes = seen[-1].demonstrated_m
     below = {side: min(status.below_table_m.get(side, 0.0) for status in seen) for side in SIDES}
     if max(below.values()) > MAX_BELOW_TABLE_M:
         depths = " and ".join(
-            f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm" for side, depth in below.items() if depth > MAX_BELOW_TABLE_M
+            f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm"
+            for side, depth in below.items()
+            if depth > MAX_BELOW_TABLE_M
         )
         yield wrong(
             "calibration",
@@ -277,12 +382,18 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
             "hands above the table",
             what_to_do(Condition.CALIBRATION_OFF),
         )
-    positions = {side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh}
+    positions = {
+        side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh
+    }
     outside_m = {side: _outside(position_m, boxes[side]) for side, position_m in positions.items()}
     crossed = [
-        _outside(position_m, boxes[other]) for side, position_m in positions.items() if (other := SIDES[1 - SIDES.index(side)]) in boxes
+        _outside(position_m, boxes[other])
+        for side, position_m in positions.items()
+        if (other := SIDES[1 - SIDES.index(side)]) in boxes
     ]
-    is_exchanged = len(outside_m) == len(SIDES) and max(crossed) < OUTSIDE_M < min(outside_m.values())
+    is_exchanged = len(outside_m) == len(SIDES) and max(crossed) < OUTSIDE_M < min(
+        outside_m.values()
+    )
     advice = what_to_do(Condition.HANDS_EXCHANGED if is_exchanged else Condition.HAND_ELSEWHERE)
     if outside_m and max(outside_m.values()) > OUTSIDE_M and _is_y_up(seen):
         written = "[{}]".format(", ".join(f"{v:g}" for v in Y_UP))
@@ -290,23 +401,33 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
             "tracker's axes",
             "z of the hands is constant while y changes like a height",
             "z up, as in frame base",
-            f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = {written}, with the position of the tracker's "
-            "origin in base [m] as its first three numbers",
+            f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = {written}, with the position "
+            "of the tracker's origin in base [m] as its first three numbers",
         )
     for side, position_m in positions.items():
         actual = f"at {_point(position_m)} m, {outside_m[side]:.2f} m from where the skill knows it"
         expected = " to ".join(map(_point, boxes[side])) + " m"
         remedy = _unit_advice(now.sources[side]) or advice
-        yield judged(outside_m[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", actual, expected, remedy)
+        yield judged(
+            outside_m[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", actual, expected, remedy
+        )
     if now.deviation_m is not None:
         actual = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
         expected = f"up to {100 * now.threshold_m:.1f} cm"
-        yield judged(now.deviation_m <= now.threshold_m, "skill", actual, expected, what_to_do("far_from_demonstrations"))
+        yield judged(
+            now.deviation_m <= now.threshold_m,
+            "skill",
+            actual,
+            expected,
+            what_to_do("far_from_demonstrations"),
+        )
 
 
 def _is_y_up(seen: Sequence[Status]) -> bool:
     """True if y seems to be the hands' height: it changes while z does not."""
-    positions_m = [status.hands_m for status in seen if all(side in status.hands_m for side in SIDES)]
+    positions_m = [
+        status.hands_m for status in seen if all(side in status.hands_m for side in SIDES)
+    ]
     heights = [[hands[side][1] for hands in positions_m] for side in SIDES]
     levels = [[hands[side][2] for hands in positions_m] for side in SIDES]
     return (
@@ -318,11 +439,18 @@ def _is_y_up(seen: Sequence[Status]) -> bool:
 
 
 def _machine(before: Status, now: Status) -> Iterator[Finding]:
-    missed, ticks, late_us = now.missed - before.missed, max(now.tick - before.tick, 1), now.lateness_us.p99
+    missed = now.missed - before.missed
+    ticks = max(now.tick - before.tick, 1)
+    late_us = now.lateness_us.p99
     if now.busy:
         expected = "a machine that keeps time; on any other, arm, network and clocks seem to fail"
-        yield Finding("note", MACHINE, f"too busy: {now.busy}", expected, what_to_do(Condition.MACHINE_BUSY))
-    actual = f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs (p99)"
+        yield Finding(
+            "note", MACHINE, f"too busy: {now.busy}", expected, what_to_do(Condition.MACHINE_BUSY)
+        )
+    actual = (
+        f"{now.rate_hz:.1f} Hz, {missed} of {ticks} deadlines missed, late by {late_us:.0f} µs "
+        "(p99)"
+    )
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period
     expected = f"less than {MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
     is_fine = missed <= MISSED_SHARE * ticks and late_us <= most_us
@@ -330,25 +458,31 @@ def _machine(before: Status, now: Status) -> Iterator[Finding]:
 
 
 def _privileges_and_recording(now: Status) -> Iterator[Finding]:
-    actual, expected = ("" if now.realtime else "not ") + "granted", "SCHED_FIFO for the daemon's user"
+    actual = ("" if now.realtime else "not ") + "granted"
+    expected = "SCHED_FIFO for the daemon's user"
     yield judged(now.realtime, "real time", actual, expected, what_to_do(Condition.NO_REAL_TIME))
-    actual, expected = ("" if now.memory_locked else "not ") + "locked", "memory that is not paged out"
+    actual = ("" if now.memory_locked else "not ") + "locked"
+    expected = "memory that is not paged out"
     yield judged(now.memory_locked, "memory", actual, expected, what_to_do(Condition.NOT_LOCKED))
     scribe = now.scribe
-    state, lost = scribe.get("state", "off"), scribe.get("lost", 0)
+    state = scribe.get("state", "off")
+    lost = scribe.get("lost", 0)
     if state == "off":
         yield Finding("note", "recording", "off", "", what_to_do(Condition.NOT_RECORDED))
         return
     actual = "; ".join([f"{state}, {lost} ticks lost", *(scribe.get("errors") or ())])
     is_fine = state != "interrupted" and not lost
-    yield judged(is_fine, "recording", actual, "recording, none lost", what_to_do(Condition.TICKS_LOST))
+    yield judged(
+        is_fine, "recording", actual, "recording, none lost", what_to_do(Condition.TICKS_LOST)
+    )
     if scribe.get("free_mb") is not None:
         yield _disk(scribe)
 
 
 def _disk(scribe: Mapping[str, Any]) -> Finding:
     """Free space for recordings, and the time until it is full."""
-    free_mb, full_h = scribe["free_mb"], hours_until_full(scribe)
+    free_mb = scribe["free_mb"]
+    full_h = hours_until_full(scribe)
     expected = f"more than {FREE_MB / 1000:g} GB, and {DISK_LASTS_H:g} h"
     is_fine = free_mb > FREE_MB and (full_h is None or full_h > DISK_LASTS_H)
     return judged(is_fine, "disk", disk(scribe), expected, what_to_do(Condition.DISK_SHORT))

@@ -31,7 +31,11 @@ from thirdhand.process import bytecode
 
 PROBE_S = 1.0
 MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
-PUBLISHED = ("**/hands/*", "**/joints/state", f"**/{NO_TYPE_HASH}")  # in any cell, because a name may be wrong
+PUBLISHED = (
+    "**/hands/*",
+    "**/joints/state",
+    f"**/{NO_TYPE_HASH}",
+)  # in any cell, because a name may be wrong
 
 Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad] of a joint
 
@@ -56,20 +60,26 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
     try:
         session = reached(args)
     except UnreachableError as error:
-        yield from (unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT])
+        yield from (
+            unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT]
+        )
         return
     with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
         try:
             with contextlib.closing(statuses(session, args.cell)) as arriving:
                 history = [next(arriving)]
                 travel = Travel()
-                if history[0].command_heard:  # otherwise the daemon would take this subscriber for a driver
+                if history[
+                    0
+                ].command_heard:  # otherwise the daemon would take this subscriber for a driver
                     closing.enter_context(travel.watching(session, args.cell))
                 end = time.monotonic() + args.seconds
                 while time.monotonic() < end:
                     history.append(next(arriving))
         except StartingError as error:
-            yield wrong("daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING))
+            yield wrong(
+                "daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING)
+            )
             return
         except UnreachableError as error:
             cells = {
@@ -78,12 +88,21 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
                 if reply.ok is not None
             }
             remedy = what_to_do(
-                Condition.NO_ANSWER if args.cell in cells else Condition.OTHER_CELL if cells else Condition.NO_DAEMON
+                Condition.NO_ANSWER
+                if args.cell in cells
+                else Condition.OTHER_CELL
+                if cells
+                else Condition.NO_DAEMON
             )
             yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
             return
         except RefusedError as error:
-            yield wrong("daemon", str(error), f"version {version('thirdhand')}", what_to_do(Condition.VERSIONS_DIFFER))
+            yield wrong(
+                "daemon",
+                str(error),
+                f"version {version('thirdhand')}",
+                what_to_do(Condition.VERSIONS_DIFFER),
+            )
             return
     yield from findings(
         *history,
@@ -125,7 +144,9 @@ class Travel:
 
     def lag_ms(self) -> float | None:
         """The measured lag of the arm behind its commands; None if it followed no motion."""
-        from thirdhand.cli.arm_lag import lag  # numpy is slow to import, and most findings need none
+        from thirdhand.cli.arm_lag import (
+            lag,
+        )  # numpy is slow to import, and most findings need none
 
         commanded, measured = (
             {name: list(series) for name, series in joints.copy().items()}
@@ -158,7 +179,12 @@ def unreachable(endpoint: str, error_text: str) -> Finding:
     try:
         socket.create_connection(address, timeout=PROBE_S).close()
     except ConnectionRefusedError:
-        return wrong("port", f"nothing listens on {host} port {port}", expected, what_to_do(Condition.PORT_CLOSED))
+        return wrong(
+            "port",
+            f"nothing listens on {host} port {port}",
+            expected,
+            what_to_do(Condition.PORT_CLOSED),
+        )
     except (OSError, OverflowError) as error:
         actual = f"{host} port {port} cannot be reached: {in_words(error)}"
         return wrong("port", actual, expected, what_to_do(Condition.NO_WAY))

@@ -23,13 +23,17 @@ def follow(args: argparse.Namespace) -> int:
     """
     if args.arm not in DRIVES:
         raise UnreadableError(
-            f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with examples/own_arm.py"
+            f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with "
+            "examples/own_arm.py"
         )
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args, settings)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
-        from thirdhand.arms.drive import Drive, DriveError  # slow imports: a missing daemon is reported before
+        from thirdhand.arms.drive import (
+            Drive,
+            DriveError,
+        )  # slow imports: a missing daemon is reported before
         from thirdhand.arms.drive import follow as driven
         from thirdhand.arms.franka import FrankaArm
         from thirdhand.arms.simulated import SimulatedArm
@@ -38,16 +42,21 @@ def follow(args: argparse.Namespace) -> int:
         status = Client(session, cell).wait_until_ready(timeout_s=args.wait, silent=False)
         if status.joints != settings.joints.names:
             raise DriveError(
-                f"the daemon of cell {cell} commands {len(status.joints)} joints, {', '.join(status.joints)}; the "
-                f"settings here have {len(settings.joints.names)}, {', '.join(settings.joints.names)}: "
-                "give the daemon's settings by --config"
+                f"the daemon of cell {cell} commands {len(status.joints)} joints, "
+                f"{', '.join(status.joints)}; the settings here have {len(settings.joints.names)}, "
+                f"{', '.join(settings.joints.names)}: give the daemon's settings by --config"
             )
-        drive: Drive = FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
+        drive: Drive = (
+            FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
+        )
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         ask_for_real_time()
         say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
         playback = driven(drive, session, cell, stop=stop, wait_s=args.wait)
-    say(f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were refused")
+    say(
+        f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were "
+        "refused"
+    )
     return 0

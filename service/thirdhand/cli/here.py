@@ -42,7 +42,8 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
         say(f"waiting until {', '.join(names)} are seen and hold still for {STILL_S:g} s")
         begun_s = time.monotonic()
         while True:
-            now, at_s = client.ask("status"), time.monotonic()
+            now = client.ask("status")
+            at_s = time.monotonic()
             lacking = _not_seen(now, names)
             if lacking.keys() - reported:
                 say("; ".join(lacking.values()))
@@ -52,13 +53,16 @@ def still(args: argparse.Namespace) -> dict[str, list[float]]:
             else:
                 positions = {**now["hands_m"], "tool": now["tool_measured_m"] or now["tool_m"]}
                 samples.append((at_s, {name: positions[name] for name in names}))
-                while any(math.dist(samples[0][1][name], samples[-1][1][name]) > STILL_M for name in names):
+                while any(
+                    math.dist(samples[0][1][name], samples[-1][1][name]) > STILL_M for name in names
+                ):
                     samples.pop(0)
                 if at_s - samples[0][0] >= STILL_S:
                     return samples[-1][1]
             if at_s - begun_s > HERE_TIMEOUT_S:
                 raise NotHereError(
-                    f"nothing was taught: {'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
+                    "nothing was taught: "
+                    f"{'; '.join(lacking.values()) or 'hands or tool did not hold still'}"
                 )
             time.sleep(HERE_POLL_S)
 
@@ -69,6 +73,14 @@ def _not_seen(status: dict[str, Any], wanted: list[str]) -> dict[str, str]:
     for side in (side for side in SIDES if side in wanted):
         age_ms = status["hand_age_ms"].get(side) if side in status["hands_m"] else None
         if age_ms is None or age_ms > MAX_HAND_AGE_MS:
-            ago = "has not been seen yet" if age_ms is None else f"was last seen {age_ms / 1000:.1f} s ago"
+            ago = (
+                "has not been seen yet"
+                if age_ms is None
+                else f"was last seen {age_ms / 1000:.1f} s ago"
+            )
             messages[side] = f"the {side} hand {ago}; --{side} X Y Z gives its position"
-    return messages | ({"tool": "the tool's position is unknown before the first tick"} if status["tick"] < 0 else {})
+    return messages | (
+        {"tool": "the tool's position is unknown before the first tick"}
+        if status["tick"] < 0
+        else {}
+    )

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from thirdhand.cli.usage import ARM_HELP, RATE_HELP, AddCommand, add_end_with, described, flag, option, reach, within
+from thirdhand.cli.usage import (
+    ARM_HELP,
+    RATE_HELP,
+    AddCommand,
+    add_end_with,
+    described,
+    flag,
+    option,
+    reach,
+    within,
+)
 from thirdhand.contract import channels
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import TOLERANCE_M, ViaPoint
@@ -12,13 +22,28 @@ def follow(add: AddCommand) -> None:
     """Options of `follow`."""
     c = add(
         "follow",
-        "Drives an arm by the joint commands of a running cell, and brakes it when the commands end.",
+        "Drives an arm by the joint commands of a running cell, and brakes it when the commands "
+        "end.",
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
-    c.add_argument("arm", metavar="ARM", help="the arm to drive: franka, or simulated, which is an ideal arm")
+    c.add_argument(
+        "arm", metavar="ARM", help="the arm to drive: franka, or simulated, which is an ideal arm"
+    )
     option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM_HELP}")
-    option(c, "--robot", "ADDRESS", "the host name or IP address of a Franka's control box", "172.16.0.2")
-    option(c, "--wait", "S", "wait this long for the daemon, and again this long for its first command", 60.0)
+    option(
+        c,
+        "--robot",
+        "ADDRESS",
+        "the host name or IP address of a Franka's control box",
+        "172.16.0.2",
+    )
+    option(
+        c,
+        "--wait",
+        "S",
+        "wait this long for the daemon, and again this long for its first command",
+        60.0,
+    )
     reach(c)
 
 
@@ -35,23 +60,48 @@ def serve(add: AddCommand) -> None:
     option(c, "--listen", "EP", listen, action="append")
     option(c, "--connect", "EP", "connect to this Zenoh endpoint; may be repeated", action="append")
     option(c, "--rate", "HZ", RATE_HELP)
-    skill = "run this skill, made by `thirdhand learn` (default: that of the settings, or else the shipped one)"
+    skill = (
+        "run this skill, made by `thirdhand learn` (default: that of the settings, or else the "
+        "shipped one)"
+    )
     option(c, "--skill", "FILE", skill)
-    joints = "wait for the arm's joint states, or assume the posture in the settings (default: [arm] source, or state)"
+    joints = (
+        "wait for the arm's joint states, or assume the posture in the settings (default: [arm] "
+        "source, or state)"
+    )
     c.add_argument("--joints", choices=("state", "assumed"), help=joints)
     option(c, "--record", "DIR", "record to .mcap files in this folder")
     live = "serve Rerun viewers of this machine on this port"
     option(c, "--live", "PORT", live, type=within(int, 0, channels.LAST_PORT))
     hold = "begin in hold, until `thirdhand resume`, whatever [arm] start is: for a service manager"
     flag(c, "--hold", hold)
-    log = "write the log on standard error as text, or as one JSON object on each line (default: text)"
+    log = (
+        "write the log on standard error as text, or as one JSON object on each line (default: "
+        "text)"
+    )
     c.add_argument("--log", choices=("text", "json"), default="text", help=log)
-    check = "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and exit with 0 or 1"
+    check = (
+        "examine settings, arm, skill, folders, disk, certificates and ports, start nothing, and "
+        "exit with 0 or 1"
+    )
     first = c.add_mutually_exclusive_group()
-    first.add_argument("--check", action="store_const", dest="run", const="thirdhand.cli.serve_check.check", help=check)
-    prepare = "compile what this cell needs, once on a machine, so that its next start takes seconds, and exit"
     first.add_argument(
-        "--prepare", action="store_const", dest="run", const="thirdhand.cli.prepare.prepare", help=prepare
+        "--check",
+        action="store_const",
+        dest="run",
+        const="thirdhand.cli.serve_check.check",
+        help=check,
+    )
+    prepare = (
+        "compile what this cell needs, once on a machine, so that its next start takes seconds, "
+        "and exit"
+    )
+    first.add_argument(
+        "--prepare",
+        action="store_const",
+        dest="run",
+        const="thirdhand.cli.prepare.prepare",
+        help=prepare,
     )
     add_end_with(c)
 
@@ -73,21 +123,48 @@ def via_points(add: AddCommand) -> None:
         f"{example} add handover --left .62 -.28 .30 --right .98 .32 .06 --tool .54 -.28 .38 "
         f"--radius .03 --follow left --std .001\n  {example} add glass --here",
     )
-    a.add_argument("name", nargs="?", help="the name of the via-point; a via-point of this name is replaced")
+    a.add_argument(
+        "name", nargs="?", help="the name of the via-point; a via-point of this name is replaced"
+    )
     for place in (*SIDES, "tool"):
         help_text = f"the position of the {place}{' hand' * (place != 'tool')} in frame base [m]"
-        a.add_argument(f"--{place}", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=help_text)
+        a.add_argument(
+            f"--{place}",
+            nargs=3,
+            type=within(float, -10, 10, " m"),
+            metavar=("X", "Y", "Z"),
+            help=help_text,
+        )
     flag(a, "--here", "use the present positions, once hands and tool hold still")
     defaults = ViaPoint("defaults", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     option(a, "--std", "M", "the standard deviation of the tool's position there [m]", defaults.std)
-    option(a, "--radius", "M", "the via-point also holds for hands within this distance [m]", defaults.radius)
+    option(
+        a,
+        "--radius",
+        "M",
+        "the via-point also holds for hands within this distance [m]",
+        defaults.radius,
+    )
     follow = "the hand that the tool moves with, within the radius"
     option(a, "--follow", None, follow, defaults.follow, choices=("none", *SIDES))
     turn = "the orientation of the tool there, as a quaternion"
-    a.add_argument("--orientation", nargs=4, type=within(float, -1.001, 1.001), metavar=("X", "Y", "Z", "W"), help=turn)
+    a.add_argument(
+        "--orientation",
+        nargs=4,
+        type=within(float, -1.001, 1.001),
+        metavar=("X", "Y", "Z", "W"),
+        help=turn,
+    )
     a.add_argument("--gripper", choices=("open", "closed"), help="the state of the gripper there")
-    option(a, "--tolerance", "M", f"replace learned points within this distance (default: {TOLERANCE_M} m)")
-    option(a, "--file", "FILE", "read the request in JSON from this file instead; - is standard input")
+    option(
+        a,
+        "--tolerance",
+        "M",
+        f"replace learned points within this distance (default: {TOLERANCE_M} m)",
+    )
+    option(
+        a, "--file", "FILE", "read the request in JSON from this file instead; - is standard input"
+    )
     reach(a)
     a = described(actions, "remove", "remove via-points by name", f"{example} remove handover")
     a.add_argument("names", metavar="NAME", nargs="+")
@@ -115,13 +192,26 @@ def correct(add: AddCommand) -> None:
         add(
             "correct",
             "Corrects the tool while the arm holds: it belongs where you led it by hand.",
-            "thirdhand correct\n  thirdhand correct --tool .55 -.28 .40\n  thirdhand correct --undo",
+            "thirdhand correct\n  thirdhand correct --tool .55 -.28 .40\n"
+            "  thirdhand correct --undo",
             run="clients.correct",
         )
     )
-    help_text = "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this hold)"
-    c.add_argument("--tool", nargs=3, type=within(float, -10, 10, " m"), metavar=("X", "Y", "Z"), help=help_text)
-    now = "correct for the hands of this moment (default: for those at which the hold began, as leading takes a hand)"
+    help_text = (
+        "the tool belongs here, in frame base [m] (default: where the arm was led by hand in this "
+        "hold)"
+    )
+    c.add_argument(
+        "--tool",
+        nargs=3,
+        type=within(float, -10, 10, " m"),
+        metavar=("X", "Y", "Z"),
+        help=help_text,
+    )
+    now = (
+        "correct for the hands of this moment (default: for those at which the hold began, as "
+        "leading takes a hand)"
+    )
     flag(c, "--now", now)
     flag(c, "--turned", "correct the orientation of the tool too")
     flag(c, "--undo", "undo the last correction")
@@ -136,12 +226,17 @@ def status(add: AddCommand) -> None:
     flag(kinds, "--watch", "show hands, tool, target and distances as they change")
     flag(kinds, "--exit-code", "exit with code 1 also if the cell is at fault")
     every = "list all cells on the network; with --watch in a table, each second"
-    c.add_argument("--all", action="store_const", dest="run", const="thirdhand.cli.cells.cells", help=every)
+    c.add_argument(
+        "--all", action="store_const", dest="run", const="thirdhand.cli.cells.cells", help=every
+    )
 
 
 def doctor(add: AddCommand) -> None:
     """Options of `doctor`."""
-    about = "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits with code 1."
+    about = (
+        "Diagnoses a running cell. For each problem it prints cause and remedy, and then exits "
+        "with code 1."
+    )
     c = reach(add("doctor", about, "thirdhand doctor"))
     flag(c, "--json", "print the findings as JSON")
     option(c, "--seconds", "S", "observe the cell for this time", 2.0, type=within(float, 0.2, 60))

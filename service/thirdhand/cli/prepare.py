@@ -20,9 +20,12 @@ def prepare(args: argparse.Namespace) -> int:
 
 def compiled_for(settings: Settings, skill: Path) -> str:
     """Compile for a cell with the skill in a file; what was done, in words. Raises SkillError."""
-    begun_s, joints = time.monotonic(), len(settings.joints.names)
+    begun_s = time.monotonic()
+    joints = len(settings.joints.names)
     compiled: set[str] = set()
-    with progress(f"compiling for an arm with {joints} joints, a minute or more", unit="functions") as show:
+    with progress(
+        f"compiling for an arm with {joints} joints, a minute or more", unit="functions"
+    ) as show:
         from thirdhand.daemon.compilation import compile_cell  # slow imports
         from thirdhand.daemon.skill_worker import skill_of
 
@@ -32,4 +35,6 @@ def compiled_for(settings: Settings, skill: Path) -> str:
 
         skill_of(skill)  # raises what is wrong with it
         compile_cell(settings, skill, report)
-    return f"{joints} joints: {len(compiled)} functions compiled in {time.monotonic() - begun_s:.0f} s"
+    return (
+        f"{joints} joints: {len(compiled)} functions compiled in {time.monotonic() - begun_s:.0f} s"
+    )

@@ -34,7 +34,9 @@ def serve(args: argparse.Namespace) -> int:
     if args.end_with is not None:
         end_with(args.end_with)
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if args.log == "json" else PrintableFormatter("%(asctime)s %(message)s"))
+    handler.setFormatter(
+        JsonFormatter() if args.log == "json" else PrintableFormatter("%(asctime)s %(message)s")
+    )
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
         with foreign_modules.named():
@@ -42,8 +44,16 @@ def serve(args: argparse.Namespace) -> int:
     except Exception as error:
         if args.log != "json":
             raise
-        log.error(in_file(in_words(error)), exc_info=not isinstance(error, OSError | ValueError | ExplainedError))
-        return 2 if isinstance(error, UsageError | SettingsError) and not isinstance(error, UnreadableError) else 1
+        log.error(
+            in_file(in_words(error)),
+            exc_info=not isinstance(error, OSError | ValueError | ExplainedError),
+        )
+        return (
+            2
+            if isinstance(error, UsageError | SettingsError)
+            and not isinstance(error, UnreadableError)
+            else 1
+        )
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -55,7 +65,9 @@ def _run(args: argparse.Namespace) -> int:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
-            reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
+            reason = (
+                error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
+            )
             raise OSError(f"cannot record in {folder}: {reason}") from None
     if args.live is not None:
         foreign_modules.require("rerun")
@@ -64,20 +76,26 @@ def _run(args: argparse.Namespace) -> int:
     with starting(settings) as start:
         gc.disable()  # a start leaves no garbage, and collections would take a tenth of its time
         with ahead_of_others():
-            from thirdhand.daemon import daemon  # a slow import, during which `start` answers requests
+            from thirdhand.daemon import (
+                daemon,
+            )  # a slow import, during which `start` answers requests
             from thirdhand.scribe.scribe import Scribe
 
         gc.freeze()  # no later collection visits what was imported
 
         def announce(running: daemon.Daemon) -> None:
-            where = ", ".join(running.endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
+            where = (
+                ", ".join(running.endpoints)
+                or f"nothing, connected to {', '.join(settings.network.connect)}"
+            )
             line = f"listening on {where} as cell {settings.cell}"
             try:
                 print(line, flush=True)
             except OSError as error:  # the daemon runs on without a reader of its output
                 log.warning("%s (standard output: %s)", line, in_words(error))
 
-        skill, scribe = skill_path(settings, args), Scribe(settings, folder=folder, live_port=args.live)
+        skill = skill_path(settings, args)
+        scribe = Scribe(settings, folder=folder, live_port=args.live)
         missing = daemon.serve(
             settings,
             skill,
@@ -88,7 +106,9 @@ def _run(args: argparse.Namespace) -> int:
             hold=args.hold or settings.arm.start == "held",
         )
     logging.shutdown()
-    os._exit(1 if missing else 0)  # everything is closed; this does not wait for threads of libraries
+    os._exit(
+        1 if missing else 0
+    )  # everything is closed; this does not wait for threads of libraries
 
 
 def settings_of(args: argparse.Namespace) -> Settings:
@@ -118,7 +138,12 @@ class JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line: time (UTC), level, logger, message and, if any, exception."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        line = {"time": time, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        line = {
+            "time": time,
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
         line |= {"exception": self.formatException(record.exc_info)} if record.exc_info else {}
         return msgspec.json.encode(line).decode()
 
@@ -137,7 +162,11 @@ def _overridden(settings: Settings, args: argparse.Namespace) -> Settings:
     for section, field, value in (
         (values, "cell", args.cell),
         (values, "rate_hz", args.rate),
-        (values["network"], "listen", args.listen or ([] if args.connect and not args.config else None)),
+        (
+            values["network"],
+            "listen",
+            args.listen or ([] if args.connect and not args.config else None),
+        ),
         (values["network"], "connect", args.connect),
         (values["arm"], "source", args.joints),
         (values["files"], "record", str(args.record) if args.record else None),

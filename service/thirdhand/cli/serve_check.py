@@ -39,15 +39,19 @@ def check(args: argparse.Namespace) -> int:
 
     def is_met(what: str, examine: Callable[..., str], *given: Any) -> bool:
         try:
-            level, text = "ok", examine(*given)
+            level = "ok"
+            text = examine(*given)
         except (ExplainedError, ImportError, OSError, ValueError) as error:
-            level, text = "wrong", "; ".join(in_file(in_words(error)).splitlines())
+            level = "wrong"
+            text = "; ".join(in_file(in_words(error)).splitlines())
         print(f"{level:<5}  {what:<14} {printable(text)}", flush=True)
         return level == "ok"
 
     if not is_met("configuration", configuration):
         return 1
-    files, network, live = settings.files, settings.network, [f"tcp/127.0.0.1:{args.live}"] * bool(args.live)
+    files = settings.files
+    network = settings.network
+    live = [f"tcp/127.0.0.1:{args.live}"] * bool(args.live)
     conditions: list[tuple[Any, ...]] = [
         ("imports", _imports),
         ("arm", _arm, settings),
@@ -55,7 +59,8 @@ def check(args: argparse.Namespace) -> int:
         ("state", lambda: _folder(state_folder(settings))),
         ("descriptors", lambda: f"{allow_descriptors()} open files"),
         *[("recordings", _folder, Path(files.record)), ("disk", _disk, files)] * bool(files.record),
-        *[("certificates", _certificates, network)] * bool(network.certificate or network.zenoh_config),
+        *[("certificates", _certificates, network)]
+        * bool(network.certificate or network.zenoh_config),
         *(("port", _endpoint, endpoint, settings) for endpoint in (*network.listen, *live)),
         *(("router", _endpoint, endpoint, None) for endpoint in network.connect),
     ]
@@ -74,7 +79,9 @@ def _imports() -> str:
 
 def _arm(settings: Settings) -> str:
     robot_description(settings)  # with its meshes
-    return f"{urdf_path(settings)}, {len(settings.joints.names)} joints, tool on {settings.arm.plate}"
+    return (
+        f"{urdf_path(settings)}, {len(settings.joints.names)} joints, tool on {settings.arm.plate}"
+    )
 
 
 def _skill(settings: Settings, path: Path) -> str:
@@ -99,7 +106,10 @@ def _folder(folder: Path) -> str:
     if not system.f_blocks:
         raise ExplainedError(f"{existing} stores no files; a folder on a disk needed")
     if not os.access(existing, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
-        raise ExplainedError(f"{folder}: {existing} cannot be written by user {os.geteuid()}; its owner can allow that")
+        raise ExplainedError(
+            f"{folder}: {existing} cannot be written by user {os.geteuid()}; its owner can allow "
+            "that"
+        )
     return f"{folder} can be {'written' if existing == folder.absolute() else 'made'}"
 
 
@@ -118,14 +128,18 @@ def _certificates(network: Network) -> str:
 
 def _endpoint(endpoint: str, settings: Settings | None) -> str:
     """Try to listen on the endpoint of a cell with these settings, or to connect to a router's."""
-    where, address = endpoint.partition("#")[0], tcp_address(endpoint)  # the rest may hold keys
+    # the rest may hold keys
+    where = endpoint.partition("#")[0]
+    address = tcp_address(endpoint)
     if address is None:
         return f"{where} is not examined"
     try:
         if settings is None:
             socket.create_connection(address, timeout=ROUTER_TIMEOUT_S).close()
             return f"{where} accepts connections"
-        family, kind, number, _, socket_address = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
+        family, kind, number, _, socket_address = socket.getaddrinfo(
+            *address, type=socket.SOCK_STREAM
+        )[0]
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(socket_address)

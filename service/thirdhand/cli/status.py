@@ -18,7 +18,14 @@ from thirdhand.cli.usage import reached
 from thirdhand.client import Client, UnreachableError, decoded, why_silent
 from thirdhand.contract import channels
 from thirdhand.contract.evidence import lasting
-from thirdhand.contract.incidents import SOURCE_NAMES, in_brief, input_name, what_happened, what_to_do, word
+from thirdhand.contract.incidents import (
+    SOURCE_NAMES,
+    in_brief,
+    input_name,
+    what_happened,
+    what_to_do,
+    word,
+)
 from thirdhand.contract.records import SIDES, Flag
 from thirdhand.contract.requests import Source, Status
 from thirdhand.process import interrupt
@@ -26,7 +33,9 @@ from thirdhand.process import interrupt
 POLL_S = 0.02
 LINE_S = 0.5  # interval of the lines of --watch
 SILENT_S = 2.0  # a daemon without a status for this time does not answer
-LATE_MS, AHEAD_MS = 1000.0, -5.0  # a sample's stamp beyond these shows that clocks differ
+# a sample's stamp beyond these shows that clocks differ
+LATE_MS = 1000.0
+AHEAD_MS = -5.0
 NOTHING_DECIDED = "starting: nothing has been decided yet"
 MODE_STYLES = {"follow": "green", "hold": "yellow", "fault": "bold red"}
 STUCK = word(Flag.STUCK)  # its explanation is already in `because`
@@ -57,10 +66,12 @@ def _watch(args: argparse.Namespace) -> int:
         elif sys.stdout.isatty():
             _draw(arriving)
         else:
-            last_s, outcome = 0.0, ("", "")
+            last_s = 0.0
+            outcome = ("", "")
             for now in arriving:
                 if time.monotonic() - last_s >= LINE_S or (now.mode, now.reason) != outcome:
-                    last_s, outcome = time.monotonic(), (now.mode, now.reason)
+                    last_s = time.monotonic()
+                    outcome = (now.mode, now.reason)
                     print(line(now), flush=True)
     return 1
 
@@ -91,14 +102,18 @@ def _draw(arriving: Iterator[Status]) -> None:
             table = Table.grid(padding=(0, 2))
             for name, text in rows(now).items():
                 table.add_row(
-                    Text(name, style="dim"), Text(text, style=MODE_STYLES[now.mode] if name == "mode" else "")
+                    Text(name, style="dim"),
+                    Text(text, style=MODE_STYLES[now.mode] if name == "mode" else ""),
                 )
             live.update(table)
 
 
 def line(now: Status) -> str:
     """A status in one line."""
-    parts = [f"tick {now.tick}", in_brief(now.mode, now.reason) + "".join(f" +{flag}" for flag in now.flags)]
+    parts = [
+        f"tick {now.tick}",
+        in_brief(now.mode, now.reason) + "".join(f" +{flag}" for flag in now.flags),
+    ]
     if now.tick < 0:
         return NOTHING_DECIDED
     parts += [f"{side} {_where(now, side)}" for side in SIDES]
@@ -126,7 +141,11 @@ def rows(now: Status) -> dict[str, str]:
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
         "what to do": now.remedy,
-        **{flag: f"{what_happened(flag)}. What to do: {what_to_do(flag)}" for flag in now.flags if flag != STUCK},
+        **{
+            flag: f"{what_happened(flag)}. What to do: {what_to_do(flag)}"
+            for flag in now.flags
+            if flag != STUCK
+        },
         "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
         "residual risk": now.residual_risk,
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
@@ -139,15 +158,23 @@ def rows(now: Status) -> dict[str, str]:
         "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is "
         f"{1000 * math.dist(now.tool_m, now.target_m):.1f} mm from it{_doubt(now)}"
         if now.tool_m is not None and now.target_m is not None
-        else f"none: the skill needs {'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
+        else "none: the skill needs "
+        f"{'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
         "led by hand": "yes, as the arm's driver reports" if now.guided else "",
         "offer": now.offer,
-        "segment": f"{' -> '.join(now.segment)}, {now.segment_belief:.0%} probable" if now.segment else "",
+        "segment": f"{' -> '.join(now.segment)}, {now.segment_belief:.0%} probable"
+        if now.segment
+        else "",
         "turned": _turned(now),
-        "tool's limits": "; ".join(f"{where} {limits.text}" for where, limits in now.tool_limits.items()),
+        "tool's limits": "; ".join(
+            f"{where} {limits.text}" for where, limits in now.tool_limits.items()
+        ),
         "limited by": now.binding,
-        "gripper": now.gripper + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
-        "rejected": "; ".join(_rejected(name, source) for name, source in now.inputs.items() if source.rejected)
+        "gripper": now.gripper
+        + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
+        "rejected": "; ".join(
+            _rejected(name, source) for name, source in now.inputs.items() if source.rejected
+        )
         or "none",
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
         "disk": disk(scribe) if scribe.get("free_mb") is not None else "",
@@ -156,10 +183,11 @@ def rows(now: Status) -> dict[str, str]:
     }
     for name in ("lateness_us", "work_us", "latency_ms"):
         label, unit = name.rsplit("_", 1)
-        values, digits = getattr(now, name), 1 if unit == "us" else 2
+        values = getattr(now, name)
+        digits = 1 if unit == "us" else 2
         texts[label] = (
-            f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f} "
-            + unit.replace("us", "µs")
+            f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max "
+            f"{values.max:.{digits}f} " + unit.replace("us", "µs")
             if values.max
             else "none yet"
         )
@@ -170,13 +198,20 @@ def rows(now: Status) -> dict[str, str]:
 
 def hours_until_full(scribe: Mapping[str, Any]) -> float | None:
     """Time until the disk of the recordings is full [h]; None if it never is, or is not known."""
-    free_mb, rate, left_mb = (scribe.get(name) for name in ("free_mb", "mb_per_hour", "keep_mb_left"))
-    return free_mb / rate if rate and free_mb is not None and (left_mb is None or left_mb >= free_mb) else None
+    free_mb, rate, left_mb = (
+        scribe.get(name) for name in ("free_mb", "mb_per_hour", "keep_mb_left")
+    )
+    return (
+        free_mb / rate
+        if rate and free_mb is not None and (left_mb is None or left_mb >= free_mb)
+        else None
+    )
 
 
 def disk(scribe: Mapping[str, Any]) -> str:
     """Free space where the scribe records, in words, and how long it lasts if that is known."""
-    rate, text = scribe.get("mb_per_hour"), f"{in_gb(scribe['free_mb'])} free where it records"
+    rate = scribe.get("mb_per_hour")
+    text = f"{in_gb(scribe['free_mb'])} free where it records"
     if not rate:
         return text
     text += f", {rate / 1000:.2g} GB an hour written"
@@ -195,7 +230,11 @@ def in_gb(size_mb: float) -> str:
 def _doubt(now: Status) -> str:
     """The error probability in words; empty if it is not known."""
     p = now.error_probability
-    return "" if p is None else f"; off by more than 10 cm with a probability of {100 * p:.{1 if p < 0.1 else 0}f} %"
+    return (
+        ""
+        if p is None
+        else f"; off by more than 10 cm with a probability of {100 * p:.{1 if p < 0.1 else 0}f} %"
+    )
 
 
 def differing_clocks(now: Status) -> str:
@@ -215,25 +254,37 @@ def _at(point: tuple[float, float, float] | None) -> str:
 
 def _where(now: Status, side: str) -> str:
     source = now.sources.get(side, Source())
-    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _arrival(source, "not seen")
+    return (f"{_at(now.hands_m.get(side))}, " if source.fresh else "") + _arrival(
+        source, "not seen"
+    )
 
 
 def _arrival(source: Source, missing: str) -> str:
     """Age and rate of a source's samples, or since when they are missing."""
     is_rejected = source.rate_hz > 0 and source.cause
-    rejected = f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
+    rejected = (
+        f"; {source.rate_hz:.0f} messages/s are rejected as {source.cause}" if is_rejected else ""
+    )
     if source.fresh:
         return f"{source.age_ms:.0f} ms old, {source.rate_hz:.0f} Hz"
-    return f"{missing} {'yet' if source.age_ms is None else f'for {source.age_ms / 1000:.1f} s'}{rejected}"
+    return (
+        f"{missing} "
+        f"{'yet' if source.age_ms is None else f'for {source.age_ms / 1000:.1f} s'}{rejected}"
+    )
 
 
 def _nearest(now: Status) -> str:
     fresh = [side for side in SIDES if now.sources.get(side, Source()).fresh]
     if not fresh:
         return "no hand is seen"
-    near = f"{100 * now.hand_distance_m:.1f} cm to a hand, at most {now.hand_limit_m_s:.2f} m/s toward it"
+    near = (
+        f"{100 * now.hand_distance_m:.1f} cm to a hand, at most {now.hand_limit_m_s:.2f} m/s "
+        "toward it"
+    )
     unseen_sides = [side for side in now.hand_age_ms if side not in fresh]
-    return near + (f"; the {unseen_sides[0]} hand is assumed where it was last seen" if unseen_sides else "")
+    return near + (
+        f"; the {unseen_sides[0]} hand is assumed where it was last seen" if unseen_sides else ""
+    )
 
 
 def _arm(now: Status) -> str:

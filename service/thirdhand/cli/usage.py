@@ -17,7 +17,13 @@ from typing import Any, NoReturn
 import msgspec
 import zenoh
 
-from thirdhand.client import CLIENT_FILE, ClientSettings, UnreachableError, client_settings, open_session
+from thirdhand.client import (
+    CLIENT_FILE,
+    ClientSettings,
+    UnreachableError,
+    client_settings,
+    open_session,
+)
 from thirdhand.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
 from thirdhand.contract.explain import did_you_mean, in_file, in_words
 from thirdhand.contract.requests import Add, RequestError, ViaPoint, decode_request
@@ -46,7 +52,9 @@ class Parser(argparse.ArgumentParser):
         formatter.add_text(self.description)
         for title, commands in self.groups.items():
             formatter.start_section(title)
-            formatter.add_arguments(argparse.Action([], name, help=about) for name, about in commands.items())
+            formatter.add_arguments(
+                argparse.Action([], name, help=about) for name, about in commands.items()
+            )
             formatter.end_section()
         formatter.add_text(self.epilog)
         return f"{self.format_usage()}\n{formatter.format_help()}"
@@ -68,7 +76,9 @@ class AddCommand:
         self._home = home
         self._abouts = abouts
 
-    def __call__(self, name: str, about: str, example: str, run: str = "") -> argparse.ArgumentParser:
+    def __call__(
+        self, name: str, about: str, example: str, run: str = ""
+    ) -> argparse.ArgumentParser:
         """The parser of a command, which the function `run` runs: `module.function` in the home, or
         a full name; by default it and its module are named as the command.
         """
@@ -105,11 +115,18 @@ def reach(sub: argparse.ArgumentParser, *, one: bool = True) -> argparse.Argumen
     group = sub.add_argument_group(
         "how the daemon is reached",
         "An option that is not given is taken from the variable in its help, else from the file\n"
-        f"{CLIENT_FILE}.\nThe certificate and Zenoh's own settings are taken from $THIRDHAND_CERTIFICATE and\n"
+        f"{CLIENT_FILE}.\nThe certificate and Zenoh's own settings are taken from "
+        "$THIRDHAND_CERTIFICATE and\n"
         "$THIRDHAND_ZENOH_CONFIG, else from the same file.",
     )
     endpoint = "Zenoh endpoint of the daemon or of a router; if repeated, the first that answers"
-    option(group, "--connect", "EP", f"{endpoint} ($THIRDHAND_CONNECT, else {ENDPOINT})", action="append")
+    option(
+        group,
+        "--connect",
+        "EP",
+        f"{endpoint} ($THIRDHAND_CONNECT, else {ENDPOINT})",
+        action="append",
+    )
     if one:
         option(group, "--cell", "NAME", "prefix of all keys ($THIRDHAND_CELL, else thirdhand)")
     sub.set_defaults(reaches=True)
@@ -139,10 +156,14 @@ def workers(given: str) -> str:
     """Read workers from the command line, as `spread` takes them."""
     if re.fullmatch(r"[1-9]\d{0,3}|dask:\S+", given):
         return given
-    raise argparse.ArgumentTypeError(f"{given} given; a number of processes, or dask:tcp://HOST:8786 needed")
+    raise argparse.ArgumentTypeError(
+        f"{given} given; a number of processes, or dask:tcp://HOST:8786 needed"
+    )
 
 
-TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions that read an option's value
+TYPE_OF_METAVAR: dict[
+    str | None, Callable[[str], Any]
+] = {  # the functions that read an option's value
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
@@ -152,19 +173,28 @@ TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {  # the functions tha
 }
 
 WORKERS_HELP = (
-    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of the scheduler); "
-    "the output is the same (default: one after the other)"
+    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of "
+    "the scheduler); the output is the same (default: one after the other)"
 )
 RATE_HELP = "the rate of the control loop (default: the rate in the cell's settings)"
-ARM_HELP = "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
+ARM_HELP = (
+    "wam, franka or ur5, or a cell's settings (FILE.toml, or FILE.toml:NAME of several cells)"
+)
 
 
 def option(
-    c: argparse._ActionsContainer, name: str, metavar: str | None, about: str, default: Any = None, **more: Any
+    c: argparse._ActionsContainer,
+    name: str,
+    metavar: str | None,
+    about: str,
+    default: Any = None,
+    **more: Any,
 ) -> None:
     """Add an option or argument with a value; its default is appended to its help."""
     if default is not None:
-        about += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
+        about += (
+            f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
+        )
     more = {"type": TYPE_OF_METAVAR.get(metavar, str), **more}
     c.add_argument(name, metavar=metavar, help=about, default=default, **more)
 
@@ -182,7 +212,9 @@ def check_writable(path: Path, suffix: str = "") -> None:
     if path.is_dir():
         raise UsageError(f"{path} is a folder; the name of a file needed")
     if suffix and path.suffix.lower() != suffix:
-        raise UsageError(f"{path}: a name that ends in {suffix} needed, like {path.with_suffix(suffix).name}")
+        raise UsageError(
+            f"{path}: a name that ends in {suffix} needed, like {path.with_suffix(suffix).name}"
+        )
     if not folder.is_dir():
         raise UsageError(f"{path}: there is no folder {folder}")
     try:
@@ -225,7 +257,9 @@ def inputs_session(args: argparse.Namespace, timeout_s: float, settings: Setting
             timeout_s=timeout_s,
             certificate=reach.certificate,
             zenoh_config=reach.zenoh_config,
-            more={} if listen else {"mode": "client"},  # a daemon forwards others' messages only to clients
+            more={}
+            if listen
+            else {"mode": "client"},  # a daemon forwards others' messages only to clients
         )
     except UnreachableError as error:
         hint = "" if listen else f" Without a daemon, use --listen {ENDPOINT}"
@@ -238,7 +272,10 @@ def added_in(path: Path) -> Add:
     """
     try:
         request: Add = decode_request(
-            sys.stdin.buffer.read() if str(path) == "-" else content(path, LARGEST_REQUEST, accepts_pipes=True), Add
+            sys.stdin.buffer.read()
+            if str(path) == "-"
+            else content(path, LARGEST_REQUEST, accepts_pipes=True),
+            Add,
         )
     except (OSError, UnusableError) as error:
         raise RequestError(f"{path} cannot be read: {in_words(error, named=False)}") from None
@@ -265,4 +302,6 @@ def end_with(pid: int) -> None:
     try:
         when_ended(pid, lambda: os.kill(os.getpid(), signal.SIGTERM))
     except ProcessLookupError:
-        raise UsageError(f"--end-with {pid}: no such process; the number of a running one accepted") from None
+        raise UsageError(
+            f"--end-with {pid}: no such process; the number of a running one accepted"
+        ) from None

@@ -26,7 +26,8 @@ from thirdhand.contract.requests import ANSWER_TIMEOUT_S, Reply, Status, ViaPoin
 
 ALIVE_QUERIES = 5
 QUERIES = 2  # queries within the time of one request, if it may be repeated
-RECONNECTED_S = 2.0  # a connection that broke returns within this time, unless the network or the daemon is down
+# a connection that broke returns within this time, unless the network or the daemon is down
+RECONNECTED_S = 2.0
 LIST = requests.encode_json(requests.List())
 Answer = TypeVar("Answer")
 
@@ -43,11 +44,19 @@ class Client:
     UncertainError, a subclass of UnreachableError: they may have been carried out.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        cell: str = "thirdhand",
+        *,
+        timeout_s: float = ANSWER_TIMEOUT_S,
+    ) -> None:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s
-        self._daemons: set[str] = set()  # Zenoh sessions of daemons of the cell, also of those that ended
+        self._daemons: set[str] = (
+            set()
+        )  # Zenoh sessions of daemons of the cell, also of those that ended
 
     def hold(self, by: str = "") -> Reply:
         """Stop the arm, which then holds; returns once that is in force. `by` names its holder."""
@@ -92,7 +101,11 @@ class Client:
         return self._typed("via_points", requests.Clear(), Reply)
 
     def correct(
-        self, tool: Vector3 | None = None, *, hands: Literal["held", "now"] = "held", turned: bool = False
+        self,
+        tool: Vector3 | None = None,
+        *,
+        hands: Literal["held", "now"] = "held",
+        turned: bool = False,
     ) -> Reply:
         """Correct the tool in a hold: it belongs at `tool` [m], None: where the arm was led by
         hand. Returns once that is in force.
@@ -115,7 +128,9 @@ class Client:
         answer: dict[str, Any] = decoded(self._answer(suffix, request), dict)
         return answer
 
-    def wait_until_ready(self, *, timeout_s: float | None = 15.0, silent: bool | None = None) -> Status:
+    def wait_until_ready(
+        self, *, timeout_s: float | None = 15.0, silent: bool | None = None
+    ) -> Status:
         """The status, once a daemon of this cell is ready.
 
         It waits for `timeout_s` [s], and longer while the daemon's start makes progress; None:
@@ -134,9 +149,13 @@ class Client:
     def _answer(self, suffix: str, request: Any) -> bytes:
         payload = requests.encode_json({} if request is None else request)
         if len(payload) > channels.LARGEST_REQUEST:
-            raise RefusedError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
+            raise RefusedError(
+                f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"
+            )
         acts = suffix != "status" and payload != LIST
-        may_repeat = not acts or suffix == "hold"  # a second hold changes nothing, and a lost one must not remain so
+        may_repeat = (
+            not acts or suffix == "hold"
+        )  # a second hold changes nothing, and a lost one must not remain so
         queries_left = QUERIES if may_repeat else 1  # a query, or its answer, may be lost
         query_s = self._timeout_s / queries_left
         end_s = time.monotonic() + min(RECONNECTED_S, self._timeout_s)
@@ -154,9 +173,13 @@ class Client:
                 break
         silent = f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
         if is_sent and acts and not is_absent:
-            raise UncertainError(f"{silent}. The request may have been carried out: the status shows it")
+            raise UncertainError(
+                f"{silent}. The request may have been carried out: the status shows it"
+            )
         if is_stored and is_absent:
-            silent += " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
+            silent += (
+                " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
+            )
         raise UnreachableError(silent)
 
     def _asked(self, suffix: str, payload: bytes, timeout_s: float) -> tuple[bytes | None, bool]:
@@ -173,7 +196,11 @@ class Client:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
         ):
-            text = "" if reply.err is None else printable_lines(reply.err.payload.to_bytes().decode(errors="replace"))
+            text = (
+                ""
+                if reply.err is None
+                else printable_lines(reply.err.payload.to_bytes().decode(errors="replace"))
+            )
             if text == "Timeout":
                 continue
             if text.startswith(requests.STARTING):

@@ -15,18 +15,29 @@ import zenoh
 from thirdhand.client.session import open_session
 from thirdhand.contract.channels import ENDPOINT, CellName, lacking
 from thirdhand.contract.explain import InvalidError, in_words, validated
-from thirdhand.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
+from thirdhand.settings.file_content import (
+    SettingsError,
+    UnreadableError,
+    UnusableError,
+    text_in,
+    toml_in,
+)
 from thirdhand.settings.user_folder import HomelessError, user_folder
 
-CLIENT_FILE = "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
+CLIENT_FILE = (
+    "$XDG_CONFIG_HOME/thirdhand/client.toml, ~/.config/thirdhand/client.toml where that is not set"
+)
 
-Endpoints = Annotated[tuple[str, ...], msgspec.Meta(extra={"accepted": "an endpoint, or a list of them,"})]
+Endpoints = Annotated[
+    tuple[str, ...], msgspec.Meta(extra={"accepted": "an endpoint, or a list of them,"})
+]
 
 
 class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The settings by which a client reaches its cell."""
 
-    connect: Endpoints = ()  # the first that answers is used; none: those of `zenoh_config`, else ENDPOINT
+    # the first that answers is used; none: those of `zenoh_config`, else ENDPOINT
+    connect: Endpoints = ()
     cell: CellName = "thirdhand"  # prefix of all keys
     certificate: str = ""  # the folder of the client's role; empty: none
     zenoh_config: str = ""  # a file with Zenoh's own settings; empty: none
@@ -36,7 +47,9 @@ class ClientSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             if lacks := lacking(endpoint):
                 raise ValueError(f"$.connect[{i}]: {lacks}")
         if {".", ".."} & set(self.cell.split("/")):
-            raise ValueError(f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted")
+            raise ValueError(
+                f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
+            )
 
     def session(self, *, timeout_s: float | None = 10.0, at_once: bool = False) -> zenoh.Session:
         """A session to the daemon, recorder or router, as `open_session` opens it."""
@@ -66,13 +79,20 @@ def client_settings(
     """
     path = _file()
     settings = {} if path is None else _checked(str(path), _read(path))
-    options = {"connect": list(connect or ()), "cell": cell, "certificate": certificate, "zenoh_config": zenoh_config}
+    options = {
+        "connect": list(connect or ()),
+        "cell": cell,
+        "certificate": certificate,
+        "zenoh_config": zenoh_config,
+    }
     for name, option in options.items():
         if text := os.environ.get(variable := f"THIRDHAND_{name.upper()}"):
             listed = [part.strip() for part in text.split(",")] if name == "connect" else text
             settings |= _checked(f"${variable}", {name: listed})
         if option or option == "":
-            settings |= _checked(f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)})
+            settings |= _checked(
+                f"--{name.replace('_', '-')}", {name: option if name == "connect" else str(option)}
+            )
     return msgspec.convert(settings, ClientSettings)
 
 
@@ -103,7 +123,9 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         content = toml_in(text_in(path))
     except (OSError, UnusableError) as error:
-        raise UnreadableError(f"cannot read client settings {path}: {in_words(error, named=False)}") from None
+        raise UnreadableError(
+            f"cannot read client settings {path}: {in_words(error, named=False)}"
+        ) from None
     except ValueError as error:
         raise SettingsError(f"{path}: {error}") from None
     if isinstance(content.get("connect"), str):

@@ -26,7 +26,16 @@ from thirdhand.client.streams import (
     wait_until_heard,
 )
 from thirdhand.contract import cdr, markers
-from thirdhand.contract.messages import BASE, GRIPPER, JointState, PoseStamped, Quaternion, SceneObject, Vector3, finite
+from thirdhand.contract.messages import (
+    BASE,
+    GRIPPER,
+    JointState,
+    PoseStamped,
+    Quaternion,
+    SceneObject,
+    Vector3,
+    finite,
+)
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, NORM_TOLERANCE, Reply, ViaPoint
 
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
@@ -52,7 +61,9 @@ def connect(
     UnreachableError, and SettingsError for settings that cannot be used.
     """
     endpoints = [endpoint] if isinstance(endpoint, str) else endpoint
-    settings = client_settings(connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config)
+    settings = client_settings(
+        connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config
+    )
     return Connection(settings.session(timeout_s=timeout_s), settings.cell)
 
 
@@ -68,7 +79,13 @@ class Connection(Client, AbstractContextManager["Connection"]):
     would reject, and UnreachableError if nobody listens.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float = ANSWER_TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        cell: str = "thirdhand",
+        *,
+        timeout_s: float = ANSWER_TIMEOUT_S,
+    ) -> None:
         super().__init__(session, cell, timeout_s=timeout_s)
         self._publishers: dict[str, Publisher] = {}
 
@@ -87,12 +104,20 @@ class Connection(Client, AbstractContextManager["Connection"]):
     ) -> None:
         """Publish the poses of the hands that the tracker sees now, in its frame."""
         arguments = {"left": left, "right": right}
-        poses = {f"hands/{side}": _pose(side, pose) for side, pose in arguments.items() if pose is not None}
+        poses = {
+            f"hands/{side}": _pose(side, pose)
+            for side, pose in arguments.items()
+            if pose is not None
+        }
         if not poses:
             raise ValueError("no hand given; left, right or both needed")
-        self._publish({suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns)
+        self._publish(
+            {suffix: _encoded(frame_id, *pose) for suffix, pose in poses.items()}, stamp_ns
+        )
 
-    def tool(self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE) -> None:
+    def tool(
+        self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE
+    ) -> None:
         """Publish the measured pose of the tool, for demonstrations."""
         self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
 
@@ -121,8 +146,12 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """
         encoded_joints(0, names, position, velocity)  # raises before anything is sent
         if not finite((*position, *velocity)):
-            raise ValueError(f"joints: {list(position)} and {list(velocity)} given; finite numbers needed")
-        self._publish({"joints/state": lambda ns: encoded_joints(ns, names, position, velocity)}, stamp_ns)
+            raise ValueError(
+                f"joints: {list(position)} and {list(velocity)} given; finite numbers needed"
+            )
+        self._publish(
+            {"joints/state": lambda ns: encoded_joints(ns, names, position, velocity)}, stamp_ns
+        )
 
     def guided(self, led: bool) -> None:
         """Publish that somebody leads the arm by hand, or no longer does. While it is led, call
@@ -139,14 +168,21 @@ class Connection(Client, AbstractContextManager["Connection"]):
         try:
             scene = tuple(objects)
         except TypeError:
-            raise ValueError(f"objects: {reprlib.repr(objects)} given; SceneObjects needed") from None
+            raise ValueError(
+                f"objects: {reprlib.repr(objects)} given; SceneObjects needed"
+            ) from None
         for scene_object in scene:
             if not isinstance(scene_object, SceneObject):
                 raise ValueError(f"object {scene_object!r} given; a SceneObject needed")
             if scene_object.shape not in markers.NUMBERS:
                 accepted = ", ".join(markers.NUMBERS)
-                raise ValueError(f"object {scene_object.name!r}: shape {scene_object.shape!r} given; one of {accepted} accepted")
-        markers.decode_objects(markers.encode_objects(0, scene))  # raises the error that the daemon would report
+                raise ValueError(
+                    f"object {scene_object.name!r}: shape {scene_object.shape!r} given; one of "
+                    f"{accepted} accepted"
+                )
+        markers.decode_objects(
+            markers.encode_objects(0, scene)
+        )  # raises the error that the daemon would report
         self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
 
     def watch(self, suffix: str, *, timeout_s: float | None = None) -> Watch:
@@ -158,12 +194,24 @@ class Connection(Client, AbstractContextManager["Connection"]):
         return Watch(self._session, self._cell, suffix, timeout_s=timeout_s)
 
     def teach(
-        self, name: str, *, left: Sequence[float], right: Sequence[float], tool: Sequence[float], **more: Any
+        self,
+        name: str,
+        *,
+        left: Sequence[float],
+        right: Sequence[float],
+        tool: Sequence[float],
+        **more: Any,
     ) -> Reply:
         """Teach one via-point: the tool's position [m] that belongs to these positions of the
         hands. `more` are further fields of `ViaPoint`. Returns once it is in force.
         """
-        point = ViaPoint(name, _position("left", left), _position("right", right), _position("tool", tool), **more)
+        point = ViaPoint(
+            name,
+            _position("left", left),
+            _position("right", right),
+            _position("tool", tool),
+            **more,
+        )
         return self.add([point])
 
     def close(self) -> None:
@@ -175,14 +223,19 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def _publish_bool(self, suffix: str, value: bool) -> None:
         if not isinstance(value, bool):
-            raise ValueError(f"{suffix.removeprefix('joints/')}: {value!r} given; True or False needed")
+            raise ValueError(
+                f"{suffix.removeprefix('joints/')}: {value!r} given; True or False needed"
+            )
         self._publish({suffix: lambda _: cdr.encode_bool(value)}, None)
 
     def _publish_closure(self, suffix: str, closure: float, stamp_ns: int | None) -> None:
         (value,) = _numbers("closure", [closure], 1)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"closure: {closure} given; {FORMS[1]} needed")
-        self._publish({suffix: lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))}, stamp_ns)
+        self._publish(
+            {suffix: lambda ns: cdr.encode_joints(JointState(ns, (GRIPPER,), (value,), ()))},
+            stamp_ns,
+        )
 
     def _publish(self, messages: dict[str, Callable[[int], bytes]], stamp_ns: int | None) -> None:
         """Publish messages that are encoded for a stamp [ns]; None: the time when all of them are
@@ -218,11 +271,14 @@ def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Calla
 def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
     """Position [m] and orientation of a pose of three or seven numbers. Raises ValueError."""
     numbers = _numbers(what, pose, 3, 7)
-    position, turned = (numbers[0], numbers[1], numbers[2]), numbers[3:]
+    position = (numbers[0], numbers[1], numbers[2])
+    turned = numbers[3:]
     if not turned:
         return position, UNTURNED
     if abs((norm := math.hypot(*turned)) - 1.0) > NORM_TOLERANCE:
-        raise ValueError(f"{what}: quaternion {list(turned)} has norm {norm:.4g}; 1 needed (x y z w)")
+        raise ValueError(
+            f"{what}: quaternion {list(turned)} has norm {norm:.4g}; 1 needed (x y z w)"
+        )
     return position, (turned[0], turned[1], turned[2], turned[3])
 
 
@@ -235,14 +291,18 @@ def _position(what: str, given: Sequence[float]) -> Vector3:
 def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
     """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
     try:
-        if isinstance(given, str | bytes | bytearray | Mapping | Set):  # their members are in no order, or no numbers
+        if isinstance(
+            given, str | bytes | bytearray | Mapping | Set
+        ):  # their members are in no order, or no numbers
             raise TypeError
         values = tuple(itertools.islice(given, counts[-1] + 1))
         if any(isinstance(value, str | bytes) for value in values):
             raise TypeError
         numbers = tuple(map(float, values))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{what}: {reprlib.repr(given)} given; {FORMS[counts[-1]]} needed") from None
+        raise ValueError(
+            f"{what}: {reprlib.repr(given)} given; {FORMS[counts[-1]]} needed"
+        ) from None
     if len(numbers) not in counts:
         most = f"more than {counts[-1]}" if len(numbers) > counts[-1] else len(numbers)
         count = len(given) if hasattr(given, "__len__") else most

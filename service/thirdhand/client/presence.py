@@ -35,20 +35,28 @@ def is_connected(session: zenoh.Session) -> bool:
     return bool(session.info.transports())
 
 
-def living(session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> frozenset[str]:
+def living(
+    session: zenoh.Session, cell: str, *, timeout_s: float = PRESENCE_TIMEOUT_S
+) -> frozenset[str]:
     """The ids of the Zenoh sessions of the daemons that serve a cell."""
-    return frozenset(session_id for _, session_id in _tokens(session, channels.presence(cell), timeout_s))
+    return frozenset(
+        session_id for _, session_id in _tokens(session, channels.presence(cell), timeout_s)
+    )
 
 
 def why_silent(session: zenoh.Session, cell: str) -> str:
     """A message with the likely reasons for a cell's silence."""
     if not is_connected(session):
-        return "this program is not connected to a daemon or router; it restores a lost connection by itself"
+        return (
+            "this program is not connected to a daemon or router; it restores a lost connection by "
+            "itself"
+        )
     served = {name for name, _ in _tokens(session, channels.PRESENCE_OF_ALL, PRESENCE_TIMEOUT_S)}
     if cell in served:
         return (
-            "its daemon is alive, but it is starting or ending, too busy, denies access, or is reached through another "
-            "cell's daemon, which forwards no streams: try again, or connect to it directly"
+            "its daemon is alive, but it is starting or ending, too busy, denies access, or is "
+            "reached through another cell's daemon, which forwards no streams: try again, or "
+            "connect to it directly"
         )
     if served:
         return f"only daemons of other cells run there: {', '.join(map(printable, sorted(served)))}"
@@ -73,8 +81,12 @@ def cells(session: zenoh.Session, *, timeout_s: float = PRESENCE_TIMEOUT_S) -> t
         for reply in replies:
             if reply.ok is not None and reply.replier_id is not None:
                 with contextlib.suppress(RefusedError):
-                    statuses[str(reply.replier_id.zid)] = decoded(reply.ok.payload.to_bytes(), Status)
-    return tuple(Cell(printable(name), session_id, statuses.get(session_id)) for name, session_id in tokens)
+                    statuses[str(reply.replier_id.zid)] = decoded(
+                        reply.ok.payload.to_bytes(), Status
+                    )
+    return tuple(
+        Cell(printable(name), session_id, statuses.get(session_id)) for name, session_id in tokens
+    )
 
 
 class Overheard(AbstractContextManager["Overheard"]):
@@ -84,7 +96,9 @@ class Overheard(AbstractContextManager["Overheard"]):
 
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
-        self._subscribers = [session.declare_subscriber(expression, self._take) for expression in expressions]
+        self._subscribers = [
+            session.declare_subscriber(expression, self._take) for expression in expressions
+        ]
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -107,5 +121,11 @@ class Overheard(AbstractContextManager["Overheard"]):
 
 def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str, str]]:
     """The cell and the Zenoh session of each token under a key."""
-    tokens = (str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=timeout_s) if reply.ok)
-    return {(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens}  # some arrive twice
+    tokens = (
+        str(reply.ok.key_expr)
+        for reply in session.liveliness().get(key, timeout=timeout_s)
+        if reply.ok
+    )
+    return {
+        (token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens
+    }  # some arrive twice

@@ -20,7 +20,10 @@ from thirdhand.contract.channels import lacking, tcp_address
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.settings.file_content import LARGEST_CONFIGURATION, UnusableError, content
 
-CERTIFICATE, KEY, AUTHORITY = "certificate.pem", "key.pem", "authority.pem"  # files in the folder of a role
+# files in the folder of a role
+CERTIFICATE = "certificate.pem"
+KEY = "key.pem"
+AUTHORITY = "authority.pem"
 FOLDER_NEEDED = f"a folder with {CERTIFICATE}, {KEY} and {AUTHORITY} needed"
 ENDPOINTS_TIMEOUT_S = 30.0  # on a busy machine Zenoh answers late
 ATTEMPT_S = 1.0  # timeout of one attempt
@@ -34,7 +37,9 @@ SERVER_PROBLEMS = {  # by OpenSSL's code of a failed verification; others: anoth
 }
 CLIENT_PROBLEMS = {  # by the alert of TLS that the server sends
     **dict.fromkeys(("UNKNOWN_CA", "DECRYPT_ERROR"), "is not from the authority there"),
-    **dict.fromkeys(("BAD_CERTIFICATE", "CERTIFICATE_UNKNOWN", "CERTIFICATE_REQUIRED"), "is not valid there"),
+    **dict.fromkeys(
+        ("BAD_CERTIFICATE", "CERTIFICATE_UNKNOWN", "CERTIFICATE_REQUIRED"), "is not valid there"
+    ),
     "CERTIFICATE_EXPIRED": "has expired by the clock there",
 }
 Attempted = TypeVar("Attempted")
@@ -87,7 +92,10 @@ def open_session(
     The caller closes the session. Raises UnreachableError, and CertificateError at once if TLS
     fails for a certificate.
     """
-    for how, endpoint in [*(("connect to", address) for address in connect), *(("listen on", address) for address in listen)]:
+    for how, endpoint in [
+        *(("connect to", address) for address in connect),
+        *(("listen on", address) for address in listen),
+    ]:
         if lacks := lacking(endpoint):
             raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
@@ -111,14 +119,16 @@ def open_session(
         # [batches] A tick publishes up to four messages, each a batch of its own. With Zenoh's 2,
         # `put` waits for the thread that sends, for 1 ms, and drops the message.
         "transport/link/tx/queue/size/real_time": 16,
-        "transport/shared_memory/enabled": False,  # it is not faster here, and it bypasses the bounds on messages
+        # it is not faster here, and it bypasses the bounds on messages
+        "transport/shared_memory/enabled": False,
         **_tls(folder),
         **(more or {}),
     }
 
     if at_once and (failed := _failures(connect)):
         raise UnreachableError(
-            _unreached(failed) or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
+            _unreached(failed)
+            or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
         )
 
     def opened() -> zenoh.Session:
@@ -127,8 +137,12 @@ def open_session(
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
-            ours = connect if folder or not zenoh_config else ()  # else the file may have certificates of its own
-            if problem := next(filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""):
+            ours = (
+                connect if folder or not zenoh_config else ()
+            )  # else the file may have certificates of its own
+            if problem := next(
+                filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""
+            ):
                 raise CertificateError(problem) from None
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
@@ -180,20 +194,27 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
     """
     if (address := tcp_address(endpoint)) is None:
         return ""
-    tls, is_plain = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), not endpoint.startswith("tls/")
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    is_plain = not endpoint.startswith("tls/")
     try:
         if folder and not is_plain:
-            certificate, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+            certificate, key, authority = (
+                Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY)
+            )
             tls.load_verify_locations(authority)
             tls.load_cert_chain(certificate, key)
         else:
-            tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
+            tls.check_hostname = False
+            tls.verify_mode = ssl.CERT_NONE
         with (
             socket.create_connection(address, timeout=ATTEMPT_S) as plain,
             tls.wrap_socket(plain, server_hostname=address[0]) as secured,
         ):
             if is_plain:
-                return f"{endpoint} accepts TLS only: tls/{endpoint.partition('/')[2]}, and a certificate, needed"
+                return (
+                    f"{endpoint} accepts TLS only: tls/{endpoint.partition('/')[2]}, and a "
+                    "certificate, needed"
+                )
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
         words = SERVER_PROBLEMS.get(error.verify_code, f"is not from the authority in {folder}")
@@ -205,22 +226,25 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         if folder or not problem:
             return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
         return (
-            f"{endpoint} requires a certificate, and none was given: the folder of your role needed, in "
-            "$THIRDHAND_CERTIFICATE or in the file of client settings"
+            f"{endpoint} requires a certificate, and none was given: the folder of your role "
+            "needed, in $THIRDHAND_CERTIFICATE or in the file of client settings"
         )
     except OSError:
         pass
     return ""
 
 
-def tried(attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: bool | None = None) -> Attempted:
+def tried(
+    attempt: Callable[[], Attempted], timeout_s: float | None, *, silent: bool | None = None
+) -> Attempted:
     """The result of `attempt`, which is repeated while it raises UnreachableError.
 
     The error is raised after `timeout_s` [s] with the same message; None: never. A CertificateError
     is raised at once. One message on standard error reports the waiting unless `silent`, which by
     default holds if there is a timeout.
     """
-    begun_s, reported = time.monotonic(), ""
+    begun_s = time.monotonic()
+    reported = ""
     silent = timeout_s is not None if silent is None else silent
     while True:
         try:
@@ -245,12 +269,16 @@ def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:
     """A message with the reason why there is no session between these endpoints."""
     if connect and "connect" in reason:
         return _unreached(_failures(connect)) or (
-            f"nobody answers at {', '.join(connect)}: "
-            "is a daemon, `thirdhand record --listen` or a router listening there, and is it not overloaded?"
+            f"nobody answers at {', '.join(connect)}: is a daemon, `thirdhand record --listen` or "
+            "a router listening there, and is it not overloaded?"
         )
     os_error = re.search(r"\(os error (\d+)\)", reason)
-    words = in_words(OSError(number := int(os_error[1]), os.strerror(number))) if os_error else reason
-    return f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
+    words = (
+        in_words(OSError(number := int(os_error[1]), os.strerror(number))) if os_error else reason
+    )
+    return (
+        f"cannot listen on {', '.join(listen)}: {words}" if listen else f"no Zenoh session: {words}"
+    )
 
 
 def _zenoh_config(path: str | Path | None) -> zenoh.Config:
@@ -270,7 +298,9 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
 def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
     """The endpoints to connect to in a configuration, for every mode or for clients."""
     configured = json.loads(config.get_json("connect/endpoints"))
-    return tuple(configured.get("client") or () if isinstance(configured, dict) else configured or ())
+    return tuple(
+        configured.get("client") or () if isinstance(configured, dict) else configured or ()
+    )
 
 
 def _tls(folder: str | Path | None) -> dict[str, Any]:
@@ -281,9 +311,13 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
     if not folder:
         return {}
     try:
-        certificate, key, authority = (Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY))
+        certificate, key, authority = (
+            Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY)
+        )
     except RuntimeError:
-        raise UnreachableError(f"certificate {folder}: no user of this name has a folder here") from None
+        raise UnreachableError(
+            f"certificate {folder}: no user of this name has a folder here"
+        ) from None
     for path in (certificate, key, authority):
         if not os.access(path, os.R_OK):
             raise UnreachableError(f"cannot read {path}: {FOLDER_NEEDED}")
@@ -293,8 +327,8 @@ def _tls(folder: str | Path | None) -> dict[str, Any]:
         tls.load_cert_chain(certificate, key, password="none")
     except ssl.SSLError:
         raise UnreachableError(
-            f"cannot use {certificate}, {key} and {authority}: certificates in PEM, and the key of the first without a "
-            "password, needed"
+            f"cannot use {certificate}, {key} and {authority}: certificates in PEM, and the key of "
+            "the first without a password, needed"
         ) from None
     settings: dict[str, Any] = {"enable_mtls": True, "root_ca_certificate": str(authority)}
     for side in ("listen", "connect"):

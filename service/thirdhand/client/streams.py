@@ -22,16 +22,29 @@ import zenoh
 from thirdhand.client.replies import decoded
 from thirdhand.client.session import UnreachableError, check_open, tried
 from thirdhand.contract import cdr, channels
-from thirdhand.contract.messages import BASE, JointState, PoseStamped, Quaternion, Vector3, WireError, finite, in_order
+from thirdhand.contract.messages import (
+    BASE,
+    JointState,
+    PoseStamped,
+    Quaternion,
+    Vector3,
+    WireError,
+    finite,
+    in_order,
+)
 from thirdhand.contract.printable import printable
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Status
 
 BRAKE_AFTER_S = 0.02  # a follower brakes after this time without a command
-LATE_COMMAND_S = 0.005  # at the lowest accepted rate, a command may be this late before the follower brakes
+LATE_COMMAND_S = (
+    0.005  # at the lowest accepted rate, a command may be this late before the follower brakes
+)
 MAX_QUEUED = 256  # received messages, half a second of commands at 500 Hz
 CTRL_C_S = 0.5  # a wait is interrupted this often, since on Windows Ctrl-C does not end one
-WATCHABLE = tuple(channel.key for channel in channels.CHANNELS if channel.direction in ("in", "out"))
+WATCHABLE = tuple(
+    channel.key for channel in channels.CHANNELS if channel.direction in ("in", "out")
+)
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
 MAX_FRAME_LETTERS = 64
@@ -43,24 +56,30 @@ def no_room_to_brake(tick_s: float) -> str:
     if tick_s <= (max_tick_s := BRAKE_AFTER_S - LATE_COMMAND_S):
         return ""
     return (
-        f"{1 / tick_s:.0f} Hz is too slow: commands would arrive every {1000 * tick_s:.0f} ms, and an arm brakes "
-        f"{1000 * BRAKE_AFTER_S:.0f} ms after its last command; {math.ceil(1 / max_tick_s)} Hz or more needed"
+        f"{1 / tick_s:.0f} Hz is too slow: commands would arrive every {1000 * tick_s:.0f} ms, and "
+        f"an arm brakes {1000 * BRAKE_AFTER_S:.0f} ms after its last command; "
+        f"{math.ceil(1 / max_tick_s)} Hz or more needed"
     )
 
 
-def encoded_joints(stamp_ns: int, names: Sequence[str], position: Sequence[float], velocity: Sequence[float]) -> bytes:
+def encoded_joints(
+    stamp_ns: int, names: Sequence[str], position: Sequence[float], velocity: Sequence[float]
+) -> bytes:
     """A message with joints [rad, rad/s]; velocities may be empty. Raises ValueError unless there
     is one number for each joint.
     """
     try:
         state = JointState(stamp_ns, tuple(names), tuple(position), tuple(velocity))
-        if len(state.position) != len(state.names) or len(state.velocity) not in (0, len(state.names)):
+        if len(state.position) != len(state.names) or len(state.velocity) not in (
+            0,
+            len(state.names),
+        ):
             raise TypeError
         return cdr.encode_joints(state)
     except (struct.error, TypeError, OverflowError, AttributeError):
         raise ValueError(
-            f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and velocities of "
-            f"{len(names)} joints needed"
+            f"{reprlib.repr(position)} and {reprlib.repr(velocity)} given; positions and "
+            f"velocities of {len(names)} joints needed"
         ) from None
 
 
@@ -113,7 +132,8 @@ def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
         for publisher in publishers:
             if not publisher.is_heard:
                 raise UnreachableError(
-                    f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running in this cell?"
+                    f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
+                    "in this cell?"
                 )
 
     tried(check, timeout_s)
@@ -133,7 +153,11 @@ def checked_stamp(stamp_ns: Any) -> int:
 
 def checked_frame(frame_id: Any) -> None:
     """Raise ValueError for what is no name of a frame."""
-    if not isinstance(frame_id, str) or len(frame_id) > MAX_FRAME_LETTERS or not frame_id.isprintable():
+    if (
+        not isinstance(frame_id, str)
+        or len(frame_id) > MAX_FRAME_LETTERS
+        or not frame_id.isprintable()
+    ):
         needed = f"a name of up to {MAX_FRAME_LETTERS} printable letters needed, or an empty one"
         raise ValueError(f"frame_id: {reprlib.repr(frame_id)} given; {needed}")
 
@@ -145,7 +169,9 @@ class Tracker(AbstractContextManager["Tracker"]):
     both hands; None: until Ctrl-C. Raises UnreachableError if there is no subscriber.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0) -> None:
+    def __init__(
+        self, session: zenoh.Session, cell: str = "thirdhand", *, timeout_s: float | None = 5.0
+    ) -> None:
         self._session = session
         self._publishers = {side: Publisher(session, cell, f"hands/{side}") for side in SIDES}
         try:
@@ -174,14 +200,17 @@ class Tracker(AbstractContextManager["Tracker"]):
         check_open(self._session)
         checked_frame(frame_id)
         pose = PoseStamped(
-            time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns), frame_id, position, orientation
+            time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns),
+            frame_id,
+            position,
+            orientation,
         )
         try:
             message = cdr.encode_pose(pose)
         except (struct.error, TypeError, OverflowError):
             raise ValueError(
-                f"{side} hand: {reprlib.repr(position)} and {reprlib.repr(orientation)} given; a position x y z [m] "
-                "and a quaternion x y z w needed"
+                f"{side} hand: {reprlib.repr(position)} and {reprlib.repr(orientation)} given; a "
+                "position x y z [m] and a quaternion x y z w needed"
             ) from None
         self._publishers[side].put(message)
 
@@ -204,9 +233,13 @@ class _Received(AbstractContextManager[Any]):
     """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
-        self.rejected, self.reason, self.lost = 0, "", 0
+        self.rejected = 0
+        self.reason = ""
+        self.lost = 0
         self._newest = "", 0  # publisher and number of the newest message
-        self._session, self._came, self._is_closed = session, threading.Condition(), False
+        self._session = session
+        self._came = threading.Condition()
+        self._is_closed = False
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
         self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
@@ -223,22 +256,29 @@ class _Received(AbstractContextManager[Any]):
         raise NotImplementedError
 
     def _count_lost(self, sample: zenoh.Sample) -> None:
-        before, lost = self.lost, int(len(self._queue) == MAX_QUEUED)
+        before = self.lost
+        lost = int(len(self._queue) == MAX_QUEUED)
         if (info := sample.source_info) is not None:
-            (last_publisher, last), self._newest = self._newest, (str(info.source_id), info.source_sn)
+            last_publisher, last = self._newest
+            self._newest = (str(info.source_id), info.source_sn)
             if last_publisher == self._newest[0]:
                 lost += (info.source_sn - last - 1) % channels.MESSAGE_NUMBERS
         self.lost += lost
         if self.lost and not before:
             key = printable(str(sample.key_expr))
-            print(f"messages on {key} are lost: this program or its network is too slow", file=sys.stderr, flush=True)
+            print(
+                f"messages on {key} are lost: this program or its network is too slow",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _take(self, sample: zenoh.Sample) -> None:
         self._count_lost(sample)
         try:
             value = self._decoded(sample)
         except ValueError as error:
-            self.rejected, self.reason = self.rejected + 1, str(error)
+            self.rejected = self.rejected + 1
+            self.reason = str(error)
             return
         with self._came:
             self._queue.append(value)
@@ -263,7 +303,9 @@ class Watch(_Received, Iterator[Any]):
     messages.
     """
 
-    def __init__(self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None) -> None:
+    def __init__(
+        self, session: zenoh.Session, cell: str, suffix: str, *, timeout_s: float | None = None
+    ) -> None:
         if suffix not in WATCHABLE:
             raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
         decode = channels.BY_KEY[suffix].codec.decode
@@ -310,7 +352,9 @@ class Follower(_Received):
     that did not arrive.
     """
 
-    def __init__(self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand") -> None:
+    def __init__(
+        self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand"
+    ) -> None:
         self._names = tuple(names)
         self._state = Publisher(session, cell, "joints/state")
         super().__init__(session, cell, "joints/command")
@@ -331,7 +375,9 @@ class Follower(_Received):
             self._queue.clear()
         return commands
 
-    def tell(self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None) -> None:
+    def tell(
+        self, position: Sequence[float], velocity: Sequence[float], *, stamp_ns: int | None = None
+    ) -> None:
         """Publish the measured joints [rad, rad/s], stamped `stamp_ns` [ns]; None: now. Velocities
         may be empty. Raises ValueError unless there is one number for each joint.
         """
@@ -349,5 +395,9 @@ class Follower(_Received):
         position, velocity = in_order(message, self._names)
         if not finite(position + velocity):
             raise WireError("a joint that is not finite")
-        attached = (-1, 0, 0) if sample.attachment is None else cdr.decode_attachment(sample.attachment.to_bytes())
+        attached = (
+            (-1, 0, 0)
+            if sample.attachment is None
+            else cdr.decode_attachment(sample.attachment.to_bytes())
+        )
         return Command(message.stamp_ns, position, velocity, *attached)

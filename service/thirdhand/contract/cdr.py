@@ -108,11 +108,14 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
     """The layout of positions, velocities and efforts with these counts. The count of velocities
     and of efforts precedes them; that of positions precedes the layout.
     """
-    layout, offset = f"<{counts[0]}d", 0
+    layout = f"<{counts[0]}d"
+    offset = 0
     for count in counts[1:]:
-        layout, offset = layout + "I", offset + 4
+        layout = layout + "I"
+        offset = offset + 4
         if count:
-            layout, offset = layout + ("4x" if offset % 8 else "") + f"{count}d", 0
+            layout = layout + ("4x" if offset % 8 else "") + f"{count}d"
+            offset = 0
     return struct.Struct(layout)
 
 
@@ -120,7 +123,8 @@ def _joint_numbers(counts: tuple[int, int, int]) -> struct.Struct:
 def _command_layout(names: tuple[str, ...]) -> tuple[bytes, struct.Struct]:
     """For commands to these joints: bytes between stamp and first number, layout of the rest."""
     n = len(names)
-    empty, layout = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n)), _joint_numbers((n, n, 0))
+    empty = encode_joints(JointState(0, names, (0.0,) * n, (0.0,) * n))
+    layout = _joint_numbers((n, n, 0))
     return empty[_STAMPED : len(empty) - layout.size], layout
 
 
@@ -161,7 +165,9 @@ def encode_trajectory(
     return bytes(out)
 
 
-def encode_diagnostics(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
+def encode_diagnostics(
+    stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]
+) -> bytes:
     """CDR bytes of a `diagnostic_msgs/msg/DiagnosticArray` of one status."""
     out = Writer()
     out.header(stamp_ns, "")
@@ -249,7 +255,9 @@ class Reader:
         encoding = _ENCODINGS.get(number >> 1, "")
         if encoding not in ("CDR", "CDR2"):
             named = f"encoding {encoding}, " if encoding else ""
-            raise WireError(f"{named}header {data[:4].hex(' ') or 'missing'}; plain CDR or CDR2 needed")
+            raise WireError(
+                f"{named}header {data[:4].hex(' ') or 'missing'}; plain CDR or CDR2 needed"
+            )
         self._is_big_endian = not number & 1
         self._max_align = 8 if encoding == "CDR" else 4
         self._data = data
@@ -263,7 +271,9 @@ class Reader:
         try:
             return layout.unpack_from(self._data, offset)
         except struct.error:
-            raise WireError(f"{len(self._data)} bytes end before byte {self._at} of the message") from None
+            raise WireError(
+                f"{len(self._data)} bytes end before byte {self._at} of the message"
+            ) from None
 
     def length(self) -> int:
         count: int = self.unpack(_LENGTH, 4)[0]
@@ -305,9 +315,12 @@ class Reader:
         if self._is_big_endian or self._max_align == 4:
             stamp: Any = self.unpack(_STAMP, 4)
             return stamp, self._raw_string(), self._raw_string(), self.unpack(_POSE, 8)
-        data, parent_at = self._data, self._at + -self._at % 4 + _TRANSFORM.size
+        data = self._data
+        parent_at = self._at + -self._at % 4 + _TRANSFORM.size
         try:
-            seconds, nanoseconds, parent_size = _TRANSFORM.unpack_from(data, parent_at - _TRANSFORM.size)
+            seconds, nanoseconds, parent_size = _TRANSFORM.unpack_from(
+                data, parent_at - _TRANSFORM.size
+            )
             child_at = parent_at + parent_size + -(parent_at + parent_size) % 4 + _LENGTH.size
             (child_size,) = _LENGTH.unpack_from(data, child_at - _LENGTH.size)
             pose_at = child_at + child_size + (4 - child_at - child_size) % 8
@@ -315,7 +328,8 @@ class Reader:
             pose = _POSE.unpack_from(data, pose_at)
         except struct.error:
             raise WireError(f"{len(data)} bytes end within a transform") from None
-        parent, child = data[parent_at : parent_at + parent_size], data[child_at : child_at + child_size]
+        parent = data[parent_at : parent_at + parent_size]
+        child = data[child_at : child_at + child_size]
         return (seconds, nanoseconds), parent, child, pose
 
     def end(self) -> None:
@@ -360,9 +374,14 @@ def decode_joints(data: bytes) -> JointState:
     A source repeats the same names, so their place in the message is found only once.
     """
     layout = _joint_layouts.get(len(data))
-    if layout is not None and data.startswith(layout.fixed, _STAMPED) and data.startswith(CDR_HEADER):
+    if (
+        layout is not None
+        and data.startswith(layout.fixed, _STAMPED)
+        and data.startswith(CDR_HEADER)
+    ):
         numbers = layout.numbers.unpack_from(data, _STAMPED + len(layout.fixed))
-        n, v = layout.counts[0], layout.counts[0] + 1 + layout.counts[1]
+        n = layout.counts[0]
+        v = layout.counts[0] + 1 + layout.counts[1]
         if numbers[n] == layout.counts[1] and numbers[v] == layout.counts[2]:
             return JointState(
                 _stamp_ns(*_STAMP.unpack_from(data, 4)),
@@ -375,7 +394,9 @@ def decode_joints(data: bytes) -> JointState:
     reader = Reader(data, MAX_BYTES)
     stamp, frame = reader.header()
     names = tuple(reader.string() for _ in range(reader.items()))
-    position, velocity, effort = reader.doubles(), reader.doubles(), reader.doubles()
+    position = reader.doubles()
+    velocity = reader.doubles()
+    effort = reader.doubles()
     reader.end()
     message = JointState(stamp, names, position, velocity, effort, frame)
     _learn_layout(message, data)
@@ -390,7 +411,9 @@ def _learn_layout(message: JointState, data: bytes) -> None:
     if len(_joint_layouts) >= _MOST_LAYOUTS:
         _joint_layouts.clear()
     fixed = data[_STAMPED : len(data) - numbers.size]
-    _joint_layouts[len(data)] = _JointLayout(fixed, numbers, counts, message.names, message.frame_id)
+    _joint_layouts[len(data)] = _JointLayout(
+        fixed, numbers, counts, message.names, message.frame_id
+    )
 
 
 def decode_string(data: bytes) -> str:
@@ -442,7 +465,9 @@ def decode_transforms(
 
     Raises WireError; mistakes of single transforms are appended to `rejected` instead, if given.
     """
-    reader, spellings, transforms = Reader(data, longest), _spellings(frames), []
+    reader = Reader(data, longest)
+    spellings = _spellings(frames)
+    transforms = []
     for _ in range(reader.items()):
         stamp, parent, child, pose = reader.transform()
         if frames and child not in spellings:
@@ -471,7 +496,12 @@ def decode_tick(data: bytes) -> tuple[int, bytes, int, int | None]:
         raise WireError(f"a Tick with {count} events in {len(data)} bytes")
     offset = 20 + count + -count % 4
     is_checked = len(data) >= offset + _LENGTH.size
-    return index, data[20 : 20 + count], lost, _LENGTH.unpack_from(data, offset)[0] if is_checked else None
+    return (
+        index,
+        data[20 : 20 + count],
+        lost,
+        _LENGTH.unpack_from(data, offset)[0] if is_checked else None,
+    )
 
 
 def decode_skill(data: bytes) -> bytes:
@@ -484,7 +514,10 @@ def decode_skill(data: bytes) -> bytes:
 def decode_record(data: bytes, size: int) -> bytes:
     """The `size` bytes of a record of fixed layout. Raises WireError."""
     if len(data) != 4 + size or data[:4] != CDR_HEADER:
-        raise WireError(f"{len(data)} bytes, {4 + size} of little-endian CDR needed: was it made by another version?")
+        raise WireError(
+            f"{len(data)} bytes, {4 + size} of little-endian CDR needed: was it made by another "
+            "version?"
+        )
     return data[4:]
 
 

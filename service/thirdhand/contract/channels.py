@@ -20,19 +20,28 @@ import msgspec
 from thirdhand.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # default endpoint of daemons and their clients
-TAKE_KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}  # the streams of a take
+TAKE_KEYS = {
+    "left": "hands/left",
+    "right": "hands/right",
+    "tool": "tool/pose",
+}  # the streams of a take
 LARGEST_REQUEST = 256 * 1024  # bytes
 _LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 CellName = Annotated[
     str,
     msgspec.Meta(
         pattern=rf"\A{_LETTER}+(/{_LETTER}+)*\Z",
-        extra={"accepted": "words joined by single slashes, without spaces, control characters and * $ ? #,"},
+        extra={
+            "accepted": "words joined by single slashes, without spaces, control characters and * "
+            "$ ? #,"
+        },
     ),
 ]
 _ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
 _ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
-PRESENCE = "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions
+PRESENCE = (
+    "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions
+)
 PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
 
@@ -61,12 +70,17 @@ CLOSURE = Codec(JOINTS.type, "cdr", cdr.encode_joints, cdr.decode_closure)
 BOOL = Codec("std_msgs/msg/Bool", "cdr", cdr.encode_bool, cdr.decode_bool)
 STRING = Codec("std_msgs/msg/String", "cdr", cdr.encode_string, cdr.decode_string)
 TRANSFORMS = Codec("tf2_msgs/msg/TFMessage", "cdr", cdr.encode_transforms, cdr.decode_transforms)
-OBJECTS = Codec("visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects)
+OBJECTS = Codec(
+    "visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects
+)
 TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
-CHECKED_TICK = TICK._replace(type="thirdhand/msg/CheckedTick")  # `tick` in recordings that leave out frames
+CHECKED_TICK = TICK._replace(
+    type="thirdhand/msg/CheckedTick"
+)  # `tick` in recordings that leave out frames
 SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
 FRAME, TIMING, STATE = (
-    Codec(f"thirdhand/msg/{name}", "cdr", cdr.encode_record, cdr.decode_record) for name in ("Frame", "Timing", "State")
+    Codec(f"thirdhand/msg/{name}", "cdr", cdr.encode_record, cdr.decode_record)
+    for name in ("Frame", "Timing", "State")
 )
 
 
@@ -82,14 +96,17 @@ class EventKind(NamedTuple):
 class Channel(NamedTuple):
     """A row of the table."""
 
-    key: str  # below the cell, or a topic of recordings if it begins with a slash; also the kind of event
+    # below the cell, or a topic of recordings if it begins with a slash; also the kind of event
+    key: str
     codec: Codec
     direction: Literal["in", "out", "request", "recording"]
     about: str
     rate: str = "on demand"  # in words
     every: int = 0  # ticks between messages; 0: not published by the loop
     event: EventKind | None = None  # None: nothing enters the loop here
-    stale_after: tuple[str, str] | None = None  # setting (section, name) with the time after which the source is silent
+    stale_after: tuple[str, str] | None = (
+        None  # setting (section, name) with the time after which the source is silent
+    )
     queryable: bool = False
     recorded: bool = True
 
@@ -102,70 +119,229 @@ class Channel(NamedTuple):
 _HAND: Any = {"rate": "30 - 500 Hz", "stale_after": ("hands", "stale_ms")}
 
 CHANNELS = (
-    Channel("hands/left", POSE, "in", "the user's left hand in the tracker's frame (`base` unless configured)",
-            event=EventKind(0, POSE), **_HAND),
+    Channel(
+        "hands/left",
+        POSE,
+        "in",
+        "the user's left hand in the tracker's frame (`base` unless configured)",
+        event=EventKind(0, POSE),
+        **_HAND,
+    ),
     Channel("hands/right", POSE, "in", "the user's right hand", event=EventKind(1, POSE), **_HAND),
-    Channel("joints/state", JOINTS, "in", "the arm's joints as measured",
-            rate="100 - 1000 Hz", event=EventKind(2, JOINTS), stale_after=("arm", "silent_ms")),
-    Channel("joints/guided", BOOL, "in", "true while the arm is led by hand; heard with `[arm] source = \"state\"`",
-            rate="with joints/state", event=EventKind(12, BOOL), stale_after=("arm", "silent_ms")),
-    Channel("clutch", BOOL, "in", "true while the clutch is pressed; heard with `[hands] clutch = \"key\"`",
-            rate="10 - 100 Hz", event=EventKind(10, BOOL), stale_after=("hands", "clutch_stale_ms")),
-    Channel("joints/command", JOINTS, "out", "position [rad] and velocity [rad/s]; silent until the arm is ready",
-            rate="every tick", every=1),
-    Channel("tool/target", POSE_WITH_COVARIANCE, "out", "what the skill predicts from both hands, and how sure it is",
-            rate="every 5th tick", every=5),
-    Channel("tool/setpoint", POSE, "out", "the target after smoothing", rate="every 5th tick", every=5),
-    Channel("gripper/command", JOINTS, "out",
-            "its joint `gripper`: 0 is open, 1 closed; silent where neither the skill nor a wish decides it",
-            rate="every 5th tick", every=5),
-    Channel("gripper/wish", CLOSURE, "in",
-            "its joint `gripper`: how far to close where the skill does not decide it, 0 to 1; heard with "
-            "`[hands] gripper = \"key\"`", rate="1 - 100 Hz", event=EventKind(11, CLOSURE)),
-    Channel("gripper/state", JOINTS, "in", "how far the gripper is closed, 0 to 1, in demonstrations",
-            rate="teaching", recorded=False),
-    Channel("tool/pose", POSE, "in", "the tool as measured, in demonstrations", rate="teaching", recorded=False),
-    Channel("objects", OBJECTS, "in", "objects on the bench, for viewers: boxes, ellipsoids, cylinders",
-            rate="1 - 30 Hz"),
-    Channel("status", _request(requests.Nothing), "out", "mode, reason, flags, rates, latency percentiles, counters",
-            rate="10 Hz, and on request", queryable=True),
-    Channel("via_points", _request(requests.ViaPointsRequest), "request", "add, remove, clear and list via-points",
-            queryable=True, recorded=False),
-    Channel("skill", _request(requests.SkillRequest), "request",
-            "load a skill from the skill folder; via-points stay with the skill they were taught to",
-            event=EventKind(3, SKILL), queryable=True),
-    Channel("hold", _request(requests.HoldRequest), "request", "stop and stay",
-            event=EventKind(4, STRING), queryable=True),
-    Channel("resume", _request(requests.HoldRequest), "request", "end an operator's hold",
-            event=EventKind(5, STRING), queryable=True),
-    Channel("reset", _request(requests.Nothing), "request",
-            "end a fault; confirm that the arm is to leave what it stands in",
-            event=EventKind(6, STRING), queryable=True),
-    Channel("segment", _request(requests.SegmentRequest), "request",
-            "the task has come to a via-point, whatever it seems",
-            event=EventKind(9, STRING), queryable=True),
-    Channel("correct", _request(requests.CorrectRequest), "request",
-            "in a hold: the tool belongs where it was led, or dragged, to; undo the last correction",
-            queryable=True, recorded=False),
-    Channel("fault", STRING, "recording", "what of the service itself failed", event=EventKind(7, STRING)),
-    Channel("way", STRING, "recording", "postures out of a place where it was stuck", event=EventKind(8, STRING)),
-    Channel("tick", TICK, "recording", "index, event kinds, and the checksum of the frame", rate="every tick", every=1),
-    Channel("frame", FRAME, "recording", "all that the tick decided", rate="25 Hz, and each decision"),
-    Channel("timing", TIMING, "recording", "how late it was and how long it took", rate="with frames, and late ticks"),
+    Channel(
+        "joints/state",
+        JOINTS,
+        "in",
+        "the arm's joints as measured",
+        rate="100 - 1000 Hz",
+        event=EventKind(2, JOINTS),
+        stale_after=("arm", "silent_ms"),
+    ),
+    Channel(
+        "joints/guided",
+        BOOL,
+        "in",
+        'true while the arm is led by hand; heard with `[arm] source = "state"`',
+        rate="with joints/state",
+        event=EventKind(12, BOOL),
+        stale_after=("arm", "silent_ms"),
+    ),
+    Channel(
+        "clutch",
+        BOOL,
+        "in",
+        'true while the clutch is pressed; heard with `[hands] clutch = "key"`',
+        rate="10 - 100 Hz",
+        event=EventKind(10, BOOL),
+        stale_after=("hands", "clutch_stale_ms"),
+    ),
+    Channel(
+        "joints/command",
+        JOINTS,
+        "out",
+        "position [rad] and velocity [rad/s]; silent until the arm is ready",
+        rate="every tick",
+        every=1,
+    ),
+    Channel(
+        "tool/target",
+        POSE_WITH_COVARIANCE,
+        "out",
+        "what the skill predicts from both hands, and how sure it is",
+        rate="every 5th tick",
+        every=5,
+    ),
+    Channel(
+        "tool/setpoint", POSE, "out", "the target after smoothing", rate="every 5th tick", every=5
+    ),
+    Channel(
+        "gripper/command",
+        JOINTS,
+        "out",
+        "its joint `gripper`: 0 is open, 1 closed; silent where neither the skill nor a wish "
+        "decides it",
+        rate="every 5th tick",
+        every=5,
+    ),
+    Channel(
+        "gripper/wish",
+        CLOSURE,
+        "in",
+        "its joint `gripper`: how far to close where the skill does not decide it, 0 to 1; "
+        "heard with "
+        '`[hands] gripper = "key"`',
+        rate="1 - 100 Hz",
+        event=EventKind(11, CLOSURE),
+    ),
+    Channel(
+        "gripper/state",
+        JOINTS,
+        "in",
+        "how far the gripper is closed, 0 to 1, in demonstrations",
+        rate="teaching",
+        recorded=False,
+    ),
+    Channel(
+        "tool/pose",
+        POSE,
+        "in",
+        "the tool as measured, in demonstrations",
+        rate="teaching",
+        recorded=False,
+    ),
+    Channel(
+        "objects",
+        OBJECTS,
+        "in",
+        "objects on the bench, for viewers: boxes, ellipsoids, cylinders",
+        rate="1 - 30 Hz",
+    ),
+    Channel(
+        "status",
+        _request(requests.Nothing),
+        "out",
+        "mode, reason, flags, rates, latency percentiles, counters",
+        rate="10 Hz, and on request",
+        queryable=True,
+    ),
+    Channel(
+        "via_points",
+        _request(requests.ViaPointsRequest),
+        "request",
+        "add, remove, clear and list via-points",
+        queryable=True,
+        recorded=False,
+    ),
+    Channel(
+        "skill",
+        _request(requests.SkillRequest),
+        "request",
+        "load a skill from the skill folder; via-points stay with the skill they were taught to",
+        event=EventKind(3, SKILL),
+        queryable=True,
+    ),
+    Channel(
+        "hold",
+        _request(requests.HoldRequest),
+        "request",
+        "stop and stay",
+        event=EventKind(4, STRING),
+        queryable=True,
+    ),
+    Channel(
+        "resume",
+        _request(requests.HoldRequest),
+        "request",
+        "end an operator's hold",
+        event=EventKind(5, STRING),
+        queryable=True,
+    ),
+    Channel(
+        "reset",
+        _request(requests.Nothing),
+        "request",
+        "end a fault; confirm that the arm is to leave what it stands in",
+        event=EventKind(6, STRING),
+        queryable=True,
+    ),
+    Channel(
+        "segment",
+        _request(requests.SegmentRequest),
+        "request",
+        "the task has come to a via-point, whatever it seems",
+        event=EventKind(9, STRING),
+        queryable=True,
+    ),
+    Channel(
+        "correct",
+        _request(requests.CorrectRequest),
+        "request",
+        "in a hold: the tool belongs where it was led, or dragged, to; undo the last correction",
+        queryable=True,
+        recorded=False,
+    ),
+    Channel(
+        "fault",
+        STRING,
+        "recording",
+        "what of the service itself failed",
+        event=EventKind(7, STRING),
+    ),
+    Channel(
+        "way",
+        STRING,
+        "recording",
+        "postures out of a place where it was stuck",
+        event=EventKind(8, STRING),
+    ),
+    Channel(
+        "tick",
+        TICK,
+        "recording",
+        "index, event kinds, and the checksum of the frame",
+        rate="every tick",
+        every=1,
+    ),
+    Channel(
+        "frame", FRAME, "recording", "all that the tick decided", rate="25 Hz, and each decision"
+    ),
+    Channel(
+        "timing",
+        TIMING,
+        "recording",
+        "how late it was and how long it took",
+        rate="with frames, and late ticks",
+    ),
     Channel("state", STATE, "recording", "all that the next frame depends on", rate="every 10 s"),
-    Channel("skill_in_force", SKILL, "recording", "the skill, where it may have changed", rate="after a gap"),
+    Channel(
+        "skill_in_force",
+        SKILL,
+        "recording",
+        "the skill, where it may have changed",
+        rate="after a gap",
+    ),
     Channel("requests", STRING, "recording", "each request and how it was answered"),
     Channel("log", STRING, "recording", "what went wrong with the recording"),
-    Channel("/tf", TRANSFORMS, "recording", "the arm's links, tool, setpoint, target and hands, for viewers",
-            rate="10 Hz", every=5),
+    Channel(
+        "/tf",
+        TRANSFORMS,
+        "recording",
+        "the arm's links, tool, setpoint, target and hands, for viewers",
+        rate="10 Hz",
+        every=5,
+    ),
     Channel("/robot_description", STRING, "recording", "the arm's URDF", rate="once"),
-)  # fmt: skip
+)
 BY_KEY = {channel.key: channel for channel in CHANNELS}
-EVENT_NUMBERS = {channel.key: channel.event.number for channel in CHANNELS if channel.event is not None}
+EVENT_NUMBERS = {
+    channel.key: channel.event.number for channel in CHANNELS if channel.event is not None
+}
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
-MESSAGE_NUMBERS = 2**32  # a daemon numbers a channel's messages by Zenoh's source information, modulo this
+MESSAGE_NUMBERS = (
+    2**32
+)  # a daemon numbers a channel's messages by Zenoh's source information, modulo this
 LAST_PORT = 65535  # of IP
 
 
@@ -181,9 +357,12 @@ def lacking(endpoint: str) -> str:
         return ""
     host, _, port = address.rpartition(":")
     if not host and not port.isdecimal():
-        host, port = port, "7447"
+        host = port
+        port = "7447"
     meant = f"{protocol if protocol in _ON_IP else 'tcp'}/{host or '127.0.0.1'}:{port}"
-    return f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
+    return (
+        f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
+    )
 
 
 def is_host(name: str) -> bool:
@@ -199,7 +378,8 @@ def tcp_address(endpoint: str) -> tuple[str, int] | None:
     """Host and port of an endpoint to which a TCP connection leads; None for others."""
     protocol, _, address = re.sub("[?#].*", "", endpoint).partition("/")
     host, _, port = address.rpartition(":")
-    host, on_tcp = host.strip("[]"), protocol in ("tcp", "tls", "ws")
+    host = host.strip("[]")
+    on_tcp = protocol in ("tcp", "tls", "ws")
     return (host, int(port)) if on_tcp and port.isdecimal() and is_host(host) else None
 
 

@@ -10,13 +10,22 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
-from thirdhand.contract.incidents import SOURCE_NAMES, THEN_RESET, Condition, Member, what_happened, what_to_do, word
+from thirdhand.contract.incidents import (
+    SOURCE_NAMES,
+    THEN_RESET,
+    Condition,
+    Member,
+    what_happened,
+    what_to_do,
+    word,
+)
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import SIDES, Cause, Flag, Reason
 from thirdhand.contract.requests import Source
 
 LONGEST_NAME = 64  # characters of a frame's name
-OF_A_BUSY_MACHINE = {  # reasons that a busy machine causes too, unless the samples of these sources are rejected
+# reasons that a busy machine causes too, unless the samples of these sources are rejected
+OF_A_BUSY_MACHINE = {
     Reason.STALE_HAND: SIDES,
     Reason.ARM_ERROR: ("arm",),
     Reason.ARM_SILENT: ("arm",),
@@ -81,7 +90,9 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Exceeded | None = None  # largest joint error at the fault
-    worst_joint: tuple[str, float, str] | None = None  # the joint that is farthest from its command now, with unit
+    worst_joint: tuple[str, float, str] | None = (
+        None  # the joint that is farthest from its command now, with unit
+    )
     measured_speed: Exceeded | None = None  # of the tool [m/s]
     commanded_speed: Exceeded | None = None
     failure: str = ""  # of the service
@@ -93,7 +104,9 @@ class Evidence(NamedTuple):
     frames: tuple[str, ...] = ()  # accepted frames
     mistake: str = ""  # in its unit, its names or its bytes
     jump: Jump | None = None
-    held_up_s: float | None = None  # delay of the newest accepted sample beyond the others; None: the clock differs
+    held_up_s: float | None = (
+        None  # delay of the newest accepted sample beyond the others; None: the clock differs
+    )
     is_set_back: bool = False  # all samples since the newest accepted one are stamped before it
 
 
@@ -102,7 +115,8 @@ NOTHING = Evidence()
 
 def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
     """An incident in words, with the figures that were seen."""
-    finding, remedy = "", ""
+    finding = ""
+    remedy = ""
     match member:
         case Reason():
             finding, remedy = _reason(member, seen)
@@ -121,19 +135,30 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
 
 def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
     """The finding and its remedy if the figures show a closer cause; empty otherwise."""
-    finding, closer = "", ""
+    finding = ""
+    closer = ""
     match reason:
         case Reason.NO_HANDS | Reason.STALE_HAND:
-            finding, closer = _unseen(seen), _rejected_remedy(seen, *SIDES)
-            if not closer and reason is Reason.STALE_HAND and any(_rate_too_low(seen, side) for side in SIDES):
+            finding = _unseen(seen)
+            closer = _rejected_remedy(seen, *SIDES)
+            if (
+                not closer
+                and reason is Reason.STALE_HAND
+                and any(_rate_too_low(seen, side) for side in SIDES)
+            ):
                 closer = what_to_do(Condition.HANDS_TOO_RARE)
             elif not closer and any(hand.batches_ms for hand in _hands(seen)):
                 closer = what_to_do(Condition.DELAYED)
         case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
-            finding = f"the hands' positions look like {unit}, which is not the unit of their tracker in the settings"
+            finding = (
+                f"the hands' positions look like {unit}, which is not the unit of their tracker in "
+                "the settings"
+            )
             closer = unit_advice(unit)
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
-            finding = "{} is {:.1f} cm, {:.1f} accepted".format(seen.measure, *(100 * value for value in seen.gate_m))
+            finding = "{} is {:.1f} cm, {:.1f} accepted".format(
+                seen.measure, *(100 * value for value in seen.gate_m)
+            )
             if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:
                 finding = f"the {' and the '.join(jumping)} jumped in the last second; {finding}"
                 closer = what_to_do(word(Cause.JUMPED))
@@ -146,14 +171,18 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
         case Reason.ARM_ERROR:
             finding = _joint_error(seen)
             if contradiction := _contradiction(seen):
-                finding = f"{contradiction}; {finding or what_happened(word(reason), seen.settings)}"
+                finding = (
+                    f"{contradiction}; {finding or what_happened(word(reason), seen.settings)}"
+                )
                 closer = what_to_do(Condition.TWO_DRIVERS) + THEN_RESET
         case Reason.ARM_SILENT:
             finding = _silence(seen)
             if _rate_too_low(seen, "arm"):
                 closer = what_to_do(Condition.JOINTS_TOO_RARE) + THEN_RESET
         case Reason.TOOL_SPEED if seen.measured_speed is not None:
-            finding = "the tool was measured at {:.2f} m/s, {:g} accepted".format(*seen.measured_speed)
+            finding = "the tool was measured at {:.2f} m/s, {:g} accepted".format(
+                *seen.measured_speed
+            )
         case Reason.TOOL_SPEED if seen.commanded_speed is not None:
             finding = "a command reached {:.2f} m/s, {:g} accepted".format(*seen.commanded_speed)
         case Reason.SERVICE:
@@ -167,37 +196,59 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
     """The rejected sample, and what to do if the figures show a closer cause; empty otherwise."""
     if seen.sample is None:
         return seen.mistake, ""
-    came, finding, closer = seen.sample, seen.mistake, ""
-    turned, advanced_s = getattr(came, "orientation", ()), (came.stamp_ns - seen.newest_ns) * 1e-9
-    position_text = f"at {figures(came.position)} in the tracker's frame" if turned else f"joints at {figures(came.position)}"
+    came = seen.sample
+    finding = seen.mistake
+    closer = ""
+    turned = getattr(came, "orientation", ())
+    advanced_s = (came.stamp_ns - seen.newest_ns) * 1e-9
+    position_text = (
+        f"at {figures(came.position)} in the tracker's frame"
+        if turned
+        else f"joints at {figures(came.position)}"
+    )
     match cause:
         case Cause.NOT_FINITE if (out := seen.outside) is not None:
             finding = f"{out.joint} at {out.value:g} {out.unit}; a finite number needed"
         case Cause.NOT_FINITE:
-            finding = f"{position_text}{f', orientation {figures(turned)}' if turned else ''}; finite numbers needed"
+            finding = (
+                f"{position_text}{f', orientation {figures(turned)}' if turned else ''}; finite "
+                "numbers needed"
+            )
         case Cause.NOT_A_ROTATION:
             norm = sum(v * v for v in turned) ** 0.5
             finding = f"orientation {figures(turned)} of norm {norm:.3g}; norm 1 needed, x y z w"
         case Cause.OUT_OF_RANGE if (out := seen.outside) is not None:
             is_degrees = out.unit == "rad" and abs(out.value) > FULL_TURN_RAD
             like = ", which looks like degrees" if is_degrees else ""
-            finding = f"{out.joint} at {out.value:.4g} {out.unit}{like}; {out.low:g} to {out.high:g} accepted"
+            finding = (
+                f"{out.joint} at {out.value:.4g} {out.unit}{like}; {out.low:g} to {out.high:g} "
+                "accepted"
+            )
             closer = what_to_do(Condition.DEGREES) if is_degrees else ""
         case Cause.REPEATED:
-            finding = f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
+            finding = (
+                f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
+            )
         case Cause.OLDER:
             finding = f"stamped {lasting(-1000 * advanced_s)} before the newest accepted one"
             if seen.is_set_back:
-                finding, closer = f"{finding}: its clock was set back", what_to_do(Condition.CLOCK_STEPPED)
+                finding = f"{finding}: its clock was set back"
+                closer = what_to_do(Condition.CLOCK_STEPPED)
         case Cause.AHEAD:
             finding = f"stamped {lasting(1000 * advanced_s)} after the newest accepted one"
             if seen.held_up_s is None:
-                finding, closer = f"{finding}: its clock stepped ahead", what_to_do(Condition.CLOCK_STEPPED)
+                finding = f"{finding}: its clock stepped ahead"
+                closer = what_to_do(Condition.CLOCK_STEPPED)
             else:
-                finding += f", which arrived {lasting(1000 * seen.held_up_s)} late (its clock is right)"
+                finding += (
+                    f", which arrived {lasting(1000 * seen.held_up_s)} late (its clock is right)"
+                )
                 closer = what_to_do(Condition.DELAYED)
         case Cause.JUMPED if (jump := seen.jump) is not None:
-            finding = f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one sample to the next"
+            finding = (
+                f"{jump.joint} from {jump.before:.4g} to {jump.after:.4g} {jump.unit}, from one "
+                "sample to the next"
+            )
         case Cause.JUMPED:
             finding = f"{position_text}, from one sample to the next"
         case Cause.SWAPPED:
@@ -213,11 +264,21 @@ def _unseen(seen: Evidence) -> str:
     clauses = []
     for side in SIDES:
         if (source := seen.sources.get(side)) is not None and not source.fresh:
-            since = "has not been seen yet" if source.age_ms is None else f"was last seen {lasting(source.age_ms)} ago"
+            since = (
+                "has not been seen yet"
+                if source.age_ms is None
+                else f"was last seen {lasting(source.age_ms)} ago"
+            )
             since = f"arrives {rate}" if (rate := _rate_too_low(seen, side)) else since
-            since += f", and arrives in batches, {lasting(source.batches_ms)} apart" if source.batches_ms else ""
+            since += (
+                f", and arrives in batches, {lasting(source.batches_ms)} apart"
+                if source.batches_ms
+                else ""
+            )
             instead = (
-                f", as what arrives is rejected as {source.cause}: {source.refused}" if _is_rejected(source) else ""
+                f", as what arrives is rejected as {source.cause}: {source.refused}"
+                if _is_rejected(source)
+                else ""
             )
             clauses.append(f"the {SOURCE_NAMES[side]} {since}{instead}")
     return "; ".join(clauses)
@@ -267,7 +328,11 @@ def _contradiction(seen: Evidence) -> str:
         return ""
     if arm.contested > seen.contested:
         return f"{arm.contested:.0%} of the arm's states in the last second contradict the rest"
-    return f"states of the arm were rejected as jumped: {arm.refused}" if arm.cause == word(Cause.JUMPED) else ""
+    return (
+        f"states of the arm were rejected as jumped: {arm.refused}"
+        if arm.cause == word(Cause.JUMPED)
+        else ""
+    )
 
 
 def _rate_too_low(seen: Evidence, name: str) -> str:
@@ -277,8 +342,12 @@ def _rate_too_low(seen: Evidence, name: str) -> str:
     source = seen.sources.get(name)
     if seen.settings is None or source is None or source.age_ms is None or _is_rejected(source):
         return ""
-    accepted_ms = seen.settings.arm.silent_ms if name == "arm" else seen.settings.hands.longest_stale_ms
-    continues = source.age_ms * source.rate_hz < 2000.0  # the next sample is not overdue by a whole interval
+    accepted_ms = (
+        seen.settings.arm.silent_ms if name == "arm" else seen.settings.hands.longest_stale_ms
+    )
+    continues = (
+        source.age_ms * source.rate_hz < 2000.0
+    )  # the next sample is not overdue by a whole interval
     if not continues or not 0.0 < source.rate_hz * accepted_ms < 1000.0:
         return ""
     return f"at {source.rate_hz:.1f} Hz, {1000 / accepted_ms:g} Hz at least needed"
@@ -291,19 +360,31 @@ def _silence(seen: Evidence) -> str:
         return f"joint states arrive {rate}"
     if source is None or source.fresh:
         return ""
-    return "no joint states arrived yet" if source.age_ms is None else f"no joint states for {lasting(source.age_ms)}"
+    return (
+        "no joint states arrived yet"
+        if source.age_ms is None
+        else f"no joint states for {lasting(source.age_ms)}"
+    )
 
 
 def _not_ready(seen: Evidence) -> tuple[str, str]:
     """The condition that keeps the arm from being ready, and its remedy."""
-    source, out = seen.sources.get("arm"), seen.outside
+    source = seen.sources.get("arm")
+    out = seen.outside
     if source is None:
         return "", ""
     if rejected := _rejected_remedy(seen, "arm"):
-        return f"what arrives from the arm is rejected as {source.cause}: {source.refused}", rejected
-    condition, closer = "the arm has not rested in one posture for long enough", ""
+        return (
+            f"what arrives from the arm is rejected as {source.cause}: {source.refused}",
+            rejected,
+        )
+    condition = "the arm has not rested in one posture for long enough"
+    closer = ""
     if out is not None:
-        condition = f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, and is moved back"
+        condition = (
+            f"{out.joint} at {out.value:.3f} {out.unit} is outside {out.low:g} to {out.high:g}, "
+            "and is moved back"
+        )
     elif seen.inside is not None:
         condition = "the part that {} moves is inside of {} by {:.3f} m".format(*seen.inside)
     if seen.inside is not None:
@@ -319,8 +400,16 @@ def _stuck(seen: Stuck | None) -> str:
     """The distance of a stuck tool from its target, what limits it, and its way out."""
     if seen is None:
         return ""
-    limits = f"{', '.join(seen.joints_at_limits)} at a limit" if seen.joints_at_limits else "it cannot come nearer"
-    way_out = f"on its way out, posture {seen.posture} of {seen.postures}" if seen.posture else "no way out is known yet"
+    limits = (
+        f"{', '.join(seen.joints_at_limits)} at a limit"
+        if seen.joints_at_limits
+        else "it cannot come nearer"
+    )
+    way_out = (
+        f"on its way out, posture {seen.posture} of {seen.postures}"
+        if seen.posture
+        else "no way out is known yet"
+    )
     return f"the tool is {seen.off_m:.2f} m from its target: {limits}; {way_out}"
 
 
@@ -331,7 +420,11 @@ def _is_rejected(source: Source) -> bool:
 
 def _rejected_remedy(seen: Evidence, *needed: str) -> str:
     """The remedy for the first needed source whose samples are all rejected; empty otherwise."""
-    rejected = (source for name in needed if (source := seen.sources.get(name)) is not None and _is_rejected(source))
+    rejected = (
+        source
+        for name in needed
+        if (source := seen.sources.get(name)) is not None and _is_rejected(source)
+    )
     return next((source.advice or what_to_do(source.cause) for source in rejected), "")
 
 
@@ -349,7 +442,9 @@ def lasting(duration_ms: float) -> str:
     if duration_ms < 1000.0:
         return f"{duration_ms:.0f} ms"
     sizes_ms = {"days": 86.4e6, "h": 3.6e6, "min": 60e3}
-    unit, size_ms = next((size for size in sizes_ms.items() if duration_ms >= 2.0 * size[1]), ("s", 1000.0))
+    unit, size_ms = next(
+        (size for size in sizes_ms.items() if duration_ms >= 2.0 * size[1]), ("s", 1000.0)
+    )
     count = duration_ms / size_ms
     return f"{count:.{3 if count < 1000.0 else 4}g} {unit}"
 

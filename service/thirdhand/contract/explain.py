@@ -42,7 +42,11 @@ def in_words(error: BaseException, *, named: bool = True) -> str:
     """
     if isinstance(error, UnicodeDecodeError):
         return f"the byte 0x{error.object[error.start]:02x} is not valid; a text in UTF-8 needed"
-    if not isinstance(error, OSError) or isinstance(error, ExplainedError) or error.strerror is None:
+    if (
+        not isinstance(error, OSError)
+        or isinstance(error, ExplainedError)
+        or error.strerror is None
+    ):
         return str(error) or type(error).__name__
     needed = NEEDED.get(error.errno or 0, "")
     file = f"{error.filename}: " * (named and error.filename is not None)
@@ -59,7 +63,9 @@ def in_file(text: str) -> str:
     """A text with JSON paths replaced by the names in a file: `$.arm.urdf` becomes `[arm] urdf`,
     `$.points[0].left` becomes `points, entry 1, left`; the root has no name.
     """
-    return _PATH.sub(lambda found: _named(found[1]) if found[1] else found[0].replace("$: ", ""), text)
+    return _PATH.sub(
+        lambda found: _named(found[1]) if found[1] else found[0].replace("$: ", ""), text
+    )
 
 
 def _named(path: str) -> str:
@@ -105,7 +111,10 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
         field_names = _known(node)
-        problem = f"{path}: unknown field {_short(unknown[1])}; known are {', '.join(field_names) or 'none'}"
+        problem = (
+            f"{path}: unknown field {_short(unknown[1])}; known are "
+            f"{', '.join(field_names) or 'none'}"
+        )
         return problem + did_you_mean(unknown[1], field_names)
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
@@ -144,7 +153,10 @@ def _with_name(path: str, given: Any, kind: Any) -> str:
 
 
 def _known(node: inspect.StructType) -> list[str]:
-    return [*([node.tag_field] if node.tag_field else []), *(field.encode_name for field in node.fields)]
+    return [
+        *([node.tag_field] if node.tag_field else []),
+        *(field.encode_name for field in node.fields),
+    ]
 
 
 def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
@@ -170,9 +182,11 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
         else:
             return None, None, ""
         value = value[field] if field else value[int(index)]
-        accepted, node = "", inner
+        accepted = ""
+        node = inner
         if isinstance(node, inspect.Metadata):
-            accepted, node = (node.extra or {}).get("accepted", ""), node.type
+            accepted = (node.extra or {}).get("accepted", "")
+            node = node.type
     return value, _chosen(node, value), accepted
 
 
@@ -184,8 +198,14 @@ def _chosen(node: Any, value: Any) -> Any:
     if len(types) == 1 and value is not None:
         return types[0]
     if isinstance(value, dict):
-        tagged = (member for member in node.types if isinstance(member, inspect.StructType) and member.tag_field)
-        return next((member for member in tagged if value.get(member.tag_field) == member.tag), node)
+        tagged = (
+            member
+            for member in node.types
+            if isinstance(member, inspect.StructType) and member.tag_field
+        )
+        return next(
+            (member for member in tagged if value.get(member.tag_field) == member.tag), node
+        )
     return node
 
 
@@ -199,7 +219,11 @@ def _needed(node: Any, value: Any, accepted: str) -> str:
         case inspect.IntType() | inspect.FloatType():
             return f"{_range(node)} accepted"
         case inspect.TupleType(item_types):
-            return f"{len(item_types)} needed" if isinstance(value, list) else f"{len(item_types)} numbers needed"
+            return (
+                f"{len(item_types)} needed"
+                if isinstance(value, list)
+                else f"{len(item_types)} numbers needed"
+            )
         case inspect.VarTupleType(max_length=most) if most:
             return f"{node.min_length or 0} to {most} needed"
         case inspect.VarTupleType(min_length=least) if least:
@@ -227,6 +251,18 @@ def _short(value: Any) -> str:
 
 def _range(node: inspect.IntType | inspect.FloatType) -> str:
     whole = "a whole number" if isinstance(node, inspect.IntType) else "a number"
-    low = f"above {node.gt}" if node.gt is not None else f"from {node.ge}" if node.ge is not None else ""
-    high = f"below {node.lt}" if node.lt is not None else f"to {node.le}" if node.le is not None else ""
+    low = (
+        f"above {node.gt}"
+        if node.gt is not None
+        else f"from {node.ge}"
+        if node.ge is not None
+        else ""
+    )
+    high = (
+        f"below {node.lt}"
+        if node.lt is not None
+        else f"to {node.le}"
+        if node.le is not None
+        else ""
+    )
     return " ".join(part for part in (whole, low, high) if part)

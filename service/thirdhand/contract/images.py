@@ -13,7 +13,10 @@ from thirdhand.contract.messages import WireError
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 _LENGTH = struct.Struct("<I")
-_MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}  # first bytes of a file, and its format
+_MAGIC = {
+    b"\xff\xd8\xff": "jpeg",
+    b"\x89PNG\r\n\x1a\n": "png",
+}  # first bytes of a file, and its format
 
 
 class CompressedImage(NamedTuple):
@@ -60,4 +63,6 @@ def _format_of(file: bytes) -> str:
     for magic, name in _MAGIC.items():
         if file.startswith(magic):
             return name
-    raise WireError(f"an image that begins with {file[:8].hex(' ') or 'nothing'}; JPEG or PNG needed")
+    raise WireError(
+        f"an image that begins with {file[:8].hex(' ') or 'nothing'}; JPEG or PNG needed"
+    )

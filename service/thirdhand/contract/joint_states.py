@@ -10,7 +10,9 @@ import math
 from thirdhand.contract.messages import JointState, in_order
 
 
-def measured(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def measured(
+    message: JointState, names: tuple[str, ...]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Measured position and velocity of the named joints, in that order.
 
     A velocity that is NaN, or an array of velocities of another length than the names, is not
@@ -31,10 +33,15 @@ class JointStates:
     """
 
     def __init__(self, names: tuple[str, ...], patience_s: float) -> None:
-        self._names, self._patience_s = names, patience_s
-        self._parts: dict[str, tuple[float, int, float, float]] = {}  # arrival [s], stamp [ns], position, velocity
+        self._names = names
+        self._patience_s = patience_s
+        self._parts: dict[
+            str, tuple[float, int, float, float]
+        ] = {}  # arrival [s], stamp [ns], position, velocity
         self._heard_s = -math.inf  # arrival of the newest message
-        self._state_s = -math.inf  # arrival of the newest state, or of the first message after a pause
+        self._state_s = (
+            -math.inf
+        )  # arrival of the newest state, or of the first message after a pause
 
     def take(self, message: JointState, at_s: float) -> JointState | None:
         """The state that a message completes, which arrived at a time [s]; None where it completes
@@ -43,7 +50,11 @@ class JointStates:
         if at_s - self._heard_s > self._patience_s:
             self._state_s = at_s
         self._heard_s = at_s
-        carried = _carried(message.names, self._names) if len(message.position) == len(message.names) else ()
+        carried = (
+            _carried(message.names, self._names)
+            if len(message.position) == len(message.names)
+            else ()
+        )
         if not carried:
             return None
         if len(carried) == len(self._names):
@@ -53,7 +64,9 @@ class JointStates:
         for name, position, velocity in zip(carried, *measured(message, carried), strict=True):
             if math.isfinite(position):
                 self._parts[name] = at_s, message.stamp_ns, position, velocity
-        self._parts = {name: part for name, part in self._parts.items() if at_s - part[0] <= self._patience_s}
+        self._parts = {
+            name: part for name, part in self._parts.items() if at_s - part[0] <= self._patience_s
+        }
         if len(self._parts) < len(self._names):
             return None
         state = self._assembled()

@@ -81,14 +81,20 @@ class Attachment(NamedTuple):
     hand_stamp_ns: int
 
 
-def in_order(message: JointState, names: tuple[str, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def in_order(
+    message: JointState, names: tuple[str, ...]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Position [rad] and velocity [rad/s] of the named joints, in the order of the names. Raises
     WireError.
     """
     order = _order(message.names, names)
-    if len(message.position) != len(message.names) or len(message.velocity) not in (0, len(message.names)):
+    if len(message.position) != len(message.names) or len(message.velocity) not in (
+        0,
+        len(message.names),
+    ):
         raise WireError(
-            f"{len(message.names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
+            f"{len(message.names)} names, {len(message.position)} positions, "
+            f"{len(message.velocity)} velocities"
         )
     velocity = message.velocity or (0.0,) * len(message.names)
     return tuple(message.position[i] for i in order), tuple(velocity[i] for i in order)
@@ -100,10 +106,14 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> tuple[int, ...]:
     indices = {name: i for i, name in enumerate(given)}
     missing = [name for name in names if name not in indices]
     if missing:
-        raise WireError(f"joints {missing} missing among {len(given)}, {', '.join(given[:10])[:200]}")
+        raise WireError(
+            f"joints {missing} missing among {len(given)}, {', '.join(given[:10])[:200]}"
+        )
     repeated = [name for name in names if given.count(name) > 1]
     if repeated:
-        raise WireError(f"joints {repeated} named more than once among {len(given)}; one position each needed")
+        raise WireError(
+            f"joints {repeated} named more than once among {len(given)}; one position each needed"
+        )
     return tuple(indices[name] for name in names)
 
 

@@ -11,7 +11,8 @@ import math
 from typing import NamedTuple, TypeAlias
 
 SIDES = ("left", "right")
-GONE_S = 5.0  # a hand that the skill does not need has disappeared after this time; occlusions are shorter
+# a hand that the skill does not need has disappeared after this time; occlusions are shorter
+GONE_S = 5.0
 SOURCES = (*SIDES, "arm")
 
 
@@ -92,7 +93,9 @@ _SIZES = {"int64": 8, "float64": 8, "int32": 4, "uint32": 4, "float32": 4, "uint
 
 def assembled(*parts: Layout) -> Layout:
     """The fields of several layouts as one, larger types first, otherwise in their order."""
-    return tuple(sorted((field for part in parts for field in part), key=lambda field: -_SIZES[field.type]))
+    return tuple(
+        sorted((field for part in parts for field in part), key=lambda field: -_SIZES[field.type])
+    )
 
 
 def definition(layout: Layout, joints: int) -> str:

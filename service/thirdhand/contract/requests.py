@@ -25,7 +25,9 @@ Point = tuple[Metre, Metre, Metre]
 Turned = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001, extra={"accepted": "-1 to 1"})]
 Orientation = tuple[Turned, Turned, Turned, Turned]  # quaternion x y z w
 Hands: TypeAlias = Literal["both", "left", "right"]
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)]
+Name = Annotated[
+    str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)
+]
 
 
 class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,9 +55,14 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     corrections: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 0
 
     def __post_init__(self) -> None:
-        if self.orientation is not None and abs(math.hypot(*self.orientation) - 1.0) > NORM_TOLERANCE:
+        if (
+            self.orientation is not None
+            and abs(math.hypot(*self.orientation) - 1.0) > NORM_TOLERANCE
+        ):
             norm = math.hypot(*self.orientation)
-            raise ValueError(f"orientation: {list(self.orientation)} has norm {norm:.4g}; 1 needed (x y z w)")
+            raise ValueError(
+                f"orientation: {list(self.orientation)} has norm {norm:.4g}; 1 needed (x y z w)"
+            )
 
 
 class _Operation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="op"):
@@ -74,7 +81,9 @@ class Add(_Operation, frozen=True, tag="add"):
         names = [point.name for point in self.points]
         for i, name in enumerate(names):
             if name in names[:i]:
-                raise ValueError(f"$.points[{i}].name: {name!r} given twice, names once each needed")
+                raise ValueError(
+                    f"$.points[{i}].name: {name!r} given twice, names once each needed"
+                )
 
 
 class Remove(_Operation, frozen=True, tag="remove"):
@@ -97,7 +106,9 @@ ViaPointsRequest: TypeAlias = Add | Remove | Clear | List
 class SkillRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Load another skill: the name of a file in the skill folder."""
 
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"\A\w[\w .-]*\Z", extra=_NAMES)]
+    name: Annotated[
+        str, msgspec.Meta(min_length=1, max_length=128, pattern=r"\A\w[\w .-]*\Z", extra=_NAMES)
+    ]
 
 
 class SegmentRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -120,7 +131,9 @@ class Correct(_Operation, frozen=True, tag="add"):
 
     def __post_init__(self) -> None:
         if self.turned and self.tool is not None:
-            raise ValueError("turned: true given with a tool; only an arm that was led has turned the tool")
+            raise ValueError(
+                "turned: true given with a tool; only an arm that was led has turned the tool"
+            )
 
 
 class UndoCorrection(_Operation, frozen=True, tag="undo"):
@@ -159,7 +172,9 @@ class Correction(msgspec.Struct, frozen=True):
     name: str
     moved_m: float
     reach_m: float
-    segment: tuple[str, ...] = ()  # the via-points at which its segment begins and ends; empty: in the whole skill
+    segment: tuple[
+        str, ...
+    ] = ()  # the via-points at which its segment begins and ends; empty: in the whole skill
     corrections: int = 1  # number of corrections at these hands
     undone: bool = False
 
@@ -169,8 +184,8 @@ class Correction(msgspec.Struct, frozen=True):
         segment = f" in the segment {' -> '.join(self.segment)}" if self.segment else ""
         effect = "no longer moves" if self.undone else "moves"
         return (
-            f"it {effect} the tool by {100 * self.moved_m:.1f} cm{segment} at these hands, and by half of that or more "
-            f"while a hand is less than {100 * self.reach_m:.0f} cm away"
+            f"it {effect} the tool by {100 * self.moved_m:.1f} cm{segment} at these hands, and by "
+            f"half of that or more while a hand is less than {100 * self.reach_m:.0f} cm away"
         )
 
 
@@ -235,11 +250,16 @@ class Percentiles(msgspec.Struct, frozen=True):
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """The input of one hand, or of the arm."""
 
-    rate_hz: float = 0.0  # messages in the last second, accepted or rejected; for the arm, states of all its joints
+    # messages in the last second, accepted or rejected; for the arm, states of all its joints
+    rate_hz: float = 0.0
     age_ms: float | None = None  # age of the newest accepted sample; None: none yet
     fresh: bool = False  # True if that sample is recent enough
-    clock_ms: float | None = None  # time from stamp to arrival, median of the last second; negative: the clock is ahead
-    late_ms: float | None = None  # mean delay of a hand's newest 49 samples beyond the minimum; None: no steady clock
+    clock_ms: float | None = (
+        None  # time from stamp to arrival, median of the last second; negative: the clock is ahead
+    )
+    late_ms: float | None = (
+        None  # mean delay of a hand's newest 49 samples beyond the minimum; None: no steady clock
+    )
     late_95_ms: float | None = None  # 95th percentile of these delays
     frame: str = ""  # frame in the newest message
     rejected: dict[str, int] = {}  # rejected samples by cause, `malformed` included
@@ -247,12 +267,19 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     refused: str = ""  # that rejection in words: what arrived, and what is accepted
     advice: str = ""  # what to do about that rejection
     contested: float = 0.0  # share of the arm's states in the last second that contradict the rest
-    scatter_mm: float | None = None  # standard deviation of a hand's samples about its motion, each axis
-    unit: str = ""  # the unit in which a hand's positions seem to be, if it is not that of the settings
-    batches_ms: float = 0.0  # interval of the batches in which a hand's samples arrive, if it is too long; 0: none
+    scatter_mm: float | None = (
+        None  # standard deviation of a hand's samples about its motion, each axis
+    )
+    unit: str = (
+        ""  # the unit in which a hand's positions seem to be, if it is not that of the settings
+    )
+    batches_ms: float = (
+        0.0  # interval of the batches in which a hand's samples arrive, if it is too long; 0: none
+    )
 
 
-ANY_DIRECTION, ALONG_TASK = "in any direction", "along the task"
+ANY_DIRECTION = "in any direction"
+ALONG_TASK = "along the task"
 
 
 class ToolLimits(msgspec.Struct, frozen=True):
@@ -266,7 +293,9 @@ class ToolLimits(msgspec.Struct, frozen=True):
     @property
     def text(self) -> str:
         """The limits in words."""
-        speed, acceleration = (joint or "[tool]" for joint in (self.speed_joint, self.acceleration_joint))
+        speed, acceleration = (
+            joint or "[tool]" for joint in (self.speed_joint, self.acceleration_joint)
+        )
         return f"{self.speed:.2f} m/s ({speed}) and {self.acceleration:.1f} m/s² ({acceleration})"
 
 
@@ -288,11 +317,14 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     rejected: dict[str, int]
     received: dict[str, int] = {}  # messages that arrived, by channel of each input
     hand_age_ms: dict[str, float]
-    hand_distance_m: float  # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
+    hand_distance_m: (
+        float  # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
+    )
     hand_limit_m_s: float  # smallest speed allowed toward a hand, over all parts of the arm
     lateness_us: Percentiles
     work_us: Percentiles
-    latency_ms: Percentiles  # from a hand's stamp to the published command; contains the difference of clocks
+    # from a hand's stamp to the published command; contains the difference of clocks
+    latency_ms: Percentiles
     scribe: dict[str, Any]
     endpoints: tuple[str, ...]
     version: str
@@ -301,29 +333,53 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     time_ns: int = 0  # time of the status by the daemon's clock
     sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
     streams: dict[str, Source] = {}  # all other streams that the cell receives, by key
-    frames: tuple[str, ...] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
-    trackers: dict[str, tuple[float, ...]] = {}  # pose of each known tracker frame in `base`, by the frame's name
+    frames: tuple[
+        str, ...
+    ] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
+    trackers: dict[
+        str, tuple[float, ...]
+    ] = {}  # pose of each known tracker frame in `base`, by the frame's name
     joints: tuple[str, ...] = ()  # their names, in order
-    hands_m: dict[str, Vector3] = {}  # estimated positions of the hands that were seen, frame `base`
-    below_table_m: dict[str, float] = {}  # depth of hands below the table top: an error of the tracker's calibration
-    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}  # least and greatest corner of the demonstrated box
-    hands_at_m: dict[str, tuple[Vector3, Vector3]] = {}  # left and right hand at each learned via-point
+    hands_m: dict[
+        str, Vector3
+    ] = {}  # estimated positions of the hands that were seen, frame `base`
+    below_table_m: dict[
+        str, float
+    ] = {}  # depth of hands below the table top: an error of the tracker's calibration
+    demonstrated_m: dict[
+        str, tuple[Vector3, Vector3]
+    ] = {}  # least and greatest corner of the demonstrated box
+    hands_at_m: dict[
+        str, tuple[Vector3, Vector3]
+    ] = {}  # left and right hand at each learned via-point
     tool_m: Vector3 | None = None  # commanded position; None before the first tick
     tool_measured_m: Vector3 | None = None  # by the newest joint state; None: not recent
     target_m: Vector3 | None = None  # None if a needed hand is not seen
     setpoint_m: Vector3 | None = None
     std_m: float | None = None  # standard deviation of the target, root mean square over the axes
-    turn_off_rad: float | None = None  # angle between commanded tool and target, or between their directions
-    turn_std_rad: float | None = None  # standard deviation of the target's orientation; None: not learned
+    turn_off_rad: float | None = (
+        None  # angle between commanded tool and target, or between their directions
+    )
+    turn_std_rad: float | None = (
+        None  # standard deviation of the target's orientation; None: not learned
+    )
     gripper: str = ""  # commanded, `open` or `closed`; empty: the skill has no gripper
     closure: float | None = None  # predicted closure of the gripper, 0 to 1
-    segment: tuple[str, ...] = ()  # the via-points at which the segment begins and ends; empty: unknown
+    segment: tuple[
+        str, ...
+    ] = ()  # the via-points at which the segment begins and ends; empty: unknown
     segment_belief: float = 0.0  # probability of that segment
-    task_clock_s: float | None = None  # time since the hands began the task; None: the skill has no clock
-    error_probability: float | None = None  # probability that the tool belongs more than 10 cm from its target
+    task_clock_s: float | None = (
+        None  # time since the hands began the task; None: the skill has no clock
+    )
+    error_probability: float | None = (
+        None  # probability that the tool belongs more than 10 cm from its target
+    )
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
-    tool_limits: dict[str, ToolLimits] = {}  # of the demonstrated places, by ANY_DIRECTION and ALONG_TASK
+    tool_limits: dict[
+        str, ToolLimits
+    ] = {}  # of the demonstrated places, by ANY_DIRECTION and ALONG_TASK
     binding: str = ""  # the limit that holds the tool back now; empty: none
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none

@@ -9,13 +9,18 @@ from typing import Any, NamedTuple
 
 from thirdhand.contract import channels, ros2
 
-DAEMON, ROUTER, HEADSET = "daemon", "router", "headset"
+DAEMON = "daemon"
+ROUTER = "router"
+HEADSET = "headset"
 HANDS = ("hands/left", "hands/right")
 WISHES = ("clutch", "gripper/wish")
 ARM = ("joints/state", "joints/guided", "gripper/state")
-TOOL, OBJECTS = ("tool/pose",), ("objects",)
+TOOL = ("tool/pose",)
+OBJECTS = ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
-MOST_OF_A_ROLE = 99  # certificates of a role; access control compares whole names, so all are listed
+MOST_OF_A_ROLE = (
+    99  # certificates of a role; access control compares whole names, so all are listed
+)
 
 
 class Role(NamedTuple):
@@ -24,7 +29,9 @@ class Role(NamedTuple):
     about: str
     publishes: tuple[str, ...] = ()
     hears: bool = False  # receives everything that the daemon publishes
-    asks: bool = False  # sends any request; all roles may request the status of every cell, and list daemons
+    asks: bool = (
+        False  # sends any request; all roles may request the status of every cell, and list daemons
+    )
     hears_inputs: bool = False  # receives what trackers and the arm publish
 
 
@@ -34,12 +41,15 @@ ROLES = {
         (*HANDS, *WISHES, *TOOL, *OBJECTS),
     ),
     HEADSET: Role(
-        "may publish hands, clutch and gripper, send requests, receive all outputs, and serve a page to browsers",
+        "may publish hands, clutch and gripper, send requests, receive all outputs, and serve a "
+        "page to browsers",
         (*HANDS, *WISHES),
         hears=True,
         asks=True,
     ),
-    "arm": Role("may publish joint states and the tool, and receive all outputs", (*ARM, *TOOL), hears=True),
+    "arm": Role(
+        "may publish joint states and the tool, and receive all outputs", (*ARM, *TOOL), hears=True
+    ),
     "bench": Role(
         "may do what tracker and arm may, like the simulated bench",
         (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
@@ -47,7 +57,9 @@ ROLES = {
     ),
     "operator": Role("may send requests, and receive all outputs", hears=True, asks=True),
     "observer": Role("may receive all outputs", hears=True),
-    "recorder": Role("may receive what trackers and the arm publish, for demonstrations", hears_inputs=True),
+    "recorder": Role(
+        "may receive what trackers and the arm publish, for demonstrations", hears_inputs=True
+    ),
     ROUTER: Role(
         "may forward everything, and must enforce the roles itself",
         (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
@@ -80,10 +92,15 @@ def access_control(
             candidates = (channels.BY_KEY[suffix] for suffix in suffixes)
             also = (ros2.of_channel(cell, channel) for channel in candidates if channel in TOPICS)
             expressions += [ros2.key(ros2_domain, topic) for topic in also]
-            expressions += [ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes]
+            expressions += [
+                ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes
+            ]
         return expressions
 
-    heard = keys(tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"), topics=True)
+    heard = keys(
+        tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"),
+        topics=True,
+    )
     asked = keys(tuple(channel.key for channel in channels.CHANNELS if channel.queryable))
     rules: list[dict[str, Any]] = []
 
@@ -93,27 +110,48 @@ def access_control(
         return str(rule["id"])
 
     def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
-        return [allow(name, "ingress", ingress, key_exprs), allow(name, "egress", egress, key_exprs)]
+        return [
+            allow(name, "ingress", ingress, key_exprs),
+            allow(name, "egress", egress, key_exprs),
+        ]
 
-    viewer_topics = {ros2.key(ros2_domain or 0, topic): topic for topic in more_topics if topic.channel.startswith("/")}
-    latched = [key_expr for key, topic in viewer_topics.items() if topic.latched for key_expr in (key, ros2.kept(key))]
+    viewer_topics = {
+        ros2.key(ros2_domain or 0, topic): topic
+        for topic in more_topics
+        if topic.channel.startswith("/")
+    }
+    latched = [
+        key_expr
+        for key, topic in viewer_topics.items()
+        if topic.latched
+        for key_expr in (key, ros2.kept(key))
+    ]
     hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *viewer_topics])
-    record = both("record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True))
+    record = both(
+        "record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True)
+    )
     ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
 
     # All roles see the daemons of all cells, which may be connected to this one.
-    status, present = [channels.key("**", "status")], [channels.PRESENCE_OF_ALL]
-    tokens, queries = ["liveliness_token"], ["liveliness_query", "declare_liveliness_subscriber"]
+    status = [channels.key("**", "status")]
+    present = [channels.PRESENCE_OF_ALL]
+    tokens = ["liveliness_token"]
+    queries = ["liveliness_query", "declare_liveliness_subscriber"]
     if latched:
         asking = [*queries, "query", "declare_subscriber"]
-        hear += both("hear what is latched", asking, [*tokens, "declare_queryable", "reply", "put"], latched)
+        hear += both(
+            "hear what is latched", asking, [*tokens, "declare_queryable", "reply", "put"], latched
+        )
     see = both("see", ["query"], ["declare_queryable", "reply"], status)
     see += both("see who lives", queries, tokens, present)
-    alive, answers = [*tokens, *queries], ["query", "reply", "declare_queryable"]
+    alive = [*tokens, *queries]
+    answers = ["query", "reply", "declare_queryable"]
     if ros2_domain is not None:
         see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
     # daemons notice each other, and pass on to each other who asks for a status
-    neighbours = both("neighbours", alive, alive, present) + both("neighbours' status", answers, answers, status)
+    neighbours = both("neighbours", alive, alive, present) + both(
+        "neighbours' status", answers, answers, status
+    )
 
     allowed = {}
     for name, role in ROLES.items():

@@ -25,13 +25,28 @@ TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
-NO_TYPE_HASH = "TypeHashNotSupported"  # stands for the hash in the keys of Humble, whose subscribers match no hash
-OWN_FRAMES = ("left_hand", "right_hand", "setpoint", "target", "tool")  # of a cell, beside the arm's links
-FRAMES = ("hands/left", "hands/right", "tool/pose")  # channels whose messages may be frames of TFMessages
-HEARD = tuple(channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event)
+# stands for the hash in the keys of Humble, whose subscribers match no hash
+NO_TYPE_HASH = "TypeHashNotSupported"
+OWN_FRAMES = (
+    "left_hand",
+    "right_hand",
+    "setpoint",
+    "target",
+    "tool",
+)  # of a cell, beside the arm's links
+FRAMES = (
+    "hands/left",
+    "hands/right",
+    "tool/pose",
+)  # channels whose messages may be frames of TFMessages
+HEARD = tuple(
+    channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event
+)
 SAID = tuple(channel for channel in channels.CHANNELS if channel.direction == "out")
 _DEPTH = 10
-_RELIABLE, _BEST_EFFORT = f"::,{_DEPTH}:,:,:,,", f"2::,{_DEPTH}:,:,:,,"  # the rest are the defaults of ROS 2
+# the rest are the defaults of ROS 2
+_RELIABLE = f"::,{_DEPTH}:,:,:,,"
+_BEST_EFFORT = f"2::,{_DEPTH}:,:,:,,"
 _LATCHED = ":1:,1:,:,:,,"  # reliable, transient local: later subscribers get the last message
 _ATTACHMENT = struct.Struct("<qqB16s")
 _PART = "[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*"
@@ -79,12 +94,16 @@ def of_settings(settings: Any) -> Iterator[Topic]:
 def heard(cell: str, settings: Any, suffixes: Collection[str]) -> list[Topic]:
     """The topics on which a cell with these settings receives messages of some channels."""
     cell_topics = [of_channel(cell, channel) for channel in HEARD if channel.key in suffixes]
-    return cell_topics + [topic for topic in of_settings(settings) if topic.heard and topic.channel in suffixes]
+    return cell_topics + [
+        topic for topic in of_settings(settings) if topic.heard and topic.channel in suffixes
+    ]
 
 
 def of_channel(cell: str, channel: channels.Channel) -> Topic:
     """A channel's own topic."""
-    return Topic(channels.topic(cell, channel.key), type_of(channel), channel.key, channel.direction == "in")
+    return Topic(
+        channels.topic(cell, channel.key), type_of(channel), channel.key, channel.direction == "in"
+    )
 
 
 def is_name(cell: str) -> bool:
@@ -112,16 +131,26 @@ def all_tokens(domain: int) -> str:
     return f"@ros2_lv/{domain}/**"
 
 
-def tokens(domain: int, cell: str, session: str, topics: Iterable[Topic]) -> dict[tuple[str, bool], str]:
+def tokens(
+    domain: int, cell: str, session: str, topics: Iterable[Topic]
+) -> dict[tuple[str, bool], str]:
     """The liveliness tokens of the daemon of a Zenoh session, by the topic's name and whether it is
     heard; its node's is under ("", False).
     """
     node = f"%/{_mangled(f'/{cell}')}/{NODE}"
     by_topic = {("", False): f"@ros2_lv/{domain}/{session}/0/0/NN/{node}"}
-    for number, topic in enumerate({(candidate.name, candidate.heard): candidate for candidate in topics}.values(), start=1):
-        kind, quality = ("MS", _BEST_EFFORT) if topic.heard else ("MP", _LATCHED if topic.latched else _RELIABLE)
+    for number, topic in enumerate(
+        {(candidate.name, candidate.heard): candidate for candidate in topics}.values(), start=1
+    ):
+        kind, quality = (
+            ("MS", _BEST_EFFORT)
+            if topic.heard
+            else ("MP", _LATCHED if topic.latched else _RELIABLE)
+        )
         topic_part = f"{_mangled(topic.name)}/{_typed(topic)}/{quality}"
-        by_topic[topic.name, topic.heard] = f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{topic_part}"
+        by_topic[topic.name, topic.heard] = (
+            f"@ros2_lv/{domain}/{session}/0/{number}/{kind}/{node}/{topic_part}"
+        )
     return by_topic
 
 

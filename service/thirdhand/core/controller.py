@@ -60,9 +60,14 @@ from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings
 
 # Plain integers, because combining the members of an enumeration takes a microsecond.
-CLAMPED, LIMITED, NEAR_LIMIT = int(Flag.TARGET_CLAMPED), int(Flag.SPEED_LIMITED), int(Flag.NEAR_JOINT_LIMIT)
-SEPARATED, STUCK, UNSURE = int(Flag.SEPARATION), int(Flag.STUCK), int(Flag.UNSURE)
-ENGAGING, EITHER_UNSEEN = int(Flag.ENGAGING), sum(UNSEEN)
+CLAMPED = int(Flag.TARGET_CLAMPED)
+LIMITED = int(Flag.SPEED_LIMITED)
+NEAR_LIMIT = int(Flag.NEAR_JOINT_LIMIT)
+SEPARATED = int(Flag.SEPARATION)
+STUCK = int(Flag.STUCK)
+UNSURE = int(Flag.UNSURE)
+ENGAGING = int(Flag.ENGAGING)
+EITHER_UNSEEN = sum(UNSEEN)
 SAMPLES = {channel.key for channel in CHANNELS if channel.direction == "in" and channel.event}
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
@@ -78,8 +83,11 @@ def start_state(settings: Settings, skill: Skill, tuning: Tuning = TUNING) -> Re
     Intake(settings, tuning=tuning).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
-    state["orientation"], state["closure"], state["gripper_wish"] = skill.orientation, NO_GRIPPER, NO_GRIPPER
-    state["skill"], state["trail_tick"] = np.frombuffer(skill.digest, np.uint8), NEVER
+    state["orientation"] = skill.orientation
+    state["closure"] = NO_GRIPPER
+    state["gripper_wish"] = NO_GRIPPER
+    state["skill"] = np.frombuffer(skill.digest, np.uint8)
+    state["trail_tick"] = NEVER
     return state
 
 
@@ -92,11 +100,18 @@ class Controller:
     """
 
     def __init__(
-        self, settings: Settings, skill: Skill, state: Record | None = None, *, urdf: str, tuning: Tuning = TUNING
+        self,
+        settings: Settings,
+        skill: Skill,
+        state: Record | None = None,
+        *,
+        urdf: str,
+        tuning: Tuning = TUNING,
     ) -> None:
         self._state = copied(start_state(settings, skill, tuning) if state is None else state)
         self._memory = as_array(self._state)  # reads a number in a third of the time
-        self._bytes, self._layout = self._memory.view(np.uint8), frame_layout(len(settings.joints.names))
+        self._bytes = self._memory.view(np.uint8)
+        self._layout = frame_layout(len(settings.joints.names))
         self.intake = Intake(settings, tuning=tuning)
         self._skill = SkillStage(settings, skill, tuning=tuning)
         self.decision = Decision(settings, tuning=tuning)
@@ -107,10 +122,20 @@ class Controller:
         self._limiter = LimiterStage(settings, self._arm, tuning=tuning)
         self._capsule_excess_m = tuning.separation.planned_margin_m
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
-        stages = (self.intake, self._skill, self.decision, self._separation, self._setpoint, self._arm, self._limiter)
+        stages = (
+            self.intake,
+            self._skill,
+            self.decision,
+            self._separation,
+            self._setpoint,
+            self._arm,
+            self._limiter,
+        )
         self.constants = dict(zip(STAGES, map(_digest, stages), strict=True))
         """Digests of the constants that each stage derived from settings, skill and description."""
-        self._here: Kinematics | None = None  # kinematics at the state's joints; None: not yet computed
+        self._here: Kinematics | None = (
+            None  # kinematics at the state's joints; None: not yet computed
+        )
 
     @property
     def state(self) -> Record:
@@ -131,23 +156,30 @@ class Controller:
         """Take over state and skill of another controller with the same settings."""
         if self.skill is not other.skill:
             self._adopt(other.skill)
-        self._bytes[:], self._here = other._bytes, other._here
+        self._bytes[:] = other._bytes
+        self._here = other._here
 
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
         """Frame of one tick, whose index must be higher than that of the tick before.
 
         Over omitted indices, the hands' motion is extrapolated; the arm moves by one period only.
         """
-        state, frame = self._state, RECORDS(1, self._layout, bytearray(self._layout.itemsize))[0]
+        state = self._state
+        frame = RECORDS(1, self._layout, bytearray(self._layout.itemsize))[0]
         conditions = self._take_in(tick, frame)
         lap("intake")
         conditions |= self._alone(frame)
         unseen = UNSEEN.index(side) if (side := conditions & EITHER_UNSEEN) else None
         request = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
         if request is not None:
-            conditions |= SEGMENT_AMBIGUOUS * request.is_ambiguous | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
+            conditions |= (
+                SEGMENT_AMBIGUOUS * request.is_ambiguous
+                | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
+            )
         lap("skill")
-        kinematics = self._decide(frame, conditions, math.nan if request is None else request.gate_m)
+        kinematics = self._decide(
+            frame, conditions, math.nan if request is None else request.gate_m
+        )
         lap("decision")
         self._separation.step(state, frame, kinematics.record)
         lap("separation")
@@ -165,7 +197,8 @@ class Controller:
         """Apply the events of a tick and advance the intake. Returns its flags `codes.Condition`.
         Raises ValueError if the tick's index does not grow.
         """
-        state, before = self._state, int(self._memory["tick"][0])
+        state = self._state
+        before = int(self._memory["tick"][0])
         if tick.index <= before:
             raise ValueError(f"tick {tick.index} after tick {before}: indices must grow")
         samples: list[Event] = []
@@ -202,11 +235,17 @@ class Controller:
 
     def _decide(self, frame: Frame, conditions: int, gate_m: float) -> Kinematics:
         """Determine the mode, and start an arm that has become ready. Returns its kinematics."""
-        state, kinematics, threshold = self._state, self._at(), self.skill.threshold
+        state = self._state
+        kinematics = self._at()
+        threshold = self.skill.threshold
         if self._memory["arm_ready"][0] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
-            conditions |= ARM_INSIDE * (self._separation.intrusion(joints)[0] > self._capsule_excess_m)
-        starts = self.decision.step(state, frame, kinematics.record, conditions, gate_m=gate_m, threshold=threshold)
+            conditions |= ARM_INSIDE * (
+                self._separation.intrusion(joints)[0] > self._capsule_excess_m
+            )
+        starts = self.decision.step(
+            state, frame, kinematics.record, conditions, gate_m=gate_m, threshold=threshold
+        )
         if starts == STARTS_MEASURED:
             self._limiter.begin(state, state["measured"])
             self._here = None
@@ -219,21 +258,32 @@ class Controller:
         """Advance setpoint and joints by one period. A setpoint outside its bounds, or a tool that
         cannot be slowed down enough, is a fault.
         """
-        state, separation = self._state, self._separation
-        met = self._setpoint.step(state, frame, wanted, here, self.skill.workspace, separation.setpoint_share)
+        state = self._state
+        separation = self._separation
+        met = self._setpoint.step(
+            state, frame, wanted, here, self.skill.workspace, separation.setpoint_share
+        )
         if met == BROKEN:
             self.decision.fail(state, frame, Reason.SETPOINT)
         lap("setpoint")
         solution = self._arm.follow(state, here, separation)
         lap("arm")
-        moved = self._limiter.step(state, frame, solution.velocity, solution.acceleration, separation)
+        moved = self._limiter.step(
+            state, frame, solution.velocity, solution.acceleration, separation
+        )
         self._here = moved.here
         if moved.excess_speed:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.excess_speed)
             frame["commanded"] = moved.moving
         memory = self._memory
-        flags = STUCK * (memory["stuck"][0] > 0) | CLAMPED * wanted.target.clamped | NEAR_LIMIT * solution.near_limit
-        flags |= UNSURE * (memory["unsure"][0] > 0) | LIMITED * (met > 0 or solution.speed_limited or moved.limited)
+        flags = (
+            STUCK * (memory["stuck"][0] > 0)
+            | CLAMPED * wanted.target.clamped
+            | NEAR_LIMIT * solution.near_limit
+        )
+        flags |= UNSURE * (memory["unsure"][0] > 0) | LIMITED * (
+            met > 0 or solution.speed_limited or moved.limited
+        )
         flags |= ENGAGING * (memory["engaging"][0] > 0)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)
         lap("limiter")
@@ -242,7 +292,9 @@ class Controller:
         """Brake the joints; or move them back into their limits, out of a thing that they are
         inside of, or along a way out. The setpoint is reset to the tool.
         """
-        state, separation, kinematics = self._state, self._separation, self._at()
+        state = self._state
+        separation = self._separation
+        kinematics = self._at()
         velocity = self.decision.own_motion(state, kinematics.tasks)
         if velocity is None:
             moved = self._limiter.stop(state, frame, separation)
@@ -265,16 +317,23 @@ class Controller:
 
 def _digest(stage: object) -> str:
     """A digest of the parameter records of a stage, and of its parts in the same package."""
-    sums, package = hashlib.blake2b(digest_size=8), type(stage).__module__.rpartition(".")[0]
+    sums = hashlib.blake2b(digest_size=8)
+    package = type(stage).__module__.rpartition(".")[0]
     for _, value in sorted(vars(stage).items()):
         if isinstance(value, np.ndarray) and value.dtype.names:
             sums.update(value.tobytes())
-        elif type(value).__module__.startswith(package) and hasattr(value, "__dict__") and not isinstance(value, Skill):
+        elif (
+            type(value).__module__.startswith(package)
+            and hasattr(value, "__dict__")
+            and not isinstance(value, Skill)
+        ):
             sums.update(_digest(value).encode())
     return sums.hexdigest()
 
 
-def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap) -> None:
+def run(
+    controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap
+) -> None:
     """Step a controller through all ticks and pass each frame to the taps. Live operation, replay
     and tests all use this loop.
     """
@@ -291,7 +350,11 @@ def outgoing(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> Outputs:
     Before the arm is ready there is no command, and without known hands no target.
     """
     tick = int(frame["tick"])
-    messages = ((stream.key, _OUTPUTS[stream.key](frame, stamp_ns, joints)) for stream in STREAMS if tick % stream.every == 0)
+    messages = (
+        (stream.key, _OUTPUTS[stream.key](frame, stamp_ns, joints))
+        for stream in STREAMS
+        if tick % stream.every == 0
+    )
     return [(key, payload) for key, payload in messages if payload is not None]
 
 
@@ -299,7 +362,9 @@ def _command(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | No
     """Joint command as CDR bytes; None while nothing is commanded."""
     if not frame["commanded"]:
         return None
-    return cdr.encode_command(stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist())
+    return cdr.encode_command(
+        stamp_ns, joints, frame["joints"].tolist(), frame["joint_velocities"].tolist()
+    )
 
 
 def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
@@ -313,7 +378,8 @@ def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | Non
         covariance[6 * i : 6 * i + 3] = row
     for i, row in enumerate(frame["orientation_covariance"].tolist()):
         covariance[6 * i + 21 : 6 * i + 24] = row
-    position, orientation = tuple(frame["target"].tolist()), tuple(frame["orientation"].tolist())
+    position = tuple(frame["target"].tolist())
+    orientation = tuple(frame["orientation"].tolist())
     message = PoseWithCovarianceStamped(stamp_ns, BASE, position, orientation, tuple(covariance))
     return cdr.encode_pose_with_covariance(message)
 
@@ -321,7 +387,10 @@ def _target(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | Non
 def _setpoint(frame: Frame, stamp_ns: int, joints: tuple[str, ...]) -> bytes | None:
     """Setpoint pose as CDR bytes."""
     message = PoseStamped(
-        stamp_ns, BASE, tuple(frame["setpoint"].tolist()), tuple(frame["setpoint_orientation"].tolist())
+        stamp_ns,
+        BASE,
+        tuple(frame["setpoint"].tolist()),
+        tuple(frame["setpoint_orientation"].tolist()),
     )
     return cdr.encode_pose(message)
 

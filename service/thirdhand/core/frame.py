@@ -32,7 +32,12 @@ Outputs: TypeAlias = Sequence[tuple[str, bytes]]
 @functools.cache
 def dtype_of(layout: Layout, joints: int) -> DType:
     """NumPy type of a layout for an arm with this number of joints, in little endian."""
-    return np.dtype([(field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints)) for field in layout])
+    return np.dtype(
+        [
+            (field.name, np.dtype(field.type).newbyteorder("<"), field.shape_for(joints))
+            for field in layout
+        ]
+    )
 
 
 as_array: Callable[[Record], Records] = operator.attrgetter("base")
@@ -95,7 +100,9 @@ Frame: TypeAlias = Record  # a record of `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
 
 _PACKAGES: tuple[ModuleType, ...] = (intake, skill, decision, separation, setpoint, arm, limiter)
-STAGES = tuple(package.__name__.rsplit(".", 1)[1] for package in _PACKAGES)  # in the order of the data
+STAGES = tuple(
+    package.__name__.rsplit(".", 1)[1] for package in _PACKAGES
+)  # in the order of the data
 _TICK = (Field("tick", "int64"),)
 FRAME = assembled(_TICK, *(package.FRAME for package in _PACKAGES))
 STATE = assembled(_TICK, *(package.STATE for package in _PACKAGES))
@@ -105,7 +112,9 @@ TIMING_FIELDS = (
     Field("missed", "int64"),  # deadlines skipped since start
     Field("lateness_us", "float32"),
     Field("work_us", "float32"),
-    Field("latency_us", "float32"),  # from the newest hand sample's stamp to the published command; 0: no new one
+    Field(
+        "latency_us", "float32"
+    ),  # from the newest hand sample's stamp to the published command; 0: no new one
     Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
@@ -184,7 +193,9 @@ def differences(a: Record, b: Record) -> dict[str, float]:
     if a.tobytes() == b.tobytes():
         return {}
     return {
-        field: float(np.max(np.abs(np.asarray(a[field], np.float64) - np.asarray(b[field], np.float64))))
+        field: float(
+            np.max(np.abs(np.asarray(a[field], np.float64) - np.asarray(b[field], np.float64)))
+        )
         for field in a.dtype.names or ()
         if a[field].tobytes() != b[field].tobytes()
     }

@@ -14,7 +14,9 @@ from kmp.compiled import compiled
 from kmp.elementary import atan2, sin_cos
 from thirdhand.core.frame import Records, Vector
 
-ROUND_TO = 1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
+ROUND_TO = (
+    1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
+)
 _TINY = 1e-12  # a smaller sine is rounding
 
 
@@ -59,18 +61,24 @@ def quaternion_of(matrix: Vector, out: Vector) -> None:
     The largest component is computed first (Shepperd 1978).
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    largest, most = 3, trace
+    largest = 3
+    most = trace
     for i in range(3):
         if matrix[i, i] > most:
-            largest, most = i, matrix[i, i]
+            largest = i
+            most = matrix[i, i]
     if largest == 3:
-        out[0], out[1] = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0]
-        out[2], out[3] = matrix[1, 0] - matrix[0, 1], 1.0 + trace
+        out[0] = matrix[2, 1] - matrix[1, 2]
+        out[1] = matrix[0, 2] - matrix[2, 0]
+        out[2] = matrix[1, 0] - matrix[0, 1]
+        out[3] = 1.0 + trace
     else:
         i = largest
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         out[i] = 1.0 - trace + 2.0 * matrix[i, i]
-        out[j], out[k] = matrix[j, i] + matrix[i, j], matrix[k, i] + matrix[i, k]
+        out[j] = matrix[j, i] + matrix[i, j]
+        out[k] = matrix[k, i] + matrix[i, k]
         out[3] = matrix[k, j] - matrix[j, k]
     normalise(out)
 
@@ -96,9 +104,13 @@ def axis_of(quaternion: Vector, out: Vector) -> None:
     out[:] = 0.0
     if not 0.0 < largest < math.inf:
         return
-    x, y, z, w = quaternion[0] / largest, quaternion[1] / largest, quaternion[2] / largest, quaternion[3] / largest
+    x = quaternion[0] / largest
+    y = quaternion[1] / largest
+    z = quaternion[2] / largest
+    w = quaternion[3] / largest
     square = x * x + y * y + z * z + w * w
-    out[0], out[1] = 2.0 * (x * z + y * w) / square, 2.0 * (y * z - x * w) / square
+    out[0] = 2.0 * (x * z + y * w) / square
+    out[1] = 2.0 * (y * z - x * w) / square
     out[2] = 1.0 - 2.0 * (x * x + y * y) / square
 
 
@@ -118,7 +130,9 @@ def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
     out[:] = 0.0
     if sine > 1e-9:
         size = atan2(sine, start[0] * end[0] + start[1] * end[1] + start[2] * end[2]) / sine
-        out[0], out[1], out[2] = size * x, size * y, size * z
+        out[0] = size * x
+        out[1] = size * y
+        out[2] = size * z
 
 
 @compiled
@@ -127,8 +141,14 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
 
     The result is 0 if one of them is 0.
     """
-    ax, ay, az, aw = start[0], start[1], start[2], start[3]
-    bx, by, bz, bw = end[0], end[1], end[2], end[3]
+    ax = start[0]
+    ay = start[1]
+    az = start[2]
+    aw = start[3]
+    bx = end[0]
+    by = end[1]
+    bz = end[2]
+    bw = end[3]
     x = bw * -ax + aw * bx - (by * az - bz * ay)
     y = bw * -ay + aw * by - (bz * ax - bx * az)
     z = bw * -az + aw * bz - (bx * ay - by * ax)
@@ -137,7 +157,9 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
     size = 2.0 * atan2(sine, abs(w)) / max(sine, _TINY)
     if w < 0.0:
         size = -size
-    out[0], out[1], out[2] = size * x, size * y, size * z
+    out[0] = size * x
+    out[1] = size * y
+    out[2] = size * z
 
 
 @compiled
@@ -146,8 +168,14 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     sine, cosine = sin_cos(0.5 * angle)
     size = 0.5 if angle < 1e-6 else sine / angle
-    ax, ay, az, aw = size * turn[0], size * turn[1], size * turn[2], cosine
-    bx, by, bz, bw = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    ax = size * turn[0]
+    ay = size * turn[1]
+    az = size * turn[2]
+    aw = cosine
+    bx = quaternion[0]
+    by = quaternion[1]
+    bz = quaternion[2]
+    bw = quaternion[3]
     quaternion[0] = aw * bx + bw * ax + ay * bz - az * by
     quaternion[1] = aw * by + bw * ay + az * bx - ax * bz
     quaternion[2] = aw * bz + bw * az + ax * by - ay * bx
@@ -155,10 +183,18 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
     normalise(quaternion)
 
 
-LEAST = 1e-9  # [m] segments at a smaller distance intersect; [m²] a segment of smaller squared length is a point
-HALVINGS = 40  # bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
+# [m] segments at a smaller distance intersect; [m²] a segment of smaller squared length is a point
+LEAST = 1e-9
+HALVINGS = (
+    40  # bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
+)
 CAPSULE = np.dtype(
-    [("link", np.int64), ("ends", np.float64, (2, 3)), ("radius", np.float64), ("max_speed", np.float64)]
+    [
+        ("link", np.int64),
+        ("ends", np.float64, (2, 3)),
+        ("radius", np.float64),
+        ("max_speed", np.float64),
+    ]
 )
 
 
@@ -168,9 +204,13 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
 
     The capsules are ordered by link.
     """
-    turn, origin = np.eye(3), np.zeros(3)
-    joint_turn, moved, next_origin = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    capsule, count = 0, len(capsules)
+    turn = np.eye(3)
+    origin = np.zeros(3)
+    joint_turn = np.empty((3, 3))
+    moved = np.empty((3, 3))
+    next_origin = np.empty(3)
+    capsule = 0
+    count = len(capsules)
     for link in range(len(q) + 1):
         if link > 0:
             frame = frames[link - 1]
@@ -207,12 +247,20 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
 @compiled
 def _about(axis: Vector, angle: float, out: Vector) -> None:
     """Write into out (3, 3) the rotation about a unit axis by an angle [rad]."""
-    x, y, z = axis[0], axis[1], axis[2]
+    x = axis[0]
+    y = axis[1]
+    z = axis[2]
     s, c = sin_cos(angle)
     v = 1.0 - c
-    out[0, 0], out[0, 1], out[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
-    out[1, 0], out[1, 1], out[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x
-    out[2, 0], out[2, 1], out[2, 2] = v * x * z - s * y, v * y * z + s * x, c + v * z * z
+    out[0, 0] = c + v * x * x
+    out[0, 1] = v * x * y - s * z
+    out[0, 2] = v * x * z + s * y
+    out[1, 0] = v * x * y + s * z
+    out[1, 1] = c + v * y * y
+    out[1, 2] = v * y * z - s * x
+    out[2, 0] = v * x * z - s * y
+    out[2, 1] = v * y * z + s * x
+    out[2, 2] = c + v * z * z
 
 
 @compiled
@@ -230,7 +278,9 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:
     """
     a = b = c = d = e = 0.0
     for i in range(3):
-        u, v, w = one[1, i] - one[0, i], other[1, i] - other[0, i], one[0, i] - other[0, i]
+        u = one[1, i] - one[0, i]
+        v = other[1, i] - other[0, i]
+        w = one[0, i] - other[0, i]
         a += u * u
         b += u * v
         c += u * w
@@ -239,17 +289,21 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:
     if a <= LEAST and d <= LEAST:
         s = t = 0.0
     elif a <= LEAST:
-        s, t = 0.0, _unit(e / d)
+        s = 0.0
+        t = _unit(e / d)
     elif d <= LEAST:
-        s, t = _unit(-c / a), 0.0
+        s = _unit(-c / a)
+        t = 0.0
     else:
         slant = a * d - b * b
         s = _unit((b * e - c * d) / slant) if slant > 1e-9 * a * d else 0.0
         t = (b * s + e) / d
         if t < 0.0:
-            s, t = _unit(-c / a), 0.0
+            s = _unit(-c / a)
+            t = 0.0
         elif t > 1.0:
-            s, t = _unit((b - c) / a), 1.0
+            s = _unit((b - c) / a)
+            t = 1.0
     square = 0.0
     for i in range(3):
         near[i] = one[0, i] + s * (one[1, i] - one[0, i])
@@ -295,7 +349,8 @@ def nearest_to_box(segment: Vector, box: Vector) -> float:
         return 0.0
     if _slope(segment, box, 1.0) <= 0.0:
         return 1.0
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         if _slope(segment, box, middle) > 0.0:
@@ -326,7 +381,10 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
     Inside of the box it is negative, minus the distance to the nearest face, and the normal points
     from that face inward.
     """
-    square, least, face, side = 0.0, math.inf, 2, -1.0
+    square = 0.0
+    least = math.inf
+    face = 2
+    side = -1.0
     for i in range(3):
         point = segment[0, i] + share * (segment[1, i] - segment[0, i])
         near[i] = point
@@ -334,9 +392,13 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
         near[6 + i] = near[3 + i] - point
         square += near[6 + i] * near[6 + i]
         if point - box[0, i] < least:
-            least, face, side = point - box[0, i], i, 1.0
+            least = point - box[0, i]
+            face = i
+            side = 1.0
         if box[1, i] - point < least:
-            least, face, side = box[1, i] - point, i, -1.0
+            least = box[1, i] - point
+            face = i
+            side = -1.0
     distance = math.sqrt(square)
     if distance > LEAST:
         for i in range(3):

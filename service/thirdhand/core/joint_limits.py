@@ -7,7 +7,9 @@ import numpy as np
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import JointSettings
 
-LIMIT_MARGIN_RAD = 1e-6  # distance kept from the position limits; rounding along a stop is below 1e-7 rad
+LIMIT_MARGIN_RAD = (
+    1e-6  # distance kept from the position limits; rounding along a stop is below 1e-7 rad
+)
 
 
 def acceleration_rate(limits: JointSettings) -> float:
@@ -23,5 +25,7 @@ def approach_gain(limits: JointSettings) -> Vector:
     At this gain, braking takes at most half of the acceleration and a quarter of the jerk.
     """
     velocity = np.array(limits.velocity)
-    gain: Vector = 0.5 * np.minimum(np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity))
+    gain: Vector = 0.5 * np.minimum(
+        np.array(limits.acceleration) / velocity, np.sqrt(np.array(limits.jerk) / velocity)
+    )
     return gain

@@ -55,7 +55,9 @@ class Kinematics:
 
 
 @compiled
-def tool_speeds(heres: Records, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, float, float]:
+def tool_speeds(
+    heres: Records, dq: Vector, ddq: Vector, jerk: Vector
+) -> tuple[float, float, float]:
     """Speed of the tool now, its maximum as accelerations are ended, and a bound of both [m/s].
 
     With Jv (3, J) the first rows of the tasks:
@@ -96,13 +98,24 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
 
     The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
     """
-    kinematics, joints = heres[0], len(dq)
-    jacobian, tool = kinematics.jacobian, kinematics.position
-    rotation, shift, turned, moved = np.eye(3), np.zeros(3), np.empty((3, 3)), np.empty(3)
-    linear, angular, axis, moment = np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
-    turn, own_shift = np.empty((3, 3)), np.empty(3)
+    kinematics = heres[0]
+    joints = len(dq)
+    jacobian = kinematics.jacobian
+    tool = kinematics.position
+    rotation = np.eye(3)
+    shift = np.zeros(3)
+    turned = np.empty((3, 3))
+    moved = np.empty(3)
+    linear = np.zeros(3)
+    angular = np.zeros(3)
+    axis = np.empty(3)
+    moment = np.empty(3)
+    turn = np.empty((3, 3))
+    own_shift = np.empty(3)
     for j in range(joints):
-        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        wx = jacobian[3, j]
+        wy = jacobian[4, j]
+        wz = jacobian[5, j]
         # moment about the origin: the tool's velocity less w × tool
         ux = jacobian[0, j] - (wy * tool[2] - wz * tool[1])
         uy = jacobian[1, j] - (wz * tool[0] - wx * tool[2])
@@ -118,26 +131,47 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
         s, c = sin_cos(way[j])
         turns = wx * wx + wy * wy + wz * wz > 0.5
         if not turns:
-            c, s = 1.0, 0.0
+            c = 1.0
+            s = 0.0
         v = 1.0 - c
-        turn[0, 0], turn[0, 1], turn[0, 2] = c + v * wx * wx, v * wx * wy - s * wz, v * wx * wz + s * wy
-        turn[1, 0], turn[1, 1], turn[1, 2] = v * wx * wy + s * wz, c + v * wy * wy, v * wy * wz - s * wx
-        turn[2, 0], turn[2, 1], turn[2, 2] = v * wx * wz - s * wy, v * wy * wz + s * wx, c + v * wz * wz
+        turn[0, 0] = c + v * wx * wx
+        turn[0, 1] = v * wx * wy - s * wz
+        turn[0, 2] = v * wx * wz + s * wy
+        turn[1, 0] = v * wx * wy + s * wz
+        turn[1, 1] = c + v * wy * wy
+        turn[1, 2] = v * wy * wz - s * wx
+        turn[2, 0] = v * wx * wz - s * wy
+        turn[2, 1] = v * wy * wz + s * wx
+        turn[2, 2] = c + v * wz * wz
         if turns:  # about the point o = w × u of the axis: o - own o
-            ox, oy, oz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
+            ox = wy * uz - wz * uy
+            oy = wz * ux - wx * uz
+            oz = wx * uy - wy * ux
             own_shift[0] = ox - (turn[0, 0] * ox + turn[0, 1] * oy + turn[0, 2] * oz)
             own_shift[1] = oy - (turn[1, 0] * ox + turn[1, 1] * oy + turn[1, 2] * oz)
             own_shift[2] = oz - (turn[2, 0] * ox + turn[2, 1] * oy + turn[2, 2] * oz)
         else:
-            own_shift[0], own_shift[1], own_shift[2] = ux * way[j], uy * way[j], uz * way[j]
+            own_shift[0] = ux * way[j]
+            own_shift[1] = uy * way[j]
+            own_shift[2] = uz * way[j]
         for i in range(3):
             moved[i] = shift[i]
             for k in range(3):
                 moved[i] += rotation[i, k] * own_shift[k]
-                turned[i, k] = rotation[i, 0] * turn[0, k] + rotation[i, 1] * turn[1, k] + rotation[i, 2] * turn[2, k]
-        rotation[:], shift[:] = turned, moved
+                turned[i, k] = (
+                    rotation[i, 0] * turn[0, k]
+                    + rotation[i, 1] * turn[1, k]
+                    + rotation[i, 2] * turn[2, k]
+                )
+        rotation[:] = turned
+        shift[:] = moved
     for i in range(3):
-        moved[i] = rotation[i, 0] * tool[0] + rotation[i, 1] * tool[1] + rotation[i, 2] * tool[2] + shift[i]
+        moved[i] = (
+            rotation[i, 0] * tool[0]
+            + rotation[i, 1] * tool[1]
+            + rotation[i, 2] * tool[2]
+            + shift[i]
+        )
     x = linear[0] + angular[1] * moved[2] - angular[2] * moved[1]
     y = linear[1] + angular[2] * moved[0] - angular[0] * moved[2]
     z = linear[2] + angular[0] * moved[1] - angular[1] * moved[0]
@@ -156,9 +190,12 @@ def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     These are the damped least-squares joint motions that move the tool along one axis and leave its
     orientation free. S makes joints with higher limits move more.
     """
-    arm, kinematics = arms[0], heres[0]
+    arm = arms[0]
+    kinematics = heres[0]
     joints = kinematics.tasks.shape[1]
-    scaled, root, right = np.empty((3, joints)), np.empty((3, 3)), np.empty(3)
+    scaled = np.empty((3, joints))
+    root = np.empty((3, 3))
+    right = np.empty(3)
     for order in range(3):
         for i in range(3):
             for joint in range(joints):

@@ -9,13 +9,20 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.frame import Vector
 
-LEAST_BRAKE_SHARE = 1e-3  # an axis that waits for the slowest one brakes with at least this share of its limit
+LEAST_BRAKE_SHARE = (
+    1e-3  # an axis that waits for the slowest one brakes with at least this share of its limit
+)
 BRAKE_SHARE_HALVINGS = 40  # bisection steps for the share of an axis
 
 
 @compiled
 def fastest_stop(
-    velocity: float, acceleration: float, max_acceleration: float, max_jerk: float, dt: float, out: Vector
+    velocity: float,
+    acceleration: float,
+    max_acceleration: float,
+    max_jerk: float,
+    dt: float,
+    out: Vector,
 ) -> None:
     """Compute the time-optimal change of one axis to rest: velocity 0 and acceleration 0.
 
@@ -34,7 +41,8 @@ def fastest_stop(
     """
     crest = velocity + acceleration * abs(acceleration) / (2.0 * max_jerk)
     sign = -1.0 if crest > 0.0 else 1.0  # in this direction the stop accelerates
-    v, a = sign * velocity, sign * acceleration
+    v = sign * velocity
+    a = sign * acceleration
     peak = math.sqrt(max(0.5 * a * a - max_jerk * v, 0.0))
     hold = 0.0
     if a > max_acceleration:  # an acceleration beyond the limit is first reduced to it
@@ -42,7 +50,9 @@ def fastest_stop(
         hold = max(-v - a * a / (2.0 * max_jerk), 0.0) / max_acceleration
     elif peak > max_acceleration:
         peak = max_acceleration
-        hold = (-v + (a * a - 2.0 * max_acceleration * max_acceleration) / (2.0 * max_jerk)) / max_acceleration
+        hold = (
+            -v + (a * a - 2.0 * max_acceleration * max_acceleration) / (2.0 * max_jerk)
+        ) / max_acceleration
     else:
         peak = max(peak, a)
     x = t = low = high = 0.0
@@ -50,17 +60,24 @@ def fastest_stop(
     after_x = after_v = after_a = 0.0
     for phase in range(3):
         if phase == 0:
-            jerk, lasts = (max_jerk, (peak - a) / max_jerk) if a <= peak else (-max_jerk, (a - peak) / max_jerk)
+            jerk, lasts = (
+                (max_jerk, (peak - a) / max_jerk)
+                if a <= peak
+                else (-max_jerk, (a - peak) / max_jerk)
+            )
         elif phase == 1:
-            jerk, lasts = 0.0, hold
+            jerk = 0.0
+            lasts = hold
         else:
-            jerk, lasts = -max_jerk, peak / max_jerk
+            jerk = -max_jerk
+            lasts = peak / max_jerk
         if lasts <= 0.0:
             continue
         if not is_sampled and dt <= t + lasts:
             h = dt - t
             after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-            after_v, after_a = v + h * (a + h * jerk / 2.0), a + h * jerk
+            after_v = v + h * (a + h * jerk / 2.0)
+            after_a = a + h * jerk
             is_sampled = True
         # the displacement is extreme where the velocity is 0, or at an end of the phase
         disc = a * a - 2.0 * jerk * v
@@ -72,15 +89,21 @@ def fastest_stop(
                 h = -v / a
             if 0.0 < h < lasts:
                 displacement = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
-                low, high = min(low, displacement), max(high, displacement)
+                low = min(low, displacement)
+                high = max(high, displacement)
         x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
         v += lasts * (a + lasts * jerk / 2.0)
         a += lasts * jerk
         t += lasts
-        low, high = min(low, x), max(high, x)
+        low = min(low, x)
+        high = max(high, x)
     if not is_sampled:
-        after_x, after_v, after_a = x, 0.0, 0.0
-    out[0], out[1], out[2] = sign * after_v, sign * after_a, sign * after_x
+        after_x = x
+        after_v = 0.0
+        after_a = 0.0
+    out[0] = sign * after_v
+    out[1] = sign * after_a
+    out[2] = sign * after_x
     out[3], out[4] = (low, high) if sign > 0.0 else (-high, -low)
     out[5] = t
 
@@ -96,17 +119,25 @@ def stop_together(
     that the tool they move slows down along its path.
     """
     count = len(velocities)
-    out, stop, slower = np.zeros((3, count)), np.zeros(6), np.empty(count)
+    out = np.zeros((3, count))
+    stop = np.zeros(6)
+    slower = np.empty(count)
     braking_together(velocities, accelerations, max_acceleration, max_jerk, slower)
     for i in range(count):
         fastest_stop(velocities[i], accelerations[i], slower[i], max_jerk[i], dt, stop)
-        out[0, i], out[1, i], out[2, i] = stop[2], stop[0], stop[1]
+        out[0, i] = stop[2]
+        out[1, i] = stop[0]
+        out[2, i] = stop[1]
     return out
 
 
 @compiled
 def braking_together(
-    velocities: Vector, accelerations: Vector, max_acceleration: Vector, max_jerk: Vector, out: Vector
+    velocities: Vector,
+    accelerations: Vector,
+    max_acceleration: Vector,
+    max_jerk: Vector,
+    out: Vector,
 ) -> None:
     """Write into out (J,) the deceleration limits with which all axes stop at the same time.
 
@@ -115,16 +146,25 @@ def braking_together(
     share_j is the smallest share, found by bisection, with which the stop of axis j lasts no longer
     than the longest of the fastest stops. Axes at rest keep their full limit.
     """
-    stop, duration = np.zeros(6), 0.0
+    stop = np.zeros(6)
+    duration = 0.0
     for i in range(len(velocities)):
         fastest_stop(velocities[i], accelerations[i], max_acceleration[i], max_jerk[i], 0.0, stop)
         duration = max(duration, stop[5])
     for i in range(len(velocities)):
-        low, share = LEAST_BRAKE_SHARE, 1.0
+        low = LEAST_BRAKE_SHARE
+        share = 1.0
         if velocities[i] != 0.0 or accelerations[i] != 0.0:
             for _ in range(BRAKE_SHARE_HALVINGS):
                 middle = 0.5 * (low + share)
-                fastest_stop(velocities[i], accelerations[i], middle * max_acceleration[i], max_jerk[i], 0.0, stop)
+                fastest_stop(
+                    velocities[i],
+                    accelerations[i],
+                    middle * max_acceleration[i],
+                    max_jerk[i],
+                    0.0,
+                    stop,
+                )
                 if stop[5] <= duration:
                     share = middle
                 else:

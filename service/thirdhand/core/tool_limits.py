@@ -23,14 +23,18 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.settings.config import Settings
 
-PATH_STEP_S, PATH_SPEED_SHARE = 0.02, 0.3  # duration of a step along a path, and its speed / max_speed
+# duration of a step along a path, and its speed / max_speed
+PATH_STEP_S = 0.02
+PATH_SPEED_SHARE = 0.3
 PATH_END_STEPS = 300  # steps in which the arm reaches the first point of a path
 ON_PATH_M = 0.03  # a posture whose tool is farther from the path is left out
 POSTURE_EVERY = 10  # every tenth step along a path gives a posture
 MOST_PATH_POINTS = 40  # points of a path without an order
 
 
-def tool_limits(arm: Arm, settings: Settings, postures: Vector, directions: Vector | None = None) -> ToolLimits:
+def tool_limits(
+    arm: Arm, settings: Settings, postures: Vector, directions: Vector | None = None
+) -> ToolLimits:
     """Limits of the tool at the postures (N, J) [rad, m] where they are least.
 
     They hold along the unit vectors `directions` (N, 3); without these, in every direction.
@@ -40,16 +44,20 @@ def tool_limits(arm: Arm, settings: Settings, postures: Vector, directions: Vect
         shares = np.linalg.norm(costs, axis=2)
     else:
         shares = np.abs(np.einsum("ni,noij->noj", directions, costs))
-    bounds, names = (settings.tool.max_speed, settings.tool.acceleration), settings.joints.names
+    bounds = (settings.tool.max_speed, settings.tool.acceleration)
+    names = settings.joints.names
     limits: list[tuple[float, str]] = []
     for order, most in enumerate(bounds):
-        joint, needed = int(shares[:, order].max(axis=0).argmax()), float(shares[:, order].max())
+        joint = int(shares[:, order].max(axis=0).argmax())
+        needed = float(shares[:, order].max())
         limits.append((1.0 / needed, names[joint]) if needed * most > 1.0 else (most, ""))
     (speed, speed_joint), (acceleration, acceleration_joint) = limits
     return ToolLimits(round(speed, 3), speed_joint, round(acceleration, 2), acceleration_joint)
 
 
-def limits_of_task(settings: Settings, urdf: str, positions: Vector, orientation: Vector) -> dict[str, ToolLimits]:
+def limits_of_task(
+    settings: Settings, urdf: str, positions: Vector, orientation: Vector
+) -> dict[str, ToolLimits]:
     """Limits of the tool where it goes through `positions` (M, 3) [m] in an orientation (4,), by
     ANY_DIRECTION and ALONG_TASK; empty if the arm reaches none of them.
     """
@@ -78,23 +86,35 @@ def path_of(skill: Skill) -> Vector:
     return np.array(path)
 
 
-def _along(arm: Arm, settings: Settings, positions: Vector, orientation: Vector) -> tuple[Vector, Vector]:
+def _along(
+    arm: Arm, settings: Settings, positions: Vector, orientation: Vector
+) -> tuple[Vector, Vector]:
     """Postures (N, J) along straight lines between positions (M, 3) [m], from the configured one
     on, by the arm's own inverse kinematics, and the directions of motion there (N, 3).
     """
-    q, still = np.array(settings.arm.posture), np.zeros(3)
+    q = np.array(settings.arm.posture)
+    still = np.zeros(3)
     step_m = PATH_SPEED_SHARE * settings.tool.max_speed * PATH_STEP_S
     for _ in range(PATH_END_STEPS):
         q = q + PATH_STEP_S * arm.step(q, positions[0], still, orientation).velocity
-    postures, directions, step = [], [], 0
+    postures = []
+    directions = []
+    step = 0
     for begin, end in itertools.pairwise(positions):
         length = float(np.linalg.norm(end - begin))
         count = int(length / step_m)
         for i in range(count):
             position = begin + (end - begin) * (i + 1) / count
-            q = q + PATH_STEP_S * arm.step(q, position, (end - begin) / (count * PATH_STEP_S), orientation).velocity
+            q = (
+                q
+                + PATH_STEP_S
+                * arm.step(q, position, (end - begin) / (count * PATH_STEP_S), orientation).velocity
+            )
             step += 1
-            if step % POSTURE_EVERY == 0 and np.linalg.norm(arm.at(q).position - position) < ON_PATH_M:
+            if (
+                step % POSTURE_EVERY == 0
+                and np.linalg.norm(arm.at(q).position - position) < ON_PATH_M
+            ):
                 postures.append(q)
                 directions.append((end - begin) / length)
     return np.array(postures), np.array(directions)
@@ -108,13 +128,15 @@ def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[
     with, the planned share of the tool's acceleration, of which the joints get that share again.
     """
     least = TUNING.arm.planned_limit_shares[1] ** 2
-    joints, tool = settings.joints, settings.tool
+    joints = settings.joints
+    tool = settings.tool
     engages = frames["flags"] & int(Flag.ENGAGING) > 0
     speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
     shares = {
         "[tool] max_speed": np.where(engages, 0.0, speed / tool.max_speed),
         "[tool] engage_speed": np.where(engages, speed / tool.engaging_speed, 0.0),
-        "[tool] max_acceleration": np.linalg.norm(frames["setpoint_acceleration"], axis=1) / tool.acceleration,
+        "[tool] max_acceleration": np.linalg.norm(frames["setpoint_acceleration"], axis=1)
+        / tool.acceleration,
     }
     for kind, field, limits in (
         ("speed", "joint_velocities", joints.velocity),
@@ -123,7 +145,9 @@ def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[
         for joint, name in enumerate(joints.names):
             shares[f"{kind} of {name}"] = np.abs(frames[field][:, joint]) / limits[joint]
     used = np.array([*shares.values()])
-    largest = np.where((used.max(axis=0) >= least) & (frames["mode"] == Mode.FOLLOW), used.argmax(axis=0), -1)
+    largest = np.where(
+        (used.max(axis=0) >= least) & (frames["mode"] == Mode.FOLLOW), used.argmax(axis=0), -1
+    )
     for number, name in enumerate(shares):
         if (met := largest == number).any():
             yield name, met

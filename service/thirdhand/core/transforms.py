@@ -21,8 +21,11 @@ class Frames:
     """
 
     def __init__(self, settings: Settings, description: str, *, links: bool = True) -> None:
-        urdf, offset = Urdf(description), settings.tool.plate_from_tool
-        self._root, self._names, self._urdf = urdf.root, settings.joints.names, urdf
+        urdf = Urdf(description)
+        offset = settings.tool.plate_from_tool
+        self._root = urdf.root
+        self._names = settings.joints.names
+        self._urdf = urdf
         self._still = {joint.child for joint in urdf.joints if joint.kind == "fixed"}
         self._links = links
         self.fixed = [transform for transform in self._at(()) if transform.child in self._still]
@@ -32,18 +35,29 @@ class Frames:
 
     def _at(self, joints: Sequence[float]) -> list[Transform]:
         """Transforms of the arm's links at joints [rad], in chain order; none without `links`."""
-        return self._urdf.transforms(dict(zip(self._names, joints, strict=False))) if self._links else []
+        return (
+            self._urdf.transforms(dict(zip(self._names, joints, strict=False)))
+            if self._links
+            else []
+        )
 
     def moving(self, frame: Frame, joints: Sequence[float]) -> list[Transform]:
         """Transforms of a frame at joints [rad], in chain order; unknown ones are left out."""
-        transforms = [transform for transform in self._at(joints) if transform.child not in self._still]
+        transforms = [
+            transform for transform in self._at(joints) if transform.child not in self._still
+        ]
         setpoint, turn, target, target_turn = (
-            tuple(frame[name].tolist()) for name in ("setpoint", "setpoint_orientation", "target", "orientation")
+            tuple(frame[name].tolist())
+            for name in ("setpoint", "setpoint_orientation", "target", "orientation")
         )
         transforms.append(Transform(self._root, "setpoint", setpoint, turn))
         for side, name in enumerate(SIDES):
             if frame["hand_ages"][side] >= 0:
-                transforms.append(Transform(self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT))
+                transforms.append(
+                    Transform(
+                        self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT
+                    )
+                )
         if frame["covariance"].any():  # without both hands nothing is predicted
             transforms.append(Transform(self._root, "target", target, target_turn))
         return transforms

@@ -14,7 +14,16 @@ from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import SIDES
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import Event, Tick, Vector, as_array, blank, frame_layout, order, state_layout
+from thirdhand.core.frame import (
+    Event,
+    Tick,
+    Vector,
+    as_array,
+    blank,
+    frame_layout,
+    order,
+    state_layout,
+)
 from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import STILL
 from thirdhand.core.intake.stage import Intake
@@ -80,17 +89,22 @@ def rehearse_motion(settings: Settings, urdf: str) -> None:
     They run only near the tool's largest speed, on a way out, and with a skill that depends on the
     past or whose teacher was late.
     """
-    arm, separation = Arm(settings, urdf), Separation(settings, urdf)
-    setpoint, limiter = SetpointStage(settings, arm), LimiterStage(settings, arm)
+    arm = Arm(settings, urdf)
+    separation = Separation(settings, urdf)
+    setpoint = SetpointStage(settings, arm)
+    limiter = LimiterStage(settings, arm)
     posture = np.array(settings.arm.posture)
     still = np.zeros(len(posture))
-    state, frame = blank(state_layout(len(posture))), blank(frame_layout(len(posture)))
+    state = blank(state_layout(len(posture)))
+    frame = blank(frame_layout(len(posture)))
     limiter.begin(state, posture)
     kinematics = arm.at(posture)
     solution = arm.follow(state, kinematics, separation)
     position, velocity, acceleration = np.zeros((3, 3))
     target = Target(position, velocity, acceleration, clamped=False)
-    request = Wanted(target, np.zeros(4), np.zeros(3), 0.0, is_ambiguous=False, needs_unseen_hand=False)
+    request = Wanted(
+        target, np.zeros(4), np.zeros(3), 0.0, is_ambiguous=False, needs_unseen_hand=False
+    )
     setpoint.begin(state, frame, kinematics)
     workspace = np.zeros((2, 3))
     workspace.setflags(write=False)
@@ -107,7 +121,13 @@ def rehearse_motion(settings: Settings, urdf: str) -> None:
     joints_limiter.speed_in_stop(joints_limiter.stop(posture, still, still), kinematics)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
-    local_scatter(np.zeros(6), np.zeros(6), error_table(np.zeros((1, 6)), np.zeros((1, 3))), 1.0, np.empty((3, 3)))
+    local_scatter(
+        np.zeros(6),
+        np.zeros(6),
+        error_table(np.zeros((1, 6)), np.zeros((1, 3))),
+        1.0,
+        np.empty((3, 3)),
+    )
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 
@@ -118,17 +138,25 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
     arm = msgspec.structs.replace(settings.arm, source="state")
     settings = msgspec.structs.replace(settings, arm=arm)
     controller = Controller(settings, skill, urdf=urdf)
-    names, trusted = settings.joints.names, still_ticks(settings)
-    change, count = trusted + FOLLOWED_TICKS, trusted + 2 * FOLLOWED_TICKS
+    names = settings.joints.names
+    trusted = still_ticks(settings)
+    change = trusted + FOLLOWED_TICKS
+    count = trusted + 2 * FOLLOWED_TICKS
     controller.step(Tick(0))
     for index in (*range(1, trusted, SAMPLE_EVERY), *range(trusted, count)):
         stamp_ns = round(1e9 * (1 + index * settings.period_s))
         sample = PoseStamped(stamp_ns, "", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        hands = [Event(f"hands/{side}", b"", sample) for side in SIDES] if index % SAMPLE_EVERY == 1 else []
+        hands = (
+            [Event(f"hands/{side}", b"", sample) for side in SIDES]
+            if index % SAMPLE_EVERY == 1
+            else []
+        )
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         adopted = [Event("skill", b"", other)] if index == change else []
         controller.step(Tick(index, (*adopted, *hands, measured)))
-    deviation_m(as_array(controller.state), SkillStage(settings, skill).rules, 0)  # runs only for a hand out of sight
+    deviation_m(
+        as_array(controller.state), SkillStage(settings, skill).rules, 0
+    )  # runs only for a hand out of sight
     controller.step(Tick(count, (order("hold"),)))
 
 

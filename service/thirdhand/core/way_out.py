@@ -23,12 +23,20 @@ from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.separation.stage import Separation
 from thirdhand.settings.config import Settings
 
-STARTS, ITERATIONS = 60, 120  # random starts of the search for postures, and steps from each start
+# random starts of the search for postures, and steps from each start
+STARTS = 60
+ITERATIONS = 120
 STEP_RAD = 0.2  # largest change of a joint in one step
-SLACK, SLACK_SHARE = 0.03, 0.1  # [rad, m] distance from the position limits; at most this share of the range
-REACHED_M, REACHED_RAD = 2e-3, 0.1  # a posture this near to position and orientation is accepted
+# [rad, m] distance from the position limits; at most this share of the range
+SLACK = 0.03
+SLACK_SHARE = 0.1
+# a posture this near to position and orientation is accepted
+REACHED_M = 2e-3
+REACHED_RAD = 0.1
 DAMPING = 1e-5  # [m²] damping of the Gauss-Newton steps
-OPPOSITE = -0.9999  # below this cosine, two directions are opposite and have no single shortest rotation
+OPPOSITE = (
+    -0.9999
+)  # below this cosine, two directions are opposite and have no single shortest rotation
 GOALS = 6  # largest number of postures to which a path is planned
 WAYS = 3  # planning ends when this number of paths is found
 MARGIN_M = 0.02  # clearance required along the path; that of its ends, if one of them has less
@@ -43,16 +51,22 @@ class WayOut:
     """Planner of ways out for the arm of one cell; equal arguments give equal paths."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
-        self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
+        self._arm = Arm(settings, urdf)
+        self._separation = Separation(settings, urdf)
         limits = settings.joints
-        lower, upper = np.array(limits.lower), np.array(limits.upper)
+        lower = np.array(limits.lower)
+        upper = np.array(limits.upper)
         slack = np.minimum(SLACK, SLACK_SHARE * (upper - lower))
-        self._lower, self._upper = lower + slack, upper - slack
+        self._lower = lower + slack
+        self._upper = upper - slack
         self._is_continuous = np.array(limits.every_kind) == "continuous"
-        self._home, self._whole = np.array(settings.arm.posture), settings.tool.orientation == "full"
+        self._home = np.array(settings.arm.posture)
+        self._whole = settings.tool.orientation == "full"
         self._lever = float(self._arm.parameters["turn_lever"][0])
 
-    def find(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> list[Vector]:
+    def find(
+        self, joints: Vector, position: Vector, orientation: Vector, hands: Vector
+    ) -> list[Vector]:
         """Path of at most WAY postures (J,) [rad] from `joints` (J,) to one with the tool at a
         position (3,) [m] in an orientation (4,), past hands (2, 3) [m] at rest; empty if none is
         found.
@@ -60,11 +74,14 @@ class WayOut:
         If no path reaches the orientation, one that reaches the position alone is taken. Of up to
         WAYS paths, the shortest one is returned.
         """
-        random, here_m = np.random.default_rng(0), self._separation.clearance(joints, hands)[0]
+        random = np.random.default_rng(0)
+        here_m = self._separation.clearance(joints, hands)[0]
         limits = self._around(joints)
         ways: list[list[Vector]] = []
         for turned in (True, False):  # without a path to position and orientation, position alone
-            for goal in self._postures(joints, limits, position, orientation if turned else None, hands, random):
+            for goal in self._postures(
+                joints, limits, position, orientation if turned else None, hands, random
+            ):
                 least = min(here_m, self._separation.clearance(goal, hands)[0], MARGIN_M) - SMALL_M
                 path = self._connect(joints, goal, limits, hands, least, random)
                 if path:
@@ -73,16 +90,25 @@ class WayOut:
                     break
             if ways:
                 break
-        return min((candidate for candidate in ways if len(candidate) <= WAY), key=_length, default=[])
+        return min(
+            (candidate for candidate in ways if len(candidate) <= WAY), key=_length, default=[]
+        )
 
-    def has_posture(self, joints: Vector, position: Vector, orientation: Vector, hands: Vector) -> bool:
+    def has_posture(
+        self, joints: Vector, position: Vector, orientation: Vector, hands: Vector
+    ) -> bool:
         """True if the arm has a collision-free posture with the tool at a position (3,) [m], in an
         orientation (4,) or any other one, beside hands (2, 3) [m]. It is looked for from `joints`
         (J,) [rad] on.
         """
-        random, limits = np.random.default_rng(0), self._around(joints)
+        random = np.random.default_rng(0)
+        limits = self._around(joints)
         starts = (np.clip(joints, *limits), *self._starts(joints, limits, random))
-        return any(True for turned in (orientation, None) for _ in self._free(starts, limits, position, turned, hands))
+        return any(
+            True
+            for turned in (orientation, None)
+            for _ in self._free(starts, limits, position, turned, hands)
+        )
 
     def _starts(self, joints: Vector, limits: Vector, random: np.random.Generator) -> list[Vector]:
         """Starts (J,) of the search for postures: the arm's posture in the settings, and STARTS
@@ -93,7 +119,12 @@ class WayOut:
         return [self._home + np.where(self._is_continuous, turns, 0.0), *drawn]
 
     def _free(
-        self, starts: Iterable[Vector], limits: Vector, position: Vector, orientation: Vector | None, hands: Vector
+        self,
+        starts: Iterable[Vector],
+        limits: Vector,
+        position: Vector,
+        orientation: Vector | None,
+        hands: Vector,
     ) -> Iterator[Vector]:
         """Collision-free postures (J,) with the tool at its target, found from these starts."""
         for start in starts:
@@ -105,8 +136,12 @@ class WayOut:
         """Lower and upper limits (2, J) [rad, m] of the search. A continuous joint is searched half
         a turn each way, which covers all its postures.
         """
-        lower = np.where(self._is_continuous, np.maximum(joints - math.pi, self._lower), self._lower)
-        upper = np.where(self._is_continuous, np.minimum(joints + math.pi, self._upper), self._upper)
+        lower = np.where(
+            self._is_continuous, np.maximum(joints - math.pi, self._lower), self._lower
+        )
+        upper = np.where(
+            self._is_continuous, np.minimum(joints + math.pi, self._upper), self._upper
+        )
         return np.array([lower, upper])
 
     def _postures(
@@ -122,10 +157,14 @@ class WayOut:
         `joints` first. Without an `orientation`, any orientation is accepted.
         """
         starts = self._starts(joints, limits, random)
-        postures = list(itertools.islice(self._free(starts, limits, position, orientation, hands), 2 * GOALS))
+        postures = list(
+            itertools.islice(self._free(starts, limits, position, orientation, hands), 2 * GOALS)
+        )
         return sorted(postures, key=lambda q: float(np.abs(q - joints).max()))[:GOALS]
 
-    def _solved(self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None) -> Vector | None:
+    def _solved(
+        self, q: Vector, limits: Vector, position: Vector, orientation: Vector | None
+    ) -> Vector | None:
         """Posture (J,) within the limits with the tool at its target, from the start q (J,); None
         if the iteration does not converge.
 
@@ -136,15 +175,20 @@ class WayOut:
         """
         for _ in range(ITERATIONS):
             kinematics = self._arm.at(q)
-            error, tasks, turn = position - kinematics.position, kinematics.tasks[:3], 0.0
+            error = position - kinematics.position
+            tasks = kinematics.tasks[:3]
+            turn = 0.0
             if orientation is not None:
                 left = kinematics.rotation.T @ self._turn(kinematics, orientation)
                 turn = float(np.linalg.norm(left))
-                error, tasks = np.append(error, self._lever * left[: len(kinematics.tasks) - 3]), kinematics.tasks
+                error = np.append(error, self._lever * left[: len(kinematics.tasks) - 3])
+                tasks = kinematics.tasks
             if np.linalg.norm(error[:3]) < REACHED_M and turn < REACHED_RAD:
                 return q
             step = tasks.T @ np.linalg.solve(tasks @ tasks.T + DAMPING * np.eye(len(tasks)), error)
-            q = np.clip(q + step * min(1.0, STEP_RAD / max(float(np.abs(step).max()), 1e-9)), *limits)
+            q = np.clip(
+                q + step * min(1.0, STEP_RAD / max(float(np.abs(step).max()), 1e-9)), *limits
+            )
         return None
 
     def _turn(self, here: Kinematics, orientation: Vector) -> Vector:
@@ -152,7 +196,8 @@ class WayOut:
         the arm follows only the direction of the tool's z axis, it is the shortest rotation of that
         axis.
         """
-        turn, target_axis = np.empty(3), np.empty(3)
+        turn = np.empty(3)
+        target_axis = np.empty(3)
         if self._whole:
             now = np.empty(4)
             quaternion_of(here.rotation, now)
@@ -168,10 +213,19 @@ class WayOut:
         the clearance `least` [m].
         """
         count = max(1, int(np.ceil(np.abs(b - a).max() / GRAIN_RAD)))
-        return all(self._separation.clearance(a + k / count * (b - a), hands)[0] > least for k in range(1, count + 1))
+        return all(
+            self._separation.clearance(a + k / count * (b - a), hands)[0] > least
+            for k in range(1, count + 1)
+        )
 
     def _connect(
-        self, start: Vector, goal: Vector, limits: Vector, hands: Vector, least: float, random: np.random.Generator
+        self,
+        start: Vector,
+        goal: Vector,
+        limits: Vector,
+        hands: Vector,
+        least: float,
+        random: np.random.Generator,
     ) -> list[Vector]:
         """Collision-free path of straight lines from `start` to `goal` (J,); empty if none is
         found.
@@ -180,7 +234,8 @@ class WayOut:
             return [start, goal]
         trees = [([start], [-1]), ([goal], [-1])]
         for number in range(NODES):
-            (grown, before), (other, other_before) = trees[number % 2], trees[1 - number % 2]
+            grown, before = trees[number % 2]
+            other, other_before = trees[1 - number % 2]
             drawn = random.uniform(limits[0], limits[1])
             new = self._grow(grown, before, drawn, hands, least)
             while new is not None:
@@ -188,7 +243,8 @@ class WayOut:
                 if met is None:
                     break
                 if np.array_equal(met, new):
-                    branch, two = _to_root(grown, before), _to_root(other, other_before)[::-1]
+                    branch = _to_root(grown, before)
+                    two = _to_root(other, other_before)[::-1]
                     path = branch[::-1] + two[::-1][1:] if number % 2 == 0 else two + branch[1:]
                     return path if np.array_equal(path[0], start) else path[::-1]
         return []
@@ -211,7 +267,9 @@ class WayOut:
         before.append(nearest)
         return new
 
-    def _shortened(self, path: list[Vector], hands: Vector, least: float, random: np.random.Generator) -> list[Vector]:
+    def _shortened(
+        self, path: list[Vector], hands: Vector, least: float, random: np.random.Generator
+    ) -> list[Vector]:
         """Path without the corners that straight lines can bypass, by SHORTCUTS random attempts."""
         for _ in range(SHORTCUTS):
             if len(path) < 3:
@@ -229,7 +287,8 @@ def _length(path: list[Vector]) -> float:
 
 def _to_root(nodes: list[Vector], before: list[int]) -> list[Vector]:
     """Postures from the newest node of a tree back to its root."""
-    path, index = [], len(nodes) - 1
+    path = []
+    index = len(nodes) - 1
     while index >= 0:
         path.append(nodes[index])
         index = before[index]

@@ -14,19 +14,26 @@ from thirdhand.daemon.cell_streams import CellStreams
 from thirdhand.daemon.clock import Deadlines
 from thirdhand.settings.config import Settings
 
-RESTS_S = 0.1  # the rest position is repeated for this time, because some controllers extrapolate the last command
+# the rest position is repeated for this time, because some controllers extrapolate the last command
+RESTS_S = 0.1
 
 
 def brake(settings: Settings, frame: Frame, clock: Deadlines, streams: CellStreams) -> None:
     """Command the stop that follows the newest frame, tick by tick, and repeat the last command."""
-    limiter, names = Limiter(settings.joints, settings.period_s), settings.joints.names
-    q, dq, ddq = (frame[name].copy() for name in ("joints", "joint_velocities", "joint_accelerations"))
-    index, stamp_ns, resting = int(frame["tick"]), clock.stamp_ns, 0
+    limiter = Limiter(settings.joints, settings.period_s)
+    names = settings.joints.names
+    q, dq, ddq = (
+        frame[name].copy() for name in ("joints", "joint_velocities", "joint_accelerations")
+    )
+    index = int(frame["tick"])
+    stamp_ns = clock.stamp_ns
+    resting = 0
     while frame["commanded"] and resting < RESTS_S * settings.rate_hz:
         deadline, _ = clock.wait()
         if dq.any():
             q, dq, ddq, _ = limiter.stop(q, dq, ddq)
-            index, stamp_ns = deadline, clock.stamp_ns
+            index = deadline
+            stamp_ns = clock.stamp_ns
         else:
             resting += 1
         attachment = cdr.encode_attachment(Attachment(index, time.time_ns(), 0))

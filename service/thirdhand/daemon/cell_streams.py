@@ -31,14 +31,20 @@ KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
 TAKEOVER_S = 0.5  # another publisher of a hand is heard after a silence of this time
-FROZEN_S = 0.5  # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
-TRACKED_S = 2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
+# a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
+FROZEN_S = 0.5
+TRACKED_S = (
+    2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
+)
 EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
-LEAP_STEPS = 5.0  # a hand that was lost appears this many steps away; one that rested goes on from where it was
+# a hand that was lost appears this many steps away; one that rested goes on from where it was
+LEAP_STEPS = 5.0
 SMOOTH_SHARE = 0.05  # of the median step: with noise, one step in 10 000 is as small
 LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
 ARM_STATE = "joints/state"
-CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are heard with some settings only
+CONFIGURED: Mapping[
+    str, Callable[[Settings], bool]
+] = {  # channels that are heard with some settings only
     ARM_STATE: lambda settings: settings.arm.source == "state",
     "joints/guided": lambda settings: settings.arm.source == "state",
     "clutch": lambda settings: settings.hands.clutch == "key",
@@ -46,8 +52,12 @@ CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {  # channels that are he
 }
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
-MAX_JOINT_STATES = 16  # messages of the arm's topic, on which grippers and other parts may publish too
-MAX_TRANSFORM_MESSAGES = 64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
+MAX_JOINT_STATES = (
+    16  # messages of the arm's topic, on which grippers and other parts may publish too
+)
+MAX_TRANSFORM_MESSAGES = (
+    64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
+)
 
 
 class Arrivals:
@@ -56,7 +66,9 @@ class Arrivals:
     __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "others", "why")
 
     def __init__(self) -> None:
-        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)  # stamp, arrival - stamp [ns]
+        self._delays: deque[tuple[int, int]] = deque(
+            maxlen=KEPT_DELAYS
+        )  # stamp, arrival - stamp [ns]
         self.count = self.malformed = self.frozen = self.others = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
@@ -66,7 +78,8 @@ class Arrivals:
         report of guiding, which have no stamp, only that it arrived.
         """
         if isinstance(message, PoseStamped | JointState):
-            self.newest, self.at_ns = message, at_ns
+            self.newest = message
+            self.at_ns = at_ns
             self._delays.append((message.stamp_ns, at_ns - message.stamp_ns))
         self.count += 1
 
@@ -92,7 +105,9 @@ class Arrivals:
         """Interval [ms] of the batches in which messages arrive: the median of the pauses between
         arrivals that are longer than accepted; 0 with fewer than three of them.
         """
-        arrivals_ms = np.array([stamp_ns + delay_ns for stamp_ns, delay_ns in tuple(self._delays)]) / 1e6
+        arrivals_ms = (
+            np.array([stamp_ns + delay_ns for stamp_ns, delay_ns in tuple(self._delays)]) / 1e6
+        )
         pauses_ms = np.diff(arrivals_ms)
         long_ms = pauses_ms[pauses_ms > accepted_ms]
         return float(np.median(long_ms)) if len(long_ms) >= LEAST_BATCHES else 0.0
@@ -147,7 +162,9 @@ class FrozenHand:
 
     def __init__(self) -> None:
         self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
-        self._steps: deque[float] = deque(maxlen=50)  # distances between poses that differ, in the tracker's unit
+        self._steps: deque[float] = deque(
+            maxlen=50
+        )  # distances between poses that differ, in the tracker's unit
         self._repeated_ns = 0  # stamp of its newest repetition
         self._varies_since_ns = 0  # stamp since which each sample differs from the one before
         self._is_tracked = False
@@ -173,7 +190,9 @@ class FrozenHand:
                 self._rests += 1
                 self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
             self._steps.append(step)
-            self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)  # its clock may be set back
+            self._varies_since_ns = min(
+                self._varies_since_ns, pose.stamp_ns
+            )  # its clock may be set back
             self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
         self._pose = pose
         self._repeated_ns = pose.stamp_ns
@@ -195,36 +214,52 @@ class CellStreams:
         arrivals: Mapping[str, Arrivals],
         failed: Callable[[str], None],
     ) -> None:
-        cell, domain = settings.cell, settings.network.ros2_domain
+        cell = settings.cell
+        domain = settings.network.ros2_domain
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
         self._sole = {key: SolePublisher() for key in self._frozen}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         inputs = [channel.key for channel in heard(settings)]
-        keys, frames = [(suffix, channels.key(cell, suffix)) for suffix in inputs], dict[str, dict[str, str]]()
+        keys = [(suffix, channels.key(cell, suffix)) for suffix in inputs]
+        frames = dict[str, dict[str, str]]()
         if domain is not None:
             topics = ros2.heard(cell, settings.ros2, inputs)
-            keys += [(topic.channel, ros2.key(domain, topic)) for topic in topics if not topic.frame]
+            keys += [
+                (topic.channel, ros2.key(domain, topic)) for topic in topics if not topic.frame
+            ]
             for transform_topic in (topic for topic in topics if topic.frame):
-                frames.setdefault(ros2.key(domain, transform_topic), {})[transform_topic.frame] = transform_topic.channel
+                frames.setdefault(ros2.key(domain, transform_topic), {})[transform_topic.frame] = (
+                    transform_topic.channel
+                )
             topics += [ros2.of_channel(cell, channel) for channel in ros2.SAID]
             topics += [topic for topic in ros2.of_settings(settings.ros2) if not topic.heard]
         self._subscribers = [
-            (suffix, session.declare_subscriber(key, RingChannel(_most(suffix)))) for suffix, key in keys
+            (suffix, session.declare_subscriber(key, RingChannel(_most(suffix))))
+            for suffix, key in keys
         ]
         remote = zenoh.Locality.REMOTE  # the cell may publish frames of its own on the same topic
         self._transforms = [
-            (by_frame, session.declare_subscriber(key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote))
+            (
+                by_frame,
+                session.declare_subscriber(
+                    key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote
+                ),
+            )
             for key, by_frame in frames.items()
         ]
         self._publishers = {
-            channel.key: Publisher(session, cell, channel.key, priority=zenoh.Priority.REAL_TIME).zenoh
+            channel.key: Publisher(
+                session, cell, channel.key, priority=zenoh.Priority.REAL_TIME
+            ).zenoh
             for channel in channels.CHANNELS
             if channel.direction == "out"
         }
         self._sent = Counter[str]()  # messages by channel
-        self._ros2 = None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
+        self._ros2 = (
+            None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
+        )
 
     def receive(self) -> list[Event]:
         """The hands' messages since the last call, and the newest state of the arm. Messages that
@@ -266,7 +301,8 @@ class CellStreams:
 
     def _decoded(self, suffix: str, raw: Any, publisher: str) -> Event | None:
         """The event of a message; None if it is refused, or completes no state of the arm."""
-        channel, arrivals = channels.BY_KEY[suffix], self._arrivals[suffix]
+        channel = channels.BY_KEY[suffix]
+        arrivals = self._arrivals[suffix]
         try:
             if len(raw) > cdr.MAX_BYTES:
                 raise WireError(f"{len(raw)} bytes, at most {cdr.MAX_BYTES} accepted")

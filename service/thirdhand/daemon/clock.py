@@ -61,7 +61,9 @@ class Deadlines:
         self.stamp_ns = wall_ns() - self.period_ns
         self._index = -1
         self._sleeps_until_ns = 0
-        self._is_in_tick = threading.Lock()  # locked by `between_ticks`, released at the end of a tick
+        self._is_in_tick = (
+            threading.Lock()
+        )  # locked by `between_ticks`, released at the end of a tick
 
     def between_ticks(self) -> None:
         """Wait, on another thread, until the loop sleeps for at least BESIDE_NS more, or has just
@@ -118,9 +120,13 @@ class SystemClock:
     """The system clock, watched for steps against the monotonic one."""
 
     def __init__(
-        self, *, now_ns: Callable[[], int] = time.monotonic_ns, wall_ns: Callable[[], int] = time.time_ns
+        self,
+        *,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._now_ns, self._wall_ns = now_ns, wall_ns
+        self._now_ns = now_ns
+        self._wall_ns = wall_ns
         self._apart_ns: int | None = None
 
     def set_by(self) -> str:
@@ -137,7 +143,11 @@ class SystemClock:
         if -STEP_NS < set_ns < STEP_NS:
             return ""
         size = f"by {abs(set_ns) / 1e9:.2f} s"
-        return f"ahead {size}, or the machine was suspended meanwhile" if set_ns > 0 else f"back {size}"
+        return (
+            f"ahead {size}, or the machine was suspended meanwhile"
+            if set_ns > 0
+            else f"back {size}"
+        )
 
 
 class Granted(NamedTuple):
@@ -179,7 +189,9 @@ def run_beside_real_time() -> None:
     the interpreter lock, it delays the loop.
     """
     with contextlib.suppress(PermissionError, AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY))
+        os.sched_setscheduler(
+            0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(BESIDE_PRIORITY)
+        )
 
 
 class Window:
@@ -196,11 +208,15 @@ class Window:
 
     def largest(self, count: int) -> float:
         """The largest of the `count` newest values; 0 while the window is empty."""
-        newest = self._values.take(range(self._count - min(count, self._count), self._count), mode="wrap")
+        newest = self._values.take(
+            range(self._count - min(count, self._count), self._count), mode="wrap"
+        )
         return float(newest.max(initial=0.0))
 
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and maximum over the window; zeros while the window is empty."""
         if not self._count:
             return Percentiles()
-        return Percentiles(*np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist())
+        return Percentiles(
+            *np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist()
+        )

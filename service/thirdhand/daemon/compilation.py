@@ -39,7 +39,8 @@ class Compilations(event.Listener):  # type: ignore[misc]
     """
 
     def __init__(self, begun: Callable[[str], object], ended: Callable[[str], object]) -> None:
-        self._begun, self._ended = begun, ended
+        self._begun = begun
+        self._ended = ended
 
     def on_start(self, event: event.Event) -> None:
         """A compilation begins."""
@@ -103,7 +104,9 @@ def run(channel: socket.socket) -> None:
     def send(*words: str) -> None:
         channel.send(" ".join(words).encode())
 
-    listener = Compilations(lambda name: send(name, "is being compiled"), lambda name: send(name, COMPILED))
+    listener = Compilations(
+        lambda name: send(name, "is being compiled"), lambda name: send(name, COMPILED)
+    )
     with event.install_listener("numba:compile", listener), ahead_of_others():
         if is_first:
             rehearse_intake(settings)
@@ -116,7 +119,10 @@ def run(channel: socket.socket) -> None:
 
 def _rehearse_beside(settings: Settings, path: Path) -> None:
     """Call what the start, requests and an arm's driver call and the loop does not."""
-    skill, posture = skill_of(path), np.array(settings.arm.posture)
-    has_posture_of(settings, posture, skill.tool_positions[0], skill.orientation, skill.hands[0].reshape(2, 3))
+    skill = skill_of(path)
+    posture = np.array(settings.arm.posture)
+    has_posture_of(
+        settings, posture, skill.tool_positions[0], skill.orientation, skill.hands[0].reshape(2, 3)
+    )
     beyond_m(settings, skill.tool_positions[:1])
     Playback(settings.joints, posture, period_s=settings.period_s)

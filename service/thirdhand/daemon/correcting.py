@@ -60,7 +60,8 @@ class Corrections:
 
     def __init__(self, settings: Settings, moment: Callable[[], Moment]) -> None:
         """`moment` gives the newest frame, and the state after it."""
-        self._settings, self._moment = settings, moment
+        self._settings = settings
+        self._moment = moment
         self._arm: Arm | None = None
         self.replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
 
@@ -74,42 +75,63 @@ class Corrections:
             return LedTool(held_tick, hands, segment, np.array(request.tool), None, joints)
         settings = self._settings
         if settings.arm.source == "assumed":
-            raise RequestError("$.tool: none given; needed, as this daemon does not measure where the arm is")
+            raise RequestError(
+                "$.tool: none given; needed, as this daemon does not measure where the arm is"
+            )
         if state["guided_tick"] < max(state["held_tick"], 1):
             raise RequestError(
-                "the arm was not led in this hold: its driver reported no guiding on `joints/guided`. Switch on hand "
-                "guiding and lead the tool, or give its position as $.tool"
+                "the arm was not led in this hold: its driver reported no guiding on "
+                "`joints/guided`. Switch on hand guiding and lead the tool, or give its position "
+                "as $.tool"
             )
         if (state["tick"] - state["arm_tick"]) * settings.period_s >= MAX_MEASURED_AGE_S:
             raise RequestError("the arm's joints are not measured now: is its driver running?")
-        speed = float((np.abs(state["measured_velocities"]) / np.array(settings.joints.per_rad)).max())
+        speed = float(
+            (np.abs(state["measured_velocities"]) / np.array(settings.joints.per_rad)).max()
+        )
         if speed > MAX_LED_RADPS:
-            raise RequestError(f"the arm moves at {speed:.2f} rad/s; {MAX_LED_RADPS} rad/s accepted: hold it still")
+            raise RequestError(
+                f"the arm moves at {speed:.2f} rad/s; {MAX_LED_RADPS} rad/s accepted: hold it still"
+            )
         self._arm = self._arm or Arm(settings, robot_description(settings))
-        kinematics, quaternion = self._arm.at(np.array(state["measured"])), np.empty(4)
+        kinematics = self._arm.at(np.array(state["measured"]))
+        quaternion = np.empty(4)
         quaternion_of(kinematics.rotation, quaternion)
         x, y, z, w = (round(value, 6) for value in quaternion.tolist())
         orientation = (x, y, z, w) if request.turned else None
-        return LedTool(held_tick, hands, segment, np.array(kinematics.position), orientation, np.array(state["measured"]))
+        return LedTool(
+            held_tick,
+            hands,
+            segment,
+            np.array(kinematics.position),
+            orientation,
+            np.array(state["measured"]),
+        )
 
-    def _hands(self, request: Correct, skill: Skill, frame: Frame, state: Record) -> tuple[Vector, int]:
+    def _hands(
+        self, request: Correct, skill: Skill, frame: Frame, state: Record
+    ) -> tuple[Vector, int]:
         """The hands (6,) [m] and the segment of a correction. Raises RequestError."""
         sides = (0, 1) if skill.conductor is None else (skill.conductor,)
         if request.hands == "held":
             if state["held"] != HELD_SEEN:
                 raise RequestError(
-                    "the hands were not seen when the hold began; resume, hold again while both are seen, or correct "
+                    "the hands were not seen when the hold began; resume, hold again while both "
+                    "are seen, or correct "
                     'for the hands of this moment ($.hands: "now")'
                 )
-            hands, segment = np.array(state["held_hands"]), int(state["held_segment"])
+            hands = np.array(state["held_hands"])
+            segment = int(state["held_segment"])
         else:
             ages, stale = (frame[name][list(sides)] for name in ("hand_ages", "stale_ticks"))
             if (ages < 0).any() or (ages >= stale).any():
                 raise RequestError("$.hands: 'now' given, but the hands are not seen now")
-            hands, belief = np.array(frame["hands"]), np.array(state["segment_belief"])
+            hands = np.array(frame["hands"])
+            belief = np.array(state["segment_belief"])
             segment = int(belief.argmax()) if belief.max() > 0.5 else -1
         if skill.model.names and not 0 <= segment < len(skill.model.names) - 1:
             raise RequestError(
-                "the segment of the task was not known; name it by `thirdhand segment NAME`, then hold again"
+                "the segment of the task was not known; name it by `thirdhand segment NAME`, then "
+                "hold again"
             )
         return hands.reshape(6), segment if skill.model.names else -1

@@ -22,7 +22,18 @@ from thirdhand.contract.messages import Attachment
 from thirdhand.contract.records import Reason
 from thirdhand.contract.requests import Status, ViaPoint, encode_json
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import STAGES, Event, Frame, Outputs, Record, Tick, blank, frame_layout, order, timed
+from thirdhand.core.frame import (
+    STAGES,
+    Event,
+    Frame,
+    Outputs,
+    Record,
+    Tick,
+    blank,
+    frame_layout,
+    order,
+    timed,
+)
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.warm_up import warm_up
 from thirdhand.daemon import supervised_thread
@@ -103,17 +114,26 @@ class Daemon:
         self._controller, self._twin = (Controller(settings, skill, urdf=urdf) for _ in range(2))
         self._measured_arm = MeasuredArm(settings, urdf)
         self._frame: Frame = blank(frame_layout(len(settings.joints.names)))
-        self._frame["tick"], self._frame["reason"], self._frame["hand_ages"] = -1, Reason.ARM_NOT_READY, -1
-        self._frame["hand_distance"], self._frame["hand_limit"] = FARTHEST_REPORTED_M, self._controller.max_part_speed
-        self._sources, self._machine = InputMonitor(settings), Machine()
+        self._frame["tick"] = -1
+        self._frame["reason"] = Reason.ARM_NOT_READY
+        self._frame["hand_ages"] = -1
+        self._frame["hand_limit"] = self._controller.max_part_speed
+        self._frame["hand_distance"] = FARTHEST_REPORTED_M
+        self._sources = InputMonitor(settings)
+        self._machine = Machine()
         self._failure = ""  # message of the service's last failure
-        self._lateness, self._work, self._latency = (Window(10 * settings.rate_hz) for _ in range(3))
-        self._granted, self._version = Granted(realtime=False, locked=False), version("thirdhand")
+        self._lateness, self._work, self._latency = (
+            Window(10 * settings.rate_hz) for _ in range(3)
+        )
+        self._granted = Granted(realtime=False, locked=False)
+        self._version = version("thirdhand")
         self._own: deque[Event] = deque()  # events from the service itself: faults, ways out
         self._saved_segment = SavedSegment(settings)
         if reached := self._saved_segment.read(stored):
             self._own.append(order("segment", reached))
-            log.info("the task continues at via-point %s, which an earlier run had reached", reached)
+            log.info(
+                "the task continues at via-point %s, which an earlier run had reached", reached
+            )
         self._way_finder = WayFinder(settings, skill_worker, self._own.append, self._note_beside)
         self._task_limits = TaskLimits(settings, skill_worker, self._note_beside)
         self._notes = (0, 0)  # time [s] and the number of notes in this second
@@ -124,11 +144,14 @@ class Daemon:
         self._outputs: Outputs = ()  # messages published in the newest tick
         self.endpoints = endpoints(self._session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
-        self._streams = CellStreams(self._session, settings, arrivals=self._sources.arrivals, failed=self._fail)
+        self._streams = CellStreams(
+            self._session, settings, arrivals=self._sources.arrivals, failed=self._fail
+        )
         self._side_streams = side_streams(self._session, settings, scribe, self._sources.arrivals)
         self._clock = Deadlines(settings.rate_hz)
         self._status = NewestStatus()
-        self._start, self._is_open = start, False
+        self._start = start
+        self._is_open = False
         is_watched = start.systemd.ping_every_s and self.endpoints
         self._own_answers = OwnAnswers(settings, self.endpoints[0]) if is_watched else None
         self._queryables = Queryables(
@@ -177,11 +200,19 @@ class Daemon:
         """
         reporter: threading.Thread | None = None
         try:
-            self._scribe.start(skill=self._file, state=self._controller.state, constants=self._controller.constants)
-            reporter = supervised_thread.start("status thread", lambda: self._report(announce), self._fail)
+            self._scribe.start(
+                skill=self._file, state=self._controller.state, constants=self._controller.constants
+            )
+            reporter = supervised_thread.start(
+                "status thread", lambda: self._report(announce), self._fail
+            )
             self._granted = ask_for_real_time()
-            self._clock = Deadlines(self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0)
-            supervised_thread.supervised("control loop", self._run, self._fail_in_the_loop, pause_s=0.0)
+            self._clock = Deadlines(
+                self._settings.rate_hz, spin_ns=SPIN_NS if self._granted.realtime else 0
+            )
+            supervised_thread.supervised(
+                "control loop", self._run, self._fail_in_the_loop, pause_s=0.0
+            )
         finally:
             brake(self._settings, self._frame, self._clock, self._streams)
             self._ended.set()
@@ -197,7 +228,9 @@ class Daemon:
             self._session.close()  # type: ignore[no-untyped-call]
             missing = self._scribe.close()
             recording = self._scribe.newest_recording
-            recording_text = f"its newest recording is {recording}" if recording else "it recorded nothing"
+            recording_text = (
+                f"its newest recording is {recording}" if recording else "it recorded nothing"
+            )
             log.info("ended: the daemon of cell %s; %s", self._settings.cell, recording_text)
             if missing:
                 log.warning("%s", missing)
@@ -242,7 +275,10 @@ class Daemon:
                 elif not self._frame["joint_velocities"].any():
                     return
                 elif time.monotonic() > stop_by:
-                    log.error("the arm did not come to rest within %g s; it gets no more commands", REST_TIMEOUT_S)
+                    log.error(
+                        "the arm did not come to rest within %g s; it gets no more commands",
+                        REST_TIMEOUT_S,
+                    )
                     return
             inbox = self._streams.receive()
             if requests:
@@ -263,7 +299,8 @@ class Daemon:
             channels.BY_KEY[event.kind].codec.decode(event.payload)
         self._twin.copy_from(self._controller)
         tick = Tick(self._newest + 1, newest)
-        frame, stages = self._twin.step(tick), [0.0] * len(STAGES)
+        frame = self._twin.step(tick)
+        stages = [0.0] * len(STAGES)
         outputs = outgoing(frame, self._clock.stamp_ns, self._settings.joints.names)
         cdr.encode_attachment(Attachment(tick.index, self._clock.stamp_ns, 0))
         timing = timed(tick.index, self._clock.stamp_ns, 0, 0.0, 0.0, 0.0, stages)
@@ -274,14 +311,18 @@ class Daemon:
 
     def _publish(self, tick: Tick, frame: Frame) -> None:
         now_ns = time.time_ns()
-        attachment = cdr.encode_attachment(Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"])))
+        attachment = cdr.encode_attachment(
+            Attachment(tick.index, now_ns, int(frame["hand_stamp_ns"]))
+        )
         self._outputs = outgoing(frame, self._clock.stamp_ns, self._settings.joints.names)
         for key, payload in self._outputs:
             self._streams.publish(key, payload, attachment)
 
     def _record(self, tick: Tick, frame: Frame) -> None:
         self._frame = frame
-        stages, before, latency_ms = [0.0] * len(STAGES), self._began_ns, 0.0
+        stages = [0.0] * len(STAGES)
+        before = self._began_ns
+        latency_ms = 0.0
         for stage, lap_ns in self._laps:
             stages[STAGE_NUMBERS[stage]] = (lap_ns - before) / 1e3
             before = lap_ns
@@ -291,13 +332,20 @@ class Daemon:
                 self._latency.add(latency_ms)
             else:
                 latency_ms = 0.0
-        late_us, work_us = self._late_ns / 1e3, (time.perf_counter_ns() - self._began_ns) / 1e3
-        time_ns, missed = self._clock.stamp_ns, self._clock.missed
+        late_us = self._late_ns / 1e3
+        work_us = (time.perf_counter_ns() - self._began_ns) / 1e3
+        time_ns = self._clock.stamp_ns
+        missed = self._clock.missed
         timing = timed(tick.index, time_ns, missed, late_us, work_us, 1e3 * latency_ms, stages)
         self._lateness.add(late_us)
         self._work.add(work_us)
         self._scribe.send(
-            tick, frame, timing, state=lambda: self._controller.state, skill=self._file, outputs=self._outputs
+            tick,
+            frame,
+            timing,
+            state=lambda: self._controller.state,
+            skill=self._file,
+            outputs=self._outputs,
         )
 
     @property
@@ -318,7 +366,9 @@ class Daemon:
                 announce(self)
                 self._start.systemd.notify("READY=1")
                 if self._own_answers is not None:
-                    supervised_thread.start("thread of own requests", self._own_answers.ask, self.note)
+                    supervised_thread.start(
+                        "thread of own requests", self._own_answers.ask, self.note
+                    )
 
     def _report(self, announce: Callable[[Daemon], None]) -> None:
         """Publish the status, log changes, and supervise the scribe ten times a second. A status is
@@ -328,21 +378,26 @@ class Daemon:
         self._open(announce)
         logged_mode: tuple[str, str] | None = None
         logged_errors: deque[str] = deque(maxlen=50)
-        due_s, system_clock = time.monotonic(), SystemClock()
+        due_s = time.monotonic()
+        system_clock = SystemClock()
         while not self._ended.is_set():
             self._status.wait(due_s - time.monotonic())
-            is_due, is_published = time.monotonic() >= due_s, self._status.begin()
+            is_due = time.monotonic() >= due_s
+            is_published = self._status.begin()
             skill = self._controller.skill
             status = self._status_now()
             self._clock.between_ticks()
-            payload, errors = encode_json(status), list(status.scribe["errors"])
+            payload = encode_json(status)
+            errors = list(status.scribe["errors"])
             if is_due or is_published:
                 self._streams.publish("status", payload)
             try:
                 if self._controller.skill is skill:  # else the segment may be that of either
                     self._saved_segment.keep(skill, status.segment, status.segment_belief)
             except OSError as error:
-                errors.append(f"the segment of the task cannot be saved for a restart: {in_words(error)}")
+                errors.append(
+                    f"the segment of the task cannot be saved for a restart: {in_words(error)}"
+                )
             self._status.end(payload)
             if self._own_answers is None or not self._own_answers.is_deaf():
                 self._start.systemd.progressed(status.tick)
@@ -371,15 +426,27 @@ class Daemon:
                     log.warning("%s", error_text)
             for line in self._sources.news(status.inputs, time.monotonic()):
                 log.warning("%s", line)
-            if status.tick >= 0 and not self._stop.is_set() and (status.mode, status.reason) != logged_mode:
+            if (
+                status.tick >= 0
+                and not self._stop.is_set()
+                and (status.mode, status.reason) != logged_mode
+            ):
                 logged_mode = (status.mode, status.reason)
-                log.info("%s at tick %d%s", in_brief(*logged_mode), status.tick, in_full(status.because, status.remedy))
+                log.info(
+                    "%s at tick %d%s",
+                    in_brief(*logged_mode),
+                    status.tick,
+                    in_full(status.because, status.remedy),
+                )
                 self._start.systemd.notify(f"STATUS={in_brief(*logged_mode)}")
 
     def _moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""
-        for _ in range(STATUS_TRIES):  # during a tick, the frame and the state are of different ticks
-            frame, state = self._frame, self._controller.state
+        for _ in range(
+            STATUS_TRIES
+        ):  # during a tick, the frame and the state are of different ticks
+            frame = self._frame
+            state = self._controller.state
             if frame["tick"] == state["tick"]:
                 break
             time.sleep(0.2 * self._settings.period_s)
@@ -387,7 +454,8 @@ class Daemon:
 
     def _status_now(self) -> Status:
         """The present status, made in parts between ticks."""
-        clock, now_s = self._clock, time.monotonic()
+        clock = self._clock
+        now_s = time.monotonic()
         clock.between_ticks()
         frame, state = self._moment()
         sources = {}
@@ -398,17 +466,30 @@ class Daemon:
         clock.between_ticks()
         inside = self._measured_arm.inside(state)
         late_ms = self._lateness.largest(round(BUSY_WINDOW_S * self._settings.rate_hz)) / 1e3
-        machine, scribe = self._machine, self._scribe.status()
-        machine.update(now_s, tick=int(frame["tick"]), missed=clock.missed, late_ms=late_ms, outcome=outcome(frame))
+        machine = self._machine
+        scribe = self._scribe.status()
+        machine.update(
+            now_s,
+            tick=int(frame["tick"]),
+            missed=clock.missed,
+            late_ms=late_ms,
+            outcome=outcome(frame),
+        )
         memory_mb = resident_mb(daemon=os.getpid(), scribe=scribe["pid"])
-        windows = {"lateness_us": self._lateness, "work_us": self._work, "latency_ms": self._latency}
+        windows = {
+            "lateness_us": self._lateness,
+            "work_us": self._work,
+            "latency_ms": self._latency,
+        }
         percentiles = {}
         for name, window in windows.items():
             clock.between_ticks()
             percentiles[name] = window.percentiles()
         clock.between_ticks()
         evidence = self._failure, inside, machine.at_stop, self._sources.clutch(state), streams
-        return CellStatus(frame, self._controller, state, sources, self._settings, *evidence).status(
+        return CellStatus(
+            frame, self._controller, state, sources, self._settings, *evidence
+        ).status(
             time_ns=time.time_ns(),
             rate_hz=clock.rate_hz(),
             missed=clock.missed,
@@ -433,7 +514,8 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     Raises SkillError, also if the arm does not reach most of the skill's tool positions, or if
     nobody accepted the skill's residual risk.
     """
-    skill, saved = skill_of(path), SavedViaPoints(settings)
+    skill = skill_of(path)
+    saved = SavedViaPoints(settings)
     skill.check_accepted()
     if skill.residual_risk:
         log.warning("residual risk of skill %r, %s", skill.name, skill.residual_risk)
@@ -444,8 +526,8 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
         adapted = skill_of(skill.file, points, tolerance)
         names = ", ".join(point.name for point in points) or "none, the skill's own were removed"
         log.info(
-            "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand via-points remove "
-            "NAME` removes one, `thirdhand via-points clear` removes all",
+            "via-points of an earlier run are in force (%d): %s. They are saved in %s; `thirdhand "
+            "via-points remove NAME` removes one, `thirdhand via-points clear` removes all",
             len(points),
             names,
             saved.path(skill),
@@ -466,10 +548,13 @@ def rehearsed(settings: Settings, skill_path: Path, start: Startup) -> StoredSki
     start.stage("skill")
     stored = load_skill(skill_path, settings)
     start.stage("rehearsal")
-    skill, urdf = stored.for_loop(), robot_description(settings)
+    skill = stored.for_loop()
+    urdf = robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
     release_start_memory()  # what only imports used: 150 MB
-    warm_up(settings, skill, urdf=urdf)  # maps again what the loop calls, before its memory is locked
+    warm_up(
+        settings, skill, urdf=urdf
+    )  # maps again what the loop calls, before its memory is locked
     return stored
 
 
@@ -503,7 +588,13 @@ def serve(
                     skill = rehearsed(settings, skill_path, start)
         start.stage("loop")
         daemon = Daemon(
-            settings, skill, skill_worker=skill_worker, skills=skills, scribe=scribe, start=start, hold=hold
+            settings,
+            skill,
+            skill_worker=skill_worker,
+            skills=skills,
+            scribe=scribe,
+            start=start,
+            hold=hold,
         )
         for number in STOPPING:
             signal.signal(number, daemon.stop)

@@ -13,8 +13,23 @@ from statistics import median
 
 import msgspec
 
-from thirdhand.contract.evidence import LONGEST_NAME, Evidence, Explanation, Jump, Outside, explained
-from thirdhand.contract.incidents import FROZEN, MALFORMED, OTHER_PUBLISHER, Condition, in_full, input_name, word
+from thirdhand.contract.evidence import (
+    LONGEST_NAME,
+    Evidence,
+    Explanation,
+    Jump,
+    Outside,
+    explained,
+)
+from thirdhand.contract.incidents import (
+    FROZEN,
+    MALFORMED,
+    OTHER_PUBLISHER,
+    Condition,
+    in_full,
+    input_name,
+    word,
+)
 from thirdhand.contract.joint_states import measured
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
 from thirdhand.contract.records import SOURCES, Cause
@@ -43,7 +58,8 @@ class _History:
         self.seen: dict[str, int] = {}
         self.logged: dict[str, int] = {}
         self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
-        self.cause, self.refused_s = "", -math.inf
+        self.cause = ""
+        self.refused_s = -math.inf
 
 
 class InputMonitor:
@@ -58,7 +74,9 @@ class InputMonitor:
         self._histories = {name: _History() for name in self._keys}
         self._counted_s = 0.0
 
-    def update(self, controller: Controller, state: Record, now_s: float) -> Iterator[tuple[str, Source]]:
+    def update(
+        self, controller: Controller, state: Record, now_s: float
+    ) -> Iterator[tuple[str, Source]]:
         """Each source with its name at this moment, from the state of this controller."""
         for source in SOURCES:
             if source in self._keys:
@@ -72,8 +90,13 @@ class InputMonitor:
         """Rate, clock and rejected messages of a stream; the `intake` rejects samples of hands and
         arm.
         """
-        history, arrivals = self._histories[name], self.arrivals[self._keys[name]]
-        if history.counts and history.counts[-1][1] != arrivals.count and arrivals.newest is not None:
+        history = self._histories[name]
+        arrivals = self.arrivals[self._keys[name]]
+        if (
+            history.counts
+            and history.counts[-1][1] != arrivals.count
+            and arrivals.newest is not None
+        ):
             history.clocks.append((now_s, (arrivals.at_ns - arrivals.newest.stamp_ns) / 1e6))
         history.counts.append((now_s, arrivals.count))
         while history.counts[0][0] < now_s - RATE_WINDOW_S - 0.05:
@@ -81,25 +104,37 @@ class InputMonitor:
         while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
             history.clocks.popleft()
         since_s, before = history.counts[0]
-        counted = {MALFORMED: arrivals.malformed, FROZEN: arrivals.frozen, OTHER_PUBLISHER: arrivals.others}
+        counted = {
+            MALFORMED: arrivals.malformed,
+            FROZEN: arrivals.frozen,
+            OTHER_PUBLISHER: arrivals.others,
+        }
         rejected = {cause: count for cause, count in counted.items() if count}
         if intake is not None:
             counts = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
             rejected = {word(cause): int(n) for cause, n in counts if n} | rejected
-        for cause in (cause for cause, count in rejected.items() if count != history.seen.get(cause)):
+        for cause in (
+            cause for cause, count in rejected.items() if count != history.seen.get(cause)
+        ):
             if cause in (FROZEN, OTHER_PUBLISHER):
                 history.found[cause] = explained(Condition[cause.upper()])
             elif cause == MALFORMED or intake is None:
-                history.found[cause] = explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
+                history.found[cause] = explained(
+                    Condition.MALFORMED, Evidence(mistake=arrivals.why)
+                )
             else:
                 refused = intake.refused[name, Cause[cause.upper()]]
                 seen_of = evidence(refused, self._settings, arrivals)
                 history.found[cause] = explained(refused.cause, seen_of)
-            history.cause, history.refused_s = cause, now_s
-        history.seen, lately = rejected, now_s - history.refused_s <= RATE_WINDOW_S
+            history.cause = cause
+            history.refused_s = now_s
+        history.seen = rejected
+        lately = now_s - history.refused_s <= RATE_WINDOW_S
         newest = history.found[history.cause] if lately else None
         return Source(
-            rate_hz=round((arrivals.count - before) / (now_s - since_s), 1) if now_s > since_s else 0.0,
+            rate_hz=round((arrivals.count - before) / (now_s - since_s), 1)
+            if now_s > since_s
+            else 0.0,
             clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
@@ -109,11 +144,18 @@ class InputMonitor:
         )
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
-        index, arrivals = SOURCES.index(source), self.arrivals[self._keys[source]]
+        index = SOURCES.index(source)
+        arrivals = self.arrivals[self._keys[source]]
         sample_tick = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
         settings = self._settings
-        age_ms = None if sample_tick < 0 else round((int(state["tick"]) - sample_tick) * settings.period_s * 1e3, 1)
-        stale_ms = 0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
+        age_ms = (
+            None
+            if sample_tick < 0
+            else round((int(state["tick"]) - sample_tick) * settings.period_s * 1e3, 1)
+        )
+        stale_ms = (
+            0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
+        )
         silent_ms = settings.arm.silent_ms if source == "arm" else stale_ms
         late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
         return msgspec.structs.replace(
@@ -127,7 +169,9 @@ class InputMonitor:
             if source == "arm" or sample_tick < 0
             else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
             unit=self._unit_of(arrivals.newest),
-            batches_ms=0.0 if source == "arm" else round(arrivals.batches_ms(stale_ms or settings.hands.stale_ms), 1),
+            batches_ms=0.0
+            if source == "arm"
+            else round(arrivals.batches_ms(stale_ms or settings.hands.stale_ms), 1),
         )
 
     def _unit_of(self, newest: PoseStamped | JointState | None) -> str:
@@ -145,21 +189,31 @@ class InputMonitor:
             return "the clutch has not been heard yet"
         silent_ms = self._settings.hands.clutch_stale_ms
         is_silent = 0 < state["clutch_until_tick"] <= state["tick"]
-        return f"the clutch was last heard as pressed, and then not for {silent_ms:g} ms" if is_silent else ""
+        return (
+            f"the clutch was last heard as pressed, and then not for {silent_ms:g} ms"
+            if is_silent
+            else ""
+        )
 
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:
         """Lines for the log: the first rejection of each cause at once, then counts."""
         counts = now_s - self._counted_s >= COUNTS_EVERY_S
         for source, now in sources.items():
-            history, name = self._histories[source], input_name(source)
-            logged, explanations = history.logged, history.found
+            history = self._histories[source]
+            name = input_name(source)
+            logged = history.logged
+            explanations = history.found
             for cause in now.rejected.keys() - logged.keys():
                 logged[cause] = now.rejected[cause]
                 yield f"{name}: rejected as {cause}{in_full(*explanations[cause])}"
-            more = {cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]}
+            more = {
+                cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]
+            }
             if counts and more:
                 logged |= now.rejected
-                causes = ", ".join(f"{n} {cause} ({now.rejected[cause]} in all)" for cause, n in more.items())
+                causes = ", ".join(
+                    f"{n} {cause} ({now.rejected[cause]} in all)" for cause, n in more.items()
+                )
                 yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {causes}"
         if counts:
             self._counted_s = now_s
@@ -168,7 +222,9 @@ class InputMonitor:
 def _too_far(sample: PoseStamped, settings: Settings) -> str:
     """Message about a position that is too far away, with the setting of its unit."""
     unit = settings.hands_in(sample.frame_id).unit
-    return too_far(sample.position, unit, f"{settings.tracker_section(sample.frame_id)} unit is {unit!r}")
+    return too_far(
+        sample.position, unit, f"{settings.tracker_section(sample.frame_id)} unit is {unit!r}"
+    )
 
 
 def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
@@ -211,11 +267,18 @@ def _turned(leap: Jump, kind: str) -> float:
     return math.remainder(far, 2.0 * math.pi) if kind == "continuous" else far
 
 
-def _outside(joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]) -> Iterator[Outside]:
+def _outside(
+    joints: JointSettings, position: tuple[float, ...], velocity: tuple[float, ...]
+) -> Iterator[Outside]:
     """Measured values outside the accepted ranges."""
-    of_joints = zip(joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True)
-    for (name, unit, per_rad, lower, upper), value, speed in zip(of_joints, position, velocity, strict=True):
-        low, high = lower - TUNING.intake.max_outside_rad * per_rad, upper + TUNING.intake.max_outside_rad * per_rad
+    of_joints = zip(
+        joints.names, joints.units, joints.per_rad, joints.lower, joints.upper, strict=True
+    )
+    for (name, unit, per_rad, lower, upper), value, speed in zip(
+        of_joints, position, velocity, strict=True
+    ):
+        low = lower - TUNING.intake.max_outside_rad * per_rad
+        high = upper + TUNING.intake.max_outside_rad * per_rad
         if not low <= value <= high:
             yield Outside(name, value, low, high, unit)
         if not abs(speed) <= (fastest := TUNING.intake.max_joint_radps * per_rad):

@@ -29,7 +29,10 @@ START_STALL_S = 60.0  # a start without a new report for this time has stalled
 START_POLL_S = 0.1
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
-ENGINES = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}  # physics of the bench; the first installed one is the default
+ENGINES = {
+    "pybullet": "PyBullet",
+    "mujoco": "MuJoCo",
+}  # physics of the bench; the first installed one is the default
 
 
 class LaunchError(ExplainedError, RuntimeError):
@@ -42,12 +45,19 @@ def engine_of(wanted: str | None = None) -> str:
     Raises LaunchError if it is not installed.
     """
     for name in (wanted,) if wanted else ENGINES:
-        with contextlib.suppress(ValueError):  # raised for a module that was removed from sys.modules
+        with contextlib.suppress(
+            ValueError
+        ):  # raised for a module that was removed from sys.modules
             if importlib.util.find_spec(name) is not None:
                 return name
-    needed = f"{ENGINES[wanted]}, which is not" if wanted else f"{' or '.join(ENGINES.values())}, none of which is"
+    needed = (
+        f"{ENGINES[wanted]}, which is not"
+        if wanted
+        else f"{' or '.join(ENGINES.values())}, none of which is"
+    )
     raise LaunchError(
-        f"the bench needs {needed} installed: pip install 'thirdhand[sim]' (PyBullet has wheels up to Python 3.11 only)"
+        f"the bench needs {needed} installed: pip install 'thirdhand[sim]' (PyBullet has wheels up "
+        "to Python 3.11 only)"
     )
 
 
@@ -66,14 +76,20 @@ class Launched:
         try:
             return self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            raise LaunchError(f"the service did not end within {timeout_s:g} s after SIGTERM") from None
+            raise LaunchError(
+                f"the service did not end within {timeout_s:g} s after SIGTERM"
+            ) from None
 
     def missing(self) -> str:
         """A message on ticks that were not recorded, from the end of the log; empty if none."""
-        from thirdhand.scribe.scribe import NOT_RECORDED  # its import is slow, and a launch must begin at once
+        from thirdhand.scribe.scribe import (
+            NOT_RECORDED,
+        )  # its import is slow, and a launch must begin at once
 
         last_lines = self.log.read_text().splitlines()[-1:]
-        return "".join(line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED))
+        return "".join(
+            line.split(maxsplit=2)[-1] for line in last_lines if line.endswith(NOT_RECORDED)
+        )
 
 
 @contextlib.contextmanager
@@ -92,14 +108,21 @@ def launched(
     cell is described by `settings`; `network` is the section [network] of its configuration. Raises
     LaunchError.
     """
-    config, log = folder / "cell.toml", folder / "service.log"
+    config = folder / "cell.toml"
+    log = folder / "service.log"
     base_settings = settings or Settings()
-    followed = msgspec.structs.replace(base_settings, arm=msgspec.structs.replace(base_settings.arm, start="follow"))  # nobody resumes
+    followed = msgspec.structs.replace(
+        base_settings, arm=msgspec.structs.replace(base_settings.arm, start="follow")
+    )  # nobody resumes
     files = {"state": folder / "state", "record": record}
     config.write_text(
         "# A cell with a free port and its own files.\n"
         f"{described(followed)}{network}[files]\n"
-        + "".join(f"{name} = {json.dumps(str(path.absolute()))}\n" for name, path in files.items() if path is not None)
+        + "".join(
+            f"{name} = {json.dumps(str(path.absolute()))}\n"
+            for name, path in files.items()
+            if path is not None
+        )
     )
     command = python(*program, "serve", "--config", str(config), *_end_with_this(), *arguments)
     with log.open("w") as errors:
@@ -116,7 +139,8 @@ def launched(
 
 def described(settings: Settings) -> str:
     """The settings that differ from the defaults as TOML, without name, network and files."""
-    values, usual = msgspec.to_builtins(settings), msgspec.to_builtins(Settings())
+    values = msgspec.to_builtins(settings)
+    usual = msgspec.to_builtins(Settings())
     changed = {name: values[name] for name in values if values[name] != usual[name]}
     rate = f"rate_hz = {changed['rate_hz']}\n" if "rate_hz" in changed else ""
     return rate + "".join(
@@ -141,7 +165,8 @@ def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], No
     Raises LaunchError.
     """
     assert process.stdout is not None
-    moved_s, last = time.monotonic(), "nothing"
+    moved_s = time.monotonic()
+    last = "nothing"
     with log.open() as lines:
         while time.monotonic() - moved_s < START_STALL_S:
             if select.select([process.stdout], [], [], START_POLL_S)[0]:
@@ -149,14 +174,18 @@ def _endpoint(process: subprocess.Popen[str], log: Path, say: Callable[[str], No
                 if line.startswith("listening on "):
                     return line.split()[2].rstrip(",")
                 if not line:
-                    raise LaunchError(f"the service did not start: {log.read_text().strip() or 'it gave no reason'}")
+                    raise LaunchError(
+                        "the service did not start: "
+                        f"{log.read_text().strip() or 'it gave no reason'}"
+                    )
             for line in lines:
                 if STARTING in line:
-                    moved_s, last = time.monotonic(), line.partition(STARTING)[2].strip()
+                    moved_s = time.monotonic()
+                    last = line.partition(STARTING)[2].strip()
                     say(f"  {STARTING}{last}")
     raise LaunchError(
-        f"the start of the service has made no progress for {START_STALL_S:g} s. Start it again on a machine with a "
-        f"free core; compiled functions are kept. Its last report: {last}"
+        f"the start of the service has made no progress for {START_STALL_S:g} s. Start it again on "
+        f"a machine with a free core; compiled functions are kept. Its last report: {last}"
     )
 
 
@@ -175,7 +204,9 @@ def played(
     which the service can be stopped: an arm that disappears is a fault. Raises LaunchError.
     """
     connection = ("--connect", endpoint, "--cell", "thirdhand")
-    command = python("-m", "thirdhand_sim", *connection, *_end_with_this(), "--once", "--output", "-", *arguments)
+    command = python(
+        "-m", "thirdhand_sim", *connection, *_end_with_this(), "--once", "--output", "-", *arguments
+    )
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     clock = threading.Timer(timeout_s, process.kill)
     clock.start()
@@ -202,7 +233,9 @@ def played(
             process.kill()
             hearing.join()
     if code != 0:
-        raise LaunchError(f"the bench ended with code {code}: {lines[-1] if lines else 'it gave no reason'}")
+        raise LaunchError(
+            f"the bench ended with code {code}: {lines[-1] if lines else 'it gave no reason'}"
+        )
     return report
 
 

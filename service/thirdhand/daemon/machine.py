@@ -15,8 +15,11 @@ from thirdhand.contract.records import Mode, Reason
 BUSY_WINDOW_S = 2.0  # load is measured over this time
 MISSED_SHARE = 0.01  # the machine is too busy if a larger share of deadlines is missed
 LATE_LOOP_MS = 20.0  # an arm brakes if its commands are this late
-WAITING_SHARE = 0.8  # the machine is overloaded if some process waits for a processor in a larger share of the time
-PRESSURE = Path("/proc/pressure/cpu")  # a file of Linux; if it is missing, only the loop is measured
+# the machine is overloaded if some process waits for a processor in a larger share of the time
+WAITING_SHARE = 0.8
+PRESSURE = Path(
+    "/proc/pressure/cpu"
+)  # a file of Linux; if it is missing, only the loop is measured
 
 
 def resident_mb(**processes: int | None) -> dict[str, float]:
@@ -46,9 +49,13 @@ class Machine:
         self._samples: deque[_Sample] = deque()
         self._outcome: tuple[Mode, Reason] | None = None
         self.now = ""  # message on a machine that is too busy; empty if it is not
-        self.at_stop = ""  # the message at the begin of the present hold or fault; empty while the arm follows
+        self.at_stop = (
+            ""  # the message at the begin of the present hold or fault; empty while the arm follows
+        )
 
-    def update(self, now_s: float, *, tick: int, missed: int, late_ms: float, outcome: tuple[Mode, Reason]) -> None:
+    def update(
+        self, now_s: float, *, tick: int, missed: int, late_ms: float, outcome: tuple[Mode, Reason]
+    ) -> None:
         """Measure the load again; call it several times a second. `late_ms` is the loop's largest
         lateness in the window, `outcome` the mode and reason of the newest frame.
         """
@@ -61,8 +68,11 @@ class Machine:
             self.at_stop = "" if outcome[0] is Mode.FOLLOW else self.now
 
     def _judged(self, late_ms: float) -> str:
-        first, last = self._samples[0], self._samples[-1]
-        missed, ticks, lasts_s = last.missed - first.missed, last.tick - first.tick, last.at_s - first.at_s
+        first = self._samples[0]
+        last = self._samples[-1]
+        missed = last.missed - first.missed
+        ticks = last.tick - first.tick
+        lasts_s = last.at_s - first.at_s
         waiting = (last.waited_s - first.waited_s) / lasts_s if lasts_s > BUSY_WINDOW_S / 2 else 0.0
         reasons = []
         if missed > MISSED_SHARE * max(ticks, 1):

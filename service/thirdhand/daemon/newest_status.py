@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 
-STATUS_TIMEOUT_S = 2.0  # after this time without a new status, a request is answered with the last one
+STATUS_TIMEOUT_S = (
+    2.0  # after this time without a new status, a request is answered with the last one
+)
 MIN_STATUS_INTERVAL_S = 0.02  # a flood of requests must not take the interpreter from the loop
 
 
@@ -24,7 +26,8 @@ class NewestStatus:
         """A status that was begun after this call; if `published`, subscribers get it too."""
         with self._changed:
             number = self._begun + 1
-            self._is_wanted, self._is_published = True, self._is_published or published
+            self._is_wanted = True
+            self._is_published = self._is_published or published
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._made >= number or self._is_over, STATUS_TIMEOUT_S)
             return self._payload
@@ -38,13 +41,16 @@ class NewestStatus:
         """Begin a status; True if a request needs it to be published."""
         with self._changed:
             self._begun += 1
-            is_published, self._is_wanted, self._is_published = self._is_published, False, False
+            is_published = self._is_published
+            self._is_wanted = False
+            self._is_published = False
             return is_published
 
     def end(self, payload: bytes) -> None:
         """End the status that was begun, with its bytes."""
         with self._changed:
-            self._payload, self._made = payload, self._begun
+            self._payload = payload
+            self._made = self._begun
             self._changed.notify_all()
 
     def close(self) -> None:

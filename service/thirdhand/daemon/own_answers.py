@@ -22,7 +22,8 @@ class OwnAnswers:
     """
 
     def __init__(self, settings: Settings, endpoint: str) -> None:
-        self._settings, self._endpoint = settings, endpoint
+        self._settings = settings
+        self._endpoint = endpoint
         self._answered_s: float | None = None
         self._was_deaf = False
         self._ended = threading.Event()
@@ -33,7 +34,9 @@ class OwnAnswers:
         with (
             contextlib.suppress(UnreachableError),
             open_session(
-                connect=[self._endpoint], certificate=network.certificate, zenoh_config=network.zenoh_config
+                connect=[self._endpoint],
+                certificate=network.certificate,
+                zenoh_config=network.zenoh_config,
             ) as session,
         ):
             client = Client(session, self._settings.cell, timeout_s=ASK_EVERY_S)
@@ -47,7 +50,11 @@ class OwnAnswers:
         silent_s = 0.0 if self._answered_s is None else time.monotonic() - self._answered_s
         is_deaf = silent_s > DEAF_AFTER_S
         if is_deaf and not self._was_deaf:
-            log.error("the daemon has not answered on its own endpoint %s for %.0f s", self._endpoint, silent_s)
+            log.error(
+                "the daemon has not answered on its own endpoint %s for %.0f s",
+                self._endpoint,
+                silent_s,
+            )
         self._was_deaf = is_deaf
         return is_deaf
 

@@ -58,7 +58,9 @@ from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import SkillError, StoredSkill
 from thirdhand.skills.via_points import in_force, points_made_of, warnings_of
 
-MAX_TAUGHT_POINTS = 400  # limit of via-points that are not the task's, with the points of their neighbourhoods
+MAX_TAUGHT_POINTS = (
+    400  # limit of via-points that are not the task's, with the points of their neighbourhoods
+)
 MAX_WAITING_REQUESTS = 16
 MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
 MAX_LIST_BYTES = 100  # a longer request is not a `list`
@@ -79,7 +81,9 @@ class Received(NamedTuple):
     received_s: float
 
 
-Order = Callable[[str, str], Reply | RequestError]  # executes hold, resume or reset, by the one of a name
+Order = Callable[
+    [str, str], Reply | RequestError
+]  # executes hold, resume or reset, by the one of a name
 
 
 class Requested(Protocol):
@@ -95,10 +99,15 @@ class RequestQueue:
     one.
     """
 
-    def __init__(self, name: str, answer: Callable[[list[Received]], None], failed: Callable[[str], None]) -> None:
-        self._name, self._answer = name, answer
+    def __init__(
+        self, name: str, answer: Callable[[list[Received]], None], failed: Callable[[str], None]
+    ) -> None:
+        self._name = name
+        self._answer = answer
         self._most, self._together = (
-            (MAX_WAITING_ORDERS, MAX_WAITING_ORDERS) if name in TOGETHER else (MAX_WAITING_REQUESTS, 1)
+            (MAX_WAITING_ORDERS, MAX_WAITING_ORDERS)
+            if name in TOGETHER
+            else (MAX_WAITING_REQUESTS, 1)
         )
         self._waiting: queue.Queue[Received | None] = queue.Queue(self._most)
         self._thread = supervised_thread.start(f"thread of {name} requests", self._serve, failed)
@@ -139,7 +148,9 @@ def _understood(suffix: str, expression: str, key: str, payload: bytes) -> tuple
         raise RequestError(f"{expression} matches several cells; the key {key} needed")
     try:
         if len(payload) > channels.LARGEST_REQUEST:
-            raise RequestError(f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted")
+            raise RequestError(
+                f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"
+            )
         return channels.BY_KEY[suffix].codec.decode(payload), ""
     except RequestError as error:
         if suffix != "hold":
@@ -172,7 +183,8 @@ class Queryables:
         self._settings = settings
         # The skill in force and one that the loop adopts next, each with its via-points, by digest.
         self._adoptable = {skill.digest: (skill, in_force(skill))}
-        self._skill_worker, self._beyond_m = skill_worker, functools.partial(skill_worker.compute, beyond_m)
+        self._skill_worker = skill_worker
+        self._beyond_m = functools.partial(skill_worker.compute, beyond_m)
         self._skills = skills
         self._status = status
         self._moment = moment
@@ -181,12 +193,18 @@ class Queryables:
         self._keep = keep
         self._failed = failed
         self._saved = SavedViaPoints(settings, self._beyond_m)
-        self._queues = {name: RequestQueue(name, self._reply_together, failed) for name in (*TOGETHER, COMPUTED)}
+        self._queues = {
+            name: RequestQueue(name, self._reply_together, failed) for name in (*TOGETHER, COMPUTED)
+        }
         self._queryables: list[zenoh.Queryable[None]] = []
 
     def open(self, session: zenoh.Session) -> None:
         """Answer requests from now on."""
-        self._queryables = [self._declare(session, channel.key) for channel in channels.CHANNELS if channel.queryable]
+        self._queryables = [
+            self._declare(session, channel.key)
+            for channel in channels.CHANNELS
+            if channel.queryable
+        ]
 
     def _declare(self, session: zenoh.Session, suffix: str) -> zenoh.Queryable[None]:
         local = threading.local()  # Zenoh has a thread for each queryable
@@ -225,25 +243,32 @@ class Queryables:
 
     def _reply_together(self, requests: Sequence[Received]) -> None:
         """Reply to requests that wait together; equal orders pass through the loop once."""
-        order_once, status_once = functools.cache(self._order), functools.cache(self._status)
+        order_once = functools.cache(self._order)
+        status_once = functools.cache(self._status)
         for request in requests:
             # Resumes that a hold separates are different orders.
-            order = functools.partial(order_once, request.holds if request.suffix == "resume" else 0)
+            order = functools.partial(
+                order_once, request.holds if request.suffix == "resume" else 0
+            )
             self._reply(request, order, status_once)
 
     def _reply(self, received: Received, order: Order, status: Requested) -> None:
-        suffix, query = received.suffix, received.query
+        suffix = received.suffix
+        query = received.query
         key = channels.key(self._settings.cell, suffix)
         # The query's end shows the client that there are no more replies.
         with query, self._skill_worker.due(received.received_s):
             try:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 if suffix == "status":
-                    answer, changes = status(published=False), False
+                    answer = status(published=False)
+                    changes = False
                 else:
                     request, remark = _understood(suffix, str(query.key_expr), key, payload)
                     reply = self._answer(suffix, request, order)
-                    answer = encode_json(msgspec.structs.replace(reply, note=remark) if remark else reply)
+                    answer = encode_json(
+                        msgspec.structs.replace(reply, note=remark) if remark else reply
+                    )
                     changes = not isinstance(request, List)
                 if changes:
                     status(published=True)
@@ -312,7 +337,12 @@ class Queryables:
         return self._adoptable[digest][0].file
 
     def _adopt(
-        self, skill: StoredSkill, *events: Event, check: Check = accept, is_loaded: bool = False, remark: str = ""
+        self,
+        skill: StoredSkill,
+        *events: Event,
+        check: Check = accept,
+        is_loaded: bool = False,
+        remark: str = "",
     ) -> Reply:
         """Have the loop adopt a skill and take `events` in one tick, and save its via-points.
 
@@ -325,30 +355,44 @@ class Queryables:
         self._keep(skill.file)
         before = self._skill
         points = in_force(skill)
-        self._adoptable = {before.digest: self._adoptable[before.digest], skill.digest: (skill, points)}
+        self._adoptable = {
+            before.digest: self._adoptable[before.digest],
+            skill.digest: (skill, points),
+        }
         adoption = Event("skill", skill.file, skill.for_loop())
         try:
-            with self._saved.replacing(skill):  # written first, because via-points that cannot be saved are not adopted
+            with self._saved.replacing(
+                skill
+            ):  # written first, because via-points that cannot be saved are not adopted
                 frame = self.inbox.send(adoption, *events, check=check).wait()
         except OSError as error:  # the skill is in force already
-            remark = f"{remark} the via-points end at a restart: they cannot be saved ({in_words(error)})".strip()
+            unsaved = f"the via-points end at a restart: they cannot be saved ({in_words(error)})"
+                remark = f"{remark} {unsaved}".strip()
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
         remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
 
     def _load(self, name: str) -> Reply:
         folder = self._skills.resolve()
-        files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and path.resolve().parent == folder]
+        files = [
+            path
+            for path in sorted(folder.glob("*.npz"))
+            if path.is_file() and path.resolve().parent == folder
+        ]
         paths = {path.stem: path for path in files}  # links to files elsewhere are ignored
         path = paths.get(name.removesuffix(".npz"))
         if path is None:
             names = ", ".join(paths) or "none"
-            raise RequestError(f"$.name: no skill {name!r} in the skill folder; its skills: {names}")
-        skill, remark = self._skill_worker.load(path), ""
+            raise RequestError(
+                f"$.name: no skill {name!r} in the skill folder; its skills: {names}"
+            )
+        skill = self._skill_worker.load(path)
+        remark = ""
         skill.check_accepted()
         if saved := self._saved.read(skill):
             points, tolerance = saved
-            skill, remark = self._skill_worker.adapt(skill, points, tolerance=tolerance), self._saved.remark
+            skill = self._skill_worker.adapt(skill, points, tolerance=tolerance)
+            remark = self._saved.remark
         return self._adopt(skill, is_loaded=True, remark=remark)
 
     def _teach(self, request: Add | Remove | Clear) -> Reply:
@@ -360,21 +404,29 @@ class Queryables:
             case Remove(names):
                 for i, name in enumerate(names):
                     if name in names[:i]:
-                        raise RequestError(f"$.names[{i}]: {name!r} given twice; each name once needed")
+                        raise RequestError(
+                            f"$.names[{i}]: {name!r} given twice; each name once needed"
+                        )
                     if name not in points:
                         listing = ", ".join(points) or "none"
-                        raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {listing}")
+                        raise RequestError(
+                            f"$.names[{i}]: no via-point {name!r}; in force: {listing}"
+                        )
                 points = {name: point for name, point in points.items() if name not in names}
             case Add(added, tolerance):
                 self._check(added)
                 points |= {point.name: point for point in added}
-        return self._adopt(self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance))
+        return self._adopt(
+            self._skill_worker.adapt(self._skill, tuple(points.values()), tolerance=tolerance)
+        )
 
     def _correct(self, request: Correct) -> Reply:
         """Correct the tool for the hands of the operator's hold."""
-        led, skill = self._corrections.led(request, self._skill), self._skill
+        led = self._corrections.led(request, self._skill)
+        skill = self._skill
         correcting = correction_at(skill, led.hands, led.segment, led.tool, led.orientation)
-        point, moved_m = correcting.point, off_m(skill, correcting)
+        point = correcting.point
+        moved_m = off_m(skill, correcting)
         if moved_m < LEAST_CORRECTION_M and not request.turned:
             raise RequestError(
                 f"the tool is {1000 * moved_m:.0f} mm from where the skill has it for these hands; "
@@ -383,8 +435,9 @@ class Queryables:
         gate_m = float(skill.model.gates_m(skill.conducting(led.hands))[0])
         if gate_m > skill.threshold:
             raise RequestError(
-                f"{skill.model.measure} is {gate_m:.3f} m at these hands; at most {skill.threshold:.3f} m accepted, as "
-                "the arm holds there whatever is corrected. Demonstrate this"
+                f"{skill.model.measure} is {gate_m:.3f} m at these hands; at most "
+                f"{skill.threshold:.3f} m accepted, as the arm holds there whatever is corrected. "
+                "Demonstrate this"
             )
         self._check([point], "$.tool")
         orientation = skill.orientation if led.orientation is None else np.array(led.orientation)
@@ -392,14 +445,16 @@ class Queryables:
         posture = self._settings, led.joints, led.tool, orientation, hands
         if not self._skill_worker.compute(has_posture_of, *posture):
             raise RequestError(
-                f"$.tool: {list(point.tool)}: no posture of the arm has the tool there and keeps clear of these hands, "
-                "of things and of itself"
+                f"$.tool: {list(point.tool)}: no posture of the arm has the tool there and keeps "
+                "clear of these hands, of things and of itself"
             )
         after, effect = self._skill_worker.correct(skill, correcting.among(skill.via_points), point)
         # A hand that led the arm may have looked like another segment.
         has_segment = request.hands == "held" and led.segment >= 0
         segments = [order("segment", skill.model.names[led.segment])] if has_segment else []
-        reply = self._adopt(after, *segments, check=functools.partial(check_same_hold, led.held_tick))
+        reply = self._adopt(
+            after, *segments, check=functools.partial(check_same_hold, led.held_tick)
+        )
         self._corrections.replaced[point] = correcting.replaced
         return self._of_correction(reply, point, effect, undone=False)
 
@@ -414,8 +469,11 @@ class Queryables:
         reply = self._adopt(after, check=functools.partial(check_same_hold, held_tick))
         return self._of_correction(reply, point, effect, undone=True)
 
-    def _of_correction(self, reply: Reply, point: ViaPoint, effect: Effect, *, undone: bool) -> Reply:
-        segment, sizes = segment_of(self._skill, point), (round(effect.moved_m, 4), round(effect.reach_m, 3))
+    def _of_correction(
+        self, reply: Reply, point: ViaPoint, effect: Effect, *, undone: bool
+    ) -> Reply:
+        segment = segment_of(self._skill, point)
+        sizes = (round(effect.moved_m, 4), round(effect.reach_m, 3))
         correction = Correction(point.name, *sizes, segment, point.corrections, undone=undone)
         return msgspec.structs.replace(reply, correction=correction, note=offer_of(self._skill))
 
@@ -424,11 +482,13 @@ class Queryables:
         for segments that the skill does not have. `at` is the place of the tool in the request.
         """
         all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
-        total = points_made_of([all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)])
+        total = points_made_of(
+            [all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)]
+        )
         if total > MAX_TAUGHT_POINTS:
             raise RequestError(
-                f"$.points: {total} via-points beside the task's, where one with a radius counts as 13; at most "
-                f"{MAX_TAUGHT_POINTS} accepted"
+                f"$.points: {total} via-points beside the task's, where one with a radius counts "
+                f"as 13; at most {MAX_TAUGHT_POINTS} accepted"
             )
         low, high = self._skill.workspace
         distances_m = self._beyond_m(self._settings, np.array([point.tool for point in added]))
@@ -437,13 +497,19 @@ class Queryables:
             if point.segment not in (None, *(begins := self._skill.model.names[:-1])):
                 listing = ", ".join(begins) or "none"
                 raise RequestError(
-                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments begin at: {listing}"
+                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments "
+                    f"begin at: {listing}"
                 )
             if not ((low <= point.tool) & (point.tool <= high)).all():
-                corners = " to ".join(f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high))
+                corners = " to ".join(
+                    f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high)
+                )
                 raise RequestError(f"{prefix} outside the skill's workspace, {corners} m accepted")
             if distance_m > 0.0:
-                raise RequestError(f"{prefix} out of the arm's reach by {distance_m:.3f} m: {accepted(self._settings)}")
+                raise RequestError(
+                    f"{prefix} out of the arm's reach by {distance_m:.3f} m: "
+                    f"{accepted(self._settings)}"
+                )
 
 
 def _in_force_since(frame: Frame) -> Reply:

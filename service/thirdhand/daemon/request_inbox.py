@@ -29,7 +29,8 @@ class PendingRequest:
     """
 
     def __init__(self, events: tuple[Event, ...], check: Check) -> None:
-        self._events, self._check = events, check
+        self._events = events
+        self._check = check
         self._refusal: RequestError | None = None
         self._frame: Future[Frame] = Future()
         self.mode_before = Mode.HOLD  # mode before the tick that took the request
@@ -54,7 +55,9 @@ class PendingRequest:
         if self._refusal is not None:
             self._frame.set_exception(self._refusal)
         elif frame is None:
-            self._frame.set_exception(RequestError("the loop failed in the tick that took the request: see the status"))
+            self._frame.set_exception(
+                RequestError("the loop failed in the tick that took the request: see the status")
+            )
         else:
             self._frame.set_result(frame)
 
@@ -67,7 +70,8 @@ class PendingRequest:
         except TimeoutError:
             if self._frame.cancel():
                 raise RequestError(
-                    "the loop did not take the request: it is starting, ending or stalled; try again"
+                    "the loop did not take the request: it is starting, ending or stalled; try "
+                    "again"
                 ) from None
             return self._frame.result()
 
@@ -82,8 +86,12 @@ class RequestInbox:
     def __init__(self) -> None:
         self._waiting: deque[PendingRequest] = deque()
         self._taken: list[PendingRequest] = []
-        self._holders: set[str] = set()  # names of those whose hold is in force; empty for one without a name
-        self.holds_received = 0  # counted by the thread that receives holds, before the loop takes them
+        self._holders: set[str] = (
+            set()
+        )  # names of those whose hold is in force; empty for one without a name
+        self.holds_received = (
+            0  # counted by the thread that receives holds, before the loop takes them
+        )
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
@@ -128,16 +136,25 @@ class RequestInbox:
         if kind == "hold":
             if by and by not in self._holders and len(self._holders - {""}) >= MAX_HOLDERS:
                 raise RequestError(
-                    f"$.by: {by!r} given, but {MAX_HOLDERS} others hold the arm; it holds until a resume without `by`"
+                    f"$.by: {by!r} given, but {MAX_HOLDERS} others hold the arm; it holds until a "
+                    "resume without `by`"
                 )
             self._holders.add(by)
         elif kind == "resume":
             if holds < self.holds_received:
                 raise RequestError("a hold was received after this resume; resume again to end it")
             if state["guided_tick"] == state["tick"] > 0:
-                raise RequestError("the arm is led by hand, which no resume ends; end hand guiding, then resume")
+                raise RequestError(
+                    "the arm is led by hand, which no resume ends; end hand guiding, then resume"
+                )
             was_led = state["operator_hold"] and state["guided_tick"] >= max(state["held_tick"], 1)
             if by and (was_led or self._holders != {by}):
-                reason = "somebody else holds the arm too" if by in self._holders else f"{by!r} does not hold the arm"
-                raise RequestError(f"$.by: {reason}; a resume without `by` needed, which ends all holds")
+                reason = (
+                    "somebody else holds the arm too"
+                    if by in self._holders
+                    else f"{by!r} does not hold the arm"
+                )
+                raise RequestError(
+                    f"$.by: {reason}; a resume without `by` needed, which ends all holds"
+                )
             self._holders.clear()

@@ -11,7 +11,9 @@ from thirdhand.daemon.single_instance import state_folder
 from thirdhand.settings.config import Settings
 from thirdhand.settings.whole_file import whole
 
-MAX_RESTART_S = 600.0  # after a longer pause the task begins again, at the segment where the hands are
+MAX_RESTART_S = (
+    600.0  # after a longer pause the task begins again, at the segment where the hands are
+)
 MIN_BELIEF = 0.5  # a less probable segment is not saved
 
 
@@ -24,11 +26,18 @@ class SavedSegment:
 
     def read(self, skill: Skill) -> str:
         """The last via-point of a task of this skill; empty if it is not known."""
-        return restored(self._path, lambda content: self._decoded(content, skill), "", what="the segment of the task")
+        return restored(
+            self._path,
+            lambda content: self._decoded(content, skill),
+            "",
+            what="the segment of the task",
+        )
 
     def _decoded(self, content: bytes, skill: Skill) -> str:
-        saved, age_s = json.loads(content), time.time() - self._path.stat().st_mtime
-        name, learned_from = saved["via_point"], saved["learned_from"]
+        saved = json.loads(content)
+        age_s = time.time() - self._path.stat().st_mtime
+        name = saved["via_point"]
+        learned_from = saved["learned_from"]
         is_valid = learned_from == skill.learned_from and 0.0 <= age_s < MAX_RESTART_S
         return str(name) if is_valid and name in skill.model.names else ""
 
@@ -38,5 +47,7 @@ class SavedSegment:
             return
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with whole(self._path) as draft:
-            draft.write_text(json.dumps({"learned_from": skill.learned_from, "via_point": segment[0]}))
+            draft.write_text(
+                json.dumps({"learned_from": skill.learned_from, "via_point": segment[0]})
+            )
         self._kept = skill.learned_from, segment[0]

@@ -16,7 +16,9 @@ MAX_STATE_BYTES = 32_000_000
 Restored = TypeVar("Restored")
 
 
-def restored(path: Path, read: Callable[[bytes], Restored], otherwise: Restored, *, what: str) -> Restored:
+def restored(
+    path: Path, read: Callable[[bytes], Restored], otherwise: Restored, *, what: str
+) -> Restored:
     """The value that `read` returns for a file's content; `otherwise` if there is no file.
 
     If the file cannot be read, or `read` raises any exception, the file is renamed, which the log
@@ -37,6 +39,10 @@ def restored(path: Path, read: Callable[[bytes], Restored], otherwise: Restored,
         else:
             where = f"is kept as {aside}"
         log.warning(
-            "%s in %s cannot be used: %s; the file %s, and the daemon continues without it", what, path, reason, where
+            "%s in %s cannot be used: %s; the file %s, and the daemon continues without it",
+            what,
+            path,
+            reason,
+            where,
         )
         return otherwise

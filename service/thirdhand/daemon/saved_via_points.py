@@ -41,7 +41,10 @@ def _identity(settings: Settings) -> str:
     calibration does not change it.
     """
     chain = Urdf(robot_description(settings)).chain(settings.arm.plate)
-    return "; ".join(" ".join([joint.name, *(f"{round(v, 2) + 0.0:.2f}" for v in joint.translation)]) for joint in chain)
+    return "; ".join(
+        " ".join([joint.name, *(f"{round(v, 2) + 0.0:.2f}" for v in joint.translation)])
+        for joint in chain
+    )
 
 
 class SavedViaPoints:
@@ -50,24 +53,34 @@ class SavedViaPoints:
     Via-points that the arm does not reach are set aside in another file.
     """
 
-    def __init__(self, settings: Settings, distances_m: Callable[[Settings, Vector], Vector] = beyond_m) -> None:
-        self._folder, self._settings, self._distances_m = state_folder(settings), settings, distances_m
+    def __init__(
+        self, settings: Settings, distances_m: Callable[[Settings, Vector], Vector] = beyond_m
+    ) -> None:
+        self._folder = state_folder(settings)
+        self._settings = settings
+        self._distances_m = distances_m
         self._arm = _identity(settings)
         self.remark = ""  # message on via-points that were set aside by the last reading
 
     def path(self, skill: Skill) -> Path:
         """The file for this skill and arm, named by a hash of the skill's demonstrations."""
-        digest = hashlib.blake2b((skill.learned_from + self._arm).encode(), digest_size=6).hexdigest()
+        digest = hashlib.blake2b(
+            (skill.learned_from + self._arm).encode(), digest_size=6
+        ).hexdigest()
         return self._folder / f"places-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """The via-points and the tolerance taught to this skill of this arm; None if there are
         none. `remark` names those that the arm does not reach.
         """
-        saved = restored(self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT)
+        saved = restored(
+            self.path(skill), lambda content: self._decoded(content, skill), None, what=WHAT
+        )
         return saved and self._reached(skill, *saved)
 
-    def restored(self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], Made], otherwise: Made) -> Made:
+    def restored(
+        self, skill: Skill, make: Callable[[tuple[ViaPoint, ...], float], Made], otherwise: Made
+    ) -> Made:
         """The value that `make` returns for the via-points and the tolerance taught to this skill
         of this arm; `otherwise` if there are none, or if that fails.
         """
@@ -84,24 +97,38 @@ class SavedViaPoints:
         """The via-points whose tool positions the arm reaches. The others are written to a file for
         `thirdhand via-points add --file`, which log and remark name.
         """
-        distances_m = self._distances_m(self._settings, np.reshape([point.tool for point in points], (-1, 3)))
-        beyond_m = {point.name: m for point, m in zip(points, distances_m.tolist(), strict=True) if m > 0.0}
+        distances_m = self._distances_m(
+            self._settings, np.reshape([point.tool for point in points], (-1, 3))
+        )
+        beyond_m = {
+            point.name: m for point, m in zip(points, distances_m.tolist(), strict=True) if m > 0.0
+        }
         self.remark = ""
         if not beyond_m:
             return points, tolerance
-        content = encode_json(Add(tuple(point for point in points if point.name in beyond_m), tolerance))
-        digest = hashlib.blake2b(self.path(skill).name.encode() + content, digest_size=6).hexdigest()
+        content = encode_json(
+            Add(tuple(point for point in points if point.name in beyond_m), tolerance)
+        )
+        digest = hashlib.blake2b(
+            self.path(skill).name.encode() + content, digest_size=6
+        ).hexdigest()
         aside = self._folder / f"out-of-reach-{digest}.json"
         try:
             with self._replacing(aside, content):
                 pass
-            where = f"are set aside: once the arm reaches them, teach them by thirdhand via-points add --file {aside}"
+            where = (
+                "are set aside: once the arm reaches them, teach them by thirdhand via-points add "
+                f"--file {aside}"
+            )
         except (OSError, SkillError) as error:
             where = (
-                f"are not in force, and the next teaching deletes them: they cannot be set aside ({in_words(error)})"
+                "are not in force, and the next teaching deletes them: they cannot be set aside "
+                f"({in_words(error)})"
             )
         names = ", ".join(f"{name!r} by {m:.3f} m" for name, m in beyond_m.items())
-        self.remark = f"via-points of skill {skill.name!r} are out of the arm's reach, {names}; they {where}"
+        self.remark = (
+            f"via-points of skill {skill.name!r} are out of the arm's reach, {names}; they {where}"
+        )
         log.warning("%s", self.remark)
         return tuple(point for point in points if point.name not in beyond_m), tolerance
 
@@ -109,8 +136,12 @@ class SavedViaPoints:
         """The via-points and the tolerance in a file; None if they are of another skill or arm."""
         saved = json.loads(content)
         if saved.pop("checksum", None) != _checksum(saved):
-            raise UnusableError("the checksum is wrong, so the file was edited; teach the via-points again")
-        request = saved["request"] and decode_request(json.dumps({"op": "add", **saved["request"]}).encode(), Add)
+            raise UnusableError(
+                "the checksum is wrong, so the file was edited; teach the via-points again"
+            )
+        request = saved["request"] and decode_request(
+            json.dumps({"op": "add", **saved["request"]}).encode(), Add
+        )
         if (saved["learned_from"], saved["arm"]) != (skill.learned_from, self._arm):
             return None
         return (request.points, request.tolerance) if request else ((), skill.tolerance)
@@ -121,8 +152,16 @@ class SavedViaPoints:
         """
         request = None
         if skill.via_points:
-            request = {"points": msgspec.to_builtins(skill.via_points), "tolerance": skill.tolerance}
-        saved = {"skill": skill.name, "learned_from": skill.learned_from, "arm": self._arm, "request": request}
+            request = {
+                "points": msgspec.to_builtins(skill.via_points),
+                "tolerance": skill.tolerance,
+            }
+        saved = {
+            "skill": skill.name,
+            "learned_from": skill.learned_from,
+            "arm": self._arm,
+            "request": request,
+        }
         content = json.dumps(saved | {"checksum": _checksum(saved)}, indent=1)
         return self._replacing(self.path(skill), content.encode())
 
@@ -132,12 +171,16 @@ class SavedViaPoints:
         try:
             try:
                 self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-                with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+                with os.fdopen(
+                    os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb"
+                ) as file:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
             except OSError as error:
-                raise SkillError(f"cannot save via-points in {self._folder}: {error.strerror}") from None
+                raise SkillError(
+                    f"cannot save via-points in {self._folder}: {error.strerror}"
+                ) from None
             yield
             part.replace(path)
         finally:

@@ -38,7 +38,9 @@ class SideStream:
         waiting: int = 1,
     ) -> None:
         self._subscriber = session.declare_subscriber(key, RingChannel(waiting))
-        self._take, self._arrivals, self._waiting = take, arrivals, waiting
+        self._take = take
+        self._arrivals = arrivals
+        self._waiting = waiting
 
     def poll(self, now_ns: int) -> None:
         """Pass on the messages that arrived since the last call, with the time now [ns]."""
@@ -69,9 +71,14 @@ def side_streams(
     def record_image(key: str, payload: bytes, now_ns: int) -> None:
         scribe.image(key, image_in(payload, now_ns), now_ns)
 
-    objects = SideStream(session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY])
+    objects = SideStream(
+        session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY]
+    )
     images = {key: functools.partial(record_image, key) for key in settings.recording.also}
     return [
         objects,
-        *(SideStream(session, key, take, arrivals[key], waiting=WAITING_IMAGES) for key, take in images.items()),
+        *(
+            SideStream(session, key, take, arrivals[key], waiting=WAITING_IMAGES)
+            for key, take in images.items()
+        ),
     ]

@@ -25,8 +25,12 @@ from thirdhand.settings.file_content import content
 from thirdhand.settings.user_folder import HomelessError, user_folder
 
 MAX_SESSIONS = 64
-LEAST_DESCRIPTORS, MAX_DESCRIPTORS = 256, 65536  # with fewer, Zenoh ends while the daemon runs on, deaf
-MAX_HANDSHAKES = 16  # pending handshakes: those that time out are closed together, which delays others
+# with fewer, Zenoh ends while the daemon runs on, deaf
+LEAST_DESCRIPTORS = 256
+MAX_DESCRIPTORS = 65536
+MAX_HANDSHAKES = (
+    16  # pending handshakes: those that time out are closed together, which delays others
+)
 HANDSHAKE_TIMEOUT_MS = 2000
 ENVELOPE_BYTES = 1024  # key, attachment and Zenoh's headers around the largest request
 
@@ -37,7 +41,12 @@ NETWORK_BOUNDS: dict[str, Any] = {
     "transport/link/rx/max_message_size": channels.LARGEST_REQUEST + ENVELOPE_BYTES,
     # A reply takes this from its query: it is dropped if the client does not read.
     "qos/network": [
-        {"messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
+        {
+            "messages": ["query"],
+            "key_exprs": ["**"],
+            "flows": ["ingress"],
+            "overwrite": {"congestion_control": "drop"},
+        }
     ],
 }
 MAX_HOLDER_BYTES = 4096  # limit of what is read from a lock file
@@ -47,7 +56,9 @@ log = logging.getLogger("thirdhand")
 def state_folder(settings: Settings) -> Path:
     """The folder of the files that a cell keeps over a restart. Raises ExplainedError."""
     try:
-        return (Path(settings.files.state) if settings.files.state else user_folder("state")) / settings.cell
+        return (
+            Path(settings.files.state) if settings.files.state else user_folder("state")
+        ) / settings.cell
     except HomelessError as error:
         raise ExplainedError(f"no folder for the cell's state: {error}, or [files] state") from None
 
@@ -77,11 +88,15 @@ class Lock:
             holder = _holder(self._descriptor)
             self.close()
             raise OccupiedError(
-                f"cell {cell} is already served on this machine ({holder}; {path} is locked): stop that daemon, or "
-                "give this one another --cell or [files] state"
+                f"cell {cell} is already served on this machine ({holder}; {path} is locked): stop "
+                "that daemon, or give this one another --cell or [files] state"
             ) from None
         except OSError as error:
-            log.warning("%s: %s; a second daemon of this cell is only detected through Zenoh", path, error.strerror)
+            log.warning(
+                "%s: %s; a second daemon of this cell is only detected through Zenoh",
+                path,
+                error.strerror,
+            )
             self.close()
         else:
             self.announce(())
@@ -117,7 +132,11 @@ def _holder(descriptor: int | None) -> str:
     """A description of the holder of a lock, from the lock file."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
         record = json.loads(os.pread(descriptor, MAX_HOLDER_BYTES, 0))  # type: ignore[arg-type]
-        where = f"listening on {', '.join(record['endpoints'])}" if record["endpoints"] else "not listening, or not yet"
+        where = (
+            f"listening on {', '.join(record['endpoints'])}"
+            if record["endpoints"]
+            else "not listening, or not yet"
+        )
         return f"process {record['pid']}, {where}"
     return "a process that did not write its number"
 
@@ -133,8 +152,8 @@ def allow_descriptors() -> int:
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit < LEAST_DESCRIPTORS:
         raise ExplainedError(
-            f"this process may open {limit} files, {LEAST_DESCRIPTORS} or more needed: raise its limit with `ulimit "
-            "-Hn`, or with LimitNOFILE= in the unit"
+            f"this process may open {limit} files, {LEAST_DESCRIPTORS} or more needed: raise its "
+            "limit with `ulimit -Hn`, or with LimitNOFILE= in the unit"
         )
     return limit
 
@@ -154,5 +173,10 @@ def occupy(session: zenoh.Session, cell: str) -> zenoh.LivelinessToken:
     holder = f"Zenoh session {min(others)}"
     with contextlib.suppress(UnreachableError, RefusedError):
         status = Client(session, cell, timeout_s=2.0).status()
-        holder += f", version {status.version}, listening on {', '.join(status.endpoints) or 'nothing'}"
-    raise OccupiedError(f"cell {cell} is already served ({holder}): stop that daemon, or give this one another --cell")
+        holder += (
+            f", version {status.version}, listening on {', '.join(status.endpoints) or 'nothing'}"
+        )
+    raise OccupiedError(
+        f"cell {cell} is already served ({holder}): stop that daemon, or give this one another "
+        "--cell"
+    )

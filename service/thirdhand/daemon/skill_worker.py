@@ -31,11 +31,15 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, skill_
 from thirdhand.skills.via_points import adapted
 
 MODULE = "thirdhand.daemon.skill_worker"
-WORK_TIMEOUT_S = ANSWER_TIMEOUT_S - 5.0  # the rest is for the tick that takes a request, and for the status
+WORK_TIMEOUT_S = (
+    ANSWER_TIMEOUT_S - 5.0
+)  # the rest is for the tick that takes a request, and for the status
 HUNG_S = 5.0  # the process hangs if it makes no progress for this time
 WORKER_POLL_S = 0.1
 BUSY = "the skill worker was busy with earlier requests; nothing was changed, try again"
-STILL_STARTING = "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
+STILL_STARTING = (
+    "the skill worker is still starting, as the machine is busy; nothing was changed, try again"
+)
 Computed = TypeVar("Computed")
 
 
@@ -73,17 +77,23 @@ class SkillWorker:
         """The skill in a file. Raises SkillError, also after `timeout_s` [s]."""
         return self.compute(skill_of, path, timeout_s=timeout_s)
 
-    def adapt(self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
+    def adapt(
+        self, skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float
+    ) -> StoredSkill:
         """The skill with these via-points and no others. Raises SkillError."""
         return self.compute(skill_of, skill.file, tuple(via_points), tolerance)
 
-    def correct(self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
+    def correct(
+        self, skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint
+    ) -> tuple[StoredSkill, Effect]:
         """The skill with these via-points and no others, and what that changes at the correction
         `at`. Raises SkillError.
         """
         return self.compute(corrected_skill_of, skill.file, tuple(via_points), at)
 
-    def compute(self, work: Callable[..., Computed], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S) -> Computed:
+    def compute(
+        self, work: Callable[..., Computed], *arguments: Any, timeout_s: float = WORK_TIMEOUT_S
+    ) -> Computed:
         """The value of `work(*arguments)` in the worker, for a function of a module. Raises
         SkillError, also after `timeout_s` [s], the wait for earlier calls included.
         """
@@ -114,7 +124,9 @@ class SkillWorker:
                 raise SkillError(f"the skill worker {error}; nothing was changed") from None
             except (OSError, EOFError):
                 self._end()
-                raise SkillError("the skill worker ended while it worked; nothing was changed, try again") from None
+                raise SkillError(
+                    "the skill worker ended while it worked; nothing was changed, try again"
+                ) from None
         finally:
             self._busy.release()
         if isinstance(answer, str):
@@ -171,19 +183,25 @@ def tool_limits_of(settings: Settings, file: bytes) -> dict[str, ToolLimits]:
     return limits_of_task(settings, robot_description(settings), path_of(skill), skill.orientation)
 
 
-def skill_of(source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0) -> StoredSkill:
+def skill_of(
+    source: Path | bytes, via_points: Sequence[ViaPoint] = (), tolerance: float = 0.0
+) -> StoredSkill:
     """The skill in a file, or the skill in force (the bytes of its file) with these via-points.
 
     Raises SkillError.
     """
     if isinstance(source, bytes):
-        skill = adapted(decoded(source, origin="the skill in force"), via_points, tolerance=tolerance)
+        skill = adapted(
+            decoded(source, origin="the skill in force"), via_points, tolerance=tolerance
+        )
     else:
         skill = skill_in(source)
     return prepared(skill)
 
 
-def corrected_skill_of(source: bytes, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
+def corrected_skill_of(
+    source: bytes, via_points: Sequence[ViaPoint], at: ViaPoint
+) -> tuple[StoredSkill, Effect]:
     """The skill in force (the bytes of its file) with these via-points, and what they change at the
     correction `at`. Raises SkillError.
     """
@@ -212,7 +230,9 @@ def run(channel: socket.socket) -> None:
         try:
             answer = work(*arguments)
         except Exception as error:  # the client gets any failure as an answer
-            answer = str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
+            answer = (
+                str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
+            )
         skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
         try:
             _send(channel, skill, *(b.raw() for b in buffers))

@@ -22,7 +22,13 @@ from thirdhand.contract import channels, ros2
 from thirdhand.contract.printable import CLEAR
 from thirdhand.contract.requests import STARTING
 from thirdhand.contract.roles import access_control
-from thirdhand.daemon.single_instance import NETWORK_BOUNDS, Lock, allow_descriptors, occupy, state_folder
+from thirdhand.daemon.single_instance import (
+    NETWORK_BOUNDS,
+    Lock,
+    allow_descriptors,
+    occupy,
+    state_folder,
+)
 from thirdhand.daemon.systemd import Systemd
 from thirdhand.process.priority import ahead_of_others
 from thirdhand.process.progress import say
@@ -43,16 +49,21 @@ class Startup:
     """
 
     def __init__(self, lock: Lock, session: zenoh.Session, cell: str) -> None:
-        self.lock, self.session, self.systemd = lock, session, Systemd()
+        self.lock = lock
+        self.session = session
+        self.systemd = Systemd()
         self._compiling: list[str] = []  # functions in compilation, callers first
         self._compiled: set[str] = set()  # functions that were compiled, here or by other processes
         self._functions: dict[str, Any] = {}  # all that the loop may call, once they are imported
-        self._is_over, self._begun_s = threading.Event(), time.monotonic()
+        self._is_over = threading.Event()
+        self._begun_s = time.monotonic()
         self._stages = [
             ("network", time.monotonic() - _process_age_s()),
             ("imports", self._begun_s),
         ]
-        keys = [channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable]
+        keys = [
+            channels.key(cell, channel.key) for channel in channels.CHANNELS if channel.queryable
+        ]
         self._queryables = [session.declare_queryable(key, self._refuse) for key in keys]
         self._reporter = threading.Thread(target=self._report, name="start", daemon=True)
         self._reporter.start()
@@ -65,7 +76,9 @@ class Startup:
     def duration(self) -> str:
         """Time since the process began and the time of each stage [s], in words."""
         stages = itertools.pairwise([*self._stages, ("", time.monotonic())])
-        parts = ", ".join(f"{name} {end_s - begin_s:.2f} s" for (name, begin_s), (_, end_s) in stages)
+        parts = ", ".join(
+            f"{name} {end_s - begin_s:.2f} s" for (name, begin_s), (_, end_s) in stages
+        )
         return f"{time.monotonic() - self._stages[0][1]:.2f} s: {parts}"
 
     @property
@@ -79,7 +92,10 @@ class Startup:
 
     @property
     def _ready(self) -> int:
-        return sum(name in self._compiled or bool(function.signatures) for name, function in self._functions.items())
+        return sum(
+            name in self._compiled or bool(function.signatures)
+            for name, function in self._functions.items()
+        )
 
     def note(self, function: str, is_ready: bool) -> None:
         """Note that the compilation of a function begins, or that it is ready."""
@@ -94,7 +110,10 @@ class Startup:
         """A context that counts the compiled functions that the loop may call and that are imported
         by now. Raises NotCompiledError at the first compilation, unless it `may_compile`.
         """
-        from numba.core import dispatcher, event  # its import is slow, so the start reports before it
+        from numba.core import (
+            dispatcher,
+            event,
+        )  # its import is slow, so the start reports before it
 
         from thirdhand.daemon.compilation import Compilations, NotCompiledError
 
@@ -111,7 +130,9 @@ class Startup:
             for function in vars(module).values()
             if isinstance(function, dispatcher.Dispatcher)
         }
-        with event.install_listener("numba:compile", Compilations(begun, lambda name: self.note(name, True))):
+        with event.install_listener(
+            "numba:compile", Compilations(begun, lambda name: self.note(name, True))
+        ):
             yield
 
     def over(self) -> None:
@@ -126,9 +147,14 @@ class Startup:
             query.reply_err(self.progress.encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
 
     def _report(self) -> None:
-        logged, logged_s, quarter, terminal, notified = "", -math.inf, -1, sys.stderr.isatty(), ""
+        logged = ""
+        logged_s = -math.inf
+        quarter = -1
+        terminal = sys.stderr.isatty()
+        notified = ""
         while not self._is_over.is_set():
-            progress, now_s = self.progress, time.monotonic()
+            progress = self.progress
+            now_s = time.monotonic()
             if progress != notified:
                 notified = progress
                 self.systemd.notify(f"STATUS={progress}", f"EXTEND_TIMEOUT_USEC={MAX_PAUSE_US}")
@@ -137,7 +163,9 @@ class Startup:
                 say(progress)
             elif progress != logged and (now_in > quarter or now_s - logged_s >= LOG_EVERY_S):
                 log.info("%s", progress)
-                logged, logged_s, quarter = progress, now_s, now_in
+                logged = progress
+                logged_s = now_s
+                quarter = now_in
             self._is_over.wait(REPORT_EVERY_S)
         if terminal:
             print(CLEAR, end="", file=sys.stderr, flush=True)
@@ -150,7 +178,9 @@ def _short(function: str) -> str:
 
 def _process_age_s() -> float:
     """Time since this process was started [s]."""
-    begun_ticks = int(Path("/proc/self/stat").read_text(errors="replace").rpartition(")")[2].split()[19])
+    begun_ticks = int(
+        Path("/proc/self/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
+    )
     return time.clock_gettime(time.CLOCK_BOOTTIME) - begun_ticks / os.sysconf("SC_CLK_TCK")
 
 
@@ -170,7 +200,8 @@ def starting(settings: Settings) -> Iterator[Startup]:
                 listen=network.listen,
                 certificate=network.certificate,
                 zenoh_config=network.zenoh_config,
-                more=NETWORK_BOUNDS | (access_control(settings.cell, *roles) if network.certificate else {}),
+                more=NETWORK_BOUNDS
+                | (access_control(settings.cell, *roles) if network.certificate else {}),
             )
         with session:
             token = occupy(session, settings.cell)  # noqa: F841  # the cell is free when the token is deleted

@@ -53,20 +53,34 @@ class CellStatus(NamedTuple):
 
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
-        frame, sources, settings = self.frame, self.sources, self.settings
-        begun, is_seen, aimed = int(frame["tick"]) >= 0, frame["hand_ages"] >= 0, bool(frame["covariance"].any())
-        skill, (mode, reason) = self.controller.skill, outcome(frame)
-        flags, seen_now = Flag(int(frame["flags"])), self.evidence()
-        why = explained(Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now)
+        frame = self.frame
+        sources = self.sources
+        settings = self.settings
+        begun = int(frame["tick"]) >= 0
+        is_seen = frame["hand_ages"] >= 0
+        aimed = bool(frame["covariance"].any())
+        skill = self.controller.skill
+        mode, reason = outcome(frame)
+        flags = Flag(int(frame["flags"]))
+        seen_now = self.evidence()
+        why = explained(
+            Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now
+        )
         faulty = [(key, stream) for key, stream in self.streams.items() if stream.cause]
-        because = [f"what arrives on {key} is {stream.cause}: {stream.refused}" for key, stream in faulty]
+        because = [
+            f"what arrives on {key} is {stream.cause}: {stream.refused}" for key, stream in faulty
+        ]
         low, high = skill.demonstrated
         return Status(
             cell=settings.cell,
             mode=word(mode),
             reason=word(reason) if begun else "",
             because="; ".join(filter(None, [why.why, *because])),
-            remedy="; ".join(filter(None, dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)]))),
+            remedy="; ".join(
+                filter(
+                    None, dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)])
+                )
+            ),
             flags=tuple(map(word, flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
@@ -87,12 +101,18 @@ class CellStatus(NamedTuple):
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
             hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if is_seen[i]},
             below_table_m={
-                side: depth_m for i, side in enumerate(SIDES) if is_seen[i] and (depth_m := self._below_table_m(i))
+                side: depth_m
+                for i, side in enumerate(SIDES)
+                if is_seen[i] and (depth_m := self._below_table_m(i))
             },
             demonstrated_m={
-                side: (_point(low[i]), _point(high[i])) for i, side in enumerate(SIDES) if skill.conductor in (None, i)
+                side: (_point(low[i]), _point(high[i]))
+                for i, side in enumerate(SIDES)
+                if skill.conductor in (None, i)
             },
-            hands_at_m={name: (_point(hands[:3]), _point(hands[3:])) for name, hands in _hands_at(skill)},
+            hands_at_m={
+                name: (_point(hands[:3]), _point(hands[3:])) for name, hands in _hands_at(skill)
+            },
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
             target_m=_point(frame["target"]) if aimed else None,
@@ -101,7 +121,9 @@ class CellStatus(NamedTuple):
             turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
             closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
-            segment=skill.model.names[frame["segment"] : frame["segment"] + 2] if frame["segment_belief"] else (),
+            segment=skill.model.names[frame["segment"] : frame["segment"] + 2]
+            if frame["segment_belief"]
+            else (),
             segment_belief=round(float(frame["segment_belief"]), 3),
             task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
             if skill.model.clock and skill.model.clock.weight
@@ -111,7 +133,9 @@ class CellStatus(NamedTuple):
             threshold_m=round(skill.threshold, 5),
             guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
             offer=offer_of(skill),
-            binding=next((name for name, _ in binding(settings, np.asarray(frame).reshape(1))), "") if begun else "",
+            binding=next((name for name, _ in binding(settings, np.asarray(frame).reshape(1))), "")
+            if begun
+            else "",
             **more,
         )
 
@@ -123,17 +147,29 @@ class CellStatus(NamedTuple):
 
     def _turned(self) -> float:
         """Angle between the tool and its target, or between their directions [rad]."""
-        tool, target = self.frame["tool_orientation"], self.frame["orientation"]
-        return round(float(off_target(tool, target, direction=self.settings.tool.orientation == "direction")), 5)
+        tool = self.frame["tool_orientation"]
+        target = self.frame["orientation"]
+        return round(
+            float(
+                off_target(tool, target, direction=self.settings.tool.orientation == "direction")
+            ),
+            5,
+        )
 
     def evidence(self) -> Evidence:
         """The figures of the incidents that may be explained."""
-        settings, skill, (error_rad, speed) = self.settings, self.controller.skill, self.controller.decision.measured
+        settings = self.settings
+        skill = self.controller.skill
+        error_rad, speed = self.controller.decision.measured
         errors = np.abs(self.frame["joints"] - self.state["measured"])
         worst = int((errors / np.array(settings.joints.per_rad)).argmax())
         limit = settings.tool.fault_speed
         return Evidence(
-            sources={name: source for name, source in self.sources.items() if not self._is_unneeded(name, source)},
+            sources={
+                name: source
+                for name, source in self.sources.items()
+                if not self._is_unneeded(name, source)
+            },
             settings=settings,
             contested=TUNING.intake.contested_off_share,
             gate_m=(float(self.frame["gate_m"]), skill.threshold),
@@ -142,7 +178,11 @@ class CellStatus(NamedTuple):
             inside=self.inside,
             stuck=self._stuck() if self.state["stuck"] else None,
             error_rad=(error_rad, settings.arm.fault_error_rad),
-            worst_joint=(settings.joints.names[worst], float(errors[worst]), settings.joints.units[worst]),
+            worst_joint=(
+                settings.joints.names[worst],
+                float(errors[worst]),
+                settings.joints.units[worst],
+            ),
             measured_speed=(speed, limit) if speed > limit else None,
             commanded_speed=(speed, settings.tool.max_speed),
             failure=self.failure,
@@ -152,19 +192,30 @@ class CellStatus(NamedTuple):
 
     def _is_unneeded(self, name: str, source: Source) -> bool:
         """True for a hand that the skill does not need, and that has disappeared."""
-        side, is_gone = self.controller.skill.conductor, source.age_ms is None or source.age_ms >= 1000 * GONE_S
+        side = self.controller.skill.conductor
+        is_gone = source.age_ms is None or source.age_ms >= 1000 * GONE_S
         return side is not None and name in SIDES and name != SIDES[side] and is_gone
 
     def _outside(self) -> Outside | None:
         """The first joint outside its limits, if the arm moves back into them."""
-        joints, measured = self.settings.joints, self.state["measured"].tolist()
+        joints = self.settings.joints
+        measured = self.state["measured"].tolist()
         candidates = map(Outside, joints.names, measured, joints.lower, joints.upper, joints.units)
         returning = int(self.state["arm_ready"]) == RETURNING
-        return next((joint for joint in candidates if returning and not joint.low <= joint.value <= joint.high), None)
+        return next(
+            (
+                joint
+                for joint in candidates
+                if returning and not joint.low <= joint.value <= joint.high
+            ),
+            None,
+        )
 
     def _stuck(self) -> Stuck:
         """Joints that keep the tool from its target, and the way out."""
-        joints, state, q = self.settings.joints, self.state, self.state["joints"][0].tolist()
+        joints = self.settings.joints
+        state = self.state
+        q = self.state["joints"][0].tolist()
         at_limits = [
             name
             for name, position, low, high, per_rad in zip(
@@ -181,9 +232,11 @@ class MeasuredArm:
     """The pose of the arm at the joints that were measured last."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
-        self._period_s, self._names = settings.period_s, settings.joints.names
+        self._period_s = settings.period_s
+        self._names = settings.joints.names
         # Own copies, because the loop uses its arm and separation at the same time.
-        self._arm, self._separation = Arm(settings, urdf), Separation(settings, urdf)
+        self._arm = Arm(settings, urdf)
+        self._separation = Separation(settings, urdf)
 
     def inside(self, state: Record) -> Inside | None:
         """What an arm that is not ready is inside of; None: nothing."""
@@ -193,11 +246,16 @@ class MeasuredArm:
         if depth_m <= 0.0:
             return None
         things = {0: "the table", NEAR_ITSELF: "another part of the arm"}
-        return Inside(self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m)
+        return Inside(
+            self._names[max(joint, 0)], things.get(thing, f"box {thing} of [obstacles]"), depth_m
+        )
 
     def position(self, state: Record) -> Vector3 | None:
         """The tool's position [m] in frame `base`; None if the measured joints are too old."""
-        if state["arm_tick"] < 0 or (state["tick"] - state["arm_tick"]) * self._period_s >= MAX_MEASURED_AGE_S:
+        if (
+            state["arm_tick"] < 0
+            or (state["tick"] - state["arm_tick"]) * self._period_s >= MAX_MEASURED_AGE_S
+        ):
             return None
         return _point(self._arm.at(state["measured"].copy()).position)
 
@@ -212,7 +270,9 @@ def _by_cause(sources: dict[str, Source]) -> dict[str, int]:
     counts: Counter[str] = Counter()
     for name, source in sources.items():
         for cause, count in source.rejected.items():
-            counts[f"{MALFORMED} {KEY_OF_SOURCE.get(name, name)}" if cause == MALFORMED else cause] += count
+            counts[
+                f"{MALFORMED} {KEY_OF_SOURCE.get(name, name)}" if cause == MALFORMED else cause
+            ] += count
     return counts
 
 
@@ -225,7 +285,9 @@ def _hands_at(skill: Skill) -> list[tuple[str, Any]]:
     without via-points, one unnamed pair of demonstrated hands.
     """
     hands = skill.model.hands
-    named_hands = zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    named_hands = (
+        zip(skill.model.names, hands, strict=True) if skill.model.names else [("", hands[0])]
+    )
     return [(name, row) for name, row in named_hands if np.isfinite(row).all()]
 
 

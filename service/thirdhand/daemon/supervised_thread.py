@@ -12,7 +12,11 @@ RESTART_PAUSE_S = 0.1
 
 
 def supervised(
-    name: str, work: Callable[[], None], failed: Callable[[str], None], *, pause_s: float = RESTART_PAUSE_S
+    name: str,
+    work: Callable[[], None],
+    failed: Callable[[str], None],
+    *,
+    pause_s: float = RESTART_PAUSE_S,
 ) -> None:
     """Run `work` to its end.
 

@@ -18,12 +18,16 @@ class Systemd:
         watchdog_us = environment.get("WATCHDOG_USEC", "")
         is_for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.ping_every_s = int(watchdog_us) / 2e6 if is_for_us and watchdog_us.isdecimal() else 0.0
-        self._pinged_tick, self._ping_s = -1, 0.0
+        self._pinged_tick = -1
+        self._ping_s = 0.0
 
     def notify(self, *assignments: str) -> None:
         """Send assignments like READY=1. Never waits; without a listener nothing happens."""
         if self._address:
-            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            with (
+                contextlib.suppress(OSError),
+                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender,
+            ):
                 sender.setblocking(False)
                 sender.sendto("\n".join(assignments).encode(), self._address)
 
@@ -32,6 +36,11 @@ class Systemd:
         ping: so a loop that stands still is noticed. Call it more often than that.
         """
         now_s = time.monotonic()
-        if self.ping_every_s and tick > self._pinged_tick and now_s >= self._ping_s + self.ping_every_s:
-            self._pinged_tick, self._ping_s = tick, now_s
+        if (
+            self.ping_every_s
+            and tick > self._pinged_tick
+            and now_s >= self._ping_s + self.ping_every_s
+        ):
+            self._pinged_tick = tick
+            self._ping_s = now_s
             self.notify("WATCHDOG=1")

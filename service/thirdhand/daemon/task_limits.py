@@ -15,7 +15,9 @@ class TaskLimits:
     """The limits that the skill worker computes for each skill that comes into force."""
 
     def __init__(self, settings: Settings, worker: SkillWorker, say: Callable[[str], None]) -> None:
-        self._settings, self._worker, self._say = settings, worker, say
+        self._settings = settings
+        self._worker = worker
+        self._say = say
         self._file = b""
         self._found: dict[str, ToolLimits] = {}
         self._work: threading.Thread | None = None
@@ -25,8 +27,11 @@ class TaskLimits:
         if file is self._file:
             return self._found
         if self._work is None or not self._work.is_alive():
-            self._file, self._found = file, {}
-            self._work = threading.Thread(target=self._compute, args=(file,), name="tool limits", daemon=True)
+            self._file = file
+            self._found = {}
+            self._work = threading.Thread(
+                target=self._compute, args=(file,), name="tool limits", daemon=True
+            )
             self._work.start()
         return {}
 

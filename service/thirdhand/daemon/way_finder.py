@@ -21,9 +21,16 @@ class WayFinder:
     """A search for ways out in the skill worker, one at a time; it sends the result to the loop."""
 
     def __init__(
-        self, settings: Settings, worker: SkillWorker, send: Callable[[Event], object], say: Callable[[str], None]
+        self,
+        settings: Settings,
+        worker: SkillWorker,
+        send: Callable[[Event], object],
+        say: Callable[[str], None],
     ) -> None:
-        self._settings, self._worker, self._send, self._say = settings, worker, send, say
+        self._settings = settings
+        self._worker = worker
+        self._send = send
+        self._say = say
         self._search: threading.Thread | None = None
         self._next_s = 0.0
 
@@ -33,8 +40,15 @@ class WayFinder:
         if not state["stuck"] or state["way_count"] or searching or time.monotonic() < self._next_s:
             return
         hands = np.array(frame["hands"])
-        arguments = state["joints"][0].copy(), frame["target"].copy(), frame["orientation"].copy(), hands
-        self._search = threading.Thread(target=self._find, args=arguments, name="way out", daemon=True)
+        arguments = (
+            state["joints"][0].copy(),
+            frame["target"].copy(),
+            frame["orientation"].copy(),
+            hands,
+        )
+        self._search = threading.Thread(
+            target=self._find, args=arguments, name="way out", daemon=True
+        )
         self._search.start()
 
     def _find(self, *arguments: np.ndarray) -> None:

@@ -37,7 +37,10 @@ _PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
 ENDED_POLL_S = 0.5
 _ALIGNED = 64  # [bytes] parts begin at multiples of this, so that arrays are used without a copy
-_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36  # Linux defines them, Python does not
+# Linux defines them, Python does not
+_PR_SET_PDEATHSIG = 1
+_PR_SET_NAME = 15
+_PR_SET_CHILD_SUBREAPER = 36
 CHILD_NICE = 5  # children yield to the control process
 CHILD_POLL_S = 0.01
 MAX_REQUEST_BYTES = 4096  # a request to the fork server is a few names
@@ -130,15 +133,18 @@ class Progress:
         """Note that the child has reported something."""
         self._pid = self._child.working_pid
         _, self._used_s = _activity(self._pid)
-        self._reported_s, self._moved_s = self._used_s, time.monotonic()
+        self._reported_s = self._used_s
+        self._moved_s = time.monotonic()
 
     def is_hung(self, limit_s: float, *, busy_s: float | None = None) -> bool:
         """True if the child makes no progress; `busy_s` replaces the limit of processor time."""
         if self._child.working_pid != self._pid:  # the child was forked after the last report
             self.report()
-        (state, used_s), now_s = _activity(self._pid), time.monotonic()
+        state, used_s = _activity(self._pid)
+        now_s = time.monotonic()
         if used_s != self._used_s or state in "RD":
-            self._used_s, self._moved_s = used_s, now_s
+            self._used_s = used_s
+            self._moved_s = now_s
         return now_s - self._moved_s > limit_s or used_s - self._reported_s > (busy_s or limit_s)
 
 
@@ -171,7 +177,9 @@ class ForkServer:
         with theirs:
             return Child(parent_end, self.request(module, name, descriptors=[theirs.fileno()]))
 
-    def request(self, module: str, *more: str, descriptors: Iterable[int] = ()) -> subprocess.Popen[bytes]:
+    def request(
+        self, module: str, *more: str, descriptors: Iterable[int] = ()
+    ) -> subprocess.Popen[bytes]:
         """Have the server import a module and, with a descriptor, fork a child that runs it."""
         with self._lock:
             self._modules[module] = None
@@ -263,7 +271,9 @@ def _serve(control: socket.socket) -> None:
             with socket.socket(fileno=descriptors[0]) as channel:
                 try:
                     between = os.fork()
-                except OSError:  # no process or memory is left: the socket closes, which the caller sees
+                except (
+                    OSError
+                ):  # no process or memory is left: the socket closes, which the caller sees
                     traceback.print_exc()
                     continue
                 if between == 0:
@@ -365,11 +375,16 @@ def from_memory(fd: int) -> list[memoryview]:
     """
     try:
         size = os.fstat(fd).st_size
-        populate = getattr(mmap, "MAP_POPULATE", 0)  # map pages now, not at the first access in the loop
-        view = memoryview(mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ))
+        populate = getattr(
+            mmap, "MAP_POPULATE", 0
+        )  # map pages now, not at the first access in the loop
+        view = memoryview(
+            mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ)
+        )
     finally:
         os.close(fd)
-    parts, offset = [], 0
+    parts = []
+    offset = 0
     while offset < size:
         (length,) = _PART_LENGTH.unpack_from(view, offset)
         offset += _ALIGNED

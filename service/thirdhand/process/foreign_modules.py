@@ -13,7 +13,18 @@ from pathlib import Path
 from thirdhand.contract.explain import ExplainedError
 
 EXTRAS = {  # the modules that each extra of the distribution brings
-    "cell": ("kmp", "mcap", "numba", "numpy", "pinocchio", "psutil", "rich", "ruckig", "scipy", "threadpoolctl"),
+    "cell": (
+        "kmp",
+        "mcap",
+        "numba",
+        "numpy",
+        "pinocchio",
+        "psutil",
+        "rich",
+        "ruckig",
+        "scipy",
+        "threadpoolctl",
+    ),
     "view": ("PIL", "rerun"),
     "learn": ("matplotlib", "sklearn", "tomlkit"),
     "formats": ("ezc3d", "rosbags"),
@@ -50,14 +61,18 @@ def named() -> Iterator[None]:
             ) from None
         variable = "PYTHONPATH"
         file = _origin(package)
-        folders = [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+        folders = [
+            Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder
+        ]
         if not any(file.is_relative_to(folder.absolute()) for folder in folders):
-            variable, file = "LD_LIBRARY_PATH", Path(error.path or "")
+            variable = "LD_LIBRARY_PATH"
+            file = Path(error.path or "")
             if not os.environ.get(variable) or ".so" not in str(error):
                 raise
         raise ForeignModuleError(
-            f"{file} cannot be imported here: {error}. ${variable} leads to another Python's files, as where ROS is "
-            f"sourced; a terminal without it needed, or `env -u {variable} thirdhand ...`"
+            f"{file} cannot be imported here: {error}. ${variable} leads to another Python's "
+            f"files, as where ROS is sourced; a terminal without it needed, or `env -u {variable} "
+            "thirdhand ...`"
         ) from None
 
 

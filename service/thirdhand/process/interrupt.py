@@ -16,13 +16,15 @@ from types import FrameType
 from typing import NoReturn
 
 EXIT_CODE = 128 + signal.SIGINT
-_CLEANS_UP, _RAISED = threading.Event(), threading.Event()
+_CLEANS_UP = threading.Event()
+_RAISED = threading.Event()
 _ENDING = threading.RLock()
 
 
 def end_at_once() -> NoReturn:
     """End this process at once, with one line, whichever threads ask for it."""
-    _ENDING.acquire()  # never released: the process ends; a second signal may come here in the same thread
+    # never released: the process ends; a second signal may come here in the same thread
+    _ENDING.acquire()
     with contextlib.suppress(OSError):
         os.write(2, b"\nthirdhand: interrupted\n" if os.isatty(2) else b"thirdhand: interrupted\n")
     os._exit(EXIT_CODE)

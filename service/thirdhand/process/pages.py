@@ -7,10 +7,14 @@ import ctypes
 import re
 from pathlib import Path
 
-_MAPPING = re.compile(  # of a file, private to this process: begin, end, is writable, path, anonymous pages [kB]
-    r"^([0-9a-f]+)-([0-9a-f]+) r(.).p \S+ \S+ [1-9]\d* +(.+)\n(?:[A-Z].*\n)*?Anonymous: +(\d+) kB", re.MULTILINE
+# of a file, private to this process: begin, end, is writable, path, anonymous pages [kB]
+_MAPPING = re.compile(
+    r"^([0-9a-f]+)-([0-9a-f]+) r(.).p \S+ \S+ [1-9]\d* +(.+)\n(?:[A-Z].*\n)*?Anonymous: +(\d+) kB",
+    re.MULTILINE,
 )
-_MADV_DONTNEED, _M_ARENA_MAX = 4, -8  # Linux and glibc define them
+# Linux and glibc define them
+_MADV_DONTNEED = 4
+_M_ARENA_MAX = -8
 
 
 def release_start_memory() -> None:
@@ -28,7 +32,11 @@ def release_start_memory() -> None:
         for begin, end, writable, path, anonymous_kb in mappings:
             if path in loaded and writable == "-" and anonymous_kb == "0":
                 address = int(begin, 16)
-                libc.madvise(ctypes.c_void_p(address), ctypes.c_size_t(int(end, 16) - address), _MADV_DONTNEED)
+                libc.madvise(
+                    ctypes.c_void_p(address),
+                    ctypes.c_size_t(int(end, 16) - address),
+                    _MADV_DONTNEED,
+                )
 
 
 def share_one_heap() -> None:

@@ -16,7 +16,9 @@ Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
-def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "1") -> Iterator[Outcome]:
+def spread(
+    work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "1"
+) -> Iterator[Outcome]:
     """The outcome of each item, in order.
 
     `workers` is a number of processes, or `dask:ADDRESS`; `work` must be a function that can be
@@ -34,10 +36,14 @@ def spread(work: Callable[[Item], Outcome], items: Sequence[Item], workers: str 
             try:
                 yield from pool.map(alone, items)
             except BrokenExecutor:
-                raise ExplainedError(f"--workers {workers}: a worker was killed, perhaps for lack of memory") from None
+                raise ExplainedError(
+                    f"--workers {workers}: a worker was killed, perhaps for lack of memory"
+                ) from None
 
 
-def _on_cluster(work: Callable[[Item], Outcome], items: Sequence[Item], address: str) -> Iterator[Outcome]:
+def _on_cluster(
+    work: Callable[[Item], Outcome], items: Sequence[Item], address: str
+) -> Iterator[Outcome]:
     option = f"--workers dask:{address}"
     try:
         from distributed import Client, KilledWorker
@@ -49,12 +55,16 @@ def _on_cluster(work: Callable[[Item], Outcome], items: Sequence[Item], address:
             raise ValueError("no host and port")
         client = Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:  # no address, or nothing answers there
-        raise ExplainedError(f"{option}: {in_words(error)}; a running cluster's address needed") from None
+        raise ExplainedError(
+            f"{option}: {in_words(error)}; a running cluster's address needed"
+        ) from None
     with client:
         try:
             yield from (future.result() for future in client.map(work, items, pure=False))
         except KilledWorker:
-            raise ExplainedError(f"{option}: a worker was killed, perhaps for lack of memory") from None
+            raise ExplainedError(
+                f"{option}: a worker was killed, perhaps for lack of memory"
+            ) from None
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

@@ -26,7 +26,12 @@ def say(line: str) -> None:
     terminal = sys.stderr.isatty()
     in_place = terminal and line.lstrip().startswith(STARTING)
     text = line[: shutil.get_terminal_size().columns - 1] if in_place else line
-    print(f"{CLEAR * terminal}{printable_lines(text)}", end="" if in_place else "\n", file=sys.stderr, flush=True)
+    print(
+        f"{CLEAR * terminal}{printable_lines(text)}",
+        end="" if in_place else "\n",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 @contextlib.contextmanager
@@ -55,10 +60,16 @@ def steps(
 class _Shown:
     """Show the progress from a thread of its own, also while the command computes."""
 
-    def __init__(self, what: str, total: int | None, unit: str, after_s: float, every_s: float) -> None:
-        self._what, self._total, self._unit = what, total, unit
-        self._after_s, self._every_s = after_s, every_s
-        self._count, self._begun = 0, time.monotonic()
+    def __init__(
+        self, what: str, total: int | None, unit: str, after_s: float, every_s: float
+    ) -> None:
+        self._what = what
+        self._total = total
+        self._unit = unit
+        self._after_s = after_s
+        self._every_s = every_s
+        self._count = 0
+        self._begun = time.monotonic()
         self._ended = threading.Event()
         show = self._draw if sys.stderr.isatty() else self._print
         self._thread = threading.Thread(target=show, name="progress", daemon=True)
@@ -68,7 +79,8 @@ class _Shown:
         self._count = count
 
     def doing(self, what: str) -> None:
-        self._what, self._begun = what, time.monotonic()
+        self._what = what
+        self._begun = time.monotonic()
         if not sys.stderr.isatty():
             say(what)
 
@@ -80,7 +92,14 @@ class _Shown:
         if self._ended.wait(self._after_s):
             return
         from rich.console import Console  # its import is slow, and most commands end before
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            SpinnerColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
         class Cursor(Console):
             """A console that never hides the cursor, which would remain hidden after Ctrl-C."""
@@ -89,10 +108,19 @@ class _Shown:
                 return False
 
         has_total = self._total is not None
-        columns = [BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()] if has_total else []
+        columns = (
+            [BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()]
+            if has_total
+            else []
+        )
         text = TextColumn("{task.description}", markup=False)
         with Progress(
-            SpinnerColumn(), text, *columns, TimeElapsedColumn(), console=Cursor(stderr=True), transient=True
+            SpinnerColumn(),
+            text,
+            *columns,
+            TimeElapsedColumn(),
+            console=Cursor(stderr=True),
+            transient=True,
         ) as bar:
             task = bar.add_task(self._what, total=self._total)
             bar.update(task, completed=self._count)
@@ -108,7 +136,10 @@ class _Shown:
                 continue
             passed = f"{passed_s:.0f} s"
             if self._total:
-                passed = f"{100 * self._count / self._total:.0f} % of {self._total} {self._unit}, {passed}"
+                passed = (
+                    f"{100 * self._count / self._total:.0f} % of {self._total} {self._unit}, "
+                    f"{passed}"
+                )
             elif self._count:
                 passed = f"{self._count} {self._unit}, {passed}"
             say(f"{self._what}: {passed}")

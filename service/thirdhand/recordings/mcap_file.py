@@ -26,7 +26,9 @@ from thirdhand.settings.whole_file import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
 _BYTES = "application/octet-stream"
-CHUNK_BYTES = 128 * 1024  # between two flushes a kill loses at most this, and a reader holds at most this
+CHUNK_BYTES = (
+    128 * 1024
+)  # between two flushes a kill loses at most this, and a reader holds at most this
 
 
 class RecordingError(ExplainedError, ValueError):
@@ -44,16 +46,30 @@ def machine() -> dict[str, str]:
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         facts["cpu"] = next(
-            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), facts["cpu"]
+            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+            facts["cpu"],
         )
     build: Any = np.show_config(mode="dicts")
     blas = build["Build Dependencies"]["blas"]
     facts["blas"] = f"{blas['name']} {blas['version']}"
     facts["features"] = " ".join(build["SIMD Extensions"].get("found", []))
     facts["libc"] = " ".join(platform.libc_ver())
-    kernels = {library.get("architecture") for library in threadpool_info() if library["user_api"] == "blas"}
+    kernels = {
+        library.get("architecture")
+        for library in threadpool_info()
+        if library["user_api"] == "blas"
+    }
     facts["kernel"] = " ".join(sorted(filter(None, kernels)))
-    for name in ("thirdhand", "numpy", "scipy", "pin", "ruckig", "msgspec", "mcap", "eclipse-zenoh"):
+    for name in (
+        "thirdhand",
+        "numpy",
+        "scipy",
+        "pin",
+        "ruckig",
+        "msgspec",
+        "mcap",
+        "eclipse-zenoh",
+    ):
         with contextlib.suppress(packages.PackageNotFoundError):
             facts[name] = packages.version(name)
     return facts
@@ -103,7 +119,9 @@ class McapFile:
     the file then holds everything written before.
     """
 
-    def __init__(self, path: Path, *, joints: int, attached: bool = True, compressed: bool = True) -> None:
+    def __init__(
+        self, path: Path, *, joints: int, attached: bool = True, compressed: bool = True
+    ) -> None:
         """`joints` is the arm's number of joints, on which the schemas depend.
 
         A file without attachments and metadata (`attached` False) has no index of them, because its
@@ -134,7 +152,9 @@ class McapFile:
         """Number of written bytes."""
         return self._stream.tell()
 
-    def put(self, topic: str, kind: str, data: bytes, time_ns: int, sequence: int, *, qos: str = "") -> None:
+    def put(
+        self, topic: str, kind: str, data: bytes, time_ns: int, sequence: int, *, qos: str = ""
+    ) -> None:
         """Write one CDR message of the type `kind`."""
         channel = self._channels.get(topic)
         if channel is None:
@@ -142,14 +162,18 @@ class McapFile:
                 self._schemas[kind] = self.writer.register_schema(
                     kind, "ros2msg", schema(kind, self._definitions).encode()
                 )
-            channel = self.writer.register_channel(topic, "cdr", self._schemas[kind], {"offered_qos_profiles": qos})
+            channel = self.writer.register_channel(
+                topic, "cdr", self._schemas[kind], {"offered_qos_profiles": qos}
+            )
             self._channels[topic] = channel
         self.writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
         self._unflushed += len(data)
 
     def attach(self, name: str, data: bytes, time_ns: int) -> None:
         """Attach a file; its media type follows from the suffix of its name."""
-        self.writer.add_attachment(time_ns, time_ns, name, _MEDIA.get(Path(name).suffix, _BYTES), data)
+        self.writer.add_attachment(
+            time_ns, time_ns, name, _MEDIA.get(Path(name).suffix, _BYTES), data
+        )
 
     def part_ends(self) -> None:
         """End the chunk here if it is large enough."""

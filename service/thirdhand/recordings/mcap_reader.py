@@ -33,9 +33,21 @@ _BEFORE_COMPRESSION = _HEAD.size + 28  # [bytes] offset of the name of the compr
 _BLOCK = 1 << 20
 _NAMING = {
     int(kind): record
-    for kind, record in ((Opcode.SCHEMA, Schema), (Opcode.CHANNEL, Channel), (Opcode.METADATA, Metadata))
+    for kind, record in (
+        (Opcode.SCHEMA, Schema),
+        (Opcode.CHANNEL, Channel),
+        (Opcode.METADATA, Metadata),
+    )
 }
-_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, LookupError, OverflowError, MemoryError)
+_BROKEN = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+)
 
 
 class FileFault(NamedTuple):
@@ -102,16 +114,23 @@ class _Reading:
     """One pass over a file."""
 
     def __init__(self, stream: IO[bytes], faults: list[FileFault]) -> None:
-        self._stream, self._faults = stream, faults
+        self._stream = stream
+        self._faults = faults
         self._size = stream.seek(0, 2)
-        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))  # None after damage
+        self._checksum: int | None = zlib.crc32(
+            self._bytes(0, len(MCAP0_MAGIC))
+        )  # None after damage
         self._chunked = False
         self.at = 0  # first byte of the record that is read
         closing = self._size - len(MCAP0_MAGIC)
-        self._closed = closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
+        self._closed = (
+            closing >= len(MCAP0_MAGIC) and self._bytes(closing, len(MCAP0_MAGIC)) == MCAP0_MAGIC
+        )
         self._footer_at = closing - _FOOTER.size
         self._footer = self._bytes(self._footer_at, _FOOTER.size) if self._footer_at > 0 else b""
-        self._closed = self._closed and self._footer[:9] == _HEAD.pack(Opcode.FOOTER, _FOOTER.size - _HEAD.size)
+        self._closed = self._closed and self._footer[:9] == _HEAD.pack(
+            Opcode.FOOTER, _FOOTER.size - _HEAD.size
+        )
 
     def named_in_summary(self) -> Iterator[McapRecord]:
         """The schemas and channels in the file's summary, if that is intact: they are needed if the
@@ -147,13 +166,17 @@ class _Reading:
                 resume_at = self._resume_at(offset, end)
                 why = str(error) or type(error).__name__
                 if resume_at is None:
-                    self._faults.append(FileFault(not self._closed, offset, self._size - offset, why))
+                    self._faults.append(
+                        FileFault(not self._closed, offset, self._size - offset, why)
+                    )
                     return
                 self._faults.append(FileFault(False, offset, resume_at - offset, why))
                 offset = resume_at
                 continue
             if self._checksum is not None:
-                self._checksum = zlib.crc32(content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum))
+                self._checksum = zlib.crc32(
+                    content, zlib.crc32(_HEAD.pack(opcode, len(content)), self._checksum)
+                )
             yield from entries
             if opcode == Opcode.DATA_END:
                 self._end(end)
@@ -191,7 +214,10 @@ class _Reading:
         if opcode == Opcode.DATA_END:
             recorded = DataEnd.read(stream).data_section_crc
             if recorded and self._checksum is not None and recorded != self._checksum:
-                why = "the checksum over all data is wrong, and those of chunks and attachments are right"
+                why = (
+                    "the checksum over all data is wrong, and those of chunks and attachments are "
+                    "right"
+                )
                 self._faults.append(FileFault(False, 0, self._stream.tell(), why))
             return []
         if opcode not in _NAMING:
@@ -228,7 +254,9 @@ class _Reading:
         if self._closed:
             _, _, start, _, checksum = _FOOTER.unpack(self._footer)
             if checksum and start and not self._summary():
-                self._faults.append(FileFault(False, at, self._size - at, "the summary's checksum is wrong"))
+                self._faults.append(
+                    FileFault(False, at, self._size - at, "the summary's checksum is wrong")
+                )
         else:
             whole = self._footer[:1] == bytes([Opcode.FOOTER])
             why = "the closing bytes are not those of MCAP" if whole else "nothing closes the file"
@@ -250,11 +278,16 @@ def _records_in(chunk: Chunk) -> list[McapRecord]:
     if chunk.compression == "zstd":
         size = max(size, zstandard.frame_content_size(chunk.data))
     elif chunk.compression == "lz4":  # its frame need not name its size
-        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK_BYTES + 1)
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(
+            chunk.data, max_length=LARGEST_CHUNK_BYTES + 1
+        )
         chunk = replace(chunk, compression="", data=unpacked)
         size = len(unpacked)
     if size > LARGEST_CHUNK_BYTES:
-        raise ValueError(f"a chunk of more than {LARGEST_CHUNK_BYTES >> 20} MiB is not unpacked: recorders write less")
+        raise ValueError(
+            f"a chunk of more than {LARGEST_CHUNK_BYTES >> 20} MiB is not unpacked: recorders "
+            "write less"
+        )
     return breakup_chunk(chunk, validate_crc=True)
 
 

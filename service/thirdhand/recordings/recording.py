@@ -37,14 +37,21 @@ from thirdhand.settings.config import Settings, robot_description, without_secre
 
 OBJECTS_NOTE = "objects"
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
-DECISIONS = ("mode", "reason", "flags", "commanded", "segment")  # a frame that changes one of these is kept
+DECISIONS = (
+    "mode",
+    "reason",
+    "flags",
+    "commanded",
+    "segment",
+)  # a frame that changes one of these is kept
 NOTED_US = 1000.0  # the timing of a tick that begins or ends this late is kept
 SHOWN_HZ = 10.0  # rate of what other tools show, in a thin recording; a replay makes it anew
 STATE_EVERY_S = 10.0  # interval of states in a thin recording; each takes 60 kB
 FORMAT = "2"  # a recording with another layout of State or Frame cannot be replayed
 _LATCHED_QOS = (
-    "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, avoid_ros_namespace_conventions: false, "
-    "deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: 0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
+    "[{history: 1, depth: 1, reliability: 1, durability: 1, liveliness: 1, "
+    "avoid_ros_namespace_conventions: false, deadline: {sec: 0, nsec: 0}, lifespan: {sec: 0, nsec: "
+    "0}, liveliness_lease_duration: {sec: 0, nsec: 0}}]"
 )
 
 
@@ -74,23 +81,35 @@ class Recorder(McapFile):
         thin: bool = False,
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
-        self._settings, self.skill, self._state = settings, skill, state  # `skill` is the file of the skill in force
-        self._begun, self._sequence = False, 0
+        # `skill` is the file of the skill in force
+        self._settings = settings
+        self.skill = skill
+        self._state = state
+        self._begun = False
+        self._sequence = 0
         self._every = self._shown_every = self._state_every = 1  # [ticks]
         self._types: dict[str, str] = {}  # of messages whose type differs from the table's
         self._tf_every = channels.BY_KEY["/tf"].every
         if thin:
-            self._every, self._state_every = settings.frame_every, round(STATE_EVERY_S * settings.rate_hz)
+            self._every = settings.frame_every
+            self._state_every = round(STATE_EVERY_S * settings.rate_hz)
             self._shown_every = self._every * max(1, round(settings.recording.frames_hz / SHOWN_HZ))
-            self._types, self._tf_every = {"tick": channels.CHECKED_TICK.type}, self._shown_every
+            self._types = {"tick": channels.CHECKED_TICK.type}
+            self._tf_every = self._shown_every
         self._decided: tuple[int, ...] = ()  # the newest frame's DECISIONS
         self._state_from = 0  # a state is due from this tick on
         self._frames = Frames(settings, self._urdf)
         self._topics = {
-            channel.key: channels.topic(settings.cell, channel.key) for channel in channels.CHANNELS if channel.recorded
+            channel.key: channels.topic(settings.cell, channel.key)
+            for channel in channels.CHANNELS
+            if channel.recorded
         }
         super().__init__(Path(path), joints=len(settings.joints.names), compressed=not checksums)
-        about = {"format": FORMAT, "cell": settings.cell, **(machine() if metadata is None else metadata)}
+        about = {
+            "format": FORMAT,
+            "cell": settings.cell,
+            **(machine() if metadata is None else metadata),
+        }
         about |= {f"constants of {stage}": digest for stage, digest in (constants or {}).items()}
         self.kept = self.pending = 0  # number of ticks in the file, and in the unfinished chunk
         try:
@@ -109,7 +128,12 @@ class Recorder(McapFile):
         message.
         """
         self._begun = True
-        self._put("/robot_description", cdr.encode_string(with_markers(self._urdf)), time_ns, qos=_LATCHED_QOS)
+        self._put(
+            "/robot_description",
+            cdr.encode_string(with_markers(self._urdf)),
+            time_ns,
+            qos=_LATCHED_QOS,
+        )
         if self._state is not None:
             self._put("state", encode(self._state), time_ns)
 
@@ -139,7 +163,8 @@ class Recorder(McapFile):
         """
         if not self._begun:
             self._begin(time_ns)
-        put, self._sequence = self._put, tick.index
+        put = self._put
+        self._sequence = tick.index
         self.pending += 1
         kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
         checked = checksum(frame) if self._types and frame is not None else None
@@ -175,7 +200,8 @@ class Recorder(McapFile):
         """True if the frame is recorded as a whole."""
         if self._every == 1:
             return True
-        before, self._decided = self._decided, tuple(int(frame[name]) for name in DECISIONS)
+        before = self._decided
+        self._decided = tuple(int(frame[name]) for name in DECISIONS)
         return bool(lost) or self._decided != before or int(frame["tick"]) % self._every == 0
 
     def note(self, key: str, text: str, time_ns: int) -> None:
@@ -183,7 +209,9 @@ class Recorder(McapFile):
         under `objects`. A replay ignores it.
         """
         if key in REPLAYED:
-            raise ValueError(f"a note under {key!r}: this topic is reserved for the data of a replay")
+            raise ValueError(
+                f"a note under {key!r}: this topic is reserved for the data of a replay"
+            )
         if not self._begun:
             self._begin(time_ns)
         if key == OBJECTS_NOTE:
@@ -203,7 +231,8 @@ class Recorder(McapFile):
 
     def flush(self) -> None:
         super().flush()
-        self.kept, self.pending = self.kept + self.pending, 0
+        self.kept = self.kept + self.pending
+        self.pending = 0
 
     def close(self) -> None:
         if not self.closed and not self._begun and self._state is not None:
@@ -222,9 +251,12 @@ def _take_hint(path: Path) -> str:
     """The end of an error message for a file that is a take: the command that shows it."""
     contents = _summary_of(path)
     topics = [f"/{channel.topic}" for channel in contents.channels.values()] if contents else []
-    if path.suffix != ".mcap" or not all(any(t.endswith(f"/{end}") for t in topics) for end in TAKE_KEYS.values()):
+    if path.suffix != ".mcap" or not all(
+        any(t.endswith(f"/{end}") for t in topics) for end in TAKE_KEYS.values()
+    ):
         return ""
-    name, folder = shlex.quote(path.stem), shlex.quote(str(path.parent))
+    name = shlex.quote(path.stem)
+    folder = shlex.quote(str(path.parent))
     return f"; it is a take: thirdhand record {name} --folder {folder} --show --plot {name}.png"
 
 
@@ -232,14 +264,24 @@ class Recording:
     """A recording on disk: its settings, its skill, and its steps."""
 
     def __init__(
-        self, path: Path, settings: Settings, attached: Mapping[str, bytes], metadata: dict[str, str], damage: str
+        self,
+        path: Path,
+        settings: Settings,
+        attached: Mapping[str, bytes],
+        metadata: dict[str, str],
+        damage: str,
     ) -> None:
-        self.path, self.settings, self.metadata, self.truncated = path, settings, metadata, ends_early(path)
+        self.path = path
+        self.settings = settings
+        self.metadata = metadata
+        self.truncated = ends_early(path)
         self.skill = attached.get("skill.npz", b"")  # empty if it is damaged, and so is `urdf`
         self.urdf = attached.get("arm.urdf", b"").decode(errors="replace")
         self._damage = damage  # before the first message
         checksums = attached.get(CHECKSUMS, b"")
-        self.checksums = dict(enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist()))
+        self.checksums = dict(
+            enumerate(np.frombuffer(checksums, "<u4", len(checksums) // 4).tolist())
+        )
         self.faults: list[FileFault] = []  # complete once all steps are read
 
     @classmethod
@@ -248,28 +290,38 @@ class Recording:
         path = existing(path)
         messages = Messages(path)
         next(iter(messages), None)
-        about, parts = messages.metadata.get("thirdhand"), messages.attachments
+        about = messages.metadata.get("thirdhand")
+        parts = messages.attachments
         is_cut = any(fault.cut for fault in messages.faults)
-        needed = ["settings.json"]  # of a file that is damaged; one that is cut has no ticks for a report
+        needed = [
+            "settings.json"
+        ]  # of a file that is damaged; one that is cut has no ticks for a report
         if is_cut or not messages.faults:
             needed += ["skill.npz", *(["arm.urdf"] if is_cut else [])]
         if about is None or any(name not in parts for name in needed):
             if is_cut:
-                raise RecordingError(f"{path} is cut before its first message ({messages.faults[-1].why})")
+                raise RecordingError(
+                    f"{path} is cut before its first message ({messages.faults[-1].why})"
+                )
             if messages.faults:
-                raise RecordingError(f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}")
+                raise RecordingError(
+                    f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}"
+                )
             raise RecordingError(
-                f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are not attached"
-                + _take_hint(path)
+                f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are "
+                "not attached" + _take_hint(path)
             )
         if about.get("format") != FORMAT:
             raise RecordingError(
-                f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by another version?"
+                f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by "
+                "another version?"
             )
         try:
             settings = validated(msgspec.json.decode(parts["settings.json"]), Settings)
         except (msgspec.DecodeError, InvalidError) as error:
-            raise RecordingError(f"the settings in {path} are not valid: {in_words(error, named=False)}") from None
+            raise RecordingError(
+                f"the settings in {path} are not valid: {in_words(error, named=False)}"
+            ) from None
         return cls(path, settings, parts, about, "; ".join(map(str, messages.faults)))
 
     def require_whole(self) -> Self:
@@ -277,15 +329,20 @@ class Recording:
         lacking = [name for name, part in (("skill", self.skill), ("arm", self.urdf)) if not part]
         if lacking and self._damage:
             part_names = " and ".join(lacking)
-            raise RecordingError(f"{self.path} lacks its {part_names}; only a report does without: {self._damage}")
+            raise RecordingError(
+                f"{self.path} lacks its {part_names}; only a report does without: {self._damage}"
+            )
         return self
 
     def ticks(self) -> int | None:
         """The number of ticks in the file's summary; None if the summary is missing."""
-        topics, contents = channels.keys_by_topic(self.settings.cell, ("tick",)), _summary_of(self.path)
+        topics = channels.keys_by_topic(self.settings.cell, ("tick",))
+        contents = _summary_of(self.path)
         if contents is None or contents.statistics is None:
             return None
-        numbers = [number for number, channel in contents.channels.items() if channel.topic in topics]
+        numbers = [
+            number for number, channel in contents.channels.items() if channel.topic in topics
+        ]
         return sum(contents.statistics.channel_message_counts.get(number, 0) for number in numbers)
 
     def steps(self, *, outputs: bool = True, whole: bool = True) -> Iterator[Step]:
@@ -297,20 +354,26 @@ class Recording:
         """
         if outputs and whole and self.checksums:
             raise RecordingError(
-                f"{self.path} has checksums instead of frames: thirdhand replay {shlex.quote(str(self.path))} "
-                "--output whole.mcap writes a recording with all frames"
+                f"{self.path} has checksums instead of frames: thirdhand replay "
+                f"{shlex.quote(str(self.path))} --output whole.mcap writes a recording with all "
+                "frames"
             )
         messages = Messages(self.path)
         whole = not self.checksums
         yield from steps(messages, self.settings, outputs=outputs, whole=whole)
-        self.faults = [*messages.faults, *(fault for fault in self.faults if fault not in messages.faults)]
+        self.faults = [
+            *messages.faults,
+            *(fault for fault in self.faults if fault not in messages.faults),
+        ]
         self.truncated = any(fault.cut for fault in messages.faults)
 
     def unreported(self, gaps: Iterable[Gap], *, last: int | None) -> list[str]:
         """Messages on the faults that no gap names, once all steps are read up to tick `last`."""
         reported = "".join(gap.why for gap in gaps)
         read = "no tick was read" if last is None else f"the last tick read is {last}"
-        return [f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported]
+        return [
+            f"{self.path}: {fault}; {read}" for fault in self.faults if str(fault) not in reported
+        ]
 
     def images(self) -> Iterator[tuple[str, CompressedImage, int]]:
         """Key, image and time of arrival [ns] of each image, in order."""
@@ -329,8 +392,14 @@ class Recording:
             if (key := topics.get(channel.topic)) is None:
                 continue
             try:
-                content = channels.BY_KEY[key].codec.decode(message.data) if key == OBJECTS_NOTE else None
-                text = cdr.decode_string(message.data) if content is None else msgspec.json.encode(content).decode()
+                content = (
+                    channels.BY_KEY[key].codec.decode(message.data) if key == OBJECTS_NOTE else None
+                )
+                text = (
+                    cdr.decode_string(message.data)
+                    if content is None
+                    else msgspec.json.encode(content).decode()
+                )
             except WireError as error:
                 messages.refuse(channel.topic, message, error)
                 self.faults.append(messages.faults[-1])

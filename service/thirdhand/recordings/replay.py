@@ -21,7 +21,14 @@ from thirdhand.recordings.steps import Gap, Step, checksum
 from thirdhand.settings.whole_file import whole
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
 
-MACHINE = ("cpu", "features", "libc", "kernel", "numpy", "blas")  # what the last bits of a result depend on
+MACHINE = (
+    "cpu",
+    "features",
+    "libc",
+    "kernel",
+    "numpy",
+    "blas",
+)  # what the last bits of a result depend on
 REPLAY_TOLERANCE = 1e-5  # [m, rad] other versions of a library may differ by this
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
 
@@ -52,7 +59,9 @@ class Replay:
     joined: int = 0
     first_difference: str = ""
     largest: dict[str, float] = field(default_factory=dict)
-    differing: set[str] = field(default_factory=set)  # stages whose constants are not those of the recording
+    differing: set[str] = field(
+        default_factory=set
+    )  # stages whose constants are not those of the recording
     recorded_on: str = ""
     here: str = ""
 
@@ -65,7 +74,9 @@ class Replay:
     @property
     def within_tolerance(self) -> bool:
         """True if all recorded positions are within 10 µm and 10 µrad."""
-        return self.ticks > 0 and all(self.largest.get(name, 0.0) <= REPLAY_TOLERANCE for name in POSITION_FIELDS)
+        return self.ticks > 0 and all(
+            self.largest.get(name, 0.0) <= REPLAY_TOLERANCE for name in POSITION_FIELDS
+        )
 
     def passes(self, *, exact: bool) -> bool:
         """True if the replay is exact, or within tolerance where that suffices."""
@@ -81,10 +92,18 @@ class Replay:
             lines.append("nothing was compared: the recording has no state to start from")
         if self.first_difference:
             lines.append(self.first_difference)
-            largest = ", ".join(f"{name} {value:.3g}" for name, value in sorted(self.largest.items()))
-            lines.append(f"largest differences: {largest or 'none in the frames that are recorded completely'}")
+            largest = ", ".join(
+                f"{name} {value:.3g}" for name, value in sorted(self.largest.items())
+            )
+            lines.append(
+                "largest differences: "
+                f"{largest or 'none in the frames that are recorded completely'}"
+            )
             if self.differing:
-                lines.append(f"the constants of {', '.join(sorted(self.differing))} are not those of the recording")
+                lines.append(
+                    f"the constants of {', '.join(sorted(self.differing))} are not those of the "
+                    "recording"
+                )
             if self.recorded_on != self.here:
                 lines.append(f"recorded on {self.recorded_on}; this is {self.here}")
         return "\n".join(lines)
@@ -107,13 +126,17 @@ def replay(
     """
     recordings = [Recording.open(path).require_whole() for path in (first, *more)]
     if output is not None and (more or output.resolve() == Path(first).resolve()):
-        raise RecordingError(f"--output {output}: a file other than the recording, and a single recording, needed")
+        raise RecordingError(
+            f"--output {output}: a file other than the recording, and a single recording, needed"
+        )
     result = Replay(recorded_on=_named(recordings[0].metadata), here=_named(machine()))
     before: Step | None = None
     with threadpool_limits(1), whole(output) if output else contextlib.nullcontext() as part:
         for i, recording in enumerate(recordings):
             before = _Comparison(recording, result, after, before, i > 0, progress, part).compared()
-            result.faults += recording.unreported(result.missing, last=None if before is None else before.tick)
+            result.faults += recording.unreported(
+                result.missing, last=None if before is None else before.tick
+            )
             result.truncated = result.truncated or recording.truncated
     return result
 
@@ -146,7 +169,9 @@ class _Skills:
         try:
             if kind == "skill":
                 return Event(kind, payload, self.decoded(payload))
-            return Event(kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None)
+            return Event(
+                kind, payload, channel.codec.decode(payload) if channel.direction == "in" else None
+            )
         except SkillError as error:
             raise RecordingError(f"an event of kind {kind!r} is not readable: {error}") from None
 
@@ -168,14 +193,19 @@ class _Comparison:
     def __post_init__(self) -> None:
         self._skills, self._steps = _Skills(self.recording), self.recording.steps(whole=False)
 
-    def _anew(self, skill: StoredSkill, start: Step) -> contextlib.AbstractContextManager[Recorder | None]:
+    def _anew(
+        self, skill: StoredSkill, start: Step
+    ) -> contextlib.AbstractContextManager[Recorder | None]:
         """A context with the recorder of the new frames; None if they are not recorded."""
         if self.output is None:
             return contextlib.nullcontext()
         if self.result.missing:
             raise RecordingError(f"--output cannot be written: {self.result.missing[-1]}")
-        settings, urdf = self.recording.settings, self.recording.urdf
-        return Recorder(self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf)
+        settings = self.recording.settings
+        urdf = self.recording.urdf
+        return Recorder(
+            self.output, settings=settings, skill=skill.file, state=start.state, urdf=urdf
+        )
 
     def compared(self) -> Step | None:
         """Compare all steps and return the last one."""
@@ -185,8 +215,11 @@ class _Comparison:
         while start is not None:
             skill = self._skills.in_force(start)
             assert skill is not None
-            self._controller = Controller(self.recording.settings, skill, start.state, urdf=self.recording.urdf)
-            self.last, self.gap_at = start, None
+            self._controller = Controller(
+                self.recording.settings, skill, start.state, urdf=self.recording.urdf
+            )
+            self.last = start
+            self.gap_at = None
             for stage, digest in self._controller.constants.items():
                 if self.recording.metadata.get(f"constants of {stage}", digest) != digest:
                     self.result.differing.add(stage)
@@ -197,7 +230,8 @@ class _Comparison:
 
     def _begins(self, start: Step) -> bool:
         """True if the replay can start from the first step; notes the ticks missing before it."""
-        before, result = self.last, self.result
+        before = self.last
+        result = self.result
         self._skills.events(start)
         joins = (
             before is not None
@@ -208,7 +242,11 @@ class _Comparison:
         if joins:
             result.joined += 1
         elif self.follows or start.lost or start.damage:
-            why = "" if start.lost else start.damage or f"{self.recording.path.name} does not continue the one before"
+            why = (
+                ""
+                if start.lost
+                else start.damage or f"{self.recording.path.name} does not continue the one before"
+            )
             self._note(start, why)
         return start.state is not None and self.after is None and self._resumes(start)
 
@@ -246,7 +284,8 @@ class _Comparison:
             assert self.last is not None
             if step.tick <= self.last.tick:
                 raise RecordingError(
-                    f"{self.recording.path}: tick {step.tick} comes after tick {self.last.tick}; growing ticks needed"
+                    f"{self.recording.path}: tick {step.tick} comes after tick {self.last.tick}; "
+                    "growing ticks needed"
                 )
             if step.lost or step.damage:
                 self._note(step, step.damage)
@@ -258,24 +297,40 @@ class _Comparison:
 
     def compare(self, tick: Tick, frame: Frame) -> None:
         """Compare the newest tick's frame, and the state after it, with the recorded ones."""
-        step, result, checksums = self.last, self.result, self.recording.checksums
+        step = self.last
+        result = self.result
+        checksums = self.recording.checksums
         assert step is not None
         different = {} if step.frame is None else differences(step.frame, frame)
-        state = self._controller.state if step.state is not None or (checksums and step.frame is not None) else None
+        state = (
+            self._controller.state
+            if step.state is not None or (checksums and step.frame is not None)
+            else None
+        )
         if step.state is not None and state is not None:
-            different |= {f"state.{name}": value for name, value in differences(step.state, state).items()}
+            different |= {
+                f"state.{name}": value for name, value in differences(step.state, state).items()
+            }
         outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
-        is_same = not different and (not checksums or checksums.get(tick.index) == checksum(frame, outputs, state))
+        is_same = not different and (
+            not checksums or checksums.get(tick.index) == checksum(frame, outputs, state)
+        )
         is_same = is_same and step.checksum in (None, checksum(frame))
         if self.recorder:
-            self.recorder.write(tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs)
+            self.recorder.write(
+                tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs
+            )
         result.ticks += 1
         result.identical += is_same
         if not is_same and not result.first_difference:
             fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
-            result.first_difference = f"first difference at tick {tick.index}: {fields or 'its checksum'}"
+            result.first_difference = (
+                f"first difference at tick {tick.index}: {fields or 'its checksum'}"
+            )
         for name, value in different.items():
-            result.largest[name] = max(result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf)
+            result.largest[name] = max(
+                result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf
+            )
         if self.progress is not None and result.ticks % 1000 == 0:
             self.progress(result.ticks)
 
@@ -288,4 +343,7 @@ def ticks(recording: Recording) -> Iterator[Tick]:
 
 
 def _named(metadata: dict[str, str]) -> str:
-    return ", ".join(f"{name} {metadata[name]}" for name in MACHINE if name in metadata) or "an unnamed machine"
+    return (
+        ", ".join(f"{name} {metadata[name]}" for name in MACHINE if name in metadata)
+        or "an unnamed machine"
+    )

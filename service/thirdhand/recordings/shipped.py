@@ -20,7 +20,8 @@ ARMS = ("wam", "franka", "ur5")  # arms of the shipped cells
 def recordings() -> Path:
     """The folder of the shipped recordings and their skill."""
     package = Path(__file__).parents[1]
-    installed, cloned = package / "shipped", package.parents[1] / "recordings"
+    installed = package / "shipped"
+    cloned = package.parents[1] / "recordings"
     return installed if installed.is_dir() else cloned
 
 
@@ -31,7 +32,9 @@ def skill_file(settings: Settings) -> Path:
 
 def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
-    from thirdhand.skills.skill_file import skill_in  # its import is slow, and most commands do not need it
+    from thirdhand.skills.skill_file import (
+        skill_in,
+    )  # its import is slow, and most commands do not need it
 
     return skill_in(recordings() / SHIPPED_SKILL)
 
@@ -53,5 +56,7 @@ def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
     if colon and path.endswith(".toml"):
         return load(Path(path), cell)
     if not Path(arm).suffix and not Path(arm).exists():
-        raise UnreadableError(f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed")
+        raise UnreadableError(
+            f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed"
+        )
     return load(Path(arm))

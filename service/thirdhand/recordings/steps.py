@@ -11,7 +11,16 @@ from typing import Any, NamedTuple
 
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import WireError
-from thirdhand.core.frame import TIMING, Frame, Outputs, Record, decode, encode, frame_layout, state_layout
+from thirdhand.core.frame import (
+    TIMING,
+    Frame,
+    Outputs,
+    Record,
+    decode,
+    encode,
+    frame_layout,
+    state_layout,
+)
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.recordings.mcap_reader import Messages
 from thirdhand.settings.config import Settings
@@ -56,7 +65,11 @@ class Gap:
     def __str__(self) -> str:
         where = "before the first tick" if self.after is None else f"after tick {self.after}"
         if self.before is not None:
-            where = f"before tick {self.before}" if self.after is None else f"{where}, before tick {self.before}"
+            where = (
+                f"before tick {self.before}"
+                if self.after is None
+                else f"{where}, before tick {self.before}"
+            )
         lost = f"{self.lost} tick{'s' * (self.lost != 1)} not recorded" if self.lost else ""
         return f"gap {where}: {'; '.join(part for part in (lost, self.why) if part)}"
 
@@ -65,7 +78,11 @@ def checksum(frame: Frame, outputs: Outputs = (), state: Record | None = None) -
     """A checksum (32 bits) of a tick's frame, and of its published messages and the state after it
     if given.
     """
-    parts = (encode(frame), *(payload for _, payload in outputs), b"" if state is None else encode(state))
+    parts = (
+        encode(frame),
+        *(payload for _, payload in outputs),
+        b"" if state is None else encode(state),
+    )
     return zlib.crc32(b"".join(parts))
 
 
@@ -81,7 +98,8 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
     joints = len(settings.joints.names)
     layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
     step: dict[str, Any] | None = None
-    fault_count, damage = 0, ""
+    fault_count = 0
+    damage = ""
     refused: set[str] = set()  # keys of which a message was not decoded
     readable: set[str] = set()  # keys of which a message was decoded
 
@@ -89,7 +107,8 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
         """The step in progress, unless a part of it is damaged or cut."""
         if step is None:
             return
-        numbers, came = step.pop("kinds"), [kind for kind, _ in step["events"]]
+        numbers = step.pop("kinds")
+        came = [kind for kind, _ in step["events"]]
         lacks_frame = outputs and whole and "frame" not in step and step["checksum"] is None
         if len(messages.faults) > fault_count and (len(came) != len(numbers) or lacks_frame):
             return
@@ -104,7 +123,8 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
             if len(messages.faults) > fault_count:
                 yield from finished()
                 damage = "; ".join(str(fault) for fault in messages.faults[fault_count:])
-                step, fault_count = None, len(messages.faults)
+                step = None
+                fault_count = len(messages.faults)
             name = names.get(channel.topic)
             if name is None or (name in _RECORDS and not outputs):
                 continue
@@ -121,8 +141,16 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
             if name == "tick":
                 yield from finished()
                 index, kinds, lost, recorded_sum = value
-                step = {"tick": index, "kinds": kinds, "events": [], "lost": lost, "time_ns": message.log_time}
-                step["damage"], step["checksum"], damage = damage, recorded_sum, ""
+                step = {
+                    "tick": index,
+                    "kinds": kinds,
+                    "events": [],
+                    "lost": lost,
+                    "time_ns": message.log_time,
+                }
+                step["damage"] = damage
+                step["checksum"] = recorded_sum
+                damage = ""
             elif step is None:
                 if name == "state":
                     yield Step(int(value["tick"]), state=value, damage=damage)
@@ -135,7 +163,9 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
                 step["events"].append((name, value))
         yield from finished()
     except WireError as error:
-        raise RecordingError(f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}") from None
+        raise RecordingError(
+            f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}"
+        ) from None
 
 
 def _value(name: str, data: bytes, layouts: dict[str, Any]) -> Any:
@@ -154,5 +184,7 @@ def _value(name: str, data: bytes, layouts: dict[str, Any]) -> Any:
 
 def _kind(number: int) -> str:
     if number not in channels.EVENT_KINDS:
-        raise WireError(f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known")
+        raise WireError(
+            f"a Tick with an event of kind {number}; {len(channels.EVENT_KINDS)} are known"
+        )
     return channels.EVENT_KINDS[number]

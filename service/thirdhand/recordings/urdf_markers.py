@@ -25,12 +25,15 @@ def with_markers(urdf: str) -> str:
     head, end, tail = urdf.rpartition("</robot>")
     if not end or any(f'name="{frame}"' in urdf for frame, _, _ in MARKERS):
         return urdf
-    links, root = [], Urdf(urdf).root
+    links = []
+    root = Urdf(urdf).root
     for frame, colour, radius in MARKERS:
         red, green, blue = (value / 255 for value in colour)
         links.append(
             f'  <link name="{frame}"><visual><geometry><sphere radius="{radius}"/></geometry>'
-            f'<material name="{frame}"><color rgba="{red:.3f} {green:.3f} {blue:.3f} 1"/></material></visual></link>\n'
-            f'  <joint name="{frame}_at" type="floating"><parent link="{root}"/><child link="{frame}"/></joint>\n'
+            f'<material name="{frame}"><color rgba="{red:.3f} {green:.3f} {blue:.3f} '
+            '1"/></material></visual></link>\n'
+            f'  <joint name="{frame}_at" type="floating"><parent link="{root}"/><child '
+            f'link="{frame}"/></joint>\n'
         )
     return f"{head}{''.join(links)}{end}{tail}"

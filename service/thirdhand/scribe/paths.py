@@ -32,7 +32,9 @@ def named_after(cell: str, folder: Path) -> list[Path]:
     OSError.
     """
     names = re.compile(re.escape(stem_of(cell)) + r"-\d{8}T\d{6}Z(-2)*")
-    paths = sorted(folder.iterdir()) if folder.exists() else []  # iterdir reports a folder that cannot be read
+    paths = (
+        sorted(folder.iterdir()) if folder.exists() else []
+    )  # iterdir reports a folder that cannot be read
     return [path for path in paths if path.suffix == ".mcap" and names.fullmatch(path.stem)]
 
 
@@ -42,10 +44,15 @@ def _ages_s(changed: list[float], longest_gap_s: float) -> list[float]:
     set meanwhile. No file is older than the time since its change, unless that is in the future.
     """
     now_s = time.time()
-    gaps = [min(max(0.0, end - begin), longest_gap_s) for begin, end in itertools.pairwise([*changed, now_s])]
+    gaps = [
+        min(max(0.0, end - begin), longest_gap_s)
+        for begin, end in itertools.pairwise([*changed, now_s])
+    ]
     ages_s = list(itertools.accumulate(gaps[::-1]))[::-1]
     since_s = [now_s - change for change in changed]
-    return [age if since < 0.0 else min(age, since) for age, since in zip(ages_s, since_s, strict=True)]
+    return [
+        age if since < 0.0 else min(age, since) for age, since in zip(ages_s, since_s, strict=True)
+    ]
 
 
 class RecordingPaths:
@@ -55,7 +62,9 @@ class RecordingPaths:
     `recording`, with a number from the second on.
     """
 
-    def __init__(self, settings: Settings, folder: str | None, recording: str | None, *, attempt: int = 1) -> None:
+    def __init__(
+        self, settings: Settings, folder: str | None, recording: str | None, *, attempt: int = 1
+    ) -> None:
         self._settings = settings
         self._folder = None if folder is None else Path(folder)
         self._explicit = None if recording is None else Path(recording)
@@ -70,13 +79,16 @@ class RecordingPaths:
         path = self._explicit
         if self._folder is None:
             while path is not None:
-                number, self._number = self._number, self._number + 1
+                number = self._number
+                self._number = self._number + 1
                 numbered = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
                 if number == 1 or not numbered.exists():
                     return numbered
             return None
         stamp = max(datetime.now(UTC).replace(microsecond=0), self._newest + timedelta(seconds=1))
-        while (path := self._folder / f"{stem_of(self._settings.cell)}-{stamp:%Y%m%dT%H%M%SZ}.mcap").exists():
+        while (
+            path := self._folder / f"{stem_of(self._settings.cell)}-{stamp:%Y%m%dT%H%M%SZ}.mcap"
+        ).exists():
             stamp += timedelta(seconds=1)
         self._newest = stamp
         return path

@@ -46,11 +46,15 @@ from thirdhand.settings.config import urdf_path
 if TYPE_CHECKING:
     from thirdhand.viewer.stream import Viewer
 
-CATCH_UP_NICE = 0  # a recording that is behind has an ordinary weight, so that an arm's driver does not wait for it
-MAX_WAITING = 10_000  # with more messages the socket fills, then the queue of the loop, and then ticks are lost
+# a recording that is behind has an ordinary weight, so that an arm's driver does not wait for it
+CATCH_UP_NICE = 0
+# with more messages the socket fills, then the queue of the loop, and then ticks are lost
+MAX_WAITING = 10_000
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
 LIVE_END_S = 8.0  # a live view that does not end within this time is abandoned
-MAX_WAITING_FRAMES = 2500  # with more frames and images waiting for the live view, new ones are left out
+MAX_WAITING_FRAMES = (
+    2500  # with more frames and images waiting for the live view, new ones are left out
+)
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, for which frames are
@@ -72,16 +76,22 @@ class LiveView:
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
-        self.url: str | None = ""  # the address; empty while the view starts, None once it has failed
+        self.url: str | None = (
+            ""  # the address; empty while the view starts, None once it has failed
+        )
         self.problems: list[str] = []
         self.left_out = 0  # number of frames and images
         self.is_paused = True
         self._waiting: deque[Callable[[Viewer], object]] = deque()
         self._outcome = (-1, -1)  # mode and reason of the newest frame
-        self._gap = 0  # number of frames and images that were left out last, and are not in the log yet
+        self._gap = (
+            0  # number of frames and images that were left out last, and are not in the log yet
+        )
         self._overflows = False
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._draw, args=(make,), name="live view", daemon=True)
+        self._thread = threading.Thread(
+            target=self._draw, args=(make,), name="live view", daemon=True
+        )
         self._thread.start()
 
     def put(self, act: Callable[[Viewer], object]) -> None:
@@ -103,7 +113,10 @@ class LiveView:
                     self.put(lambda viewer, skill=payload: viewer.learn(skill))  # type: ignore[misc]
             return
         if self._gap:
-            text = f"{self._gap} frames and images before tick {received.tick.index} are left out: too slow to draw"
+            text = (
+                f"{self._gap} frames and images before tick {received.tick.index} are left out: "
+                "too slow to draw"
+            )
             self._gap = 0
             self.put(lambda viewer: viewer.gap(text, time_ns))
         self.put(lambda viewer: viewer.add(frame, time_ns, received.timing, events))
@@ -111,7 +124,9 @@ class LiveView:
     def image(self, image: ImageArrival) -> None:
         """Queue an image, which is left out if too many entries wait."""
         if not self._is_left_out():
-            self.put(lambda viewer: viewer.image(image.key, decode_image(image.data), image.time_ns))
+            self.put(
+                lambda viewer: viewer.image(image.key, decode_image(image.data), image.time_ns)
+            )
 
     def _is_left_out(self) -> bool:
         """True if there is no room for a frame or image, which is counted."""
@@ -165,9 +180,17 @@ class ScribeProcess:
             self._live = LiveView(lambda: _viewer(setup, skill))
         paths = RecordingPaths(setup.settings, setup.folder, setup.recording, attempt=setup.attempt)
         self._segments = Segments(
-            setup.settings, paths, say=self._errors.append, unmarked=setup.unmarked, constants=setup.constants
+            setup.settings,
+            paths,
+            say=self._errors.append,
+            unmarked=setup.unmarked,
+            constants=setup.constants,
         )
-        state = None if setup.state is None else np.frombuffer(setup.state, state_layout(self._joints))[0]
+        state = (
+            None
+            if setup.state is None
+            else np.frombuffer(setup.state, state_layout(self._joints))[0]
+        )
         self._segments.begin(skill, state)
         self.report()
 
@@ -179,7 +202,9 @@ class ScribeProcess:
                 self._errors.append(live.problems.pop(0))
             if live.left_out > 2 * self._reported_left_out:
                 self._reported_left_out = live.left_out
-                self._errors.append(f"the live view is too slow: {live.left_out} frames and images were left out")
+                self._errors.append(
+                    f"the live view is too slow: {live.left_out} frames and images were left out"
+                )
         segments = self._segments
         report = ScribeReport(
             state=segments.state,
@@ -205,7 +230,9 @@ class ScribeProcess:
         received = unpack(message, skills, joints=self._joints)
         live = self._live
         if isinstance(received, Note):
-            key, text, noted_ns = received.key, received.text, received.time_ns
+            key = received.key
+            text = received.text
+            noted_ns = received.time_ns
             self._segments.note(key, text, noted_ns)
             if key != "status" and live is not None:
                 live.put(lambda viewer: viewer.note(key, text, noted_ns))
@@ -260,14 +287,21 @@ def _run_with(nice: int) -> None:
 def _viewer(setup: ScribeSetup, skill: bytes | None) -> Viewer:
     from thirdhand.viewer.stream import Viewer  # its import takes half a second and starts threads
 
-    return Viewer(urdf=urdf_path(setup.settings), live_port=setup.live_port, settings=setup.settings, skill=skill)
+    return Viewer(
+        urdf=urdf_path(setup.settings),
+        live_port=setup.live_port,
+        settings=setup.settings,
+        skill=skill,
+    )
 
 
 def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[bytes]]:
     """The next message and the files sent with it; an empty message if the other side closed."""
     while True:
         try:
-            size, ancillary, _, _ = source.recvmsg_into([buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT)
+            size, ancillary, _, _ = source.recvmsg_into(
+                [buffer], socket.CMSG_SPACE(16 * 4), socket.MSG_DONTWAIT
+            )
             break
         except BlockingIOError:
             time.sleep(SOCKET_POLL_S)
@@ -283,7 +317,9 @@ def _work(source: socket.socket) -> None:
     ended = threading.Event()
 
     def read() -> None:
-        with contextlib.suppress(OSError):  # an ordinary weight: it needs little time, and its queue shows the backlog
+        with contextlib.suppress(
+            OSError
+        ):  # an ordinary weight: it needs little time, and its queue shows the backlog
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
             while (received := _receive(source, buffer))[0]:

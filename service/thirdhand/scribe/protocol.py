@@ -71,27 +71,40 @@ def pack(
     outputs: Outputs = (),
 ) -> bytes:
     """The message of a tick, without the bytes of skills."""
-    events = [(event.kind, None if event.kind == "skill" else event.payload) for event in tick.inbox]
+    events = [
+        (event.kind, None if event.kind == "skill" else event.payload) for event in tick.inbox
+    ]
     end = None if state is None else state.tobytes()
-    sent = _Tick(tick.index, lost, events, list(outputs), frame.tobytes(), timing.tobytes(), end, with_skill)
+    sent = _Tick(
+        tick.index, lost, events, list(outputs), frame.tobytes(), timing.tobytes(), end, with_skill
+    )
     return msgspec.msgpack.encode(sent)
 
 
-def unpack(message: bytes, skills: list[bytes], *, joints: int) -> TickMessage | Note | ImageArrival:
+def unpack(
+    message: bytes, skills: list[bytes], *, joints: int
+) -> TickMessage | Note | ImageArrival:
     """The tick, note or image in a message. `joints` is the arm's number of joints; `skills` are
     the files sent with the message, in order.
     """
-    sent, files = _MESSAGES.decode(message), iter(skills)
+    sent = _MESSAGES.decode(message)
+    files = iter(skills)
     if isinstance(sent, Note):
         return sent
     if isinstance(sent, ImageArrival):
         return msgspec.structs.replace(sent, data=next(files))
-    inbox = tuple(Event(kind, next(files) if data is None else data, None) for kind, data in sent.events)
+    inbox = tuple(
+        Event(kind, next(files) if data is None else data, None) for kind, data in sent.events
+    )
     frame: Record = np.frombuffer(sent.frame, frame_layout(joints))[0]
     timing: Record = np.frombuffer(sent.timing, TIMING)[0]
-    state: Record | None = None if sent.state is None else np.frombuffer(sent.state, state_layout(joints))[0]
+    state: Record | None = (
+        None if sent.state is None else np.frombuffer(sent.state, state_layout(joints))[0]
+    )
     skill = next(files) if sent.with_skill else None
-    return TickMessage(Tick(sent.index, inbox), frame, timing, state, skill, sent.lost, sent.outputs)
+    return TickMessage(
+        Tick(sent.index, inbox), frame, timing, state, skill, sent.lost, sent.outputs
+    )
 
 
 def pack_note(key: str, text: str, time_ns: int) -> bytes:
@@ -138,4 +151,6 @@ class ScribeReport(msgspec.Struct, frozen=True):
     errors: tuple[str, ...] = ()  # new error messages
     free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
     mb_per_hour: float | None = None  # recent growth of recordings; None: not known yet
-    keep_mb_left: float | None = None  # growth until each file takes an older one's place; None: without end
+    keep_mb_left: float | None = (
+        None  # growth until each file takes an older one's place; None: without end
+    )

@@ -24,7 +24,14 @@ import msgspec
 
 from thirdhand.core.frame import Outputs, Record, Tick
 from thirdhand.process import child
-from thirdhand.scribe.protocol import MAX_PACKET_BYTES, ScribeReport, ScribeSetup, pack, pack_image, pack_note
+from thirdhand.scribe.protocol import (
+    MAX_PACKET_BYTES,
+    ScribeReport,
+    ScribeSetup,
+    pack,
+    pack_image,
+    pack_note,
+)
 from thirdhand.settings.config import Settings
 
 BUFFER_BYTES = 4 * 1024 * 1024  # the socket holds some seconds of ticks
@@ -32,7 +39,9 @@ _SO_SNDBUFFORCE = 32  # Linux defines it, Python does not
 READY_TIMEOUT_S = 30.0  # a starting scribe without progress for this time is replaced
 RESTART_S = 1.0  # minimum interval of starts
 NOT_RECORDED = "ticks are not recorded"
-HUNG_AFTER_S = 5.0  # a scribe that reports twice a second hangs if it made no progress for this time
+HUNG_AFTER_S = (
+    5.0  # a scribe that reports twice a second hangs if it made no progress for this time
+)
 CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
 MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
 REPORTED = ("recording", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
@@ -62,19 +71,30 @@ class Scribe:
         ready_s: float = READY_TIMEOUT_S,
     ) -> None:
         self._settings = settings
-        self._restart_s, self._silent_s, self._ready_s = restart_s, silent_s, ready_s
-        self._folder, self._recording, self._live_port = folder, recording, live_port
+        self._restart_s = restart_s
+        self._silent_s = silent_s
+        self._ready_s = ready_s
+        self._folder = folder
+        self._recording = recording
+        self._live_port = live_port
         self._wanted = any(value is not None for value in (folder, recording, live_port))
-        self._socket: socket.socket | None = None  # socket to the child; None once the child is dead
+        self._socket: socket.socket | None = (
+            None  # socket to the child; None once the child is dead
+        )
         self._child: child.Child | None = None
         self._progress: child.Progress | None = None
         self._listens = False  # True once the child has reported
-        self._queue: deque[tuple[bytes, list[bytes]]] = deque()  # messages with the skills to send; for the loop
+        self._queue: deque[tuple[bytes, list[bytes]]] = (
+            deque()
+        )  # messages with the skills to send; for the loop
         self._most = round(MAX_QUEUED_S * settings.rate_hz)
-        self._send_all, self._overflows = True, False
+        self._send_all = True
+        self._overflows = False
         self._gap = self._lost = self._sent = self._restarts = 0
         self._since_state = 0
-        self._lost_before = self._unmarked = 0  # ticks lost with dead scribes, and those that no recording marks
+        self._lost_before = self._unmarked = (
+            0  # ticks lost with dead scribes, and those that no recording marks
+        )
         self._sent_before = 0  # ticks sent to dead scribes
         self._started = 0.0
         self._constants: dict[str, str] = {}
@@ -83,7 +103,9 @@ class Scribe:
         self.newest_recording: str | None = None  # the path, also while no recording can be written
         self._errors: deque[str] = deque(maxlen=5)
 
-    def start(self, *, skill: bytes, state: Record | None, constants: Mapping[str, str] | None = None) -> None:
+    def start(
+        self, *, skill: bytes, state: Record | None, constants: Mapping[str, str] | None = None
+    ) -> None:
         """Start the process; ticks may be sent at once. Never waits. Recordings tell these digests
         of the core's `constants`.
         """
@@ -136,7 +158,9 @@ class Scribe:
             return
         if self._overflows or len(self._queue) >= self._most:
             self._drain()
-            self._overflows = bool(self._queue) or not self._most  # ends when the queue is empty: one long gap
+            self._overflows = (
+                bool(self._queue) or not self._most
+            )  # ends when the queue is empty: one long gap
             if self._overflows:
                 self.skip()
                 return
@@ -144,10 +168,13 @@ class Scribe:
         self._since_state += 1
         with_state = send_all or self._since_state >= self._settings.rate_hz
         after = state() if with_state else None
-        message = pack(tick, frame, timing, state=after, lost=self._gap, with_skill=send_all, outputs=outputs)
+        message = pack(
+            tick, frame, timing, state=after, lost=self._gap, with_skill=send_all, outputs=outputs
+        )
         skills = [event.payload for event in tick.inbox if event.kind == "skill"]
         self._queue.append((message, [*skills, skill] if send_all else skills))
-        self._gap, self._send_all = 0, False
+        self._gap = 0
+        self._send_all = False
         if with_state:
             self._since_state = 0
         self._drain()
@@ -214,7 +241,9 @@ class Scribe:
             limit_s = self._silent_s if self._listens else self._ready_s
             if self._progress.is_hung(limit_s):
                 self._progress.report()
-                self._errors.append(f"the scribe made no progress for {limit_s:g} s, so it is replaced")
+                self._errors.append(
+                    f"the scribe made no progress for {limit_s:g} s, so it is replaced"
+                )
                 self._child.kill()
             return
         self._socket = None
@@ -233,7 +262,9 @@ class Scribe:
         unreported = max(0, self._sent - self._sent_before - last.kept - last.lost)
         self._lost_before += last.lost + unreported
         self._unmarked = last.unmarked + unreported + (0 if self._listens else self._unmarked)
-        self._sent_before, self._report, self._listens = self._sent, ScribeReport(), False
+        self._sent_before = self._sent
+        self._report = ScribeReport()
+        self._listens = False
 
     def status(self) -> dict[str, Any]:
         """The process's status: alive, its state (`off`, `starting`, `recording`, `drawing` without
@@ -251,25 +282,33 @@ class Scribe:
             "restarts": self._restarts,
             "errors": list(self._errors),
             **{name: getattr(report, name) for name in REPORTED},
-            "live": None if self._live_port is None else report.live if alive else "",  # empty: it is starting
+            "live": None
+            if self._live_port is None
+            else report.live
+            if alive
+            else "",  # empty: it is starting
         }
 
     def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> str:
         """Let the process write everything and close its files, and return a message on ticks that
         are not recorded (empty: none). It is killed if it hangs, or after `timeout_s` [s].
         """
-        running, progress = self._child, self._progress
+        running = self._child
+        progress = self._progress
         if running is not None and progress is not None:
             progress.report()
             running.send_signal(signal.SIGCONT)  # it may have been stopped
-            end, is_shut = time.monotonic() + timeout_s, False
+            end = time.monotonic() + timeout_s
+            is_shut = False
             while running.poll() is None:
                 self._listen()  # else reports fill the socket, and the last one is left out
                 self._drain()
                 if not is_shut and not self._queue:
                     is_shut = True
                     with contextlib.suppress(OSError):
-                        running.socket.shutdown(socket.SHUT_WR)  # a forked process may still hold this end
+                        running.socket.shutdown(
+                            socket.SHUT_WR
+                        )  # a forked process may still hold this end
                 if time.monotonic() > end or progress.is_hung(self._ready_s):
                     self._errors.append("the scribe did not end in time: its last data are lost")
                     running.kill()
@@ -277,7 +316,8 @@ class Scribe:
                     break
                 time.sleep(0.005)
             self._listen()
-            last, self._socket = self._report, None
+            last = self._report
+            self._socket = None
             self._count_lost()
             self._report = msgspec.structs.replace(last, lost=0)
             self._child = None
@@ -285,18 +325,30 @@ class Scribe:
             for _, fd in self._memory.values():
                 os.close(fd)
             self._memory = {}
-            self._lost, self._queue, self._most = self._lost + len(self._queue), deque(), 0
-        lost = self._lost + self._lost_before if self._folder is not None or self._recording is not None else 0
+            self._lost = self._lost + len(self._queue)
+            self._queue = deque()
+            self._most = 0
+        lost = (
+            self._lost + self._lost_before
+            if self._folder is not None or self._recording is not None
+            else 0
+        )
         return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> None:
         """Start a process and send it its setup."""
-        folder, recording = (None if path is None else str(path.absolute()) for path in (self._folder, self._recording))
+        folder, recording = (
+            None if path is None else str(path.absolute())
+            for path in (self._folder, self._recording)
+        )
         begin = None if state is None else state.tobytes()
         places = folder, recording, self._live_port
-        setup = ScribeSetup(self._settings, begin, *places, self._restarts + 1, self._unmarked, self._constants)
+        setup = ScribeSetup(
+            self._settings, begin, *places, self._restarts + 1, self._unmarked, self._constants
+        )
         self._child = child.start("scribe", "thirdhand.scribe.process", socket.SOCK_SEQPACKET)
-        self._progress, self._started = child.Progress(self._child), time.monotonic()
+        self._progress = child.Progress(self._child)
+        self._started = time.monotonic()
         ours = self._child.socket
         ours.setblocking(False)
         try:

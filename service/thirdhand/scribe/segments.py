@@ -48,19 +48,25 @@ class Segments:
         constants: Mapping[str, str] | None = None,
     ) -> None:
         self._constants = constants
-        self._settings, self._paths, self._say = settings, paths, say
+        self._settings = settings
+        self._paths = paths
+        self._say = say
         self._recorder: Recorder | None = None
         self._wanted = True
         self._skill: bytes | None = None
         self._complete: Path | None = None
         self._kept = self.lost = 0
         self._unmarked = unmarked
-        self._marked = self._marked_pending = 0  # lost ticks marked in this recording; those marks not on disk yet
+        self._marked = self._marked_pending = (
+            0  # lost ticks marked in this recording; those marks not on disk yet
+        )
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = False
         self._failure: object = None  # cause of the last reported failure
         self._written = 0  # [bytes] in files that have ended
-        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))  # time [s], total [bytes]
+        self._sizes: deque[tuple[float, int]] = deque(
+            maxlen=round(GROWTH_S / SAMPLE_S)
+        )  # time [s], total [bytes]
 
     @property
     def kept(self) -> int:
@@ -98,7 +104,8 @@ class Segments:
         recorder = None if path is None else self._recorder_at(path, state)
         if recorder is not None:
             self._marked = self._marked_pending = 0
-            self._began, self._moved = self._tried, False
+            self._began = self._tried
+            self._moved = False
         return recorder
 
     def _recorder_at(self, path: Path, state: Record | None) -> Recorder | None:
@@ -106,10 +113,18 @@ class Segments:
         try:
             if self._full and shutil.disk_usage(existing_folder(path.parent)).free < MIN_FREE_BYTES:
                 return None
-            settings, skill, now_ns = self._settings, self._skill, time.time_ns()
+            settings = self._settings
+            skill = self._skill
+            now_ns = time.time_ns()
             constants = self._constants
             return Recorder(
-                path, settings=settings, skill=skill, state=state, constants=constants, time_ns=now_ns, thin=True
+                path,
+                settings=settings,
+                skill=skill,
+                state=state,
+                constants=constants,
+                time_ns=now_ns,
+                thin=True,
             )
         except OSError as error:
             self._failed(path, error)
@@ -119,14 +134,19 @@ class Segments:
     def free_mb(self) -> float | None:
         """Free space on the disk of the recording [MB]; None without a recording."""
         with contextlib.suppress(OSError):
-            return None if self.path is None else round(shutil.disk_usage(existing_folder(self.path.parent)).free / 1e6)
+            return (
+                None
+                if self.path is None
+                else round(shutil.disk_usage(existing_folder(self.path.parent)).free / 1e6)
+            )
         return None
 
     def mb_per_hour(self) -> float | None:
         """Recent growth of recordings [MB/h]; None if it is not known yet."""
         if not self._sizes:
             return None
-        (begin_s, begin), now_s = self._sizes[0], time.monotonic()
+        begin_s, begin = self._sizes[0]
+        now_s = time.monotonic()
         if now_s - begin_s < MIN_GROWTH_S:
             return None
         return round((self._written + self._size() - begin) / MB * 3600 / (now_s - begin_s), 1)
@@ -146,12 +166,16 @@ class Segments:
         cause = error.errno or str(error)
         if cause != self._failure:
             self._failure = cause
-            self._say(f"recording to {path} failed: {error.strerror or error}; it continues once this is repaired")
+            self._say(
+                f"recording to {path} failed: {error.strerror or error}; it continues once this is "
+                "repaired"
+            )
 
     def write(self, received: TickMessage) -> int:
         """Write a tick, and return the number of lost ticks before it that are marked with it."""
         self._skill = next(
-            (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"), self._skill
+            (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"),
+            self._skill,
         )
         self._skill = received.skill or self._skill
         now = time.monotonic()
@@ -179,7 +203,11 @@ class Segments:
 
     def _due(self, now: float) -> bool:
         files = self._settings.files
-        return self._size() > files.segment_mb * MB or self._moved or now - self._began > files.segment_minutes * 60
+        return (
+            self._size() > files.segment_mb * MB
+            or self._moved
+            or now - self._began > files.segment_minutes * 60
+        )
 
     def _next(self, state: Record) -> None:
         """Continue in a new recording, which begins with the old one's last state, or in the old
@@ -250,15 +278,22 @@ class Segments:
         self._marked_pending = 0
         if recorder.kept:
             if self._failure is not None:
-                self._say(f"recording continues in {recorder.path}; {self.lost} ticks are lost in all")
-            self._full, self._failure = False, None
+                self._say(
+                    f"recording continues in {recorder.path}; {self.lost} ticks are lost in all"
+                )
+            self._full = False
+            self._failure = None
         lost_name = recorder.lost_name()
         if lost_name == "removed":
-            self._say(f"recording {recorder.path} was removed while it was written; the next one begins")
+            self._say(
+                f"recording {recorder.path} was removed while it was written; the next one begins"
+            )
             self._leave(recorder, recorder.kept + recorder.pending, self._marked)
         elif lost_name and not self._moved:
             self._moved = True
-            self._say(f"recording {recorder.path} was moved while it was written; the next one begins")
+            self._say(
+                f"recording {recorder.path} was moved while it was written; the next one begins"
+            )
 
     def close(self) -> None:
         """End the recording."""
@@ -282,7 +317,9 @@ def _write_tick(recorder: Recorder, received: TickMessage, missing: int, is_last
         last=is_last,
     )
     if missing:
-        recorder.note("log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns)
+        recorder.note(
+            "log", f"{missing} ticks before tick {received.tick.index} are not recorded", time_ns
+        )
 
 
 def _discard(path: Path) -> None:

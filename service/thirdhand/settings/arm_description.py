@@ -23,11 +23,15 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
         text = _text(path)
         if not cover or "<mesh" not in text:
             return text
-        from thirdhand.settings.mesh_cover import covered  # its import is slow, and few arms need it
+        from thirdhand.settings.mesh_cover import (
+            covered,
+        )  # its import is slow, and few arms need it
 
         return covered(text, path, packages)
     except OSError as error:
-        raise SettingsError(f"[arm] urdf: cannot read {path}: {in_words(error, named=False)}") from None
+        raise SettingsError(
+            f"[arm] urdf: cannot read {path}: {in_words(error, named=False)}"
+        ) from None
     except UrdfError as error:
         raise SettingsError(f"[arm] urdf: {error}") from None
 
@@ -76,11 +80,13 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
     Raises SettingsError.
     """
     arm, joints, reach = (
-        {**part} if isinstance(part := given.get(name, {}), dict) else {} for name in ("arm", "joints", "reach")
+        {**part} if isinstance(part := given.get(name, {}), dict) else {}
+        for name in ("arm", "joints", "reach")
     )
     if "plate" not in arm:
         raise SettingsError(
-            f"[arm] plate: missing; the link that carries the tool needed, the last ones are {', '.join(urdf.leaves)}"
+            "[arm] plate: missing; the link that carries the tool needed, the last ones are "
+            f"{', '.join(urdf.leaves)}"
         )
     moving = urdf.movable(str(arm["plate"]))
     joints.setdefault("names", [joint.name for joint in moving])
@@ -95,7 +101,10 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
         ("arm", arm, "posture"),
     )
     if missing := [f"[{path}] {name}" for path, section, name in required if name not in section]:
-        needed = f"missing; the URDF does not define it, {len(moving)} numbers needed, one for each joint"
+        needed = (
+            f"missing; the URDF does not define it, {len(moving)} numbers needed, one for each "
+            "joint"
+        )
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
 
@@ -106,22 +115,29 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
     """
     moving = urdf.movable(plate)
     reach = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))
-    reach += sum(max(abs(joint.lower), abs(joint.upper)) for joint in moving if joint.kind == "prismatic")
+    reach += sum(
+        max(abs(joint.lower), abs(joint.upper)) for joint in moving if joint.kind == "prismatic"
+    )
     for shape in urdf.shapes:
         if (size := extent(shape)) > reach:
             raise SettingsError(
-                f"[arm] urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and the arm {reach:.3g} m; "
-                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 0.001 0.001"; '
+                f"[arm] urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and "
+                f"the arm {reach:.3g} m; "
+                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 '
+                '0.001 0.001"; '
                 "tables and walls belong into [table] and [obstacles]"
             )
     names = tuple(joint.name for joint in moving)
     if joints.names != names:
         raise SettingsError(
-            f"[joints] names: {list(joints.names)} given; the chain's {list(names)} in this order needed"
+            f"[joints] names: {list(joints.names)} given; the chain's {list(names)} in this order "
+            "needed"
         )
     kinds = tuple(joint.kind for joint in moving)
     if joints.every_kind != kinds:
-        raise SettingsError(f"[joints] kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed")
+        raise SettingsError(
+            f"[joints] kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed"
+        )
     wide = []
     for i, joint in enumerate(moving):
         for name, low, high in (
@@ -135,6 +151,8 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
             if not low <= value <= high:
                 accepted = f"{low} or more" if name == "lower" else f"up to {high}"
                 where = f"[joints] {name}, entry {i + 1}"
-                wide.append(f"{where}: {value} given; {accepted} accepted by the URDF of {joint.name}")
+                wide.append(
+                    f"{where}: {value} given; {accepted} accepted by the URDF of {joint.name}"
+                )
     if wide:
         raise SettingsError("\n".join(wide))

@@ -18,15 +18,25 @@ from thirdhand.contract.channels import CellName
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.messages import BASE
 from thirdhand.settings.arm_description import check, completed, description
-from thirdhand.settings.file_content import SettingsError, UnreadableError, UnusableError, text_in, toml_in
+from thirdhand.settings.file_content import (
+    SettingsError,
+    UnreadableError,
+    UnusableError,
+    text_in,
+    toml_in,
+)
 from thirdhand.settings.network import Network, Ros2
 from thirdhand.settings.urdf import Urdf, UrdfError
 
 WAM = Path(__file__).parents[1] / "arms" / "wam.urdf"
 RATES_HZ = (50, 1000)  # lowest and highest accepted rate
 MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
-REACHED_SHARE = 0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
-LEAST_REACHED_SHARE = 0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
+REACHED_SHARE = (
+    0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
+)
+LEAST_REACHED_SHARE = (
+    0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
+)
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
@@ -42,13 +52,18 @@ FROM_FOLDER = (
 )
 # Relative paths in these settings start from the current folder.
 FROM_HERE = (("files", "state"), ("files", "record"))
-MAX_ACCELERATION_PER_SPEED = 12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+MAX_ACCELERATION_PER_SPEED = (
+    12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+)
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
-SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9  # sizes of numbers but 0; powers of others overflow, or are 0
+# sizes of numbers but 0; powers of others overflow, or are 0
+SMALLEST_NUMBER = 1e-9
+LARGEST_NUMBER = 1e9
 FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
 LEAST_OUTER_M = 0.01  # an arm that moves its tool by less is none
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
-PRISMATIC_M = 0.5  # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
+# tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
+PRISMATIC_M = 0.5
 
 
 class Following(NamedTuple):
@@ -72,16 +87,40 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class HandSettings(Section, frozen=True):
     """The tracker's frame and unit, and the times for which a hand may be silent."""
 
-    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"  # name of the tracker's frame; `base` is accepted too
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = (
+        "base"  # name of the tracker's frame; `base` is accepted too
+    )
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after unit and axes
-    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # the arm holds after this time without a sample
-    stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0  # delays raise `stale_ms` up to this; 0: never
-    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0  # one hand may be out of sight for this time
-    clutch: Literal["none", "key"] = "none"  # "key": the arm follows only while `clutch` says that it is pressed
-    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0  # a clutch is released after this silence
-    gripper: Literal["none", "key"] = "none"  # "key": `gripper/wish` decides the gripper where the skill does not
+    axes: Literal["right-handed", "left-handed"] = (
+        "right-handed"  # of left-handed axes (Unity), z is reversed first
+    )
+    base_from_tracker: Pose = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )  # pose of the tracker's frame, after unit and axes
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
+        100.0  # the arm holds after this time without a sample
+    )
+    stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
+        0.0  # delays raise `stale_ms` up to this; 0: never
+    )
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
+        500.0  # one hand may be out of sight for this time
+    )
+    clutch: Literal["none", "key"] = (
+        "none"  # "key": the arm follows only while `clutch` says that it is pressed
+    )
+    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = (
+        300.0  # a clutch is released after this silence
+    )
+    gripper: Literal["none", "key"] = (
+        "none"  # "key": `gripper/wish` decides the gripper where the skill does not
+    )
 
     @property
     def longest_stale_ms(self) -> float:
@@ -95,24 +134,58 @@ class TrackerSettings(Section, frozen=True):
     """
 
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    axes: Literal["right-handed", "left-handed"] = "right-handed"  # of left-handed axes (Unity), z is reversed first
-    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tracker's frame, after the unit
+    axes: Literal["right-handed", "left-handed"] = (
+        "right-handed"  # of left-handed axes (Unity), z is reversed first
+    )
+    base_from_tracker: Pose = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )  # pose of the tracker's frame, after the unit
 
 
 class ToolSettings(Section, frozen=True):
     """The tool: its pose on the tool plate, and its limits of motion."""
 
-    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of the tool in the frame of the plate
-    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8  # [m/s] largest speed of the setpoint
-    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.15  # [m/s] until the tool reaches its target; 0: off
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0  # [m/s²] largest; at most 12.5 * max_speed
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0  # [m/s³] largest; at most 500 * max_speed
-    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0  # [m/s] a faster tool, as measured, is a fault
-    orientation: Literal["direction", "full"] = "direction"  # follow the direction of the tool's +z, or all axes
-    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0  # [rad/s] largest rate of turning the tool
+    plate_from_tool: Pose = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )  # pose of the tool in the frame of the plate
+    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = (
+        0.8  # [m/s] largest speed of the setpoint
+    )
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = (
+        0.15  # [m/s] until the tool reaches its target; 0: off
+    )
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = (
+        10.0  # [m/s²] largest; at most 12.5 * max_speed
+    )
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
+        400.0  # [m/s³] largest; at most 500 * max_speed
+    )
+    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = (
+        1.0  # [m/s] a faster tool, as measured, is a fault
+    )
+    orientation: Literal["direction", "full"] = (
+        "direction"  # follow the direction of the tool's +z, or all axes
+    )
+    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = (
+        1.0  # [rad/s] largest rate of turning the tool
+    )
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
-    follow: Literal["closely", "default", "calmly"] = "default"  # less lag, or less overshoot and jerk: docs/tune.md
+    follow: Literal["closely", "default", "calmly"] = (
+        "default"  # less lag, or less overshoot and jerk: docs/tune.md
+    )
 
     @property
     def engaging_speed(self) -> float:
@@ -137,7 +210,9 @@ class ToolSettings(Section, frozen=True):
         """Jerk limit of the setpoint [m/s³], as a norm: `max_jerk`, but at most 500 `max_speed`,
         which reaches that acceleration within 25 ms; of this, the share that `follow` uses.
         """
-        return FOLLOWING[self.follow].jerk_share * min(self.max_jerk, MAX_JERK_PER_SPEED * self.max_speed)
+        return FOLLOWING[self.follow].jerk_share * min(
+            self.max_jerk, MAX_JERK_PER_SPEED * self.max_speed
+        )
 
     @property
     def room(self) -> float:
@@ -161,14 +236,32 @@ class ArmSettings(Section, frozen=True):
     """
 
     urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
-    packages: tuple[str, ...] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
+    packages: tuple[
+        str, ...
+    ] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
-    source: Literal["state", "assumed"] = "state"  # wait for `joints/state`, or begin at `posture` without an arm
-    start: Literal["follow", "held"] = "follow"  # "held": after every start the arm holds until `thirdhand resume`
-    posture: PerJoint = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)  # [rad] preferred; start if assumed
+    source: Literal["state", "assumed"] = (
+        "state"  # wait for `joints/state`, or begin at `posture` without an arm
+    )
+    start: Literal["follow", "held"] = (
+        "follow"  # "held": after every start the arm holds until `thirdhand resume`
+    )
+    posture: PerJoint = (
+        0.1761,
+        0.8604,
+        -0.5,
+        2.5414,
+        -0.4273,
+        -1.0823,
+        0.0,
+    )  # [rad] preferred; start if assumed
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
-    fault_error_rad: Positive = 0.1  # largest difference between measured and commanded joint position
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0  # a moving arm is at fault after this silence
+    fault_error_rad: Positive = (
+        0.1  # largest difference between measured and commanded joint position
+    )
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
+        100.0  # a moving arm is at fault after this silence
+    )
 
 
 class JointSettings(Section, frozen=True):
@@ -190,7 +283,9 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
-    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()  # from the URDF; empty: all revolute
+    kinds: tuple[
+        Literal["revolute", "continuous", "prismatic"], ...
+    ] = ()  # from the URDF; empty: all revolute
     lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
     upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
     velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
@@ -221,7 +316,9 @@ class Reach(Section, frozen=True):
     centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
     inner: Positive = 0.35  # [m] inner radius of the shell
     outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] outer radius of the shell
-    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15  # [m] least x, in front of the base plate
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = (
+        0.15  # [m] least x, in front of the base plate
+    )
     min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] least z, above the table
 
 
@@ -237,13 +334,24 @@ class People(Section, frozen=True):
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm
-    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24  # [m] length from the tracked point toward the elbow
+    length: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.24  # [m] length from the tracked point toward the elbow
+    )
     toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.024  # [m] least distance to a hand's capsule
-    position_uncertainty: Annotated[float, msgspec.Meta(ge=0)] = 0.006  # [m] of hand and arm; 3 deviations of 2 mm
-    brake: Positive = 3.0  # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
-    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # interval of samples + one tick + ramp of the braking
-    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25  # [m/s] largest speed toward a receiving hand
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.024  # [m] least distance to a hand's capsule
+    )
+    position_uncertainty: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.006  # [m] of hand and arm; 3 deviations of 2 mm
+    )
+    # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
+    brake: Positive = 3.0
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = (
+        30.0  # interval of samples + one tick + ramp of the braking
+    )
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = (
+        0.25  # [m/s] largest speed toward a receiving hand
+    )
 
     @property
     def distance(self) -> float:
@@ -262,7 +370,9 @@ class Obstacles(Section, frozen=True):
     """Obstacles other than people: the table, the arm itself, and boxes."""
 
     boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01  # [m] least distance; from the arm itself at most 0.01
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.01  # [m] least distance; from the arm itself at most 0.01
+    )
     brake: Positive = 2.0  # [m/s²] assumed deceleration toward obstacles
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # ramp of the braking
 
@@ -279,35 +389,49 @@ class TableTop(Section, frozen=True):
 class SkillSettings(Section, frozen=True):
     """The timing with which the skill is followed."""
 
-    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0  # the tool is this far ahead of the teacher's timing
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = (
+        0.0  # the tool is this far ahead of the teacher's timing
+    )
 
 
 class Files(Section, frozen=True):
     """The skill, folders of via-points and recordings, and the limits of recordings."""
 
-    skill: str = ""  # the skill's file, beside which are the others that clients ask for; empty: the shipped one
-    state: str = ""  # a folder for via-points over a restart; empty: thirdhand in $XDG_STATE_HOME or ~/.local/state
+    # the skill's file, beside which are the others that clients ask for; empty: the shipped one
+    skill: str = ""
+    # a folder for via-points over a restart; empty: thirdhand in $XDG_STATE_HOME or ~/.local/state
+    state: str = ""
     record: str = ""  # a folder; empty: nothing is recorded
     segment_mb: Annotated[float, msgspec.Meta(ge=0.01)] = (
         200.0  # at this size a recording ends and the next begins, without a gap
     )
     segment_minutes: Positive = 10.0  # age at which the next recording begins, without a gap
-    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0  # largest size of this cell's .mcap files; 0: no limit
-    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # .mcap files older than this are deleted; 0: no limit
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = (
+        50_000.0  # largest size of this cell's .mcap files; 0: no limit
+    )
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.0  # .mcap files older than this are deleted; 0: no limit
+    )
 
 
 class RecordingSettings(Section, frozen=True):
     """The content of recordings."""
 
-    also: tuple[CellName, ...] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
-    frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0  # whole frames a second; others as checksums; 0: every frame
+    also: tuple[
+        CellName, ...
+    ] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
+    frames_hz: Annotated[float, msgspec.Meta(ge=0)] = (
+        25.0  # whole frames a second; others as checksums; 0: every frame
+    )
 
 
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
-    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500  # ticks of the loop in a second
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = (
+        500  # ticks of the loop in a second
+    )
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     trackers: dict[str, TrackerSettings] = {}
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
@@ -332,7 +456,8 @@ class Settings(Section, frozen=True):
         unusable = {
             path: value
             for path, value in _numbers(msgspec.to_builtins(self), "$")
-            if value != 0.0 and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER  # also what is not finite
+            if value != 0.0
+            and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER  # also what is not finite
         }
         for path, value in unusable.items():
             sizes = f"{SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
@@ -340,36 +465,61 @@ class Settings(Section, frozen=True):
         if {".", ".."} & set(self.cell.split("/")):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
         if (size := len(self.cell.encode())) > MAX_CELL_BYTES:
-            yield f"$.cell: a name of {size} bytes given; at most {MAX_CELL_BYTES} accepted, as files have this name"
+            yield (
+                f"$.cell: a name of {size} bytes given; at most {MAX_CELL_BYTES} accepted, as "
+                "files have this name"
+            )
         if unusable:
             return
         if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
             yield (
-                f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits and single _, "
-                "none of them with a digit first, joined by slashes needed"
+                f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits "
+                "and single _, none of them with a digit first, joined by slashes needed"
             )
         named = dict.fromkeys(topic.name for topic in ros2.of_settings(self.ros2))
         if named and self.network.ros2_domain is None:
-            yield f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to {ros2.LAST_DOMAIN} needed"
+            yield (
+                f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to "
+                f"{ros2.LAST_DOMAIN} needed"
+            )
         if self.ros2.joints and sorted(self.ros2.joints) != sorted(self.joints.names):
-            yield f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, in any order"
+            yield (
+                f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, "
+                "in any order"
+            )
         for name in self.trackers:
             if not re.fullmatch(r"[\w./-]{1,64}", name):
-                yield f"$.trackers: the frame {name!r} given; 1 to 64 letters, digits and _ . / - accepted"
+                yield (
+                    f"$.trackers: the frame {name!r} given; 1 to 64 letters, digits and _ . / - "
+                    "accepted"
+                )
             elif name in (BASE, self.hands.frame):
-                yield f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and $.hands.frame needed"
+                yield (
+                    f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and "
+                    "$.hands.frame needed"
+                )
         for path, pose in (
             ("$.hands.base_from_tracker", self.hands.base_from_tracker),
-            *((f"$.trackers.{name}.base_from_tracker", tracker.base_from_tracker) for name, tracker in self.trackers.items()),
+            *(
+                (f"$.trackers.{name}.base_from_tracker", tracker.base_from_tracker)
+                for name, tracker in self.trackers.items()
+            ),
             ("$.tool.plate_from_tool", self.tool.plate_from_tool),
         ):
             norm = math.hypot(*pose[3:])
             if max(map(abs, pose[:3])) > FARTHEST_FRAME_M:
-                yield f"{path}: {list(pose[:3])} given; {FARTHEST_FRAME_M:g} m or less on each axis accepted"
+                yield (
+                    f"{path}: {list(pose[:3])} given; {FARTHEST_FRAME_M:g} m or less on each axis "
+                    "accepted"
+                )
             if abs(norm - 1.0) > 1e-3:
-                yield f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y z w)"
+                yield (
+                    f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y "
+                    "z w)"
+                )
         if not math.hypot(*self.people.toward_elbow) > 1e-6:
-            yield f"$.people.toward_elbow: {list(self.people.toward_elbow)} given; a direction needed"
+            direction = list(self.people.toward_elbow)
+            yield f"$.people.toward_elbow: {direction} given; a direction needed"
         if self.tool.fault_speed < self.tool.max_speed:
             yield (
                 f"$.tool.fault_speed: {self.tool.fault_speed} given; "
@@ -381,41 +531,59 @@ class Settings(Section, frozen=True):
                 f"at most $.tool.max_speed = {self.tool.max_speed} accepted"
             )
         if self.reach.inner >= self.reach.outer:
-            yield f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = {self.reach.outer} needed"
+            yield (
+                f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = "
+                f"{self.reach.outer} needed"
+            )
         yield from self._problems_of_joints()
 
     def _problems_of_joints(self) -> Iterator[str]:
         count = len(self.joints.names)
         if not count or len(set(self.joints.names)) < count:
-            yield f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, needed"
+            yield (
+                f"$.joints.names: {list(self.joints.names)} given; different names, 1 at least, "
+                "needed"
+            )
             return
-        fields: dict[str, tuple[object, ...]] = {f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS}
+        fields: dict[str, tuple[object, ...]] = {
+            f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS
+        }
         fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
         uneven = {path: values for path, values in fields.items() if len(values) != count}
         for path, values in uneven.items():
             quantity = "kinds" if path == "$.joints.kinds" else "numbers"
-            yield f"{path}: {len(values)} {quantity}, {count} needed, one for each of $.joints.names"
+            needed = f"{count} needed, one for each of $.joints.names"
+                yield f"{path}: {len(values)} {quantity}, {needed}"
         if uneven:
             return
         widest = self._widest()
         for name in LIMITS:
-            for i, (limit, bound) in enumerate(zip(getattr(self.joints, name), widest[name], strict=True)):
+            for i, (limit, bound) in enumerate(
+                zip(getattr(self.joints, name), widest[name], strict=True)
+            ):
                 if name == "lower" and limit < bound:
                     yield f"$.joints.lower[{i}]: {limit} given; {bound} or more accepted"
                 if name == "upper" and limit > bound:
                     yield f"$.joints.upper[{i}]: {limit} given; {bound} or less accepted"
                 if name not in ("lower", "upper") and not 0 < limit <= bound:
                     yield f"$.joints.{name}[{i}]: {limit} given; above 0, up to {bound} accepted"
-        for i, (low, high, position) in enumerate(zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)):
+        for i, (low, high, position) in enumerate(
+            zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)
+        ):
             if not low < high:
-                yield f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} needed"
+                yield (
+                    f"$.joints.lower[{i}]: {low} given; less than $.joints.upper[{i}] = {high} "
+                    "needed"
+                )
             elif not low <= position <= high:
                 yield f"$.arm.posture[{i}]: {position} given; {low} to {high} accepted"
 
     def _widest(self) -> dict[str, PerJoint]:
         """Bounds of the limits: the defaults for the shipped arm, infinity for others."""
         if not self.arm.urdf:
-            return dict(zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True))
+            return dict(
+                zip(JointSettings.__struct_fields__, JointSettings.__struct_defaults__, strict=True)
+            )
         n = len(self.joints.names)
         return {name: (-math.inf if name == "lower" else math.inf,) * n for name in LIMITS}
 
@@ -437,7 +605,11 @@ class Settings(Section, frozen=True):
         """
         if (tracker := self.trackers.get(frame)) is None:
             return self.hands
-        of_tracker = {"unit": tracker.unit, "axes": tracker.axes, "base_from_tracker": tracker.base_from_tracker}
+        of_tracker = {
+            "unit": tracker.unit,
+            "axes": tracker.axes,
+            "base_from_tracker": tracker.base_from_tracker,
+        }
         return msgspec.structs.replace(self.hands, frame=frame, **of_tracker)
 
     @property
@@ -454,14 +626,23 @@ class Settings(Section, frozen=True):
     @property
     def frame_every(self) -> int:
         """Ticks from one whole frame of a recording to the next."""
-        return max(1, round(self.rate_hz / self.recording.frames_hz)) if self.recording.frames_hz else 1
+        return (
+            max(1, round(self.rate_hz / self.recording.frames_hz))
+            if self.recording.frames_hz
+            else 1
+        )
 
 
 def without_secrets(settings: Settings) -> Settings:
     """The settings without the parameters of endpoints, which may hold keys."""
     network = settings.network
-    listen, connect = (tuple(endpoint.partition("#")[0] for endpoint in endpoints) for endpoints in (network.listen, network.connect))
-    return msgspec.structs.replace(settings, network=msgspec.structs.replace(network, listen=listen, connect=connect))
+    listen, connect = (
+        tuple(endpoint.partition("#")[0] for endpoint in endpoints)
+        for endpoints in (network.listen, network.connect)
+    )
+    return msgspec.structs.replace(
+        settings, network=msgspec.structs.replace(network, listen=listen, connect=connect)
+    )
 
 
 def urdf_path(settings: Settings) -> Path:
@@ -497,7 +678,9 @@ def _make_paths_absolute(given: Any, folder: Path | None) -> None:
             table[name] = _absolute(value, base, f"[{section}] {name}")
         elif isinstance(table, dict) and isinstance(value, list | tuple):
             table[name] = [
-                _absolute(entry, base, f"[{section}] {name}, entry {i + 1}") if isinstance(entry, str) else entry
+                _absolute(entry, base, f"[{section}] {name}, entry {i + 1}")
+                if isinstance(entry, str)
+                else entry
                 for i, entry in enumerate(value)
             ]
 
@@ -511,7 +694,9 @@ def _absolute(value: str, base: Path, where: str) -> str:
     try:
         return str((base / Path(value).expanduser()).absolute()) if value else ""
     except RuntimeError:
-        raise SettingsError(f"{where}: {value!r} given; no user of this name has a folder here") from None
+        raise SettingsError(
+            f"{where}: {value!r} given; no user of this name has a folder here"
+        ) from None
 
 
 def converted(given: Any, *, origin: str, folder: Path | None = None) -> Settings:
@@ -524,9 +709,13 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
     """
     try:
         _make_paths_absolute(given, folder)
-        arm, reach = (given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach"))
+        arm, reach = (
+            given.get(name) if isinstance(given, dict) else None for name in ("arm", "reach")
+        )
         if isinstance(arm, dict) and isinstance(arm.get("urdf"), str) and arm["urdf"]:
-            urdf_text = description(urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False)
+            urdf_text = description(
+                urdf_path(Settings(arm=ArmSettings(urdf=arm["urdf"]))), cover=False
+            )
             given = completed(given, Urdf(urdf_text, origin=arm["urdf"]))
         settings = validated(given, Settings)
         urdf = Urdf(robot_description(settings), origin=settings.arm.urdf or WAM.name)
@@ -543,17 +732,24 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
 
     Raises SettingsError if the arm reaches too small a share of it.
     """
-    from thirdhand.settings.reachable import Shell, workspace_of  # its import is slow, and few arms need it
+    from thirdhand.settings.reachable import (
+        Shell,
+        workspace_of,
+    )  # its import is slow, and few arms need it
 
     workspace = workspace_of(
-        urdf.chain(settings.arm.plate), settings.joints.lower, settings.joints.upper, settings.tool.plate_from_tool
+        urdf.chain(settings.arm.plate),
+        settings.joints.lower,
+        settings.joints.upper,
+        settings.tool.plate_from_tool,
     )
     reach = settings.reach
     shell = workspace.shell(reach.min_x, reach.min_z)
     if shell.outer < LEAST_OUTER_M:
         raise SettingsError(
-            f"[arm] plate: its joints move the tool by {1000 * shell.outer:.0f} mm; an arm that moves it, or a pose of "
-            "the tool away from the last axis ([tool] plate_from_tool), needed"
+            f"[arm] plate: its joints move the tool by {1000 * shell.outer:.0f} mm; an arm that "
+            "moves it, or a pose of the tool away from the last axis ([tool] plate_from_tool), "
+            "needed"
         )
     outer = reach.outer if "outer" in given else min(shell.outer, reach.outer)
     inner = reach.inner if "inner" in given else min(shell.inner, shell.inner / shell.outer * outer)
@@ -563,9 +759,9 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
     needed = REACHED_SHARE if given & {"centre", "inner", "outer"} else LEAST_REACHED_SHARE
     if share < needed:
         raise SettingsError(
-            f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % needed. "
-            f"By its kinematics the tool is {shell.inner:g} to {shell.outer:g} m from {list(shell.centre)}; "
-            f"min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
+            f"[reach]: the arm reaches {100 * share:.0f} % of it; at least {100 * needed:.0f} % "
+            f"needed. By its kinematics the tool is {shell.inner:g} to {shell.outer:g} m from "
+            f"{list(shell.centre)}; min_x = {reach.min_x:g} and min_z = {reach.min_z:g} given"
         )
     return msgspec.structs.replace(settings, reach=reach)
 
@@ -576,19 +772,26 @@ def _of_cell(given: dict[str, Any], cell: str, origin: str) -> dict[str, Any]:
     """
     cells = given.pop("cells", {})
     if not isinstance(cells, dict) or not all(isinstance(table, dict) for table in cells.values()):
-        raise SettingsError(f"{origin}: [cells]: tables by the cells' names needed, like [cells.bench1.tool]")
+        raise SettingsError(
+            f"{origin}: [cells]: tables by the cells' names needed, like [cells.bench1.tool]"
+        )
     if not cells and not cell:
         return given
     if cell not in cells:
         problem = f"cell {cell!r} given" if cell else "no cell given"
-        raise SettingsError(f"{origin}: {problem}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} needed")
+        raise SettingsError(
+            f"{origin}: {problem}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} "
+            "needed"
+        )
     return _merged(given | {"cell": cell}, cells[cell])
 
 
 def _merged(given: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     pairs = {name: (given.get(name), value) for name, value in changes.items()}
     return given | {
-        name: _merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
+        name: _merged(before, value)
+        if isinstance(before, dict) and isinstance(value, dict)
+        else value
         for name, (before, value) in pairs.items()
     }
 
@@ -610,5 +813,7 @@ def load(path: Path, cell: str = "") -> Settings:
     try:
         text = text_in(path, accepts_pipes=True)
     except (OSError, UnusableError) as error:
-        raise UnreadableError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
+        raise UnreadableError(
+            f"cannot read configuration {path}: {in_words(error, named=False)}"
+        ) from None
     return parse(text, origin=str(path), folder=path.parent, cell=cell)

@@ -18,7 +18,9 @@ else:
     import tomli as tomllib
 
 LARGEST_CONFIGURATION = 1_000_000  # [bytes]
-LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # begin of a file that stands for one of Git LFS
+LFS_POINTER = (
+    b"version https://git-lfs.github.com/spec/"  # begin of a file that stands for one of Git LFS
+)
 NOT_FETCHED = "it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches that"
 MOST_DOTS = 1000  # in a line of TOML
 
@@ -42,7 +44,9 @@ def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> b
     """
     about = path.stat()
     is_file = stat.S_ISREG(about.st_mode)
-    if not (is_file or stat.S_ISDIR(about.st_mode) or (accepts_pipes and stat.S_ISFIFO(about.st_mode))):
+    if not (
+        is_file or stat.S_ISDIR(about.st_mode) or (accepts_pipes and stat.S_ISFIFO(about.st_mode))
+    ):
         raise UnusableError("it is not a file")
     if is_file and about.st_size > largest_bytes:
         raise UnusableError(f"it has {about.st_size} bytes, at most {largest_bytes} accepted")
@@ -75,7 +79,11 @@ def text_in(path: Path, *, accepts_pipes: bool = False) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        kind = "UTF-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else f"not at byte {error.start}"
+        kind = (
+            "UTF-16"
+            if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+            else f"not at byte {error.start}"
+        )
         raise UnusableError(f"text in UTF-8 needed, and it is {kind}") from None
 
 

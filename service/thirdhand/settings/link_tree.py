@@ -31,35 +31,48 @@ class Edge(Protocol):
 def root_of(links: Sequence[str], joints: Sequence[Edge]) -> str:
     """The root link. Raises ValueError if links and joints do not form a tree."""
     if len(links) > MAX_LINKS:
-        raise ValueError(f"{len(links)} links; up to {MAX_LINKS} accepted: leave out what does not belong to the arm")
+        raise ValueError(
+            f"{len(links)} links; up to {MAX_LINKS} accepted: leave out what does not belong to "
+            "the arm"
+        )
     for kind, names in (("link", links), ("joint", [joint.name for joint in joints])):
         if "" in names:
             raise ValueError(f"a {kind} without a name")
         if twice := _named([name for name, count in Counter(names).items() if count > 1]):
             raise ValueError(f"{kind} {twice} is declared twice; each name once needed")
-    declared, above = set(links), {joint.child: joint for joint in joints}
+    declared = set(links)
+    above = {joint.child: joint for joint in joints}
     for joint in joints:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if not link:
                 raise ValueError(f"joint {joint.name!r} names no {role} link")
             if link not in declared:
-                raise ValueError(f"joint {joint.name!r}: its {role} {link!r} is not declared; a <link> of it needed")
+                raise ValueError(
+                    f"joint {joint.name!r}: its {role} {link!r} is not declared; a <link> of it "
+                    "needed"
+                )
         if (other := above[joint.child]) is not joint:
             raise ValueError(
-                f"link {joint.child!r} is the child of two joints, {joint.name!r} and {other.name!r}; one needed: arms "
-                "with closed loops are not supported, cut the loop where it does not carry the tool"
+                f"link {joint.child!r} is the child of two joints, {joint.name!r} and "
+                f"{other.name!r}; one needed: arms with closed loops are not supported, cut the "
+                "loop where it does not carry the tool"
             )
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
-        raise ValueError(f"no joint connects {_named(roots)}; one root needed: connect them by fixed joints")
-    reached, below = set(roots), _children(joints)
+        raise ValueError(
+            f"no joint connects {_named(roots)}; one root needed: connect them by fixed joints"
+        )
+    reached = set(roots)
+    below = _children(joints)
     waiting = list(roots)
     while waiting:
         children = below.get(waiting.pop(), [])
         reached.update(children)
         waiting += children
     if lost := [link for link in links if link not in reached]:
-        raise ValueError(f"the joints above {_named(lost)} form a cycle; a tree with one root needed")
+        raise ValueError(
+            f"the joints above {_named(lost)} form a cycle; a tree with one root needed"
+        )
     return roots[0]
 
 

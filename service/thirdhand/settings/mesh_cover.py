@@ -28,12 +28,20 @@ END_DIGITS = 4  # a capsule's ends are rounded to 0.1 mm, and its radius is enla
 MIN_AXIS2_M2 = 1e-12  # added to a squared length, so that an axis of length 0 divides nothing by 0
 CAPSULE_CACHE = Path("~/.cache/thirdhand/capsules")  # files are named by a digest of mesh and scale
 EVALUATIONS = 100  # the cost is evaluated this often for each principal axis
-SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))  # first steps: two tilts, two offsets / size
+SIMPLEX = np.vstack(
+    (np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1)))
+)  # first steps: two tilts, two offsets / size
 RADII = np.linspace(1.0, 1.5, 12)  # tried radii / smallest radius that holds all points
 _HEIGHTS = (np.arange(100) + 0.5) / 100
-_TURNS = np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))  # the golden angle spreads directions evenly
+_TURNS = (
+    np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))
+)  # the golden angle spreads directions evenly
 DIRECTIONS = np.column_stack(
-    (np.sqrt(1.0 - _HEIGHTS**2) * np.cos(_TURNS), np.sqrt(1.0 - _HEIGHTS**2) * np.sin(_TURNS), _HEIGHTS)
+    (
+        np.sqrt(1.0 - _HEIGHTS**2) * np.cos(_TURNS),
+        np.sqrt(1.0 - _HEIGHTS**2) * np.sin(_TURNS),
+        _HEIGHTS,
+    )
 ).astype(np.float32)  # (100, 3) unit vectors over half a sphere
 
 
@@ -47,11 +55,16 @@ def covered(text: str, path: Path, packages: tuple[str, ...] = ()) -> str:
     """
     robot = ElementTree.fromstring(text)
     if lost := unfound(robot, path, packages, "collision"):
-        raise UrdfError(f"{path}: {lost}. Links with a box, cylinder or sphere instead need no mesh")
+        raise UrdfError(
+            f"{path}: {lost}. Links with a box, cylinder or sphere instead need no mesh"
+        )
     for link in robot.iter("link"):
         for mesh in (element for shape in link.iter("collision") for element in shape.iter("mesh")):
             if COVER not in mesh.attrib:
-                mesh.set(COVER, " ".join(f"{number:.5f}" for number in _capsule(mesh, link, path, packages)))
+                mesh.set(
+                    COVER,
+                    " ".join(f"{number:.5f}" for number in _capsule(mesh, link, path, packages)),
+                )
     return ElementTree.tostring(robot, encoding="unicode")
 
 
@@ -61,13 +74,18 @@ def _capsule(
     """The capsule around a mesh in its own frame, with the URDF's scale; a negative scale mirrors
     the mesh. Raises UrdfError.
     """
-    name, scale = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+    name = mesh.get("filename", "")
+    scale = mesh.get("scale", "1 1 1")
     subject = f"{urdf}: the collision mesh {name} of link {link.get('name', '')!r}"
     try:
         factors = np.array([float(number) for number in scale.split()])
         if factors.shape != (3,) or not np.isfinite(factors).all() or not factors.all():
-            raise UrdfError(f"{subject}: scale {scale!r} given; three finite numbers, none of them 0, needed")
-        file = next(candidate for candidate in _candidates(name, urdf, packages) if candidate.is_file())
+            raise UrdfError(
+                f"{subject}: scale {scale!r} given; three finite numbers, none of them 0, needed"
+            )
+        file = next(
+            candidate for candidate in _candidates(name, urdf, packages) if candidate.is_file()
+        )
         data = content(file, MAX_MESH_BYTES)
         made_by = hashlib.sha256(Path(__file__).read_bytes())
         made_by.update(repr((file.suffix.lower(), factors.tolist())).encode() + data)
@@ -80,7 +98,9 @@ def _capsule(
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
-        words = in_words(error, named=False).rpartition("message:")[2]  # the library's source file is cut off
+        words = in_words(error, named=False).rpartition("message:")[
+            2
+        ]  # the library's source file is cut off
         raise UrdfError(f"{subject} cannot be read: {' '.join(words.split())}") from None
     return capsule
 
@@ -103,7 +123,9 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
     for link in robot.iter("link"):
         for mesh in (element for shape in link.iter(kind) for element in shape.iter("mesh")):
             name = mesh.get("filename", "")
-            if COVER not in mesh.attrib and not any(candidate.is_file() for candidate in _candidates(name, urdf, packages)):
+            if COVER not in mesh.attrib and not any(
+                candidate.is_file() for candidate in _candidates(name, urdf, packages)
+            ):
                 lost.setdefault(name, link.get("name", ""))
     if not lost:
         return ""
@@ -116,10 +138,12 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
     if not name.startswith(("package://", "model://")):
         return f"{problem}: there is no {tried[0]}; put it there"
     path = name.rpartition("://")[2]
-    folders = ", ".join(str(candidate).removesuffix(path) for candidate in tried if str(candidate).endswith(path))
+    folders = ", ".join(
+        str(candidate).removesuffix(path) for candidate in tried if str(candidate).endswith(path)
+    )
     return (
-        f"{problem}; package {path.partition('/')[0]!r} with this file is in none of {folders}. Name the folder that "
-        "holds the package in [arm] packages (`thirdhand arm`: by --packages)"
+        f"{problem}; package {path.partition('/')[0]!r} with this file is in none of {folders}. "
+        "Name the folder that holds the package in [arm] packages (`thirdhand arm`: by --packages)"
     )
 
 
@@ -127,10 +151,18 @@ def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     """The paths at which the file of a mesh may be."""
     scheme, _, path = name.rpartition("://")
     path = name.removeprefix("file:") if name.startswith("file:/") and not scheme else path
-    path = path.removeprefix("localhost") if path.startswith("localhost/") and scheme == "file" else path
-    folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))  # of the URDF, and of a link's target
+    path = (
+        path.removeprefix("localhost")
+        if path.startswith("localhost/") and scheme == "file"
+        else path
+    )
+    folders = dict.fromkeys(
+        (urdf.absolute().parent, urdf.resolve().parent)
+    )  # of the URDF, and of a link's target
     if scheme not in ("package", "model"):
-        return [folder / file for file in dict.fromkeys((path, unquote(path))) for folder in folders]
+        return [
+            folder / file for file in dict.fromkeys((path, unquote(path))) for folder in folders
+        ]
     package, _, inside = path.partition("/")
     named = [Path(root).expanduser() for root in packages]
     above = dict.fromkeys(parent for folder in folders for parent in (folder, *folder.parents))
@@ -149,7 +181,9 @@ def _vertices(file: Path, data: bytes) -> Points:
     """
     count = int.from_bytes(data[80:84], "little")
     if file.suffix.lower() == ".stl" and len(data) == 84 + 50 * count:
-        triangles = np.frombuffer(data[84:], np.dtype([("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("", "<u2")]))
+        triangles = np.frombuffer(
+            data[84:], np.dtype([("normal", "<f4", 3), ("at", "<f4", (3, 3)), ("", "<u2")])
+        )
         return triangles["at"].reshape(-1, 3).astype(np.float64)
     import coal  # its import is slow, and few arms need it
 
@@ -169,9 +203,12 @@ def _unit_m(collada: bytes) -> float:
 
 def _kept(name: str) -> tuple[float, ...] | None:
     """A cached capsule; None if there is no such file, or it does not hold a capsule."""
-    with contextlib.suppress(OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
+    with contextlib.suppress(
+        OSError, ValueError, RuntimeError
+    ):  # RuntimeError: a user without a home
         capsule = tuple(
-            float(number) for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()
+            float(number)
+            for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()
         )
         if len(capsule) == 7 and all(map(math.isfinite, capsule)) and capsule[6] > 0.0:
             return capsule
@@ -202,7 +239,8 @@ def capsule_around(points: Points) -> tuple[float, ...]:
     outline = _outline(points)
     middle = outline.mean(axis=0)
     outline = outline - middle
-    size, best = float(np.abs(outline).max()) + 10.0**-END_DIGITS, (math.inf, np.zeros(6))
+    size = float(np.abs(outline).max()) + 10.0**-END_DIGITS
+    best = (math.inf, np.zeros(6))
 
     def around(q: Points, axis: Points, across: Points) -> tuple[float, Points]:
         along = axis + q[:2] @ across
@@ -218,7 +256,12 @@ def capsule_around(points: Points) -> tuple[float, ...]:
             np.zeros(4),
             (axis, across),
             method="Nelder-Mead",
-            options={"maxfev": EVALUATIONS, "initial_simplex": SIMPLEX, "xatol": 1e-3, "fatol": 1e-4 * size**4},
+            options={
+                "maxfev": EVALUATIONS,
+                "initial_simplex": SIMPLEX,
+                "xatol": 1e-3,
+                "fatol": 1e-4 * size**4,
+            },
         )
         best = min(best, around(optimum.x, axis, across), key=lambda one: one[0])
     ends = np.round(best[1] + np.tile(middle, 2), END_DIGITS)
@@ -233,10 +276,16 @@ def _along(points: Points, along: Points, start: Points) -> tuple[float, Points]
     away = points - start
     heights = away @ along
     squares = np.maximum((away * away).sum(axis=1) - heights * heights, 0.0)
-    radii = (math.sqrt(squares.max()) + 10.0**-END_DIGITS) * RADII  # above 0, or points on a line cost nothing
+    radii = (
+        math.sqrt(squares.max()) + 10.0**-END_DIGITS
+    ) * RADII  # above 0, or points on a line cost nothing
     depths = np.sqrt(radii[:, None] ** 2 - squares)
-    low, high = (heights + depths).min(axis=1), (heights - depths).max(axis=1)
-    low, high = np.where(low > high, 0.5 * (low + high), low), np.where(low > high, 0.5 * (low + high), high)
+    low = (heights + depths).min(axis=1)
+    high = (heights - depths).max(axis=1)
+    low, high = (
+        np.where(low > high, 0.5 * (low + high), low),
+        np.where(low > high, 0.5 * (low + high), high),
+    )
     costs = radii**3 * (high - low + 4.0 / 3.0 * radii)
     i = int(costs.argmin())
     return float(costs[i]), np.concatenate((start + low[i] * along, start + high[i] * along))
@@ -251,6 +300,7 @@ def _outline(points: Points) -> Points:
 
 def _radius(points: Points, ends: Points) -> float:
     """The greatest distance of points (N, 3) from the segment between two ends (6,)."""
-    start, axis = ends[:3], ends[3:] - ends[:3]
+    start = ends[:3]
+    axis = ends[3:] - ends[:3]
     share = np.clip((points - start) @ axis / (axis @ axis + MIN_AXIS2_M2), 0.0, 1.0)
     return float(np.linalg.norm(points - start - share[:, None] * axis, axis=1).max())

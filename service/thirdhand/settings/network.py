@@ -19,7 +19,10 @@ Domain = Annotated[
 
 
 _TOPIC = "(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)"
-Topic = Annotated[str, msgspec.Meta(pattern=rf"\A{_TOPIC}*\Z", extra={"accepted": "a topic's full name, /like/this,"})]
+Topic = Annotated[
+    str,
+    msgspec.Meta(pattern=rf"\A{_TOPIC}*\Z", extra={"accepted": "a topic's full name, /like/this,"}),
+]
 FrameSource = Annotated[
     str,
     msgspec.Meta(
@@ -29,7 +32,9 @@ FrameSource = Annotated[
 ]
 HandSources = Annotated[
     tuple[FrameSource, FrameSource],
-    msgspec.Meta(extra={"accepted": 'both hands\' frames, like ["/tf:left_wrist", "/tf:right_wrist"],'}),
+    msgspec.Meta(
+        extra={"accepted": 'both hands\' frames, like ["/tf:left_wrist", "/tf:right_wrist"],'}
+    ),
 ]
 
 
@@ -38,7 +43,11 @@ def is_local(endpoint: str) -> bool:
     protocol, _, address = endpoint.partition("/")
     host = re.sub(r"(:\w*)?([?#].*)?$", "", address).strip("[]")
     try:
-        return protocol == "unixsock-stream" or host == "localhost" or ipaddress.ip_address(host).is_loopback
+        return (
+            protocol == "unixsock-stream"
+            or host == "localhost"
+            or ipaddress.ip_address(host).is_loopback
+        )
     except ValueError:
         return False
 
@@ -49,43 +58,71 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     With a certificate all endpoints are TLS, and each role has its own rights.
     """
 
-    listen: tuple[str, ...] = (ENDPOINT,)  # endpoints on which the daemon listens; port 0: a free one
+    listen: tuple[str, ...] = (
+        ENDPOINT,
+    )  # endpoints on which the daemon listens; port 0: a free one
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
-    certificate: str = ""  # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
-    revoked: tuple[str, ...] = ()  # names of certificates, like tracker-2, that are no longer accepted
-    zenoh_config: str = ""  # file with Zenoh's own settings, where the service sets none; empty: none
-    ros2_domain: Domain = None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
-    allow_insecure: bool = False  # accept a network without TLS: everyone on it, or at its router, can move the arm
+    certificate: str = (
+        ""  # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
+    )
+    revoked: tuple[
+        str, ...
+    ] = ()  # names of certificates, like tracker-2, that are no longer accepted
+    zenoh_config: str = (
+        ""  # file with Zenoh's own settings, where the service sets none; empty: none
+    )
+    ros2_domain: Domain = (
+        None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
+    )
+    allow_insecure: bool = (
+        False  # accept a network without TLS: everyone on it, or at its router, can move the arm
+    )
 
     @property
     def reached_at(self) -> tuple[str, ...]:
         """The endpoints at which programs of this machine reach the daemon."""
-        listening = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in self.listen]
-        return tuple(endpoint for endpoint in listening if not re.search(r":0([?#]|$)", endpoint)) or self.connect
+        listening = [
+            re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in self.listen
+        ]
+        return (
+            tuple(endpoint for endpoint in listening if not re.search(r":0([?#]|$)", endpoint))
+            or self.connect
+        )
 
     def __post_init__(self) -> None:
         endpoints = {"listen": self.listen, "connect": self.connect}
-        for name, endpoint in ((f"{key}[{i}]", entry) for key, entries in endpoints.items() for i, entry in enumerate(entries)):
+        for name, endpoint in (
+            (f"{key}[{i}]", entry)
+            for key, entries in endpoints.items()
+            for i, entry in enumerate(entries)
+        ):
             if lacks := lacking(endpoint):
                 raise ValueError(f"$.network.{name}: {lacks}")
             if self.certificate and not endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.{name}: {endpoint} given; with a certificate tls/... needed")
+                raise ValueError(
+                    f"$.network.{name}: {endpoint} given; with a certificate tls/... needed"
+                )
             if not self.certificate and endpoint.startswith("tls/"):
-                raise ValueError(f"$.network.certificate: none given; for {endpoint} the folder of one needed")
+                raise ValueError(
+                    f"$.network.certificate: none given; for {endpoint} the folder of one needed"
+                )
             if not (self.certificate or self.allow_insecure or is_local(endpoint)):
                 raise ValueError(
-                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an address like "
-                    "127.0.0.1, or certificate = ... with tls/..., or else allow_insecure = true needed"
+                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an "
+                    "address like 127.0.0.1, or certificate = ... with tls/..., or else "
+                    "allow_insecure = true needed"
                 )
         if self.revoked and not self.certificate:
             raise ValueError(
-                "$.network.revoked: given without $.network.certificate, without which no client has a certificate"
+                "$.network.revoked: given without $.network.certificate, without which no client "
+                "has a certificate"
             )
         for i, name in enumerate(self.revoked):
             if not any(name in names(role) for role in (*ROLES, DAEMON)):
                 raise ValueError(
                     f"$.network.revoked[{i}]: {name!r} given; a certificate's name needed: one of "
-                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like {names('tracker')[1]}"
+                    f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like "
+                    f"{names('tracker')[1]}"
                 )
 
 
@@ -97,24 +134,43 @@ class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     position_commands: Topic = ""  # forward_command_controller for positions: /<its name>/commands
     trajectory: Topic = ""  # joint_trajectory_controller: /<its name>/joint_trajectory
-    joint_states: Topic = ""  # joint_state_broadcaster: /joint_states, received in addition to the cell's own
-    joints: tuple[str, ...] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
-    hands: HandSources = ("", "")  # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
+    joint_states: Topic = (
+        ""  # joint_state_broadcaster: /joint_states, received in addition to the cell's own
+    )
+    joints: tuple[
+        str, ...
+    ] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
+    hands: HandSources = (
+        "",
+        "",
+    )  # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
     tool: FrameSource = ""  # the tool in demonstrations, as such a frame
-    tf: Topic = ""  # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
-    robot_description: Topic = ""  # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
+    # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
+    tf: Topic = ""
+    robot_description: Topic = (
+        ""  # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
+    )
     diagnostics: Topic = ""  # /diagnostics: mode, reason and lateness each second
 
     def __post_init__(self) -> None:
-        sources = {"$.ros2.hands[0]": self.hands[0], "$.ros2.hands[1]": self.hands[1], "$.ros2.tool": self.tool}
+        sources = {
+            "$.ros2.hands[0]": self.hands[0],
+            "$.ros2.hands[1]": self.hands[1],
+            "$.ros2.tool": self.tool,
+        }
         first_of: dict[str, str] = {}
         for path, source in sources.items():
             topic, _, frame = source.partition(":")
             if topic.endswith("_static"):
-                raise ValueError(f"{path}: {source!r} given; a topic of frames that move needed, like /tf")
+                raise ValueError(
+                    f"{path}: {source!r} given; a topic of frames that move needed, like /tf"
+                )
             if source and topic == self.tf and frame in ros2.OWN_FRAMES:
                 raise ValueError(
-                    f"{path}: {source!r} given, which this cell publishes itself on $.ros2.tf; a tracker's frame needed"
+                    f"{path}: {source!r} given, which this cell publishes itself on $.ros2.tf; a "
+                    "tracker's frame needed"
                 )
             if source and (first := first_of.setdefault(source, path)) != path:
-                raise ValueError(f"{path}: {source!r} given; another frame than that of {first} needed")
+                raise ValueError(
+                    f"{path}: {source!r} given; another frame than that of {first} needed"
+                )

@@ -12,20 +12,40 @@ from collections.abc import Sequence
 from thirdhand.contract.records import Mode
 
 Colour = tuple[int, int, int]
-ORANGE, SKY, GREEN, YELLOW = (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66)
-BLUE, VERMILLION, PURPLE, GREY = (38, 138, 204), (216, 96, 2), (204, 121, 167), (160, 165, 173)
-LEFT, RIGHT, TOOL, TARGET, MEASURED, NEAREST, PLACE = SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, GREY
+ORANGE = (230, 159, 0)
+SKY = (86, 180, 233)
+GREEN = (0, 158, 115)
+YELLOW = (240, 228, 66)
+BLUE = (38, 138, 204)
+VERMILLION = (216, 96, 2)
+PURPLE = (204, 121, 167)
+GREY = (160, 165, 173)
+LEFT = SKY
+RIGHT = ORANGE
+TOOL = GREEN
+TARGET = PURPLE
+MEASURED = YELLOW
+NEAREST = VERMILLION
+PLACE = GREY
 OFF = BLUE  # curve of the hands' deviation
 GATE = VERMILLION  # curve of the deviation above which the arm holds
-LATENCY, WORK, LATENESS = PURPLE, SKY, ORANGE
+LATENCY = PURPLE
+WORK = SKY
+LATENESS = ORANGE
 BY_TRACK = {"left": LEFT, "right": RIGHT, "tool": TOOL}  # the paths of hands and tool
 BY_JOINT = (SKY, ORANGE, GREEN, PURPLE, YELLOW, BLUE, VERMILLION)
 BY_MODE: dict[Mode, Colour] = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: VERMILLION}
 ARM_BODY: Colour = (200, 203, 208)
-PAPER: Colour = (248, 240, 234)  # white with the tint of a hold or a fault, the darkest background of plots
+PAPER: Colour = (
+    248,
+    240,
+    234,
+)  # white with the tint of a hold or a fault, the darkest background of plots
 RGB = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in the luminance
 LEAST_CONTRAST = 4.5  # WCAG 2 requires this for text
-BACKGROUND, TABLE, GRID = (24, 27, 33), (58, 63, 72), (70, 76, 86)
+BACKGROUND = (24, 27, 33)
+TABLE = (58, 63, 72)
+GRID = (70, 76, 86)
 
 
 def faint(colour: Colour, opacity: float) -> tuple[int, int, int, int]:

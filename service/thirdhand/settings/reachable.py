@@ -24,14 +24,20 @@ from thirdhand.settings.urdf import UrdfJoint
 Vectors = NDArray[np.float64]
 POSTURES = 30_000  # with more the shell's radii change by less than 1 %
 TEST_POINTS = 8_000  # points in space are tested for being reached
-NEAR_SHARE = 0.03  # a reached point is within 0.03 of the arm's extent of the tool in one of the postures
+NEAR_SHARE = (
+    0.03  # a reached point is within 0.03 of the arm's extent of the tool in one of the postures
+)
 RAIL_STEPS = 9  # positions of a prismatic joint below the first joint that turns
 NEAR_POSTURES = 12  # this many of the nearest postures are compared for each point
 MORE_NEAR_POSTURES = 64  # compared for a point that is near none of NEAR_POSTURES
-BEYOND_SHARE = 0.08  # distance / extent of points out of reach; measured for reached points: at most 0.072
+BEYOND_SHARE = (
+    0.08  # distance / extent of points out of reach; measured for reached points: at most 0.072
+)
 REACHED = 0.95  # a layer is reached if this share of the best layer's share of points is reached
 LAYERS = 40  # distances from the shoulder that are tested
-FOLDED = 0.4  # min. inner radius / outer radius: nearer to its shoulder an arm is folded onto itself
+FOLDED = (
+    0.4  # min. inner radius / outer radius: nearer to its shoulder an arm is folded onto itself
+)
 STRETCHED = 0.96  # max. outer radius / maximum distance: farther out an arm is singular
 
 
@@ -63,15 +69,22 @@ class Workspace:
         from_rails, self.directions, axes = _placed(chain, unmoved, plate_from_tool)
         along = np.array([axis for _, axis in axes[:rails]]).reshape(rails, 3)
         self.positions = from_rails + self.postures[:, :rails] @ along
-        self._turns, self._axis = moving[rails].kind != "prismatic", axes[rails][1]
-        self._centre, self._first = _shoulder(axes[rails:]), ends[rails]
+        self._turns = moving[rails].kind != "prismatic"
+        self._axis = axes[rails][1]
+        self._centre = _shoulder(axes[rails:])
+        self._first = ends[rails]
         self.shoulder = self._centre + ends[:rails].mean(axis=1) @ along
         self._reach = float(np.linalg.norm(from_rails - self._centre, axis=1).max())
         self.extent = float(np.linalg.norm(self.positions - self.shoulder, axis=1).max())
         steps = [np.linspace(low, high, RAIL_STEPS) for low, high in ends[:rails]]
-        self._stops = [np.array(stop) @ along for stop in itertools.product(*steps)] if rails else [np.zeros(3)]
+        self._stops = (
+            [np.array(stop) @ along for stop in itertools.product(*steps)]
+            if rails
+            else [np.zeros(3)]
+        )
         flat, angles = self._flattened(from_rails)
-        self._tree, self._starts = cKDTree(flat), angles - self.postures[:, rails]
+        self._tree = cKDTree(flat)
+        self._starts = angles - self.postures[:, rails]
 
     def reaches(self, points: Vectors) -> NDArray[np.bool_]:
         """A mask (M,) of the points (M, 3) that are near the tool in one of the postures."""
@@ -87,7 +100,9 @@ class Workspace:
         """Distances (M,) [m] of points (M, 3) from the tool in the nearest posture, over all stops
         of the rails below the first joint that turns.
         """
-        return np.asarray(np.min([self._distances(points - stop, neighbours) for stop in self._stops], axis=0))
+        return np.asarray(
+            np.min([self._distances(points - stop, neighbours) for stop in self._stops], axis=0)
+        )
 
     def _distances(self, points: Vectors, neighbours: int) -> Vectors:
         """Distances (M,) [m] of points (M, 3) from the tool in the nearest posture with the rails
@@ -103,7 +118,9 @@ class Workspace:
             return np.asarray(distances.min(axis=1))
         lower, upper = self._first
         turn = (angles[:, None] - self._starts[indices] - lower) % (2 * math.pi)
-        excess = np.where(turn <= upper - lower, 0.0, np.minimum(turn - (upper - lower), 2 * math.pi - turn))
+        excess = np.where(
+            turn <= upper - lower, 0.0, np.minimum(turn - (upper - lower), 2 * math.pi - turn)
+        )
         return np.asarray(np.hypot(distances, 2.0 * flat[:, :1] * np.sin(excess / 2.0)).min(axis=1))
 
     def _flattened(self, points: Vectors) -> tuple[Vectors, Vectors]:
@@ -114,7 +131,8 @@ class Workspace:
             return points, np.zeros(len(points))
         across = np.linalg.svd(self._axis[None])[2][1]  # any direction across the axis
         away = points - self._centre
-        x, y = away @ across, away @ np.cross(self._axis, across)
+        x = away @ across
+        y = away @ np.cross(self._axis, across)
         return np.column_stack((np.hypot(x, y), away @ self._axis)), np.arctan2(y, x)
 
     def shell(self, min_x: float, min_z: float) -> Shell:
@@ -124,13 +142,18 @@ class Workspace:
         points, distances = _ball(self.shoulder, self.extent, min_x, min_z)
         edges = np.linspace(0.0, self.extent, LAYERS + 1)
         layer = np.digitize(distances, edges) - 1
-        reached, counts = self.reaches(points), np.bincount(layer, minlength=LAYERS)[:LAYERS]
-        shares = np.bincount(layer, weights=reached, minlength=LAYERS)[:LAYERS] / np.maximum(counts, 1)
+        reached = self.reaches(points)
+        counts = np.bincount(layer, minlength=LAYERS)[:LAYERS]
+        shares = np.bincount(layer, weights=reached, minlength=LAYERS)[:LAYERS] / np.maximum(
+            counts, 1
+        )
         first, last = _longest((shares >= REACHED * shares.max(initial=0.0)) & (counts > 0))
         outer = min(edges[last], STRETCHED * self.extent)
         inner = max(edges[first], FOLDED * outer)
         x, y, z = self.shoulder.tolist()
-        return Shell((round(x, 4), round(y, 4), round(z, 4)), round(float(inner), 4), round(float(outer), 4))
+        return Shell(
+            (round(x, 4), round(y, 4), round(z, 4)), round(float(inner), 4), round(float(outer), 4)
+        )
 
     def share(self, shell: Shell, min_x: float, min_z: float) -> float:
         """Reached share of the part of a shell where z >= `min_z` and x >= `min_x`; 0 if that part
@@ -143,7 +166,10 @@ class Workspace:
 
 @functools.cache
 def workspace_of(
-    chain: tuple[UrdfJoint, ...], lower: tuple[float, ...], upper: tuple[float, ...], plate_from_tool: tuple[float, ...]
+    chain: tuple[UrdfJoint, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
+    plate_from_tool: tuple[float, ...],
 ) -> Workspace:
     """A workspace, cached by its arguments."""
     return Workspace(chain, lower, upper, plate_from_tool)
@@ -156,7 +182,9 @@ def _spread(count: int, dimensions: int) -> Vectors:
     g = 2.0
     for _ in range(50):
         g = (1.0 + g) ** (1.0 / (dimensions + 1))
-    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * g ** -np.arange(1.0, dimensions + 1)) % 1.0)
+    return np.asarray(
+        (0.5 + np.arange(1, count + 1)[:, None] * g ** -np.arange(1.0, dimensions + 1)) % 1.0
+    )
 
 
 def _turns(lower: float, upper: float) -> tuple[float, float]:
@@ -189,19 +217,27 @@ def _placed(
     """
     x, y, z, *quaternion = plate_from_tool
     toward = Rotation.from_quat(quaternion).as_matrix()[:, 2]
-    positions, along = np.tile((x, y, z), (len(postures), 1)), np.tile(toward, (len(postures), 1))
+    positions = np.tile((x, y, z), (len(postures), 1))
+    along = np.tile(toward, (len(postures), 1))
     columns = iter(postures.T[::-1, :, None])
     for joint in reversed(chain):  # from the plate to the root
         axis = np.array(joint.axis)
         if joint.kind == "prismatic":
             positions = positions + next(columns) * axis
         elif joint.kind != "fixed":  # R(q) v = v + sin q (a x v) + (1 - cos q) a x (a x v)
-            cross, q = np.cross(axis, np.eye(3)), next(columns)
-            first, second = np.sin(q), 1.0 - np.cos(q)
-            positions, along = (v + first * (v @ cross) + second * (v @ (cross @ cross)) for v in (positions, along))
+            cross = np.cross(axis, np.eye(3))
+            q = next(columns)
+            first = np.sin(q)
+            second = 1.0 - np.cos(q)
+            positions, along = (
+                v + first * (v @ cross) + second * (v @ (cross @ cross)) for v in (positions, along)
+            )
         joint_turn = Rotation.from_quat(joint.rotation).as_matrix().T
-        positions, along = positions @ joint_turn + joint.translation, along @ joint_turn
-    rest_turn, rest_at, axes = np.eye(3), np.zeros(3), []
+        positions = positions @ joint_turn + joint.translation
+        along = along @ joint_turn
+    rest_turn = np.eye(3)
+    rest_at = np.zeros(3)
+    axes = []
     for joint in chain:
         rest_at = rest_at + rest_turn @ np.array(joint.translation)
         rest_turn = rest_turn @ Rotation.from_quat(joint.rotation).as_matrix()
@@ -214,8 +250,12 @@ def _shoulder(axes: Sequence[tuple[Vectors, Vectors]]) -> Vectors:
     """The point of the first axis that is nearest to the second. For parallel axes, or one alone:
     the projection of the second's origin onto the first axis.
     """
-    (origin, along), (other, across) = axes[0], axes[min(1, len(axes) - 1)]
-    between, cosine = other - origin, float(along @ across)
+    origin, along = axes[0]
+    other, across = axes[min(1, len(axes) - 1)]
+    between = other - origin
+    cosine = float(along @ across)
     if 1.0 - cosine * cosine > 1e-6:
-        between = between - across * ((between @ across) - cosine * (between @ along)) / (1.0 - cosine * cosine)
+        between = between - across * ((between @ across) - cosine * (between @ along)) / (
+            1.0 - cosine * cosine
+        )
     return np.asarray(origin + along * (between @ along))

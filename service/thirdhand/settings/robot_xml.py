@@ -14,7 +14,12 @@ from xml.parsers import expat
 Element = ElementTree.Element
 MAX_DEPTH = 64  # nested elements; a URDF needs 6
 MAX_ELEMENTS = 100_000  # an arm with a hand has about 1000
-ANY_LIMIT = {"lower": "-1e4", "upper": "1e4", "velocity": "1e4", "effort": "0"}  # Pinocchio requires a <limit>
+ANY_LIMIT = {
+    "lower": "-1e4",
+    "upper": "1e4",
+    "velocity": "1e4",
+    "effort": "0",
+}  # Pinocchio requires a <limit>
 MAX_NUMBER = 1e6  # largest magnitude of any number of a link or joint
 NUMERIC = {  # attributes with numbers by element, in addition to xyz and rpy
     "box": ("size",),
@@ -29,7 +34,9 @@ QUATERNION = "quat_xyzw"  # of URDF 1.1, read as the equal `rpy`
 ORIGIN_ATTRIBUTES = {"xyz", "rpy"}  # attributes of an <origin> that are read
 MAX_NORM_ERROR = 1e-3  # of a quaternion
 MIN_COSINE = 1e-9  # of a pitch at which roll and yaw differ
-MACROS = "its macros are not expanded: make a URDF of it first, by `xacro arm.urdf.xacro > arm.urdf`"
+MACROS = (
+    "its macros are not expanded: make a URDF of it first, by `xacro arm.urdf.xacro > arm.urdf`"
+)
 
 
 def element_of(text: str | bytes) -> Element:
@@ -43,18 +50,24 @@ def element_of(text: str | bytes) -> Element:
     parser = expat.ParserCreate(None if isinstance(text, bytes) else "utf-8")
     parser.buffer_text = True
     open_tags: list[str] = []
-    count, foreign = 0, 0  # elements; open elements inside one with a prefix
+    # elements; open elements inside one with a prefix
+    count = 0
+    foreign = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count, foreign
         count += 1
         open_tags.append(tag)
         if len(open_tags) > MAX_DEPTH:
-            raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_DEPTH} elements in each other")
+            raise ValueError(
+                f"line {parser.CurrentLineNumber}: more than {MAX_DEPTH} elements in each other"
+            )
         if count > MAX_ELEMENTS:
             raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_ELEMENTS} elements")
         matters = len(open_tags) > 1 and open_tags[1] in ("link", "joint")
-        if tag.startswith("xacro:") or (matters and any("${" in value or "$(" in value for value in attributes.values())):
+        if tag.startswith("xacro:") or (
+            matters and any("${" in value or "$(" in value for value in attributes.values())
+        ):
             raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
         if foreign or ":" in tag:
             foreign += 1
@@ -62,7 +75,10 @@ def element_of(text: str | bytes) -> Element:
         plain = {name: value for name, value in attributes.items() if ":" not in name}
         if tag == "origin" and QUATERNION in plain:
             if "rpy" in plain:
-                raise ValueError(f"line {parser.CurrentLineNumber}: <origin> has rpy and {QUATERNION}; one needed")
+                raise ValueError(
+                    f"line {parser.CurrentLineNumber}: <origin> has rpy and {QUATERNION}; one "
+                    "needed"
+                )
             plain["rpy"] = _rpy(Element(tag, {QUATERNION: plain.pop(QUATERNION)}))
         builder.start(tag, plain)
 
@@ -78,7 +94,9 @@ def element_of(text: str | bytes) -> Element:
         if not foreign and open_tags:
             builder.data(data)
 
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, characters
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = characters
     try:
         parser.Parse(encoded, True)
     except (expat.ExpatError, LookupError) as error:  # LookupError: an unknown encoding
@@ -91,7 +109,10 @@ def _rpy(origin: Element) -> str:
     quaternion = numbers(origin, QUATERNION, "")
     norm = math.hypot(*quaternion)
     if len(quaternion) != 4 or abs(norm - 1.0) > MAX_NORM_ERROR:
-        raise ValueError(f"<origin {QUATERNION}={origin.get(QUATERNION)!r}>: a quaternion x y z w of norm 1 needed")
+        raise ValueError(
+            f"<origin {QUATERNION}={origin.get(QUATERNION)!r}>: a quaternion x y z w of norm 1 "
+            "needed"
+        )
     x, y, z, w = (number / norm for number in quaternion)
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     cosine = math.hypot(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z))
@@ -124,7 +145,9 @@ def numbers(element: Element | None, name: str, default: str) -> tuple[float, ..
     except ValueError:
         values = (math.nan,)
     if element is not None and not all(abs(number) <= MAX_NUMBER for number in values):
-        raise ValueError(f"<{element.tag} {name}={text!r}>: finite numbers up to {MAX_NUMBER:g} needed")
+        raise ValueError(
+            f"<{element.tag} {name}={text!r}>: finite numbers up to {MAX_NUMBER:g} needed"
+        )
     return values
 
 
@@ -133,7 +156,9 @@ def three(element: Element | None, name: str, default: str) -> tuple[float, floa
     values = numbers(element, name, default)
     if len(values) != 3:
         assert element is not None
-        raise ValueError(f"<{element.tag} {name}={element.get(name)!r}>: {len(values)} numbers, 3 needed")
+        raise ValueError(
+            f"<{element.tag} {name}={element.get(name)!r}>: {len(values)} numbers, 3 needed"
+        )
     return values[0], values[1], values[2]
 
 
@@ -146,7 +171,8 @@ def check_numbers(robot: Element) -> None:
             for name in element.attrib:
                 if element.tag == "origin" and name not in ORIGIN_ATTRIBUTES:
                     raise ValueError(
-                        f"{part.tag} {part.get('name', '')!r}: {unread('origin', name, ORIGIN_ATTRIBUTES)}"
+                        f"{part.tag} {part.get('name', '')!r}: "
+                        f"{unread('origin', name, ORIGIN_ATTRIBUTES)}"
                     )
                 if name in ("xyz", "rpy") or name in NUMERIC.get(element.tag, ()):
                     try:
@@ -170,7 +196,8 @@ def kinematics(robot: Element, moving: Mapping[str, tuple[float, float, float]])
     for link in robot.findall("link"):
         ElementTree.SubElement(out, "link", name=link.get("name", ""))
     for joint in robot.findall("joint"):
-        name, kind = joint.get("name", ""), "fixed"
+        name = joint.get("name", "")
+        kind = "fixed"
         if name in moving:
             kind = "prismatic" if joint.get("type") == "prismatic" else "continuous"
         joint_copy = ElementTree.SubElement(out, "joint", name=name, type=kind)

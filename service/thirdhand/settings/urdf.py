@@ -9,10 +9,20 @@ from typing import NamedTuple
 from thirdhand.contract.explain import ExplainedError, did_you_mean
 from thirdhand.contract.messages import Quaternion, Transform, Vector3
 from thirdhand.settings.link_tree import root_of
-from thirdhand.settings.robot_xml import Element, check_numbers, element_of, kinematics, numbers, three, unread
+from thirdhand.settings.robot_xml import (
+    Element,
+    check_numbers,
+    element_of,
+    kinematics,
+    numbers,
+    three,
+    unread,
+)
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic")  # an arm's chain may have these
-CONTINUOUS_RAD = 6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise
+CONTINUOUS_RAD = (
+    6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise
+)
 
 
 class UrdfError(ExplainedError, ValueError):
@@ -74,7 +84,10 @@ class Urdf:
                 for collision in link.findall("collision")
             )
             if len(self.shapes) > MAX_SHAPES:
-                raise ValueError(f"{len(self.shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links fewer")
+                raise ValueError(
+                    f"{len(self.shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links "
+                    "fewer"
+                )
         except ValueError as error:
             raise UrdfError(f"{origin}: not a robot description: {error}") from None
         self._above = {joint.child: joint for joint in self.joints}
@@ -88,14 +101,18 @@ class Urdf:
         while link != self.root:
             if link not in self._above:
                 last = ", ".join(self.leaves) + did_you_mean(link, self._above)
-                raise UrdfError(f"{self.origin}: no link {link!r}; the last ones of the arm are {last}")
+                raise UrdfError(
+                    f"{self.origin}: no link {link!r}; the last ones of the arm are {last}"
+                )
             joints.append(self._above[link])
             link = joints[-1].parent
         return tuple(reversed(joints))
 
     def kinematics(self, names: Sequence[str]) -> str:
         """A URDF with links and joints only, in which the joints of these names move."""
-        return kinematics(self._robot, {joint.name: joint.axis for joint in self.joints if joint.name in names})
+        return kinematics(
+            self._robot, {joint.name: joint.axis for joint in self.joints if joint.name in names}
+        )
 
     def above(self, link: str) -> UrdfJoint | None:
         """The joint that carries a link; None for the root."""
@@ -114,12 +131,16 @@ class Urdf:
             if joint.kind not in JOINT_KINDS:
                 mistake = f"is {joint.kind}; {', '.join(JOINT_KINDS)} or fixed needed"
             elif joint.mimics:
-                mistake = f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on their own needed"
+                mistake = (
+                    f"follows {joint.mimics!r} by <mimic>; before {tip!r}, joints that move on "
+                    "their own needed"
+                )
             if mistake:
                 raise UrdfError(f"{self.origin}: joint {joint.name!r} {mistake}")
         if len(moving) > MAX_MOVING:
             raise UrdfError(
-                f"{self.origin}: {len(moving)} joints move before link {tip!r}; up to {MAX_MOVING} accepted"
+                f"{self.origin}: {len(moving)} joints move before link {tip!r}; up to {MAX_MOVING} "
+                "accepted"
             )
         if not moving:
             raise UrdfError(f"{self.origin}: no movable joint before link {tip!r}")
@@ -132,10 +153,15 @@ class Urdf:
 
 def _moved(joint: UrdfJoint, position: float) -> Transform:
     """Pose of a joint's child link in its parent link."""
-    translation, turn = joint.translation, joint.rotation
+    translation = joint.translation
+    turn = joint.rotation
     if position and joint.kind == "prismatic":
         dx, dy, dz = rotated(turn, joint.axis)
-        translation = (translation[0] + position * dx, translation[1] + position * dy, translation[2] + position * dz)
+        translation = (
+            translation[0] + position * dx,
+            translation[1] + position * dy,
+            translation[2] + position * dz,
+        )
     elif position:
         turn = multiply(turn, about(joint.axis, position))
     return Transform(joint.parent, joint.child, translation, turn)
@@ -153,13 +179,19 @@ def _limited(joint: UrdfJoint) -> UrdfJoint:
 
 def _lack(joint: UrdfJoint) -> str:
     """The reason why a joint of the chain cannot be moved; empty if it can."""
-    is_continuous, unit = joint.kind == "continuous", "m" if joint.kind == "prismatic" else "rad"
+    is_continuous = joint.kind == "continuous"
+    unit = "m" if joint.kind == "prismatic" else "rad"
     if not any(joint.axis):
         return "has the axis 0 0 0; a direction needed"
     if not is_continuous and not -MAX_JOINT_LIMIT <= joint.lower < joint.upper <= MAX_JOINT_LIMIT:
         problem = f"has the limits {_or_none(joint.lower)} to {_or_none(joint.upper)}"
-        return f"{problem}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its <limit> and soft limits"
-    if not 0.0 < joint.velocity <= MAX_JOINT_LIMIT and not (is_continuous and joint.velocity == math.inf):
+        return (
+            f"{problem}; lower below upper, within {MAX_JOINT_LIMIT:g} {unit}, needed in its "
+            "<limit> and soft limits"
+        )
+    if not 0.0 < joint.velocity <= MAX_JOINT_LIMIT and not (
+        is_continuous and joint.velocity == math.inf
+    ):
         problem = f"has the velocity {_or_none(joint.velocity)}"
         return f"{problem}; above 0, up to {MAX_JOINT_LIMIT:g} {unit}/s, needed in its <limit>"
     if not min(joint.acceleration, joint.jerk) > 0.0:
@@ -173,16 +205,23 @@ def _or_none(number: float) -> str:
 
 
 def _joint(element: Element) -> UrdfJoint:
-    name, kind = element.get("name", ""), element.get("type", "")
-    origin, limit, mimic = element.find("origin"), element.find("limit"), element.find("mimic")
+    name = element.get("name", "")
+    kind = element.get("type", "")
+    origin = element.find("origin")
+    limit = element.find("limit")
+    mimic = element.find("mimic")
     soft = element.find("safety_controller") if kind != "continuous" else None
     soft_lower, soft_upper = (_limit(soft, f"soft_{side}_limit") for side in ("lower", "upper"))
     if soft_lower == soft_upper == 0.0:  # as if they were not given
         soft_lower = soft_upper = math.nan
-    acceleration, deceleration, jerk = (_limit(limit, name) for name in ("acceleration", "deceleration", "jerk"))
+    acceleration, deceleration, jerk = (
+        _limit(limit, name) for name in ("acceleration", "deceleration", "jerk")
+    )
     try:
         x, y, z = three(element.find("axis"), "xyz", "1 0 0")
-        norm = math.hypot(x, y, z) or 1.0  # a joint with the axis 0 0 0 cannot move: `movable` rejects it
+        norm = (
+            math.hypot(x, y, z) or 1.0
+        )  # a joint with the axis 0 0 0 cannot move: `movable` rejects it
         return UrdfJoint(
             name,
             kind,
@@ -228,8 +267,18 @@ def _limit(limit: Element | None, which: str) -> float:
 
 
 COVER = "covered_by"  # our own attribute of a mesh with its capsule; other readers ignore it
-SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
-SIZE_COUNTS = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}  # numbers in the attributes of SIZES
+SIZES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "sphere": ("radius",),
+}
+SIZE_COUNTS = {
+    "box": 3,
+    "cylinder": 2,
+    "capsule": 2,
+    "sphere": 1,
+}  # numbers in the attributes of SIZES
 VERSIONS = ("1", "1.0", "1.1", "1.2")
 ATTRIBUTES = {  # that are read, of joints of the chain
     "axis": {"xyz"},
@@ -243,17 +292,21 @@ MAX_SHAPES = 500  # an arm with a hand has 30
 
 
 def _shape(link: str, element: Element) -> Shape:
-    geometry, origin = element.find("geometry"), element.find("origin")
+    geometry = element.find("geometry")
+    origin = element.find("origin")
     if geometry is None or not len(geometry):
         raise ValueError(f"a collision of link {link!r} without geometry")
-    kind, shape = geometry[0].tag, geometry[0]
+    kind = geometry[0].tag
+    shape = geometry[0]
     try:
         if kind == "mesh":
             size = numbers(shape, COVER, "")
         elif kind in SIZES:
             size = tuple(number for name in SIZES[kind] for number in numbers(shape, name, ""))
             if len(size) != SIZE_COUNTS[kind] or not all(number > 0.0 for number in size):
-                raise ValueError(f"<{kind}> has no size; {' and '.join(SIZES[kind])} above 0 needed")
+                raise ValueError(
+                    f"<{kind}> has no size; {' and '.join(SIZES[kind])} above 0 needed"
+                )
         else:
             raise ValueError(f"<{kind}> is no shape; {', '.join(SIZES)} and mesh accepted")
         return Shape(link, kind, size, three(origin, "xyz", "0 0 0"), _turn(origin))
@@ -263,7 +316,9 @@ def _shape(link: str, element: Element) -> Shape:
 
 def _turn(origin: Element | None) -> Quaternion:
     roll, pitch, yaw = three(origin, "rpy", "0 0 0")
-    return multiply(about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll)))
+    return multiply(
+        about((0, 0, 1), yaw), multiply(about((0, 1, 0), pitch), about((1, 0, 0), roll))
+    )
 
 
 def _link(element: Element, which: str) -> str:

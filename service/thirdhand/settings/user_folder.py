@@ -25,5 +25,7 @@ def user_folder(kind: Literal["cache", "config", "state"]) -> Path:
         try:
             folder = Path.home() / IN_HOME[kind]
         except RuntimeError:
-            raise HomelessError(f"this user has no home folder; ${variable} or $HOME needed") from None
+            raise HomelessError(
+                f"this user has no home folder; ${variable} or $HOME needed"
+            ) from None
     return folder / "thirdhand"

@@ -61,15 +61,25 @@ def correction_at(
     It replaces earlier ones of the same segment at hands that are nearer than
     PATH_END_M, which are at the same place.
     """
-    left, right, names = _point(hands[:3]), _point(hands[3:]), skill.model.names
+    left = _point(hands[:3])
+    right = _point(hands[3:])
+    names = skill.model.names
     end = _end_of(skill, hands, segment) if names else ""
     name_of_segment = None if end or not names else names[segment]
     if end:
         replaced = [point for point in skill.via_points if point.name == end]
     else:
-        earlier = [p for p in skill.via_points if _NUMBERED.fullmatch(p.name) and p.segment == name_of_segment]
-        replaced = [point for point in earlier if _apart_m(skill, hands, _hands(point)) < PATH_END_M]
-    numbers = [int(found[1]) for point in skill.via_points if (found := _NUMBERED.fullmatch(point.name))]
+        earlier = [
+            p
+            for p in skill.via_points
+            if _NUMBERED.fullmatch(p.name) and p.segment == name_of_segment
+        ]
+        replaced = [
+            point for point in earlier if _apart_m(skill, hands, _hands(point)) < PATH_END_M
+        ]
+    numbers = [
+        int(found[1]) for point in skill.via_points if (found := _NUMBERED.fullmatch(point.name))
+    ]
     before = replaced[-1] if end and replaced else ViaPoint(end, left, right, _point(tool))
     point = msgspec.structs.replace(
         before,
@@ -104,20 +114,24 @@ def offer_of(skill: Skill) -> str:
     times = max(point.corrections for point in repeated)
     places = ", ".join(point.name for point in repeated)
     return (
-        f"{places} {'was' if len(repeated) == 1 else 'were'} corrected up to {times} times at nearly the same hands: "
-        "show the task once as it should be, by `thirdhand record NAME`, and learn the skill again with this take, "
-        "by `thirdhand learn`"
+        f"{places} {'was' if len(repeated) == 1 else 'were'} corrected up to {times} times at "
+        "nearly the same hands: show the task once as it should be, by `thirdhand record NAME`, "
+        "and learn the skill again with this take, by `thirdhand learn`"
     )
 
 
 def segment_of(skill: Skill, point: ViaPoint) -> tuple[str, ...]:
     """The via-points at which the segment of a correction begins and ends; empty if it has none."""
     return (
-        () if point.segment not in skill.model.names[:-1] else (str(point.segment), rest_of(point, skill.model.names))
+        ()
+        if point.segment not in skill.model.names[:-1]
+        else (str(point.segment), rest_of(point, skill.model.names))
     )
 
 
-def corrected(skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) -> tuple[StoredSkill, Effect]:
+def corrected(
+    skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint
+) -> tuple[StoredSkill, Effect]:
     """The skill with these via-points and no others, and what that changes at the correction `at`.
 
     Raises SkillError, also if the correction moves the tool more than MAX_GAIN times as far as
@@ -127,9 +141,9 @@ def corrected(skill: StoredSkill, via_points: Sequence[ViaPoint], at: ViaPoint) 
     effect = effect_of(skill, after, at)
     if effect.gain > MAX_GAIN and at.name not in skill.model.names:
         raise SkillError(
-            f"a correction of {100 * effect.moved_m:.0f} cm so near to what was shown or taught would move the tool "
-            f"{effect.gain:.1f} times as far as the hands; {MAX_GAIN:g} times accepted. Correct it in smaller steps, "
-            "or demonstrate this"
+            f"a correction of {100 * effect.moved_m:.0f} cm so near to what was shown or taught "
+            f"would move the tool {effect.gain:.1f} times as far as the hands; {MAX_GAIN:g} times "
+            "accepted. Correct it in smaller steps, or demonstrate this"
         )
     return after, effect
 
@@ -141,11 +155,15 @@ def effect_of(before: Skill, after: Skill, at: ViaPoint) -> Effect:
     `reach_m` is the smallest one of these directions.
     """
     sides = (0, 1) if after.conductor is None else (after.conductor,)
-    axes = np.concatenate([sign * np.eye(6)[3 * side : 3 * side + 3] for side in sides for sign in (1.0, -1.0)])
+    axes = np.concatenate(
+        [sign * np.eye(6)[3 * side : 3 * side + 3] for side in sides for sign in (1.0, -1.0)]
+    )
     steps = np.arange(0.0, MAX_REACH_M + 0.5 * REACH_STEP_M, REACH_STEP_M)
     hands = (_hands(at) + steps[:, None] * axes[:, None]).reshape(-1, 6)
     names = [rest_of(at, after.model.names)] * len(hands)
-    change = (after.mean(hands, names) - before.mean(hands, names)).reshape(len(axes), len(steps), 3)
+    change = (after.mean(hands, names) - before.mean(hands, names)).reshape(
+        len(axes), len(steps), 3
+    )
     size_m = np.linalg.norm(change, axis=2)
     moved_m = float(size_m[0, 0])
     is_less = size_m < 0.5 * moved_m
@@ -156,7 +174,10 @@ def effect_of(before: Skill, after: Skill, at: ViaPoint) -> Effect:
 
 def _end_of(skill: Skill, hands: Vector, segment: int) -> str:
     """The via-point at an end of a segment at which hands (6,) are; empty if at neither."""
-    ends = {skill.model.names[k]: _apart_m(skill, hands, skill.model.hands[k]) for k in (segment, segment + 1)}
+    ends = {
+        skill.model.names[k]: _apart_m(skill, hands, skill.model.hands[k])
+        for k in (segment, segment + 1)
+    }
     name = min(ends, key=lambda name: ends[name])
     return name if ends[name] < PATH_END_M else ""
 

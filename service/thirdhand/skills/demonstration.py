@@ -55,7 +55,9 @@ class Demonstration(NamedTuple):
     @property
     def turns(self) -> Vector:
         """The entries (T, 18) of both hands' rotation matrices, row by row."""
-        rotations = (Rotation.from_quat(part[:, 3:]).as_matrix() for part in (self.left, self.right))
+        rotations = (
+            Rotation.from_quat(part[:, 3:]).as_matrix() for part in (self.left, self.right)
+        )
         return np.hstack([matrices.reshape(-1, 9) for matrices in rotations])
 
     @property
@@ -79,8 +81,12 @@ class Demonstration(NamedTuple):
 
     def every(self, step: int) -> Demonstration:
         """The demonstration with one of every `step` samples."""
-        demonstration = Demonstration._make(part[::step] if isinstance(part, np.ndarray) else part for part in self)
-        return demonstration._replace(begins=tuple(sorted({-(-begin // step) for begin in self.begins})))
+        demonstration = Demonstration._make(
+            part[::step] if isinstance(part, np.ndarray) else part for part in self
+        )
+        return demonstration._replace(
+            begins=tuple(sorted({-(-begin // step) for begin in self.begins}))
+        )
 
 
 class NamedDemonstration(NamedTuple):
@@ -93,7 +99,10 @@ class NamedDemonstration(NamedTuple):
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     """The hash with which a skill names the demonstrations that it was learned from."""
     parts = (
-        part.tobytes() for demonstration in demonstrations for part in (demonstration.hands, demonstration.tool, demonstration.gripper) if part is not None
+        part.tobytes()
+        for demonstration in demonstrations
+        for part in (demonstration.hands, demonstration.tool, demonstration.gripper)
+        if part is not None
     )
     return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
 
@@ -101,7 +110,10 @@ def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
 def exchanged(demonstration: Demonstration) -> list[Demonstration]:
     """The demonstration with its hands exchanged, and also with those of its via-points, if any."""
     mirrored = demonstration._replace(left=demonstration.right, right=demonstration.left)
-    places = tuple(msgspec.structs.replace(place, left=place.right, right=place.left) for place in mirrored.places)
+    places = tuple(
+        msgspec.structs.replace(place, left=place.right, right=place.left)
+        for place in mirrored.places
+    )
     return [mirrored, mirrored._replace(places=places)] if places else [mirrored]
 
 
@@ -120,9 +132,12 @@ def persons(demonstrations: Sequence[Demonstration]) -> list[int]:
 def _sittings(demonstrations: Sequence[Demonstration]) -> list[str]:
     """The sitting of each demonstration; its own number if there are too few sittings."""
     in_time = sorted(range(len(demonstrations)), key=lambda i: int(demonstrations[i].stamps_ns[0]))
-    out, sitting = [""] * len(demonstrations), 0
+    out = [""] * len(demonstrations)
+    sitting = 0
     for before, after in pairwise([*in_time[:1], *in_time]):
-        pause_ns = int(demonstrations[after].stamps_ns[0]) - int(demonstrations[before].stamps_ns[-1])
+        pause_ns = int(demonstrations[after].stamps_ns[0]) - int(
+            demonstrations[before].stamps_ns[-1]
+        )
         sitting += pause_ns > 1e9 * SITTING_S
         out[after] = str(sitting)
     return out if sitting + 1 >= LEAST_SITTINGS else [str(i) for i in range(len(demonstrations))]
@@ -131,9 +146,13 @@ def _sittings(demonstrations: Sequence[Demonstration]) -> list[str]:
 def check(demonstration: Demonstration) -> None:
     """Raise SkillError if nothing can be learned from a demonstration."""
     if len({len(part) for part in demonstration[:4]}) > 1:
-        counts = ", ".join(f"{len(getattr(demonstration, name))} {name}" for name in Demonstration._fields[:4])
+        counts = ", ".join(
+            f"{len(getattr(demonstration, name))} {name}" for name in Demonstration._fields[:4]
+        )
         raise SkillError(f"a demonstration of {counts}: as many of each needed")
-    hands, tool, period_s = demonstration.hands, demonstration.tool, demonstration.period_s
+    hands = demonstration.hands
+    tool = demonstration.tool
+    period_s = demonstration.period_s
     if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
         raise SkillError("a demonstration holds numbers that are not finite")
     if len(hands) < LEAST_SAMPLES or period_s <= 0 or period_s > LONGEST_PERIOD_S:
@@ -143,14 +162,27 @@ def check(demonstration: Demonstration) -> None:
     if (np.abs(np.linalg.norm(tool[:, 3:], axis=1) - 1) > NORM_TOLERANCE).any():
         raise SkillError("a demonstration's tool orientations are not quaternions of norm 1")
     closure = demonstration.gripper
-    if closure is not None and (closure.shape != demonstration.stamps_ns.shape or not np.isfinite(closure).all()):
-        raise SkillError(f"a demonstration's gripper has shape {closure.shape}: one finite number a sample needed")
-    if closure is not None and (closure.min() < -CLOSURE_MARGIN or closure.max() > 1.0 + CLOSURE_MARGIN):
+    if closure is not None and (
+        closure.shape != demonstration.stamps_ns.shape or not np.isfinite(closure).all()
+    ):
         raise SkillError(
-            f"a demonstration's gripper goes from {closure.min():g} to {closure.max():g}: 0 (open) to 1 (closed) needed"
+            f"a demonstration's gripper has shape {closure.shape}: one finite number a sample "
+            "needed"
+        )
+    if closure is not None and (
+        closure.min() < -CLOSURE_MARGIN or closure.max() > 1.0 + CLOSURE_MARGIN
+    ):
+        raise SkillError(
+            f"a demonstration's gripper goes from {closure.min():g} to {closure.max():g}: 0 (open) "
+            "to 1 (closed) needed"
         )
 
 
 def moved_m(demonstration: Demonstration) -> float:
     """The range of motion [m] along an axis, of the hands or the tool, whichever is smaller."""
-    return float(min(np.ptp(demonstration.hands, axis=0).max(), np.ptp(demonstration.tool[:, :3], axis=0).max()))
+    return float(
+        min(
+            np.ptp(demonstration.hands, axis=0).max(),
+            np.ptp(demonstration.tool[:, :3], axis=0).max(),
+        )
+    )

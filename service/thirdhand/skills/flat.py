@@ -14,11 +14,15 @@ POINT_NOISE = 0.1  # variance of a point / variance of the kernel
 DEVIATION = 0.2  # standard deviation far from all data, of zeta [rad] or of the closure
 
 
-def flat_orientation(skill_inputs: Vector, kernel: Kernel, orientation: Vector) -> LearnedOrientation:
+def flat_orientation(
+    skill_inputs: Vector, kernel: Kernel, orientation: Vector
+) -> LearnedOrientation:
     """The constant orientation (4,) as a primitive over inputs (N, I), for via-points."""
     inputs = skill_inputs[:: max(1, len(skill_inputs) // 200)]
     zeta = np.zeros((len(inputs), 3))
-    return LearnedOrientation(even(inputs, zeta, kernel, np.zeros(3)), np.asarray(orientation, np.float64))
+    return LearnedOrientation(
+        even(inputs, zeta, kernel, np.zeros(3)), np.asarray(orientation, np.float64)
+    )
 
 
 def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
@@ -36,7 +40,8 @@ def even(inputs: Vector, outputs: Vector, kernel: Kernel, prior: Vector) -> KMP:
     """A primitive of equally exact points: N / lambda_c = DEVIATION² and
     lambda_c Sigma = POINT_NOISE I.
     """
-    width, scale = outputs.shape[1], len(inputs) / DEVIATION**2
+    width = outputs.shape[1]
+    scale = len(inputs) / DEVIATION**2
     covariance = np.tile(POINT_NOISE / scale * np.eye(width), (len(inputs), 1, 1))
     return KMP.fit(
         inputs,

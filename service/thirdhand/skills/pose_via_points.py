@@ -19,8 +19,12 @@ from thirdhand.core.skill.via_points import rest_of
 from thirdhand.skills.flat import flat_gripper, flat_orientation, is_flat
 from thirdhand.skills.skill_file import SkillError
 
-STD_RAD, STD_CLOSURE = 0.004, 0.02  # standard deviations of a via-point's orientation and closure
-STEEPEST_RAD_PER_M = 40.0  # largest turn between via-points: hands that tremble by 1 mm turn the tool by 2°
+# standard deviations of a via-point's orientation and closure
+STD_RAD = 0.004
+STD_CLOSURE = 0.02
+STEEPEST_RAD_PER_M = (
+    40.0  # largest turn between via-points: hands that tremble by 1 mm turn the tool by 2°
+)
 NEAR_RAD = math.radians(1.0)  # orientations this near to each other never contradict each other
 NEAR_M = 0.01  # a gripper cannot be open and closed at hands this near to each other
 NOTED_RAD = math.radians(2.0)  # orientations missed by more are reported
@@ -33,30 +37,40 @@ def turn_through(
     """The learned orientation adapted to those of via-points; `owners` are the via-points of the
     inputs (V, I). None if the orientation is constant.
     """
-    taught = {i: point.orientation for i, point in enumerate(owners) if point.orientation is not None}
+    taught = {
+        i: point.orientation for i, point in enumerate(owners) if point.orientation is not None
+    }
     base = skill.turn and replace(skill.turn, primitive=skill.turn.primitive.base)
     if not taught:
         return None if base is None or is_flat(base.primitive) else base
     if base is None:
         learned = skill.model.primitive.base
         base = flat_orientation(learned.inputs, learned.kernel, skill.orientation)
-    taught_inputs, quaternions = inputs[list(taught)], np.array(list(taught.values()))
+    taught_inputs = inputs[list(taught)]
+    quaternions = np.array(list(taught.values()))
     quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
     now = OrientationKMP(base.primitive, base.auxiliary).mean(taught_inputs)
     quaternions *= np.where((now * quaternions).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     zeta = log(quaternions, base.auxiliary)
-    return replace(base, primitive=_through(base.primitive, taught_inputs, zeta, STD_RAD / 2, tolerance))
+    return replace(
+        base, primitive=_through(base.primitive, taught_inputs, zeta, STD_RAD / 2, tolerance)
+    )
 
 
 def gripper_through(
     skill: Skill, owners: Sequence[ViaPoint], inputs: Vector, tolerance: float
 ) -> LearnedGripper | None:
     """The learned gripper adapted to those of via-points; None if neither has a gripper."""
-    taught = {i: CLOSURES[point.gripper] for i, point in enumerate(owners) if point.gripper is not None}
+    taught = {
+        i: CLOSURES[point.gripper] for i, point in enumerate(owners) if point.gripper is not None
+    }
     base = skill.gripper.primitive.base if skill.gripper else None
     if not taught:
         return None if base is None or is_flat(base) else LearnedGripper(base)
-    base = base or flat_gripper(skill.model.primitive.base.inputs, ell=skill.model.gripper_ell).primitive
+    base = (
+        base
+        or flat_gripper(skill.model.primitive.base.inputs, ell=skill.model.gripper_ell).primitive
+    )
     closures = np.array(list(taught.values()))[:, None]
     return LearnedGripper(_through(base, inputs[list(taught)], closures, STD_CLOSURE, tolerance))
 
@@ -67,25 +81,35 @@ def check_turns(owners: Sequence[ViaPoint], inputs: Vector) -> None:
     """
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     for i, j in np.argwhere(np.triu(hands < math.pi / STEEPEST_RAD_PER_M, 1)).tolist():
-        first, other, distance_m = owners[i], owners[j], float(hands[i, j])
+        first = owners[i]
+        other = owners[j]
+        distance_m = float(hands[i, j])
         pair = (
-            f"via-points {first.name!r} and {other.name!r} contradict each other: their hands are {distance_m:.4f} m "
-            "apart"
+            f"via-points {first.name!r} and {other.name!r} contradict each other: their hands are "
+            f"{distance_m:.4f} m apart"
         )
         if first.orientation is not None and other.orientation is not None:
-            turn, most = _angle(first.orientation, other.orientation), STEEPEST_RAD_PER_M * distance_m + NEAR_RAD
+            turn = _angle(first.orientation, other.orientation)
+            most = STEEPEST_RAD_PER_M * distance_m + NEAR_RAD
             if turn > most:
-                by, to = math.degrees(turn), math.degrees(most)
-                raise SkillError(f"{pair} and their tools turned by {by:.0f}°; up to {to:.0f}° accepted")
+                by = math.degrees(turn)
+                to = math.degrees(most)
+                raise SkillError(
+                    f"{pair} and their tools turned by {by:.0f}°; up to {to:.0f}° accepted"
+                )
         if {first.gripper, other.gripper} == {"open", "closed"} and distance_m < NEAR_M:
-            raise SkillError(f"{pair}, with the gripper open at one and closed at the other; {NEAR_M} m needed")
+            raise SkillError(
+                f"{pair}, with the gripper open at one and closed at the other; {NEAR_M} m needed"
+            )
 
 
 def missed_by_rad(skill: Skill, point: ViaPoint) -> float | None:
     """The error [rad] of a via-point's orientation; None if it has none."""
     if point.orientation is None or skill.turn is None:
         return None
-    inputs = skill.model.inputs(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])
+    inputs = skill.model.inputs(
+        np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)]
+    )
     x, y, z, w = OrientationKMP(skill.turn.primitive, skill.turn.auxiliary).mean(inputs)[0].tolist()
     return _angle(point.orientation, (x, y, z, w))
 
@@ -97,4 +121,6 @@ def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 def _through(base: KMP, at: Vector, outputs: Vector, deviation: float, tolerance: float) -> KMP:
     """The primitive adapted to outputs (V, O) at inputs (V, I), each with this deviation."""
     covariance = deviation**2 / len(base.inputs) * np.eye(outputs.shape[1])
-    return base.adapt(at, Gaussians(outputs, np.tile(covariance, (len(at), 1, 1))), tolerance=tolerance)
+    return base.adapt(
+        at, Gaussians(outputs, np.tile(covariance, (len(at), 1, 1))), tolerance=tolerance
+    )

@@ -32,20 +32,25 @@ class OutOfReach(NamedTuple):
 
 def out_of_reach(skill: StoredSkill, distances_m: Vector, settings: Settings) -> OutOfReach:
     """The verdict on a skill whose tool positions have these distances (M,) [m], see `beyond_m`."""
-    number, total = int(np.count_nonzero(distances_m)), len(distances_m)
+    number = int(np.count_nonzero(distances_m))
+    total = len(distances_m)
     if not number:
         return OutOfReach("", is_refused=False)
     lost = np.count_nonzero(distances_m > (RETAUGHT_M if skill.model.names else 0.0))
     is_refused = bool(lost > REFUSED_SHARE * total)
     if is_refused:
-        remedy = "Learn a skill from demonstrations within reach; or move the arm, or change [reach] if it is wrong"
+        remedy = (
+            "Learn a skill from demonstrations within reach; or move the arm, or change [reach] if "
+            "it is wrong"
+        )
     else:
         remedy = "The tool stops at the edge of its reach there" + (
-            ": teach these places anew within reach (thirdhand via-points add)" * bool(skill.model.names)
+            ": teach these places anew within reach (thirdhand via-points add)"
+            * bool(skill.model.names)
         )
     return OutOfReach(
-        f"{number} of {total} places of the tool in skill {skill.name!r} are out of the arm's reach, the farthest by "
-        f"{distances_m.max():.3f} m: {accepted(settings)}. {remedy}",
+        f"{number} of {total} places of the tool in skill {skill.name!r} are out of the arm's "
+        f"reach, the farthest by {distances_m.max():.3f} m: {accepted(settings)}. {remedy}",
         is_refused,
     )
 
@@ -55,8 +60,8 @@ def accepted(settings: Settings) -> str:
     reach = settings.reach
     centre = ", ".join(f"{value:g}" for value in reach.centre)
     return (
-        f"{reach.inner:g} to {reach.outer:g} m from the shoulder ({centre}), x ≥ {reach.min_x:g} m and "
-        f"z ≥ {reach.min_z:g} m accepted, where the joints' limits allow it"
+        f"{reach.inner:g} to {reach.outer:g} m from the shoulder ({centre}), x ≥ {reach.min_x:g} m "
+        f"and z ≥ {reach.min_z:g} m accepted, where the joints' limits allow it"
     )
 
 
@@ -64,8 +69,12 @@ def beyond_m(settings: Settings, positions: Vector) -> Vector:
     """The distances (M,) [m] of positions (M, 3) from `[reach]` or from the joints' workspace,
     whichever is larger; 0 within both.
     """
-    joints, still = settings.joints, np.zeros(3)
-    held = [clamp(position, still, still, box=ANYWHERE, reach=settings.reach).position for position in positions]
+    joints = settings.joints
+    still = np.zeros(3)
+    held = [
+        clamp(position, still, still, box=ANYWHERE, reach=settings.reach).position
+        for position in positions
+    ]
     chain = Urdf(description(urdf_path(settings), cover=False)).chain(settings.arm.plate)
     workspace = workspace_of(chain, joints.lower, joints.upper, settings.tool.plate_from_tool)
     distances = np.linalg.norm(positions - np.reshape(held, positions.shape), axis=1)

@@ -20,7 +20,9 @@ def recognised(moving: Vector, periods_s: float, segments: Records, out: Vector)
         recognise(out[t], moving[t], periods_s, segments, FIRST_SEGMENT_ODDS)
 
 
-def covered(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records) -> Vector:
+def covered(
+    hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records
+) -> Vector:
     """Shares of the segments (T,) that hands (T, 6 or more) with this stillness (T, 2) have
     covered, and their distances from the paths [m]: (T, 4).
     """
@@ -30,7 +32,9 @@ def covered(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segment
 
 
 @compiled
-def _cover(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records, out: Vector) -> None:
+def _cover(
+    hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments: Records, out: Vector
+) -> None:
     for t in range(len(hands)):
         segment = segments[labels[t]]
         out[t, 0], out[t, 1] = along_both(hands[t], stillness[t], segment)
@@ -39,7 +43,9 @@ def _cover(hands: Vector, stillness: Vector, labels: NDArray[np.int64], segments
 
 
 @compiled
-def all_followed(hands: Vector, shares: Vector, labels: NDArray[np.int64], segments: Records, out: Vector) -> None:
+def all_followed(
+    hands: Vector, shares: Vector, labels: NDArray[np.int64], segments: Records, out: Vector
+) -> None:
     """Add the motion of the followed hands in the segments (T,) to `out` (T, 3), see
     `add_followed`.
     """

@@ -27,7 +27,9 @@ class ResidualRisk(msgspec.Struct, frozen=True):
     def accepted(self) -> str:
         """The accepted risks and the person, in words; empty if there are none."""
         is_accepted = bool(self.residual and self.accepted_by)
-        return printable(f"accepted by {self.accepted_by}: {'; '.join(self.residual)}") * is_accepted
+        return (
+            printable(f"accepted by {self.accepted_by}: {'; '.join(self.residual)}") * is_accepted
+        )
 
     @property
     def refusal(self) -> str:
@@ -35,6 +37,6 @@ class ResidualRisk(msgspec.Struct, frozen=True):
         if self.accepted_by or not self.residual:
             return ""
         return (
-            f"nobody has accepted its residual risk: {'; '.join(self.residual)}. Who takes the responsibility learns "
-            f"it again with {OPTION} NAME"
+            f"nobody has accepted its residual risk: {'; '.join(self.residual)}. Who takes the "
+            f"responsibility learns it again with {OPTION} NAME"
         )

@@ -37,11 +37,17 @@ from thirdhand.skills.residual_risk import ResidualRisk
 
 LONGEST_SKILL_NAME = 128  # [characters]
 SKILL_FORMAT = 6
-TURN, GRIPPER = "turn.", "gripper."  # prefixes of the arrays of their primitives
-LARGEST_FILE, MOST_ARRAYS = 100_000_000, 500  # [B] unpacked, and in how many arrays; a skill has below a hundred
+# prefixes of the arrays of their primitives
+TURN = "turn."
+GRIPPER = "gripper."
+# [B] unpacked, and in how many arrays; a skill has below a hundred
+LARGEST_FILE = 100_000_000
+MOST_ARRAYS = 500
 MOST_POINTS = 2500  # reference points, which bound the duration of a tick
 HIGHEST_GATE_M = 1.0  # a larger threshold would let everything pass
-LONGEST_TEXT, LONGEST_FIGURES = 200, 1_000_000  # characters
+# characters
+LONGEST_TEXT = 200
+LONGEST_FIGURES = 1_000_000
 RANGES = {  # minimum, maximum and unit of the numbers in each array
     "threshold": (1e-6, HIGHEST_GATE_M, "m"),
     "tolerance": (0.0, MAX_SKILL_DISTANCE_M, "m"),
@@ -60,17 +66,39 @@ RANGES = {  # minimum, maximum and unit of the numbers in each array
 }
 # The array holds a scale, a time [s], squared distances, and, of a skill with an alarm, ratios and
 # the alarm.
-REGIONS, FARTHEST_RADIUS = "regions", 1e6
+REGIONS = "regions"
+FARTHEST_RADIUS = 1e6
 ALL_RANGES = (
     RANGES
     | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
     | {name: bounds for model in MODELS for name, bounds in model.ranges.items()}
 )
 INPUT_ARRAYS = ("base_inputs", "via_inputs", "error_inputs")
-PRIMITIVE = {"ell", "lambda_mean", "lambda_covariance", "prior_mean", "base_weights", "weights", "replaced"} | {
-    f"{part}_{quantity}" for part in ("base", "via") for quantity in ("inputs", "mean", "covariance")
+PRIMITIVE = {
+    "ell",
+    "lambda_mean",
+    "lambda_covariance",
+    "prior_mean",
+    "base_weights",
+    "weights",
+    "replaced",
+} | {
+    f"{part}_{quantity}"
+    for part in ("base", "via")
+    for quantity in ("inputs", "mean", "covariance")
 }
-OTHERS = ("format", "units", "name", "learned_from", "places", "figures", "conductor", "turned", "checksum", "names")
+OTHERS = (
+    "format",
+    "units",
+    "name",
+    "learned_from",
+    "places",
+    "figures",
+    "conductor",
+    "turned",
+    "checksum",
+    "names",
+)
 DEMONSTRATIONS = "demonstrations"
 KNOWN = {
     *ALL_RANGES,
@@ -82,8 +110,11 @@ KNOWN = {
     TURN + "auxiliary",
 }
 MARGIN_M = 0.25  # a prediction at a learned input may leave the box by this distance
-STEEPEST = 1000.0  # [m/m] largest derivative of the tool's position; also of zeta [rad/m] and of the closure [1/m]
-FARTHEST_TURN = 2.0 * np.pi  # [rad] largest zeta of an orientation, half its angle; also largest closure
+# [m/m] largest derivative of the tool's position; also of zeta [rad/m] and of the closure [1/m]
+STEEPEST = 1000.0
+FARTHEST_TURN = (
+    2.0 * np.pi
+)  # [rad] largest zeta of an orientation, half its angle; also largest closure
 
 
 class SkillError(ExplainedError, ValueError):
@@ -97,8 +128,12 @@ class SkillError(ExplainedError, ValueError):
 class StoredSkill(Skill):
     """A skill with its figures and its file, which the loop does not need."""
 
-    figures: str = field(default="", repr=False)  # JSON of `Figures`; empty if the skill was not judged
-    demonstrations: bytes = field(default=b"", repr=False)  # see `stored_demonstrations`; empty: not in the file
+    figures: str = field(
+        default="", repr=False
+    )  # JSON of `Figures`; empty if the skill was not judged
+    demonstrations: bytes = field(
+        default=b"", repr=False
+    )  # see `stored_demonstrations`; empty: not in the file
     file: bytes = field(default=b"", repr=False)  # bytes as stored and recorded
 
     @cached_property
@@ -146,7 +181,9 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         arrays |= {TURN + name: array for name, array in to_arrays(skill.turn.primitive).items()}
         arrays[TURN + "auxiliary"] = skill.turn.auxiliary
     if skill.gripper:
-        arrays |= {GRIPPER + name: array for name, array in to_arrays(skill.gripper.primitive).items()}
+        arrays |= {
+            GRIPPER + name: array for name, array in to_arrays(skill.gripper.primitive).items()
+        }
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
 
@@ -180,12 +217,15 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
         arrays = arrays_in(data)
         if (number := arrays["format"].item()) != SKILL_FORMAT:
             raise SkillError(
-                f"{origin}: skill of format {number}, of {SKILL_FORMAT} needed: learn it anew with this version"
+                f"{origin}: skill of format {number}, of {SKILL_FORMAT} needed: learn it anew with "
+                "this version"
             )
         for fault in _spoilt(arrays):
             raise SkillError(f"{origin}: {fault}")
-        model, via_points = _model(arrays), validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
-        turn, gripper = _part(arrays, TURN), _part(arrays, GRIPPER)
+        model = _model(arrays)
+        via_points = validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
+        turn = _part(arrays, TURN)
+        gripper = _part(arrays, GRIPPER)
         skill = StoredSkill(
             name=printable(str(arrays["name"])),
             model=model.from_arrays(arrays, via_points),
@@ -228,14 +268,24 @@ def skill_in(path: Path) -> StoredSkill:
 
 
 def _regions(numbers: list[float]) -> Regions:
-    (scale, std_s), radii, remainder = numbers[:2], numbers[2 : 2 + len(LEVELS)], numbers[2 + len(LEVELS) :]
+    scale, std_s = numbers[:2]
+    radii = numbers[2 : 2 + len(LEVELS)]
+    remainder = numbers[2 + len(LEVELS) :]
     regions = Regions(scale, std_s, tuple(radii))
-    return regions._replace(ratios=tuple(remainder[:-1]), alarm=remainder[-1]) if remainder else regions
+    return (
+        regions._replace(ratios=tuple(remainder[:-1]), alarm=remainder[-1])
+        if remainder
+        else regions
+    )
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     """The arrays of the primitive with this prefix."""
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): array
+        for name, array in arrays.items()
+        if name.startswith(prefix)
+    }
 
 
 def _model(arrays: Mapping[str, NDArray[Any]]) -> type[Model]:
@@ -247,16 +297,21 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
-    model_arrays = [name for name in _model(arrays).ranges if name in arrays]  # one that is missing is found missing later
+    model_arrays = [
+        name for name in _model(arrays).ranges if name in arrays
+    ]  # one that is missing is found missing later
     clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
     yield from _beyond(arrays, [*RANGES, *model_arrays], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
             yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
             if len(part["base_inputs"]) > MOST_POINTS:
-                yield f"{len(part['base_inputs'])} points of {prefix}, at most {MOST_POINTS} accepted"
+                points = len(part["base_inputs"])
+            yield f"{points} points of {prefix}, at most {MOST_POINTS} accepted"
     for prefix in ("", TURN, GRIPPER):
-        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (prefix or _model(arrays) is not HandsKMP):
+        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (
+            prefix or _model(arrays) is not HandsKMP
+        ):
             yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
     if (side := arrays.get("conductor", np.array(0)).tolist()) not in (0, 1):
         yield f"conductor is {side!r}: 0 for the left hand or 1 for the right one accepted"
@@ -273,19 +328,26 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     if len(arrays["base_inputs"]) > MOST_POINTS:
         yield f"{len(arrays['base_inputs'])} reference points, at most {MOST_POINTS} accepted"
     if str(arrays["checksum"]) != checksum(arrays):
-        yield "it was changed since it was written (the checksum is another); learn it anew, or fetch it again"
+        yield (
+            "it was changed since it was written (the checksum is another); learn it anew, or "
+            "fetch it again"
+        )
 
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
     """Faults of arrays with numbers out of their ranges. The last input may be a clock's."""
-    is_timed = bool((arrays.get("task_clock", np.zeros(2))[1:2] > 0.0).any())  # the clock has a weight
+    is_timed = bool(
+        (arrays.get("task_clock", np.zeros(2))[1:2] > 0.0).any()
+    )  # the clock has a weight
     for name in names:
-        array, (low, high, unit) = arrays[name], ALL_RANGES[name]
+        array = arrays[name]
+        low, high, unit = ALL_RANGES[name]
         if array.dtype.kind not in "iuf":
             yield f"{prefix}{name} has numbers of type {array.dtype}, real ones needed"
             continue
         if is_timed and name in INPUT_ARRAYS and array.ndim == 2:
-            array, times = array[:, :-1], array[:, -1]
+            times = array[:, -1]
+            array = array[:, :-1]
             if not (np.abs(times) <= LONGEST_CLOCK_S * MOST_CLOCK_WEIGHT).all():
                 yield f"{prefix}{name} has a clock that is no number, or too late"
         if array.size and not (low <= array.min() and array.max() <= high):  # NaN is in no range
@@ -305,7 +367,8 @@ def _no_regions(array: NDArray[Any]) -> Iterator[str]:
     elif len(array) > 2 + count and not 0 < array[-1] <= 1:
         yield f"an alarm at the error probability {array[-1]:g}: above 0, and up to 1, accepted"
     elif abs(array[2 + LEVELS.index(0.95)] - REGION_95) > 0.01:
-        yield f"a 95 % region of {array[2 + LEVELS.index(0.95)]:g}: the scale makes it {REGION_95:g}"
+        region = array[2 + LEVELS.index(0.95)]
+        yield f"a 95 % region of {region:g}: the scale makes it {REGION_95:g}"
 
 
 def _is_json(array: NDArray[Any]) -> bool:
@@ -327,8 +390,10 @@ def _faults(skill: Skill) -> Iterator[str]:
     """Faults of a skill that would harm the motion or mislead a reader."""
     if lacking := unusable_name(skill.name):
         yield lacking
-    primitive, needed = skill.model.primitive, skill.model.shape
-    inputs, outputs = primitive.inputs.shape[1], primitive.outputs
+    primitive = skill.model.primitive
+    needed = skill.model.shape
+    inputs = primitive.inputs.shape[1]
+    outputs = primitive.outputs
     if (inputs, outputs) != needed:
         yield f"{inputs} inputs and {outputs} outputs, {needed[0]} and {needed[1]} needed"
         return
@@ -348,34 +413,49 @@ def _faults(skill: Skill) -> Iterator[str]:
 
 def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
     """Faults of the predictions of the orientation's or the gripper's primitive at its inputs."""
-    needed_shape, shape = (skill.model.shape[0], outputs), (primitive.inputs.shape[1], primitive.outputs)
+    needed_shape = (skill.model.shape[0], outputs)
+    shape = (primitive.inputs.shape[1], primitive.outputs)
     if shape != needed_shape:
-        yield f"{name} has {shape[0]} inputs and {shape[1]} outputs, {needed_shape[0]} and {needed_shape[1]} needed"
+        yield (
+            f"{name} has {shape[0]} inputs and {shape[1]} outputs, {needed_shape[0]} and "
+            f"{needed_shape[1]} needed"
+        )
         return
     with np.errstate(all="ignore"):
         magnitudes = np.abs(primitive.mean(primitive.inputs))
         steep = np.linalg.norm(primitive.jacobians(primitive.inputs), axis=(1, 2)).max()
     if not magnitudes.max() <= FARTHEST_TURN:
-        yield f"{name} says {magnitudes.max():g} where it was learned, up to {FARTHEST_TURN:.2g} accepted"
+        yield (
+            f"{name} says {magnitudes.max():g} where it was learned, up to {FARTHEST_TURN:.2g} "
+            "accepted"
+        )
     if not steep <= STEEPEST:
-        yield f"{name} changes by {steep:g} a metre where it was learned, up to {STEEPEST:g} accepted"
+        change = f"changes by {steep:g} a metre where it was learned"
+            yield f"{name} {change}, up to {STEEPEST:g} accepted"
 
 
 def _tried(skill: Skill) -> Iterator[str]:
     """Faults of the skill's predictions at its own inputs, as with weights of another skill."""
     with np.errstate(all="ignore"):
-        tried = [(model.hands, model.mean(model.hands)) for model in (skill.model.unadapted(), skill.model)]
+        tried = [
+            (model.hands, model.mean(model.hands))
+            for model in (skill.model.unadapted(), skill.model)
+        ]
     low, high = skill.workspace
     for where, positions in tried:
         beyond = np.maximum(np.maximum(low - positions, positions - high), 0.0).max(axis=1)
         if not (np.isfinite(positions).all() and beyond.max() <= MARGIN_M):
             worst = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
             yield (
-                f"with the hands at {np.round(where[worst], 3).tolist()}, where it was learned, the tool is at "
-                f"{positions[worst].tolist()}; its box and {MARGIN_M} m around it accepted"
+                f"with the hands at {np.round(where[worst], 3).tolist()}, where it was learned, "
+                f"the tool is at {positions[worst].tolist()}; its box and {MARGIN_M} m around it "
+                "accepted"
             )
     primitive = skill.model.primitive
     for hands in primitive.inputs[:: max(1, len(primitive.inputs) // 5)]:
         steep = float(np.linalg.norm(primitive.jacobian(hands)))
         if not steep <= STEEPEST:
-            yield f"with the hands at {np.round(hands, 3).tolist()} the tool moves {steep:g} times as far as they do"
+            yield (
+                f"with the hands at {np.round(hands, 3).tolist()} the tool moves {steep:g} times "
+                "as far as they do"
+            )

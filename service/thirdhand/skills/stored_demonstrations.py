@@ -24,7 +24,10 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill, arrays_in
 
 KEPT_HZ = 50.0
 MOST_KEPT = 50_000  # 5 MB
-REMEDY = "learn it anew from its demonstrations with this version, or learn from all demonstrations without --from"
+REMEDY = (
+    "learn it anew from its demonstrations with this version, or learn from all demonstrations "
+    "without --from"
+)
 
 
 class _About(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,8 +45,13 @@ class _About(msgspec.Struct, frozen=True, kw_only=True):
 
 def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
     """The demonstrations as bytes."""
-    kept_hz = min(KEPT_HZ, MOST_KEPT / sum(demo.period_s * len(demo.stamps_ns) for _, demo in demonstrations))
-    thin = [(name, demo.every(max(1, int(1.0 / (kept_hz * demo.period_s) + 1e-6)))) for name, demo in demonstrations]
+    kept_hz = min(
+        KEPT_HZ, MOST_KEPT / sum(demo.period_s * len(demo.stamps_ns) for _, demo in demonstrations)
+    )
+    thin = [
+        (name, demo.every(max(1, int(1.0 / (kept_hz * demo.period_s) + 1e-6))))
+        for name, demo in demonstrations
+    ]
     about = [
         _About(
             name=name,
@@ -62,9 +70,14 @@ def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
         out,
         about=np.frombuffer(msgspec.json.encode(about), np.uint8),
         stamps=np.concatenate([demo.stamps_ns for _, demo in thin]),
-        poses=np.concatenate([np.hstack([demo.left, demo.right, demo.tool]) for _, demo in thin]).astype(np.float32),
+        poses=np.concatenate(
+            [np.hstack([demo.left, demo.right, demo.tool]) for _, demo in thin]
+        ).astype(np.float32),
         closures=np.concatenate(
-            [np.zeros(len(demo.stamps_ns)) if demo.gripper is None else demo.gripper for _, demo in thin]
+            [
+                np.zeros(len(demo.stamps_ns)) if demo.gripper is None else demo.gripper
+                for _, demo in thin
+            ]
         ).astype(np.float32),
     )
     return out.getvalue()
@@ -77,26 +90,31 @@ def stored_demonstrations(skill: StoredSkill) -> list[NamedDemonstration]:
     """
     if not skill.demonstrations:
         raise SkillError(
-            f"skill {skill.name!r} cannot be refined: its file does not hold the demonstrations that it was learned "
-            f"from; {REMEDY}"
+            f"skill {skill.name!r} cannot be refined: its file does not hold the demonstrations "
+            f"that it was learned from; {REMEDY}"
         )
     try:
         arrays = arrays_in(skill.demonstrations)
         about = validated(msgspec.json.decode(arrays["about"].tobytes()), tuple[_About, ...])
         ends = np.cumsum([entry.samples for entry in about])
         columns = [np.split(arrays[name], ends) for name in ("stamps", "poses", "closures")]
-        out = [_demonstration(entry, *parts) for entry, *parts in zip(about, *(part[:-1] for part in columns), strict=True)]
+        out = [
+            _demonstration(entry, *parts)
+            for entry, *parts in zip(about, *(part[:-1] for part in columns), strict=True)
+        ]
         for _, demonstration in out:
             check(demonstration)
     except (ValueError, KeyError, IndexError, zipfile.BadZipFile, msgspec.MsgspecError) as error:
         raise SkillError(
-            f"skill {skill.name!r} cannot be refined: its demonstrations are damaged ({in_words(error, named=False)}); "
-            f"{REMEDY}"
+            f"skill {skill.name!r} cannot be refined: its demonstrations are damaged "
+            f"({in_words(error, named=False)}); {REMEDY}"
         ) from None
     return out
 
 
-def _demonstration(about: _About, stamps: np.ndarray, poses: np.ndarray, closures: np.ndarray) -> NamedDemonstration:
+def _demonstration(
+    about: _About, stamps: np.ndarray, poses: np.ndarray, closures: np.ndarray
+) -> NamedDemonstration:
     left, right, tool = (poses[:, first : first + 7].astype(np.float64) for first in (0, 7, 14))
     return NamedDemonstration(
         printable(about.name),

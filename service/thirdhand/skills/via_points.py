@@ -16,10 +16,17 @@ from thirdhand.contract.requests import ViaPoint, ViaPointInForce
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.via_points import NEIGHBOURS, neighbourhoods, rest_of
-from thirdhand.skills.pose_via_points import NOTED_RAD, check_turns, gripper_through, missed_by_rad, turn_through
+from thirdhand.skills.pose_via_points import (
+    NOTED_RAD,
+    check_turns,
+    gripper_through,
+    missed_by_rad,
+    turn_through,
+)
 from thirdhand.skills.skill_file import SkillError, StoredSkill, with_file
 
-MAX_GAIN = 4.0  # [m/m] largest ratio of the tool's motion to the hands', of an affine mean and between via-points
+# [m/m] largest ratio of the tool's motion to the hands', of an affine mean and between via-points
+MAX_GAIN = 4.0
 NEAR_M = 0.001  # tools this near to each other never contradict each other
 DEVIATIONS = 3.0  # nor do tools within this multiple of their standard deviations
 NOTED_M = 0.005  # via-points missed or moved by more are reported
@@ -36,7 +43,9 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
     """
     if not tolerance >= 0:
         names = [point.name for point in via_points]
-        raise SkillError(f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted")
+        raise SkillError(
+            f"cannot adapt to {names}: tolerance is {tolerance:g} m; 0 or more accepted"
+        )
     if skill.conductor is not None:
         via_points = [of_one(point, skill.conductor) for point in via_points]
     inputs = neighbourhoods(via_points)[0]
@@ -50,11 +59,18 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
             # The covariance of IJRR 2019 is N times that of a single point. The reference is scaled
             # by 1 / N unless it is a mixture's, so the variance of a via-point is scaled, too.
             weight = 1.0 if skill.components else 1.0 / len(skill.model.primitive.base.inputs)
-            skill = replace(skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight))
-            model_inputs = skill.model.inputs(inputs, [rest_of(point, skill.model.names) for point in owners])
-            turn, gripper = turn_through(skill, owners, model_inputs, tolerance), gripper_through(skill, owners, model_inputs, tolerance)
+            skill = replace(
+                skill, model=skill.model.through(via_points, tolerance=tolerance, weight=weight)
+            )
+            model_inputs = skill.model.inputs(
+                inputs, [rest_of(point, skill.model.names) for point in owners]
+            )
+            turn = turn_through(skill, owners, model_inputs, tolerance)
+            gripper = gripper_through(skill, owners, model_inputs, tolerance)
     except ValueError as error:
-        raise SkillError(f"cannot adapt to {[point.name for point in via_points]}: {error}") from None
+        raise SkillError(
+            f"cannot adapt to {[point.name for point in via_points]}: {error}"
+        ) from None
     return with_file(replace(skill, turn=turn, gripper=gripper))
 
 
@@ -71,15 +87,20 @@ def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) 
     """
     inputs, outputs, deviations = neighbourhoods(via_points)
     owners = [point for point in via_points for _ in range(points_made_of([point]))]
-    is_distinct = np.zeros((len(owners), len(owners)), bool) if skill is None else _are_distinct(skill, owners)
+    is_distinct = (
+        np.zeros((len(owners), len(owners)), bool)
+        if skill is None
+        else _are_distinct(skill, owners)
+    )
     hands = np.linalg.norm(inputs[:, None] - inputs, axis=2)
     tools = np.linalg.norm(outputs[:, None] - outputs, axis=2)
     allowed = MAX_GAIN * hands + NEAR_M + DEVIATIONS * (deviations[:, None] + deviations)
     for i, j in np.argwhere((tools > allowed) & ~is_distinct)[:1].tolist():
         raise SkillError(
-            f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their hands are "
-            f"{hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most {allowed[i, j]:.4f} m accepted, "
-            f"{MAX_GAIN:g} times the hands' distance and what their std allow"
+            f"via-points {owners[i].name!r} and {owners[j].name!r} contradict each other: their "
+            f"hands are {hands[i, j]:.4f} m apart and their tools {tools[i, j]:.4f} m; at most "
+            f"{allowed[i, j]:.4f} m accepted, {MAX_GAIN:g} times the hands' distance and what "
+            "their std allow"
         )
 
 
@@ -88,7 +109,12 @@ def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]
     of two of its segments, or to one of each.
     """
     task_names = skill.model.names
-    names = np.array([p.name if p.name in task_names else f"{p.segment} ->" if p.segment in task_names else "" for p in owners])
+    names = np.array(
+        [
+            p.name if p.name in task_names else f"{p.segment} ->" if p.segment in task_names else ""
+            for p in owners
+        ]
+    )
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 
@@ -109,14 +135,16 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
     and via-points of both skills that move by more.
     """
     out = [
-        f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was demonstrated or taught "
-        "near it says otherwise. A smaller std makes it count more; a greater tolerance removes what was shown there"
+        f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was "
+        "demonstrated or taught near it says otherwise. A smaller std makes it count more; a "
+        "greater tolerance removes what was shown there"
         for point in in_force(after)
         if point.missed_by_m > NOTED_M
     ]
     out += [
-        f"the orientation of via-point {point.name!r} is missed by {math.degrees(point.missed_by_rad):.0f}°: what was "
-        "demonstrated or taught near it says otherwise"
+        f"the orientation of via-point {point.name!r} is missed by "
+        f"{math.degrees(point.missed_by_rad):.0f}°: what was demonstrated or taught near it says "
+        "otherwise"
         for point in in_force(after)
         if point.missed_by_rad is not None and point.missed_by_rad > NOTED_RAD
     ]
@@ -129,7 +157,9 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
 
 def tool_at(skill: Skill, point: ViaPoint) -> Vector:
     """The tool position (3,) [m] for hands that rest at a via-point."""
-    position: Vector = skill.mean(np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)])[0]
+    position: Vector = skill.mean(
+        np.array([[*point.left, *point.right]]), [rest_of(point, skill.model.names)]
+    )[0]
     return position
 
 

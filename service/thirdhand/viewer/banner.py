@@ -13,8 +13,11 @@ from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.settings import palette
 from thirdhand.settings.config import Settings
 
-WIDTH, HEIGHT = 640, 80  # pixels
-LETTERS, MARGIN = 44, 24
+# pixels
+WIDTH = 640
+HEIGHT = 80
+LETTERS = 44
+MARGIN = 24
 
 
 def _incident(reason: int, is_engaging: bool) -> str:
@@ -30,15 +33,21 @@ def headline(mode: int, reason: int, is_engaging: bool = False) -> str:
 def log_line(mode: int, reason: int, is_engaging: bool, settings: Settings) -> str:
     """The headline, and what happened."""
     named = _incident(reason, is_engaging)
-    return ": ".join(filter(None, (headline(mode, reason, is_engaging), what_happened(named, settings))))
+    return ": ".join(
+        filter(None, (headline(mode, reason, is_engaging), what_happened(named, settings)))
+    )
 
 
 @functools.cache
 def banner(mode: int, reason: int, is_engaging: bool = False) -> NDArray[np.uint8]:
     """The picture (HEIGHT, WIDTH, 3) that shows the headline."""
     image = Image.new("RGB", (WIDTH, HEIGHT), palette.BY_MODE[Mode(mode)])
-    draw, text, size = ImageDraw.Draw(image), headline(mode, reason, is_engaging), LETTERS
+    draw = ImageDraw.Draw(image)
+    text = headline(mode, reason, is_engaging)
+    size = LETTERS
     while draw.textlength(text, font=ImageFont.load_default(size)) > WIDTH - 2 * MARGIN:
         size -= 1
-    draw.text((MARGIN, HEIGHT / 2), text, fill=(0, 0, 0), anchor="lm", font=ImageFont.load_default(size))
+    draw.text(
+        (MARGIN, HEIGHT / 2), text, fill=(0, 0, 0), anchor="lm", font=ImageFont.load_default(size)
+    )
     return np.asarray(image)

@@ -23,10 +23,14 @@ TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
 WINDOW_S = 20.0  # live curves show this time
 LEGEND_SHARE = 0.175  # this share of the time axis is kept free for legends
-NUMBERS_SHARE = 0.032  # width of the numbers left of a curve, which modes lack, as share of the time axis
+NUMBERS_SHARE = (
+    0.032  # width of the numbers left of a curve, which modes lack, as share of the time axis
+)
 HEADROOM = 1.25  # range of an axis / usual range of its curves
 MAX_GATE_RATIO = 4.0  # a gate farther above the curves is not drawn, as it would flatten them
-EYE, LOOK_AT, UP = (0.90, -0.72, 0.62), (0.53, 0.0, 0.23), (0.0, 0.0, 1.0)
+EYE = (0.90, -0.72, 0.62)
+LOOK_AT = (0.53, 0.0, 0.23)
+UP = (0.0, 0.0, 1.0)
 
 
 class PlotView(NamedTuple):
@@ -43,14 +47,20 @@ class PlotView(NamedTuple):
 
 def plot_views(settings: Settings) -> dict[str, PlotView]:
     """All views of curves by path, with ranges from the settings."""
-    joints, tool, period_us = settings.joints, settings.tool, 1e6 * settings.period_s
-    velocity, acceleration, kinds = max(joints.velocity), max(joints.acceleration), joints.every_kind
+    joints = settings.joints
+    tool = settings.tool
+    period_us = 1e6 * settings.period_s
+    velocity = max(joints.velocity)
+    acceleration = max(joints.acceleration)
+    kinds = joints.every_kind
     unit = "rad" if set(joints.units) == {"rad"} else "rad or m"
     lowest = min(
-        max(low, -math.pi) if kind == "continuous" else low for low, kind in zip(joints.lower, kinds, strict=True)
+        max(low, -math.pi) if kind == "continuous" else low
+        for low, kind in zip(joints.lower, kinds, strict=True)
     )
     highest = max(
-        min(high, math.pi) if kind == "continuous" else high for high, kind in zip(joints.upper, kinds, strict=True)
+        min(high, math.pi) if kind == "continuous" else high
+        for high, kind in zip(joints.upper, kinds, strict=True)
     )
     return {
         view.origin: view
@@ -60,20 +70,36 @@ def plot_views(settings: Settings) -> dict[str, PlotView]:
             PlotView("/gripper", "Gripper closure [%]", 0, 110, True),
             PlotView("/segment", "Segment of the task: number and probability", 0, 8, True),
             PlotView("/deviation", "Uncertainty, and deviation of the hands [mm]", 0, 250),
-            PlotView("/doubt", "Probability that the target is off by more than 10 cm [%]", 0, 110, True),
+            PlotView(
+                "/doubt", "Probability that the target is off by more than 10 cm [%]", 0, 110, True
+            ),
             PlotView("/speed", "Speed [m/s]", 0, tool.max_speed),
             PlotView("/separation/distance", "Nearest hand: distance [m]", 0, 1.0),
             PlotView("/separation/limit", "Nearest hand: allowed speed toward it [m/s]", 0, 1.5),
             PlotView("/joints/velocity", f"Joint velocity [{unit}/s]", -velocity, velocity),
             PlotView("/joints/position", f"Joint position [{unit}]", lowest, highest, True),
-            PlotView("/joints/acceleration", f"Joint acceleration [{unit}/s²]", -acceleration, acceleration),
-            PlotView("/joints/error", f"Joint error, measured - commanded [{unit}]", 0, settings.arm.fault_error_rad),
+            PlotView(
+                "/joints/acceleration",
+                f"Joint acceleration [{unit}/s²]",
+                -acceleration,
+                acceleration,
+            ),
+            PlotView(
+                "/joints/error",
+                f"Joint error, measured - commanded [{unit}]",
+                0,
+                settings.arm.fault_error_rad,
+            ),
             PlotView("/latency", "Hand to command [ms]", 0, 20),
             PlotView("/timing/lateness", "Lateness of a tick [µs]", 0, period_us / 2),
             PlotView("/timing/work", "Work of a tick [µs]", 0, period_us),
             PlotView("/timing/stages", "Work of each stage [µs]", 0, period_us / 4),
             PlotView(
-                "/age", "Age of the newest sample of each hand [ms]", 0, 1.2 * settings.hands.longest_stale_ms, True
+                "/age",
+                "Age of the newest sample of each hand [ms]",
+                0,
+                1.2 * settings.hands.longest_stale_ms,
+                True,
             ),
         )
     }
@@ -105,21 +131,32 @@ def blueprint(
     """The blueprint of a live view, or of a file with a duration of `end_s` [s] and curves up to
     `tops`. `gate_m` is the deviation [m] above which the arm holds with the skill in force.
     """
-    views, reached = plot_views(settings), dict(tops or {})
+    views = plot_views(settings)
+    reached = dict(tops or {})
     tops = {origin: HEADROOM * top for origin, top in reached.items()}
-    gate_mm, most_mm = 1e3 * gate_m, MAX_GATE_RATIO * reached.get("/deviation", views["/deviation"].high)
+    gate_mm = 1e3 * gate_m
+    most_mm = MAX_GATE_RATIO * reached.get("/deviation", views["/deviation"].high)
     if gate_mm <= most_mm:
         tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
     left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
     relative = rrb.TimeRangeBoundary.cursor_relative
-    boundary, first_s, last_s = (relative, -WINDOW_S, 0.0) if end_s is None else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
+    boundary, first_s, last_s = (
+        (relative, -WINDOW_S, 0.0)
+        if end_s is None
+        else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
+    )
     whole_s = max(1.0, (last_s - first_s) / (1 - LEGEND_SHARE))
     time_range, beside_numbers = (
-        rr.TimeRange(start=boundary(seconds=first_s - share * whole_s), end=boundary(seconds=first_s + whole_s))
+        rr.TimeRange(
+            start=boundary(seconds=first_s - share * whole_s),
+            end=boundary(seconds=first_s + whole_s),
+        )
         for share in (0.0, NUMBERS_SHARE)
     )
     loaded = (
-        rrb.VisibleTimeRanges(rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative()))
+        rrb.VisibleTimeRanges(
+            rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative())
+        )
         if live
         else None
     )
@@ -140,7 +177,9 @@ def blueprint(
 
     def modes() -> rrb.StateTimelineView:
         axis = rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=beside_numbers)
-        return rrb.StateTimelineView(origin="/", contents=["/mode", "/reason"], name="Mode", time_view=axis)
+        return rrb.StateTimelineView(
+            origin="/", contents=["/mode", "/reason"], name="Mode", time_view=axis
+        )
 
     bench = rrb.Vertical(
         _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
@@ -153,15 +192,28 @@ def blueprint(
     curves = rrb.Vertical(
         rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/segment"), active_tab=0),
         rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),
-        rrb.Tabs(plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0),
-        rrb.Tabs(*(plot(f"/joints/{quantity}") for quantity in ("velocity", "position", "acceleration", "error"))),
+        rrb.Tabs(
+            plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0
+        ),
+        rrb.Tabs(
+            *(
+                plot(f"/joints/{quantity}")
+                for quantity in ("velocity", "position", "acceleration", "error")
+            )
+        ),
         modes(),  # below the curves, with the same time axis
         row_shares=[3, 3, 3, 5, 2.6],  # the legend of the joints has seven names
     )
     task = rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
     timing = rrb.Horizontal(
-        rrb.Vertical(*(plot(origin) for origin in ("/latency", "/timing/lateness", "/age")), _log()),
-        rrb.Vertical(*(plot(origin) for origin in ("/timing/work", "/timing/stages")), modes(), row_shares=[4, 4, 2]),
+        rrb.Vertical(
+            *(plot(origin) for origin in ("/latency", "/timing/lateness", "/age")), _log()
+        ),
+        rrb.Vertical(
+            *(plot(origin) for origin in ("/timing/work", "/timing/stages")),
+            modes(),
+            row_shares=[4, 4, 2],
+        ),
         name="Timing",
     )
     learning = rrb.Horizontal(
@@ -184,7 +236,9 @@ def blueprint(
     return SentBlueprint(
         rrb.Tabs(task, timing, learning, active_tab=TABS.index(tab)),
         rrb.TopPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else None),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIMELINE, play_state="following" if live else None
+        ),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         auto_views=False,
@@ -212,5 +266,7 @@ def _log() -> rrb.TextLogView:
     return rrb.TextLogView(
         origin="/log",
         name="Log",
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"]),
+        columns=rrb.TextLogColumns(
+            timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"]
+        ),
     )

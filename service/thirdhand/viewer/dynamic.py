@@ -28,7 +28,8 @@ from thirdhand.viewer.blueprint import TIMELINE
 from thirdhand.viewer.static import ArmModels
 
 SCENE_HZ = 100
-TRAIL_S, TRAIL_HZ = 3.0, 20
+TRAIL_S = 3.0
+TRAIL_HZ = 20
 TRAIL_BREAK_M = 0.15  # a longer step between two corners of a trail is not a motion of the hand
 NEAREST_SHOWN_M = 0.5  # a nearer hand is connected with the arm by a line
 SAME_M = 1e-5  # smaller differences of deviations come from rounding
@@ -36,7 +37,9 @@ TINY = 1e-4  # scale that makes the links of an arm invisible; the viewer reject
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
 PAUSE_FRAMES = 2  # a longer step between two frames, in intervals of a recording's frames, is a gap
 BREAK_NS = 1000  # a curve ends this long after the last frame before a gap
-REPEAT_S = 0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
+REPEAT_S = (
+    0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
+)
 Columns = Callable[..., rr.chunk.Chunk]
 
 
@@ -55,14 +58,21 @@ class DrawnFrame(NamedTuple):
 class DynamicScene:
     """Convert batches of frames into chunks, with the state that the next batch continues."""
 
-    def __init__(self, models: ArmModels, settings: Settings, *, start_ns: int | None = None) -> None:
+    def __init__(
+        self, models: ArmModels, settings: Settings, *, start_ns: int | None = None
+    ) -> None:
         """Seconds count from `start_ns` [ns] in a live view, and from the first frame in a file."""
-        rate_hz, names = settings.rate_hz, settings.joints.names
+        rate_hz = settings.rate_hz
+        names = settings.joints.names
         self._joints, self._ghost = (
-            [model.get_joint_by_name(name) for name in names] for model in (models.commanded, models.measured)
+            [model.get_joint_by_name(name) for name in names]
+            for model in (models.commanded, models.measured)
         )
-        self._live, self._settings, self._repeat_ticks = start_ns is not None, settings, settings.ticks_in(REPEAT_S)
-        self._every, self._trail_every = max(1, round(rate_hz / SCENE_HZ)), max(1, round(rate_hz / TRAIL_HZ))
+        self._live = start_ns is not None
+        self._settings = settings
+        self._repeat_ticks = settings.ticks_in(REPEAT_S)
+        self._every = max(1, round(rate_hz / SCENE_HZ))
+        self._trail_every = max(1, round(rate_hz / TRAIL_HZ))
         self._max_step_ticks = PAUSE_FRAMES * settings.frame_every
         self._period_ms = 1000.0 / rate_hz
         self._direction = settings.tool.orientation == "direction"
@@ -70,9 +80,11 @@ class DynamicScene:
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
             name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
         }
-        self._body, people = models.body, settings.people
+        self._body = models.body
+        people = settings.people
         toward = np.array(people.toward_elbow)
-        self._forearm, self._hand_radius = people.length / np.linalg.norm(toward) * toward, people.radius
+        self._forearm = people.length / np.linalg.norm(toward) * toward
+        self._hand_radius = people.radius
         self._gate: float | None = None
         self._missed = 0
         self._followed = False
@@ -104,7 +116,9 @@ class DynamicScene:
         """The chunks that show a batch of frames."""
         begin = 0
         for i, drawn in enumerate(batch):
-            step_ticks = int(drawn.frame["tick"]) - int(batch[i - 1].frame["tick"] if i else self._last_tick)
+            step_ticks = int(drawn.frame["tick"]) - int(
+                batch[i - 1].frame["tick"] if i else self._last_tick
+            )
             if drawn.after_gap or step_ticks > self._max_step_ticks:
                 yield from self._unbroken(batch[begin:i])
                 yield from self._interruption()
@@ -133,8 +147,13 @@ class DynamicScene:
 
         def columns(path: str, rows: Any, *parts: Any) -> rr.chunk.Chunk:
             to_ns = LOG_NS if path == "/log" else 1
-            index = [rr.TimeColumn("tick", sequence=ticks[rows]), *self.index(times[rows], to_ns=to_ns)]
-            return rr.chunk.Chunk.from_columns(path, index, [column for part in parts for column in part])
+            index = [
+                rr.TimeColumn("tick", sequence=ticks[rows]),
+                *self.index(times[rows], to_ns=to_ns),
+            ]
+            return rr.chunk.Chunk.from_columns(
+                path, index, [column for part in parts for column in part]
+            )
 
         is_seen = frames["hand_ages"] >= 0
         is_repeated = self._live and ticks[-1] - self._mode_sent_tick > self._repeat_ticks
@@ -142,7 +161,8 @@ class DynamicScene:
             yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, is_seen, columns)
         yield from self._modes(frames, columns)
-        before, self._last_tick = np.concatenate([[self._last_tick], ticks[:-1]]), int(ticks[-1])
+        before = np.concatenate([[self._last_tick], ticks[:-1]])
+        self._last_tick = int(ticks[-1])
         self._last_ns = int(times[-1])
         sampled = np.flatnonzero(ticks // self._every != before // self._every)
         if len(sampled):
@@ -157,23 +177,39 @@ class DynamicScene:
             if joint is not None:
                 size = rr.Transform3D.columns(scale=[(TINY, TINY, TINY)])
                 pose = [*joint.compute_transform_columns([0.0], clamp=False), *size]
-                yield rr.chunk.Chunk.from_columns(f"/measured/joints/{number}", self.index(time_ns), pose)
+                yield rr.chunk.Chunk.from_columns(
+                    f"/measured/joints/{number}", self.index(time_ns), pose
+                )
 
     def _curves(
-        self, batch: list[DrawnFrame], frames: NDArray[Any], seen: NDArray[np.bool_], columns: Columns
+        self,
+        batch: list[DrawnFrame],
+        frames: NDArray[Any],
+        seen: NDArray[np.bool_],
+        columns: Columns,
     ) -> Iterator[rr.chunk.Chunk]:
-        def scalars(path: str, rows: Any, values: NDArray[Any], view: str = "") -> Iterator[rr.chunk.Chunk]:
+        def scalars(
+            path: str, rows: Any, values: NDArray[Any], view: str = ""
+        ) -> Iterator[rr.chunk.Chunk]:
             samples = values[rows]
             if len(samples):
-                self.peaks.setdefault(view or path, []).append(float(np.nanmax(np.abs(samples), initial=0.0)))
+                self.peaks.setdefault(view or path, []).append(
+                    float(np.nanmax(np.abs(samples), initial=0.0))
+                )
                 width = self._widths[path] = samples[0].size
-                yield columns(path, rows, rr.Scalars.columns(scalars=samples.ravel()).partition([width] * len(samples)))
+                yield columns(
+                    path,
+                    rows,
+                    rr.Scalars.columns(scalars=samples.ravel()).partition([width] * len(samples)),
+                )
 
         every = slice(None)
         yield from scalars("/joints/position", every, frames["joints"])
         yield from scalars("/joints/velocity", every, frames["joint_velocities"])
         yield from scalars("/joints/acceleration", every, frames["joint_accelerations"])
-        yield from scalars("/speed/tool", every, np.linalg.norm(frames["setpoint_velocity"], axis=1), "/speed")
+        yield from scalars(
+            "/speed/tool", every, np.linalg.norm(frames["setpoint_velocity"], axis=1), "/speed"
+        )
         for side, name in enumerate(SIDES):
             speeds = np.linalg.norm(frames["hand_velocities"][:, side], axis=1)
             yield from scalars(f"/speed/{name}", np.flatnonzero(seen[:, side]), speeds, "/speed")
@@ -183,32 +219,67 @@ class DynamicScene:
         is_predicted = _predicted(frames, seen)
         aimed = np.flatnonzero(is_predicted)
         following = is_predicted & (frames["mode"] == Mode.FOLLOW)
-        off_mm = np.where(following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan)
+        off_mm = np.where(
+            following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan
+        )
         gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
         self._followed = bool(following[-1])
-        yield from scalars("/error/target", np.flatnonzero(following | gap_starts), off_mm, "/error")
         yield from scalars(
-            "/turn/target", np.flatnonzero(following | gap_starts), self._rotation_error(frames, following), "/turn"
+            "/error/target", np.flatnonzero(following | gap_starts), off_mm, "/error"
         )
-        std_m, std_deg = (standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance"))
-        yield from scalars("/turn/std", np.flatnonzero(is_predicted & (std_deg > 0)), np.degrees(std_deg), "/turn")
+        yield from scalars(
+            "/turn/target",
+            np.flatnonzero(following | gap_starts),
+            self._rotation_error(frames, following),
+            "/turn",
+        )
+        std_m, std_deg = (
+            standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance")
+        )
+        yield from scalars(
+            "/turn/std", np.flatnonzero(is_predicted & (std_deg > 0)), np.degrees(std_deg), "/turn"
+        )
         segmented = np.flatnonzero(frames["segment_belief"] > 0)
         yield from scalars("/segment/number", segmented, frames["segment"] + 1.0)
         yield from scalars("/segment/probable", segmented, frames["segment_belief"])
         gripping = is_predicted & (frames["closure"] >= 0)
-        yield from scalars("/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper")
+        yield from scalars(
+            "/gripper/predicted", np.flatnonzero(gripping), 100.0 * frames["closure"], "/gripper"
+        )
         is_commanded = gripping & (frames["gripper"] != UNKNOWN)
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
-        yield from scalars("/deviation/target", np.flatnonzero(is_predicted & (std_m > 0)), 1e3 * std_m, "/deviation")
-        yield from scalars("/doubt/target", np.flatnonzero(is_predicted), 100.0 * frames["error_probability"], "/doubt")
-        other = is_predicted & (np.abs(frames["gate_m"] - std_m) > SAME_M)  # a gate that compares something else
-        yield from scalars("/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation")
+        yield from scalars(
+            "/deviation/target",
+            np.flatnonzero(is_predicted & (std_m > 0)),
+            1e3 * std_m,
+            "/deviation",
+        )
+        yield from scalars(
+            "/doubt/target",
+            np.flatnonzero(is_predicted),
+            100.0 * frames["error_probability"],
+            "/doubt",
+        )
+        other = is_predicted & (
+            np.abs(frames["gate_m"] - std_m) > SAME_M
+        )  # a gate that compares something else
+        yield from scalars(
+            "/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation"
+        )
         if self._gate is not None and len(aimed):
-            yield from scalars("/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate))
-        measured = [i for i, drawn in enumerate(batch) if drawn.measured is not None and frames["commanded"][i]]
+            yield from scalars(
+                "/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate)
+            )
+        measured = [
+            i
+            for i, drawn in enumerate(batch)
+            if drawn.measured is not None and frames["commanded"][i]
+        ]
         error_rad = np.zeros(len(batch))
-        error_rad[measured] = [np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured]
+        error_rad[measured] = [
+            np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured
+        ]
         yield from scalars("/joints/error", measured, error_rad)
         timed = [i for i, drawn in enumerate(batch) if drawn.timing is not None]
         if timed:
@@ -216,13 +287,18 @@ class DynamicScene:
             timings[timed] = [batch[i].timing for i in timed]
             yield from scalars("/timing/lateness", timed, timings["lateness_us"])
             yield from scalars("/timing/work", timed, timings["work_us"])
-            yield from scalars("/timing/stages", timed, timings["stages_us"].reshape(-1, len(STAGES)))
+            yield from scalars(
+                "/timing/stages", timed, timings["stages_us"].reshape(-1, len(STAGES))
+            )
             answered = np.flatnonzero(timings["latency_us"] > 0)
             yield from scalars("/latency/hand", answered, timings["latency_us"] / 1e3, "/latency")
             missed = int(timings["missed"][timed[-1]])
             if missed > self._missed:
                 fresh = missed - self._missed
-                text = f"{fresh} deadline{'s' * (fresh > 1)} missed before tick {frames['tick'][timed[-1]]}"
+                text = (
+                    f"{fresh} deadline{'s' * (fresh > 1)} missed before tick "
+                    f"{frames['tick'][timed[-1]]}"
+                )
                 yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
             self._missed = missed
         ages = np.where(seen, frames["hand_ages"] * self._period_ms, np.nan)
@@ -232,7 +308,8 @@ class DynamicScene:
         """Angle between tool and target (T,) [°], as `[tool] orientation` defines it; NaN while the
         arm does not follow.
         """
-        angles, names = np.full(len(frames), np.nan), ("tool_orientation", "orientation")
+        angles = np.full(len(frames), np.nan)
+        names = ("tool_orientation", "orientation")
         for name in names:  # a frame may be damaged
             following = following & (np.linalg.norm(frames[name], axis=1) > 0.5)
         tool, target = (frames[name][following] for name in names)
@@ -241,9 +318,13 @@ class DynamicScene:
 
     def _modes(self, frames: NDArray[Any], columns: Columns) -> Iterator[rr.chunk.Chunk]:
         """Mode, reason and engaging where they change; to live viewers also every REPEAT_S."""
-        changed, sent, ticks = [], [], frames["tick"].tolist()
+        changed = []
+        sent = []
+        ticks = frames["tick"].tolist()
         engaging = (frames["flags"] & int(Flag.ENGAGING) > 0).tolist()
-        for i, now in enumerate(zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)):
+        for i, now in enumerate(
+            zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)
+        ):
             if now != self._shown:
                 changed.append(i)
                 self._shown = now
@@ -253,15 +334,25 @@ class DynamicScene:
             self._mode_sent_tick = ticks[i]
         if not sent:
             return
-        modes, reasons = frames["mode"].tolist(), frames["reason"].tolist()
-        yield columns("/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent]))
-        yield columns("/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent]))
+        modes = frames["mode"].tolist()
+        reasons = frames["reason"].tolist()
+        yield columns(
+            "/mode", sent, rr.StateChange.columns(state=[word(Mode(modes[i])) for i in sent])
+        )
+        yield columns(
+            "/reason", sent, rr.StateChange.columns(state=[word(Reason(reasons[i])) for i in sent])
+        )
         for i in sent:
             picture = banner(modes[i], reasons[i], engaging[i])
             layout = rr.components.ImageFormat(
-                width=picture.shape[1], height=picture.shape[0], color_model="RGB", channel_datatype="U8"
+                width=picture.shape[1],
+                height=picture.shape[0],
+                color_model="RGB",
+                channel_datatype="U8",
             )
-            texture = rr.Mesh3D.columns(albedo_texture_buffer=[picture.tobytes()], albedo_texture_format=[layout])
+            texture = rr.Mesh3D.columns(
+                albedo_texture_buffer=[picture.tobytes()], albedo_texture_format=[layout]
+            )
             yield columns("/scene/banner", [i], texture)
         for i in changed:  # one chunk each: the viewer shows one level for all rows of a chunk
             level = "ERROR" if modes[i] == Mode.FAULT else "INFO"
@@ -281,17 +372,33 @@ class DynamicScene:
         for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
             if joint is not None:
                 angles = frames["joints"][rows, number].tolist()
-                yield columns(f"/arm/joints/{number}", rows, joint.compute_transform_columns(angles, clamp=False))
+                yield columns(
+                    f"/arm/joints/{number}",
+                    rows,
+                    joint.compute_transform_columns(angles, clamp=False),
+                )
             if ghost is not None and len(measured_rows):
                 angles = [float(q[number]) for q in measured if q is not None]
-                yield columns(f"/measured/joints/{number}", measured_rows, ghost.compute_transform_columns(angles, clamp=False))
-        tool = rr.Transform3D.columns(translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows])
+                yield columns(
+                    f"/measured/joints/{number}",
+                    measured_rows,
+                    ghost.compute_transform_columns(angles, clamp=False),
+                )
+        tool = rr.Transform3D.columns(
+            translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows]
+        )
         yield columns("/scene/tool", rows, tool)
-        yield columns("/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows]))
+        yield columns(
+            "/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows])
+        )
         for side, name in enumerate(SIDES):
             drawn_rows = rows[seen[rows, side]]
             if len(drawn_rows):
-                yield columns(f"/scene/{name}_hand", drawn_rows, rr.Points3D.columns(positions=frames["hands"][drawn_rows, side]))
+                yield columns(
+                    f"/scene/{name}_hand",
+                    drawn_rows,
+                    rr.Points3D.columns(positions=frames["hands"][drawn_rows, side]),
+                )
         drawn_rows = rows[_predicted(frames, seen)[rows]]
         if len(drawn_rows):
             variances, axes = np.linalg.eigh(frames["covariance"][drawn_rows])
@@ -299,8 +406,11 @@ class DynamicScene:
             half = np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3)
             unsure = frames["flags"][drawn_rows] & int(Flag.UNSURE) > 0
             colours = [palette.GATE if is_unsure else palette.TARGET for is_unsure in unsure]
-            orientations, centres = Rotation.from_matrix(axes).as_quat(), frames["target"][drawn_rows]
-            region = rr.Ellipsoids3D.columns(half_sizes=half, centers=centres, quaternions=orientations, colors=colours)
+            orientations = Rotation.from_matrix(axes).as_quat()
+            centres = frames["target"][drawn_rows]
+            region = rr.Ellipsoids3D.columns(
+                half_sizes=half, centers=centres, quaternions=orientations, colors=colours
+            )
             yield columns("/scene/target", drawn_rows, region)
         if len(near := rows[seen[rows].any(axis=1)]):
             lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)
@@ -311,8 +421,10 @@ class DynamicScene:
         """The line (2, 3) from the nearest hand to the arm, and its length as text; without a hand
         nearby, a point and no text.
         """
-        body, nearest = self._body, (NEAREST_SHOWN_M, np.zeros((2, 3)))
-        placed, near = np.empty((len(body.capsules), 2, 3)), np.empty(9)
+        body = self._body
+        nearest = (NEAREST_SHOWN_M, np.zeros((2, 3)))
+        placed = np.empty((len(body.capsules), 2, 3))
+        near = np.empty(9)
         place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
         if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST_REPORTED_M):
             for side in np.flatnonzero(seen):
@@ -320,24 +432,37 @@ class DynamicScene:
                 for ends, radius in zip(placed, body.capsules["radius"].tolist(), strict=True):
                     distance = between_segments(ends, hand, near) - radius - self._hand_radius
                     if distance < nearest[0]:
-                        surfaces = near[:3] + radius * near[6:], near[3:6] - self._hand_radius * near[6:]
+                        surfaces = (
+                            near[:3] + radius * near[6:],
+                            near[3:6] - self._hand_radius * near[6:],
+                        )
                         nearest = distance, np.stack(surfaces)
         distance, line = nearest
-        return line.astype(np.float32), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
+        return line.astype(
+            np.float32
+        ), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
 
-    def _trail(self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns) -> Iterator[rr.chunk.Chunk]:
+    def _trail(
+        self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns
+    ) -> Iterator[rr.chunk.Chunk]:
         """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
-        stale = np.maximum(frames["stale_ticks"], self._stale_ticks)  # older recordings have no limits of their own
+        stale = np.maximum(
+            frames["stale_ticks"], self._stale_ticks
+        )  # older recordings have no limits of their own
         tracks = [
             (name, frames["hands"][:, side], frames["hand_ages"][:, side], stale[:, side])
             for side, name in enumerate(SIDES)
         ]
         tracks.append(("tool", frames["tool"], np.where(frames["commanded"], 0, -1), stale[:, 0]))
         for name, positions, ages, limits in tracks:
-            trail, drawn_rows, strips = self._trails[name], [], []
+            trail = self._trails[name]
+            drawn_rows = []
+            strips = []
             for i in rows:
                 fresh = 0 <= ages[i] < limits[i]
-                if not fresh or (trail and np.linalg.norm(trail[-1] - positions[i]) > TRAIL_BREAK_M):
+                if not fresh or (
+                    trail and np.linalg.norm(trail[-1] - positions[i]) > TRAIL_BREAK_M
+                ):
                     trail.clear()
                 if fresh:
                     trail.append(positions[i].astype(np.float32))
@@ -345,7 +470,9 @@ class DynamicScene:
                     drawn_rows.append(i)
                     strips.append(np.array(trail, np.float32).reshape(-1, 3))
             if drawn_rows:
-                yield columns(f"/scene/{name}_trail", drawn_rows, rr.LineStrips3D.columns(strips=strips))
+                yield columns(
+                    f"/scene/{name}_trail", drawn_rows, rr.LineStrips3D.columns(strips=strips)
+                )
 
 
 def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -58,19 +58,29 @@ def skill_contents(skill: bytes) -> SkillContents:
         with np.load(io.BytesIO(skill), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         reference = np.asarray(arrays.get("base_mean", np.empty((0, 3))), np.float64)
-        is_tool = "outputs: tool x y z [m]" in str(arrays.get("units", "")) and reference.shape[1:] == (3,)
+        is_tool = "outputs: tool x y z [m]" in str(arrays.get("units", "")) and reference.shape[
+            1:
+        ] == (3,)
         via_points = {point.name: point for point in _demonstrated(arrays)}
         via_points |= {
-            point.name: MarkedViaPoint(point.name, point.left, point.right, point.tool, point.radius, point.follow)
-            for point in msgspec.json.decode(str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...])
+            point.name: MarkedViaPoint(
+                point.name, point.left, point.right, point.tool, point.radius, point.follow
+            )
+            for point in msgspec.json.decode(
+                str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...]
+            )
         }
         return SkillContents(
             printable(str(arrays.get("name", ""))),
             reference if is_tool else np.empty((0, 3)),
             tuple(via_points.values()),
             float(arrays.get("threshold", np.inf)),
-            printable_values(msgspec.json.decode(str(arrays["figures"]))) if "figures" in arrays else {},
-            demonstrations(arrays["demonstrations"].tobytes()) if "demonstrations" in arrays else [],
+            printable_values(msgspec.json.decode(str(arrays["figures"])))
+            if "figures" in arrays
+            else {},
+            demonstrations(arrays["demonstrations"].tobytes())
+            if "demonstrations" in arrays
+            else [],
         )
     except (OSError, KeyError, TypeError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"a skill that cannot be drawn: {in_words(error)}") from None
@@ -80,7 +90,9 @@ def _demonstrated(arrays: dict[str, Any]) -> Iterator[MarkedViaPoint]:
     """The named via-points in a skill's demonstrations."""
     if "names" in arrays and "nominal" in arrays:
         names = map(printable, msgspec.json.decode(str(arrays["names"]), type=tuple[str, ...]))
-        for name, positions in zip(names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True):
+        for name, positions in zip(
+            names, np.asarray(arrays["nominal"], np.float64).reshape(-1, 3, 3).tolist(), strict=True
+        ):
             left, right, tool = ((x, y, z) for x, y, z in positions)
             yield MarkedViaPoint(name, left, right, tool)
 
@@ -99,21 +111,40 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
     """The chunks that show a skill; `at` makes a chunk of one row from a path and columns."""
     for first, (name, colour) in enumerate(palette.BY_TRACK.items()):
         columns = slice(3 * first, 3 * first + 3)
-        lines = [track[:: 1 + len(track) // MAX_LINE_POINTS, columns] for track in skill.demonstrations]
-        style = {"colors": [palette.faint(colour, 0.12)] * len(lines), "radii": [rr.Radius.ui_points(0.5)] * len(lines)}
-        yield at(f"/skill/demonstrations/{name}", *row(rr.LineStrips3D, len(lines), strips=lines, **style))
+        lines = [
+            track[:: 1 + len(track) // MAX_LINE_POINTS, columns] for track in skill.demonstrations
+        ]
+        style = {
+            "colors": [palette.faint(colour, 0.12)] * len(lines),
+            "radii": [rr.Radius.ui_points(0.5)] * len(lines),
+        }
+        yield at(
+            f"/skill/demonstrations/{name}",
+            *row(rr.LineStrips3D, len(lines), strips=lines, **style),
+        )
     count = len(skill.reference)
     style = {"colors": [palette.faint(palette.TOOL, 0.4)] * count, "radii": [0.0022] * count}
     yield at("/skill/reference", *row(rr.Points3D, count, positions=skill.reference, **style))
-    points, count = skill.via_points, len(skill.via_points)
-    style = {"colors": [palette.PLACE] * count, "radii": [0.01] * count, "labels": [point.name for point in points]}
-    yield at("/skill/places/tool", *row(rr.Points3D, count, positions=[point.tool for point in points], **style))
+    points = skill.via_points
+    count = len(skill.via_points)
+    style = {
+        "colors": [palette.PLACE] * count,
+        "radii": [0.01] * count,
+        "labels": [point.name for point in points],
+    }
+    yield at(
+        "/skill/places/tool",
+        *row(rr.Points3D, count, positions=[point.tool for point in points], **style),
+    )
     for side, colour in (("left", palette.LEFT), ("right", palette.RIGHT)):
         centres = [getattr(point, side) for point in points]
         half = [[max(point.radius, 0.004)] * 3 for point in points]
         style = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
         style |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
-        yield at(f"/skill/places/{side}", *row(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style))
+        yield at(
+            f"/skill/places/{side}",
+            *row(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style),
+        )
     triples = [[point.left, point.tool, point.right] for point in points]
     style = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
     yield at("/skill/places/belong", *row(rr.LineStrips3D, count, strips=triples, **style))
@@ -129,15 +160,26 @@ def about(skill: SkillContents) -> str:
     if len(skill.reference):
         lines.append(f"{len(skill.reference)} reference points of the tool (faint points).")
     lines.append(
-        f"Learned from {count} demonstrations (faint lines)." if count else "Its file holds no demonstrations."
+        f"Learned from {count} demonstrations (faint lines)."
+        if count
+        else "Its file holds no demonstrations."
     )
-    lines.append(f"The arm holds if the deviation from what the skill knows exceeds {1000 * skill.threshold:.0f} mm.")
+    lines.append(
+        "The arm holds if the deviation from what the skill knows exceeds "
+        f"{1000 * skill.threshold:.0f} mm."
+    )
     lines += ["", "## Via-points", ""]
     if skill.via_points:
-        lines += ["| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |", "|---|---|---|---|"]
+        lines += [
+            "| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |",
+            "|---|---|---|---|",
+        ]
         for point in skill.via_points:
             position_text = ", ".join(f"{value:.3f}" for value in point.tool)
-            lines.append(f"| {as_markdown(point.name)} | {position_text} | {1000 * point.radius:.0f} | {point.follow} |")
+            lines.append(
+                f"| {as_markdown(point.name)} | {position_text} | {1000 * point.radius:.0f} | "
+                f"{point.follow} |"
+            )
     else:
         lines.append("None.")
     if rows:
@@ -155,5 +197,7 @@ def about(skill: SkillContents) -> str:
             ]
             lines.append(f"| {' | '.join(cells)} |")
         lines += [f"- {as_markdown(text)}" for text in skill.figures.get("warnings", ())]
-        lines += [f"- residual risk: {as_markdown(text)}" for text in skill.figures.get("residual", ())]
+        lines += [
+            f"- residual risk: {as_markdown(text)}" for text in skill.figures.get("residual", ())
+        ]
     return "\n".join(lines)

@@ -24,7 +24,8 @@ def object_chunks(
     Names that are already `labelled` are not shown again. `at` makes a chunk of one row from a path
     and columns.
     """
-    names, labelled = set(), set(labelled)
+    names = set()
+    labelled = set(labelled)
     for scene_object in objects:
         path = _path(scene_object.name)
         names.add(scene_object.name)
@@ -36,36 +37,62 @@ def object_chunks(
         yield at(path, *rr.CoordinateFrame.columns(frame=[frame]))
         if scene_object.shape == "cylinder":
             radius = (scene_object.size[0] + scene_object.size[1]) / 4
-            yield at(path, *row(rr.Cylinders3D, 1, lengths=[scene_object.size[2]], radii=[radius], **pose, **style))
+            yield at(
+                path,
+                *row(
+                    rr.Cylinders3D,
+                    1,
+                    lengths=[scene_object.size[2]],
+                    radii=[radius],
+                    **pose,
+                    **style,
+                ),
+            )
         else:
             kind = rr.Boxes3D if scene_object.shape == "box" else rr.Ellipsoids3D
             yield at(path, *row(kind, 1, half_sizes=half, **pose, **style))
-        label = {"labels": [printable(scene_object.name)], "show_labels": [scene_object.name not in labelled]}
+        label = {
+            "labels": [printable(scene_object.name)],
+            "show_labels": [scene_object.name not in labelled],
+        }
         label |= {"colors": [palette.light(colour)]}
         yield at(f"{path}/name", *rr.CoordinateFrame.columns(frame=[frame]))
-        yield at(f"{path}/name", *row(rr.Points3D, 1, positions=[_label_at(scene_object)], radii=[0.0], **label))
+        yield at(
+            f"{path}/name",
+            *row(rr.Points3D, 1, positions=[_label_at(scene_object)], radii=[0.0], **label),
+        )
     for name in set(before) - names:
         yield at(_path(name), *rr.Clear.columns(is_recursive=[True]))
 
 
 def are_the_same(before: tuple[SceneObject, ...], after: tuple[SceneObject, ...]) -> bool:
     """True if objects have only moved: names, shapes, sizes and colours are as before."""
-    return [_look(scene_object) for scene_object in before] == [_look(scene_object) for scene_object in after]
+    return [_look(scene_object) for scene_object in before] == [
+        _look(scene_object) for scene_object in after
+    ]
 
 
-def moved_chunks(rows: Sequence[Sequence[SceneObject]], index: list[rr.TimeColumn]) -> Iterator[rr.chunk.Chunk]:
+def moved_chunks(
+    rows: Sequence[Sequence[SceneObject]], index: list[rr.TimeColumn]
+) -> Iterator[rr.chunk.Chunk]:
     """The chunks that move objects which are already shown, a row for each time of the index."""
     count = len(rows)
     for moves in zip(*rows, strict=True):
-        first, path = moves[0], _path(moves[0].name)
+        first = moves[0]
+        path = _path(moves[0].name)
         frames = ["tf#/" if move.frame_id == BASE else move.frame_id for move in moves]
-        kind: Any = {"cylinder": rr.Cylinders3D, "box": rr.Boxes3D}.get(first.shape, rr.Ellipsoids3D)
-        centers, turns = [move.position for move in moves], [move.orientation for move in moves]
+        kind: Any = {"cylinder": rr.Cylinders3D, "box": rr.Boxes3D}.get(
+            first.shape, rr.Ellipsoids3D
+        )
+        centers = [move.position for move in moves]
+        turns = [move.orientation for move in moves]
         labels = [_label_at(move) for move in moves]
         poses = kind.columns(centers=centers, quaternions=turns).partition([1] * count)
         names = rr.Points3D.columns(positions=labels).partition([1] * count)
         for where, columns in ((path, poses), (f"{path}/name", names)):
-            yield rr.chunk.Chunk.from_columns(where, index, [*rr.CoordinateFrame.columns(frame=frames), *columns])
+            yield rr.chunk.Chunk.from_columns(
+                where, index, [*rr.CoordinateFrame.columns(frame=frames), *columns]
+            )
 
 
 def _look(found: SceneObject) -> tuple[object, ...]:

@@ -9,7 +9,11 @@ import msgspec
 from thirdhand.contract.explain import in_file
 from thirdhand.contract.incidents import ORDERS
 
-_REQUESTS = {"via_points": "Teaching", "skill": "Loading a skill", **{name: f"A request to {name}" for name in ORDERS}}
+_REQUESTS = {
+    "via_points": "Teaching",
+    "skill": "Loading a skill",
+    **{name: f"A request to {name}" for name in ORDERS},
+}
 
 
 def sentence(note: str) -> str:
@@ -19,7 +23,10 @@ def sentence(note: str) -> str:
         return note
     outcome, _, why = content.partition(": ")
     if outcome in ("refused", "failed"):
-        return f"{_REQUESTS[name]} {'was refused' if outcome == 'refused' else outcome}: {in_file(why)}"
+        return (
+            f"{_REQUESTS[name]} {'was refused' if outcome == 'refused' else outcome}: "
+            f"{in_file(why)}"
+        )
     try:
         request = msgspec.json.decode(content, type=dict[str, Any])
     except msgspec.DecodeError:
@@ -30,7 +37,10 @@ def sentence(note: str) -> str:
         case _ if name == "skill":
             return f"Skill {request.get('name')} is in force."
         case {"op": "add", "points": [*points]}:
-            return f"Taught: {_list([str(point.get('name')) for point in points if isinstance(point, dict)])}."
+            return (
+                "Taught: "
+                f"{_list([str(point.get('name')) for point in points if isinstance(point, dict)])}."
+            )
         case {"op": "remove", "names": [*names]}:
             return f"Removed: {_list(names)}."
         case {"op": "clear"}:

@@ -35,7 +35,11 @@ from thirdhand.viewer.blueprint import EYE, LOOK_AT, UP
 GHOST = "measured/"  # prefix of its frames' names
 ARC_STEPS = 48
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-BANNER_AT = (0.55, 0.66, -0.44)  # right of, above and in front of the point that the camera looks at
+BANNER_AT = (
+    0.55,
+    0.66,
+    -0.44,
+)  # right of, above and in front of the point that the camera looks at
 BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 VISUAL = "/visual_geometries/"
@@ -51,11 +55,16 @@ class ArmModels:
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
-        live = urdf == urdf_path(settings)  # otherwise the URDF is a recording's, whose meshes are already covered
+        live = urdf == urdf_path(
+            settings
+        )  # otherwise the URDF is a recording's, whose meshes are already covered
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
-        self.body, self.covered = body_of(settings, text), any(shape.kind == "mesh" for shape in Urdf(text).shapes)
+        self.body = body_of(settings, text)
+        self.covered = any(shape.kind == "mesh" for shape in Urdf(text).shapes)
         with tempfile.TemporaryDirectory() as folder:
-            self.remark = _write_drawn(urdf.read_bytes(), settings, drawn_urdf := Path(folder) / "arm.urdf")
+            self.remark = _write_drawn(
+                urdf.read_bytes(), settings, drawn_urdf := Path(folder) / "arm.urdf"
+            )
             self.commanded = rr.urdf.UrdfTree.from_file_path(drawn_urdf, entity_path_prefix="arm")
             self.measured = rr.urdf.UrdfTree.from_file_path(
                 drawn_urdf,
@@ -69,13 +78,19 @@ class ArmModels:
             _, visual, path = chunk.entity_path.partition(VISUAL)
             if visual:
                 rows = chunk.to_record_batch()
-                size, names = size + rows.nbytes, rows.schema.names
-                drawn[path] = drawn.get(path, False) or any(name.startswith(_DRAWN) for name in names)
+                size = size + rows.nbytes
+                names = rows.schema.names
+                drawn[path] = drawn.get(path, False) or any(
+                    name.startswith(_DRAWN) for name in names
+                )
         self.mesh_mb = 2 * size // 1_000_000
         self.undrawn = tuple(path for path, is_drawn in drawn.items() if not is_drawn)
         if self.undrawn and not self.remark:
             links = ", ".join(dict.fromkeys(path.partition("/")[0] for path in self.undrawn))
-            self.remark = f"the viewer cannot draw the meshes of links {links}; the arm is drawn by its capsules"
+            self.remark = (
+                f"the viewer cannot draw the meshes of links {links}; the arm is drawn by its "
+                "capsules"
+            )
 
 
 def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
@@ -83,12 +98,20 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     prefixes and collision shapes, which are not drawn. Visual shapes whose mesh is not found or not
     readable are left out; return a remark about them, or an empty text.
     """
-    robot, origin = element_of(urdf), urdf_path(settings)
+    robot = element_of(urdf)
+    origin = urdf_path(settings)
     for link in robot.findall("link"):
         for part in (*link.findall("inertial"), *link.findall("collision")):
             link.remove(part)
-    packages = (*settings.arm.packages, *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)))
-    packages += tuple(f"{prefix}/share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix)
+    packages = (
+        *settings.arm.packages,
+        *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
+    )
+    packages += tuple(
+        f"{prefix}/share"
+        for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+        if prefix
+    )
     lost = unfound(robot, origin, packages, "visual")
     cause = f"{lost}; ROS_PACKAGE_PATH names more" if lost else ""
     files: dict[ElementTree.Element, Path] = {}
@@ -116,13 +139,22 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
     def fix(path: str, *archetypes: Any) -> None:
         stream.log(path, *archetypes, static=True)
 
-    for tree, path, ghost in ((models.commanded, "/arm", False), (models.measured, "/measured", True)):
+    for tree, path, ghost in (
+        (models.commanded, "/arm", False),
+        (models.measured, "/measured", True),
+    ):
         _log_arm(stream, tree, path, models.undrawn, ghost=ghost)
         if models.remark or (models.covered and not ghost):
             _log_capsules(fix, tree, path, models, settings, ghost=ghost)
     fix("/scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    fix("/scene/base", rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name))
-    fix("/scene/ghost_base", rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + models.measured.root_link().name))
+    fix(
+        "/scene/base",
+        rr.Transform3D(parent_frame="tf#/", child_frame=models.commanded.root_link().name),
+    )
+    fix(
+        "/scene/ghost_base",
+        rr.Transform3D(parent_frame="tf#/", child_frame=GHOST + models.measured.root_link().name),
+    )
     _log_surroundings(fix, settings)
     fix("/scene/tool", rr.TransformAxes3D(0.07))
     for name, colour, radius in (
@@ -131,27 +163,48 @@ def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings
         ("setpoint", palette.TOOL, 0.008),
     ):
         labels = [name.replace("_", " ")]
-        marker = rr.Points3D.from_fields(colors=[colour], radii=[radius], labels=labels, show_labels=radius > 0.01)
+        marker = rr.Points3D.from_fields(
+            colors=[colour], radii=[radius], labels=labels, show_labels=radius > 0.01
+        )
         fix(f"/scene/{name}", marker)
     wireframe = rr.components.FillMode.TransparentFillMajorWireframe
     region = rr.Ellipsoids3D.from_fields(
-        colors=[palette.TARGET], line_radii=[0.0006], fill_mode=wireframe, labels=["target, 95 %"], show_labels=False
+        colors=[palette.TARGET],
+        line_radii=[0.0006],
+        fill_mode=wireframe,
+        labels=["target, 95 %"],
+        show_labels=False,
     )
     fix("/scene/target", region)
     for name, colour in palette.BY_TRACK.items():
         fix(f"/scene/{name}_trail", rr.LineStrips3D.from_fields(colors=[colour], radii=[0.002]))
-    fix("/scene/nearest", rr.LineStrips3D.from_fields(colors=[palette.NEAREST], radii=[0.0015], show_labels=True))
+    fix(
+        "/scene/nearest",
+        rr.LineStrips3D.from_fields(colors=[palette.NEAREST], radii=[0.0015], show_labels=True),
+    )
     _log_names(fix, settings)
 
 
 def _log_arm(
-    stream: rr.RecordingStream, tree: rr.urdf.UrdfTree, path: str, undrawn: tuple[str, ...], *, ghost: bool
+    stream: rr.RecordingStream,
+    tree: rr.urdf.UrdfTree,
+    path: str,
+    undrawn: tuple[str, ...],
+    *,
+    ghost: bool,
 ) -> None:
     """Log the shapes of the arm: solid, or transparent as a ghost."""
-    fill = rr.components.FillMode.TransparentFillMajorWireframe if ghost else rr.components.FillMode.Solid
+    fill = (
+        rr.components.FillMode.TransparentFillMajorWireframe
+        if ghost
+        else rr.components.FillMode.Solid
+    )
     colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
-        if "/collision_geometries/" in chunk.entity_path or chunk.entity_path.partition(VISUAL)[2] in undrawn:
+        if (
+            "/collision_geometries/" in chunk.entity_path
+            or chunk.entity_path.partition(VISUAL)[2] in undrawn
+        ):
             continue
         stream.send_chunks(chunk)
         names = chunk.to_record_batch().schema.names
@@ -159,25 +212,48 @@ def _log_arm(
             if any(name.startswith(f"{shape.__name__}:") for name in names):
                 lines = "radii" if shape is rr.Boxes3D else "line_radii"
                 style: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
-                stream.log(chunk.entity_path, shape.from_fields(fill_mode=fill, **style), static=True)
+                stream.log(
+                    chunk.entity_path, shape.from_fields(fill_mode=fill, **style), static=True
+                )
         if ghost and any(name.startswith("Asset3D:") for name in names):
             stream.log(chunk.entity_path, rr.Asset3D.from_fields(albedo_factor=colour), static=True)
     for joint in tree.joints():
         if joint.joint_type == "fixed":
-            stream.log(f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True)
+            stream.log(
+                f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True
+            )
 
 
 def _log_capsules(
-    fix: Any, tree: rr.urdf.UrdfTree, path: str, models: ArmModels, settings: Settings, *, ghost: bool
+    fix: Any,
+    tree: rr.urdf.UrdfTree,
+    path: str,
+    models: ArmModels,
+    settings: Settings,
+    *,
+    ghost: bool,
 ) -> None:
     """Log the capsules of the arm, each in the frame of its link."""
-    moved = [joint.child_link for name in settings.joints.names if (joint := tree.get_joint_by_name(name)) is not None]
-    root, body, faint = tree.root_link().name, models.body, ghost or not models.remark
+    moved = [
+        joint.child_link
+        for name in settings.joints.names
+        if (joint := tree.get_joint_by_name(name)) is not None
+    ]
+    root = tree.root_link().name
+    body = models.body
+    faint = ghost or not models.remark
     for link in np.unique(body.capsules["link"]):
         capsules = body.capsules[body.capsules["link"] == link]
         along = capsules["ends"][:, 1] - capsules["ends"][:, 0]
-        turns = [Rotation.align_vectors([axis], [UP])[0].as_quat() if axis.any() else UPRIGHT for axis in along]
-        fill = rr.components.FillMode.TransparentFillMajorWireframe if faint else rr.components.FillMode.Solid
+        turns = [
+            Rotation.align_vectors([axis], [UP])[0].as_quat() if axis.any() else UPRIGHT
+            for axis in along
+        ]
+        fill = (
+            rr.components.FillMode.TransparentFillMajorWireframe
+            if faint
+            else rr.components.FillMode.Solid
+        )
         shapes = rr.Capsules3D(
             lengths=np.linalg.norm(along, axis=1),
             radii=capsules["radius"],
@@ -188,19 +264,29 @@ def _log_capsules(
             fill_mode=fill,
         )
         frame = moved[link - 1] if link else root
-        fix(f"{path}/capsules/{link}", rr.CoordinateFrame(f"{GHOST if ghost else ''}{frame}"), shapes)
+        fix(
+            f"{path}/capsules/{link}",
+            rr.CoordinateFrame(f"{GHOST if ghost else ''}{frame}"),
+            shapes,
+        )
 
 
 def _log_surroundings(fix: Any, settings: Settings) -> None:
     """Log the table, the obstacles and the arm's reach."""
-    (x, y, top), (half_x, half_y) = settings.table.centre, settings.table.half_size
+    x, y, top = settings.table.centre
+    half_x, half_y = settings.table.half_size
     solid = rr.components.FillMode.Solid
     half = [(half_x, half_y, 0.0095)]
     fix(
         "/scene/table",
-        rr.Boxes3D(centers=[(x, y, top - 0.01)], half_sizes=half, colors=[palette.TABLE], fill_mode=solid),
+        rr.Boxes3D(
+            centers=[(x, y, top - 0.01)], half_sizes=half, colors=[palette.TABLE], fill_mode=solid
+        ),
     )
-    edge = [(x + a * half_x, y + b * half_y, top) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    edge = [
+        (x + a * half_x, y + b * half_y, top)
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+    ]
     fix("/scene/table/edge", rr.LineStrips3D([edge], colors=[palette.GREY], radii=[0.0015]))
     if boxes := settings.obstacles.boxes:
         fix(
@@ -212,23 +298,27 @@ def _log_surroundings(fix: Any, settings: Settings) -> None:
                 fill_mode=solid,
             ),
         )
-    faint, thin = (
-        palette.faint(palette.GREY, 0.08),
-        rr.Radius.ui_points(0.5),
-    )  # width in pixels, constant near the camera
-    fix("/scene/reach", rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=thin))
+    # width in pixels, constant near the camera
+    faint = palette.faint(palette.GREY, 0.08)
+    thin = rr.Radius.ui_points(0.5)
+    fix(
+        "/scene/reach",
+        rr.LineStrips3D(list(reach_lines(settings.reach)), colors=[faint], radii=thin),
+    )
 
 
 def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
     """Lines (P, 3) [m] on the outer shell of the reach: two parallels and three meridians."""
     centre = np.array(reach.centre)
     lowest = max(np.arcsin(np.clip((reach.min_z - centre[2]) / reach.outer, -1.0, 1.0)), -np.pi / 2)
-    around, up = np.linspace(-np.pi / 2, np.pi / 2, ARC_STEPS), np.linspace(lowest, np.pi / 2, ARC_STEPS)
+    around = np.linspace(-np.pi / 2, np.pi / 2, ARC_STEPS)
+    up = np.linspace(lowest, np.pi / 2, ARC_STEPS)
     arcs = [(around, np.full(ARC_STEPS, height)) for height in (lowest, 0.0)]
     arcs += [(np.full(ARC_STEPS, bearing), up) for bearing in (-np.pi / 3, 0.0, np.pi / 3)]
     for bearing, height in arcs:
         direction = np.stack(
-            [np.cos(bearing) * np.cos(height), np.sin(bearing) * np.cos(height), np.sin(height)], axis=1
+            [np.cos(bearing) * np.cos(height), np.sin(bearing) * np.cos(height), np.sin(height)],
+            axis=1,
         )
         points = centre + reach.outer * direction
         points = points[points[:, 0] >= reach.min_x]
@@ -238,7 +328,10 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
 
 def _log_names(fix: Any, settings: Settings) -> None:
     """Log names, units and colours of the curves, and labels and colours of the modes."""
-    joints = [name.rpartition("/")[2].removesuffix("_joint").replace("_", " ") for name in settings.joints.names]
+    joints = [
+        name.rpartition("/")[2].removesuffix("_joint").replace("_", " ")
+        for name in settings.joints.names
+    ]
     units = settings.joints.units
     series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
         (
@@ -269,7 +362,11 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
-        ("/joints/error", "largest [rad]" if set(units) == {"rad"} else "largest [rad or m]", palette.MEASURED),
+        (
+            "/joints/error",
+            "largest [rad]" if set(units) == {"rad"} else "largest [rad or m]",
+            palette.MEASURED,
+        ),
         ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),
@@ -281,14 +378,22 @@ def _log_names(fix: Any, settings: Settings) -> None:
         is_largest = path.startswith(("/timing", "/latency", "/age"))
         policy = rr.components.AggregationPolicy.Max if is_largest else None
         widths = [1.5] * len(names)
-        fix(path, rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy))
+        fix(
+            path,
+            rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy),
+        )
     for path, members, colours_packed in (
         ("/mode", Mode, [palette.packed(palette.BY_MODE[mode]) for mode in Mode]),
         ("/reason", Reason, [palette.packed(palette.GREY)] * len(Reason)),
     ):
         names = [word(member) for member in members]
         labels = [title(name) for name in names]
-        fix(path, rr.StateConfiguration(values=names, labels=labels, colors=np.array(colours_packed, np.uint32)))
+        fix(
+            path,
+            rr.StateConfiguration(
+                values=names, labels=labels, colors=np.array(colours_packed, np.uint32)
+            ),
+        )
     fix("/scene/banner", _board())
 
 
@@ -299,7 +404,8 @@ def _board() -> rr.Mesh3D:
     right = np.cross(UP, toward) / np.linalg.norm(np.cross(UP, toward))
     up = np.cross(toward, right)
     centre = LOOK_AT + np.stack([right, up, toward], axis=1) @ (far * np.array(BANNER_AT))
-    right, up = 0.5 * far * BANNER_WIDTH * right, 0.5 * far * BANNER_WIDTH * HEIGHT / WIDTH * up
+    right = 0.5 * far * BANNER_WIDTH * right
+    up = 0.5 * far * BANNER_WIDTH * HEIGHT / WIDTH * up
     corners = [centre - right - up, centre + right - up, centre + right + up, centre - right + up]
     return rr.Mesh3D(
         vertex_positions=corners,

@@ -38,9 +38,18 @@ from thirdhand.viewer.static import ArmModels, log_static
 
 FILE_BATCH_S = 1.0
 LIVE_BATCH_S = 0.2
-LIVE_MB = 24  # memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
-SCENE_REPEAT_S = 10.0  # interval at which live viewers get skill and objects again, as they connect late
-PEAKS = ("lateness_us", "work_us", "latency_us", "stages_us")  # of the ticks between two frames, the largest is drawn
+LIVE_MB = (
+    24  # memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
+)
+SCENE_REPEAT_S = (
+    10.0  # interval at which live viewers get skill and objects again, as they connect late
+)
+PEAKS = (
+    "lateness_us",
+    "work_us",
+    "latency_us",
+    "stages_us",
+)  # of the ticks between two frames, the largest is drawn
 
 
 class ViewerError(ExplainedError, RuntimeError):
@@ -71,19 +80,27 @@ class Viewer:
         self._repeat_ticks = settings.ticks_in(SCENE_REPEAT_S)
         self._pending: list[DrawnFrame] = []
         self._position: tuple[float, ...] | None = None  # of the joints, as measured last
-        self._timing: Record | None = None  # of the newest tick, with the peaks since the last frame
+        self._timing: Record | None = (
+            None  # of the newest tick, with the peaks since the last frame
+        )
         self._after_gap = False
         self._skill = b""
         self._contents: SkillContents | None = None  # of the skill
         self._objects: tuple[SceneObject, ...] = ()
-        self._moved: list[tuple[int, tuple[SceneObject, ...]]] = []  # times [ns], objects: to be sent with the frames
+        self._moved: list[
+            tuple[int, tuple[SceneObject, ...]]
+        ] = []  # times [ns], objects: to be sent with the frames
         self._repeated_ns = 0
         self._repeated_tick = 0
 
         self.models = ArmModels(urdf, settings)
-        self._remarks = [self.models.remark] if self.models.remark else []  # for the log, with the next frame
+        self._remarks = (
+            [self.models.remark] if self.models.remark else []
+        )  # for the log, with the next frame
         start_ms = time.time_ns() // 1_000_000
-        self._dynamic = DynamicScene(self.models, settings, start_ns=1_000_000 * start_ms if self._live else None)
+        self._dynamic = DynamicScene(
+            self.models, settings, start_ns=1_000_000 * start_ms if self._live else None
+        )
         if live_port is None:
             assert rrd is not None
             sink: Any = rr.FileSink(rrd)
@@ -91,8 +108,12 @@ class Viewer:
         else:
             port = _free_port(live_port)
             self.url = f"rerun+http://127.0.0.1:{port}/proxy"
-            sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=f"{LIVE_MB + self.models.mesh_mb}MiB")
-            recording_id = f"{settings.cell}-{start_ms}"  # from this time a page computes a picture's age
+            sink = rr.GrpcServerSink(
+                "127.0.0.1", port, server_memory_limit=f"{LIVE_MB + self.models.mesh_mb}MiB"
+            )
+            recording_id = (
+                f"{settings.cell}-{start_ms}"  # from this time a page computes a picture's age
+            )
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(settings.cell)
@@ -103,7 +124,11 @@ class Viewer:
         self._stream.flush()
 
     def add(
-        self, frame: Record | None, time_ns: int, timing: Record | None = None, events: Iterable[tuple[str, bytes]] = ()
+        self,
+        frame: Record | None,
+        time_ns: int,
+        timing: Record | None = None,
+        events: Iterable[tuple[str, bytes]] = (),
     ) -> None:
         """Draw the frame of a tick at a time [ns], and the arm and skill in its `events` (kind,
         bytes). The events and timing of a tick without a frame are drawn with the next frame.
@@ -111,7 +136,9 @@ class Viewer:
         for kind, payload in events:
             if kind == "joints/state":
                 with contextlib.suppress(WireError):
-                    self._position = measured(cdr.decode_joints(payload), self._settings.joints.names)[0]
+                    self._position = measured(
+                        cdr.decode_joints(payload), self._settings.joints.names
+                    )[0]
             elif kind == "skill":
                 self.learn(payload)
         if timing is not None:
@@ -119,7 +146,9 @@ class Viewer:
         if frame is None:
             return
         tick = int(frame["tick"])
-        if not self._repeated_ns or (self._live and tick - self._repeated_tick > self._repeat_ticks):
+        if not self._repeated_ns or (
+            self._live and tick - self._repeated_tick > self._repeat_ticks
+        ):
             self._repeated_tick = tick
             self._repeated_ns = time_ns
             self._put_skill()
@@ -127,7 +156,11 @@ class Viewer:
         while self._remarks:
             self.log(self._remarks.pop(0), "WARN", time_ns)
         joints = self._settings.joints
-        position = None if self._position is None else in_turn(joints, np.array(self._position), frame["joints"])
+        position = (
+            None
+            if self._position is None
+            else in_turn(joints, np.array(self._position), frame["joints"])
+        )
         self._pending.append(DrawnFrame(frame, time_ns, self._timing, position, self._after_gap))
         self._timing = None
         self._after_gap = False
@@ -161,7 +194,9 @@ class Viewer:
     def image(self, key: str, image: CompressedImage, time_ns: int) -> None:
         """Show an image under `cameras/<key>`."""
         if self._repeated_ns:
-            column = rr.EncodedImage.columns(blob=[image.data], media_type=[f"image/{image.format}"])
+            column = rr.EncodedImage.columns(
+                blob=[image.data], media_type=[f"image/{image.format}"]
+            )
             self._put([self._at(time_ns)(f"/cameras/{key}", *column)])
 
     def log(self, text: str, level: str, time_ns: int) -> None:
@@ -180,7 +215,9 @@ class Viewer:
         """
         self._send()
         if not self._live and self._dynamic.end_s > 0:
-            tops = {view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()}
+            tops = {
+                view: float(np.percentile(peaks, 95)) for view, peaks in self._dynamic.peaks.items()
+            }
             self._send_blueprint(tops=tops, end_s=self._dynamic.end_s)
         self._stream.flush()
         self._stream.disconnect()
@@ -196,7 +233,8 @@ class Viewer:
             self._put(list(learned.skill_chunks(self._contents, chunk_at)))
 
     def _show_objects(self, objects: tuple[SceneObject, ...], time_ns: int) -> None:
-        previous, self._objects = self._objects, objects
+        previous = self._objects
+        self._objects = objects
         if not self._repeated_ns or objects == previous:
             return
         if scene_objects.are_the_same(previous, objects):
@@ -207,9 +245,13 @@ class Viewer:
 
     def _put_objects(self, time_ns: int, previous: Iterable[SceneObject] = ()) -> None:
         """Show the objects; an object whose name a via-point has gets no second label."""
-        via_points = () if self._contents is None else (point.name for point in self._contents.via_points)
+        via_points = (
+            () if self._contents is None else (point.name for point in self._contents.via_points)
+        )
         names = (item.name for item in previous)
-        self._put(list(scene_objects.object_chunks(self._objects, names, via_points, self._at(time_ns))))
+        self._put(
+            list(scene_objects.object_chunks(self._objects, names, via_points, self._at(time_ns)))
+        )
 
     def _at(self, time_ns: int, *, to_ns: int = 1) -> Callable[..., rr.chunk.Chunk]:
         """The function that makes a chunk of one row at this time [ns]."""
@@ -219,7 +261,8 @@ class Viewer:
     def _send(self) -> None:
         """Send what is pending."""
         if self._pending:
-            batch, self._pending = self._pending, []
+            batch = self._pending
+            self._pending = []
             self._put(list(self._dynamic.chunks(batch)))
         self._send_moved()
 
@@ -228,7 +271,8 @@ class Viewer:
         times as much of a file as a row.
         """
         if self._moved:
-            moved, self._moved = self._moved, []
+            moved = self._moved
+            self._moved = []
             index = self._dynamic.index(np.array([time_ns for time_ns, _ in moved], np.int64))
             self._put(list(scene_objects.moved_chunks([objects for _, objects in moved], index)))
 
@@ -253,7 +297,9 @@ def _free_port(port: int) -> int:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(("127.0.0.1", port))
         except OSError as error:
-            raise ViewerError(f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any") from None
+            raise ViewerError(
+                f"port {port} on 127.0.0.1: {error.strerror}; choose another, or 0 for any"
+            ) from None
         return int(probe.getsockname()[1])
 
 

@@ -33,8 +33,14 @@ def devices() -> int:
         vulkan = ctypes.CDLL("libvulkan.so.1")
     except OSError:
         return 0
-    instance, count = ctypes.c_void_p(), ctypes.c_uint32()
-    if vulkan.vkCreateInstance(ctypes.byref(InstanceCreateInfo(CREATE_INSTANCE)), None, ctypes.byref(instance)) != 0:
+    instance = ctypes.c_void_p()
+    count = ctypes.c_uint32()
+    if (
+        vulkan.vkCreateInstance(
+            ctypes.byref(InstanceCreateInfo(CREATE_INSTANCE)), None, ctypes.byref(instance)
+        )
+        != 0
+    ):
         return 0
     result = vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
     return count.value if result == 0 else 0
@@ -45,5 +51,7 @@ def is_there() -> bool:
     if not sys.platform.startswith("linux"):
         return True  # elsewhere the viewer draws by the system's own interface
     program = Path(__file__).read_text(encoding="utf-8") + "\nprint(devices())"
-    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    process = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
     return process.stdout.strip() not in {"", "0"}

@@ -36,40 +36,55 @@ EXAMPLE = """example:
 
 FOLDERS = {
     "letters": "recorded letters besides the modelled ones: X.npz with demo00, demo01, ...",
-    "hands": "recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and right [m]",
-    "data": "recorded takes for `partners`, without which it measures the made tasks alone: robot_*.npz, "
-    "give_P*.npz and walk_*.npz with t [s], left, right and tool [m]",
+    "hands": (
+        "recorded hands for `motion`, and `people --set tuning`: .npz files with time_s, left and "
+        "right [m]"
+    ),
+    "data": "recorded takes for `partners`, without which it measures the made tasks alone: "
+    "robot_*.npz, give_P*.npz and walk_*.npz with t [s], left, right and tool [m]",
 }
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     recorded = {name: " (recorded hands)" * name.endswith(OF_OTHERS) for name in EXPERIMENTS}
-    names = "\n".join(f"  {name:<16} {experiment.about}{recorded[name]}" for name, experiment in EXPERIMENTS.items())
+    names = "\n".join(
+        f"  {name:<16} {experiment.about}{recorded[name]}"
+        for name, experiment in EXPERIMENTS.items()
+    )
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.lab",
-        description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, and a Rerun "
-        f"recording each.\n\n{names}",
+        description="The experiments of the paper, and beyond it: figures, a JSON of the numbers, "
+        f"and a Rerun recording each.\n\n{names}",
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    name_help = "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
+    name_help = (
+        "one of the above; all: those whose results in DIR are missing or stale; stale: list these"
+    )
     p.add_argument("name", metavar="NAME", choices=[*EXPERIMENTS, "all", "stale"], help=name_help)
     output = "folder of the results (for stale: recordings/experiments by default)"
     p.add_argument("--output", metavar="DIR", type=Path, help=output)
     for name, text in FOLDERS.items():
         p.add_argument(f"--{name}", metavar="DIR", type=Path, help=text)
-    people = "the people of `people`: those on whom parameters are chosen, or the others (default: %(default)s)"
+    people = (
+        "the people of `people`: those on whom parameters are chosen, or the others (default: "
+        "%(default)s)"
+    )
     p.add_argument("--set", choices=["tuning", "test"], default="test", help=people)
     workers = "processes, or the cluster at dask:ADDRESS, where that helps (default: %(default)s)"
-    p.add_argument("--workers", type=workers_of, default=str(min(2, os.cpu_count() or 1)), help=workers)
+    p.add_argument(
+        "--workers", type=workers_of, default=str(min(2, os.cpu_count() or 1)), help=workers
+    )
     share = "of the full size, for a quick look: above 0, up to 1"
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     p.add_argument("--arm", default="wam", help=arm)
     redraw_help = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
     p.add_argument("--redraw", action="store_true", help=redraw_help)
-    p.add_argument("--anew", action="store_true", help="with all: make those that are not stale, too")
+    p.add_argument(
+        "--anew", action="store_true", help="with all: make those that are not stale, too"
+    )
     p.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return p
 
@@ -82,7 +97,10 @@ def jobs(name: str, options: Options) -> dict[str, Options]:
     if options.hands is not None and name == "motion":
         names = [name + OF_OTHERS]
     tuning = {"people"} if options.group == "tuning" else set()
-    return {job: options if job.endswith(OF_OTHERS) or job in tuning else replace(options, hands=None) for job in names}
+    return {
+        job: options if job.endswith(OF_OTHERS) or job in tuning else replace(options, hands=None)
+        for job in names
+    }
 
 
 def redraw(results: Results, experiment: ModuleType) -> None:
@@ -91,7 +109,9 @@ def redraw(results: Results, experiment: ModuleType) -> None:
     Raises ExperimentError if its figures show more than its numbers.
     """
     if not hasattr(experiment, "draw_numbers"):
-        raise ExperimentError(f"the figures of {results.name} show more than its numbers: run it without --redraw")
+        raise ExperimentError(
+            f"the figures of {results.name} show more than its numbers: run it without --redraw"
+        )
     experiment.draw_numbers(results, results.measured())
 
 
@@ -100,8 +120,12 @@ def make(results: Results, experiment: ModuleType, options: Options) -> None:
     earlier_options = (result_of(results.folder, results.name) or {}).get("options", {})
     for option, value in earlier_options.items():
         if isinstance(value, dict) and getattr(options, option) is None:
-            raise ExperimentError(f"the result in {results.folder} is of recordings: name them by --{option} DIR again")
-    began, results.origin = time.monotonic(), origin(results.name, options)
+            raise ExperimentError(
+                f"the result in {results.folder} is of recordings: name them by --{option} DIR "
+                "again"
+            )
+    began = time.monotonic()
+    results.origin = origin(results.name, options)
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)
     if (now := commit()) != results.origin["commit"]:
@@ -119,7 +143,9 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"{args.name}: a folder of recorded hands is missing: --hands DIR")
     if args.name != "stale" and args.output is None:
         p.error("--output DIR is missing: the folder for the results")
-    options = Options(args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm)
+    options = Options(
+        args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm
+    )
     selected = jobs(args.name, options)
     try:
         if args.name == "stale":
@@ -142,7 +168,9 @@ def made(name: str, options: Options, args: argparse.Namespace) -> int:
         experiment = importlib.import_module(f"thirdhand_sim.lab.{EXPERIMENTS[name].module}")
         redraw(results, experiment) if args.redraw else make(results, experiment, options)
     except Exception as error:
-        explanation = f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+        explanation = (
+            f"{in_words(error)}\n" if isinstance(error, FAILURES) else traceback.format_exc()
+        )
         sys.stderr.write(f"python -m thirdhand_sim.lab: {name}: {explanation}")
         return 1
     return 0
@@ -150,7 +178,10 @@ def made(name: str, options: Options, args: argparse.Namespace) -> int:
 
 def stale(folder: Path, wanted: dict[str, Options]) -> int:
     """Lists the results in a folder that do not belong to this tree; returns the exit code."""
-    reasons = {name: staleness(name, result_of(folder, name), tree(), options) for name, options in wanted.items()}
+    reasons = {
+        name: staleness(name, result_of(folder, name), tree(), options)
+        for name, options in wanted.items()
+    }
     for name, why in reasons.items():
         if why:
             print(f"{name:<16} {why}")

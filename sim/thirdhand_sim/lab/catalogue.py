@@ -55,7 +55,9 @@ class Seeds(NamedTuple):
         """The seeds as a result's JSON names them."""
         parts = {"learned": self.learned, "tuning": self.tuning, "evaluation": self.evaluation}
         return {"method": self.method} | {
-            part: {name: str(stream) for name, stream in streams.items()} for part, streams in parts.items() if streams
+            part: {name: str(stream) for name, stream in streams.items()}
+            for part, streams in parts.items()
+            if streams
         }
 
 
@@ -97,14 +99,25 @@ SHIPPED = Stream("demonstration", 1, range(1, 6))
 _SHIPPED = {"demonstrations": SHIPPED}
 # The ridge of ProMP was chosen on the letters of seed 0.
 _WRITTEN = Seeds(_letters(1), tuning=_letters(0))
-_TUNED_HANDS = {"people": Stream("moving hands", 0, range(3)), "stops": Stream("sudden stop", 0, range(24))}
+_TUNED_HANDS = {
+    "people": Stream("moving hands", 0, range(3)),
+    "stops": Stream("sudden stop", 0, range(24)),
+}
 _TEACHERS = {**_SHIPPED, "teachers": Stream("moving hands", 0, range(100, 105))}
 
-ALL, CORE, KMP = ("core", "learning", "kmp"), ("core", "learning"), ("kmp",)
+ALL = ("core", "learning", "kmp")
+CORE = ("core", "learning")
+KMP = ("kmp",)
 _TEST, _TUNING, _LEARNED = (GROUP_SEEDS[group] for group in ("test", "tuning", "demonstrations"))
 _PEOPLE = Seeds(
-    {"people": Stream("person", _TEST, range(24)), "breaking": Stream("breaking scene", _TEST, range(40))},
-    tuning={"people": Stream("person", _TUNING, range(10)), "breaking": Stream("breaking scene", _TUNING, range(10))},
+    {
+        "people": Stream("person", _TEST, range(24)),
+        "breaking": Stream("breaking scene", _TEST, range(40)),
+    },
+    tuning={
+        "people": Stream("person", _TUNING, range(10)),
+        "breaking": Stream("breaking scene", _TUNING, range(10)),
+    },
     learned={"people": Stream("person", _LEARNED, range(6))},
 )
 _PARTNERS = Seeds(
@@ -131,11 +144,17 @@ _SENSITIVITY = Seeds(  # one of each for each seed of a session
 )
 
 EXPERIMENTS: Mapping[str, Experiment] = {
-    "hands": Experiment("hands", ALL, Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED)),
-    "statistics": Experiment("statistics", ALL, Seeds(_scenes(100), tuning=TUNED_SCENES, learned=_SHIPPED)),
+    "hands": Experiment(
+        "hands", ALL, Seeds(_hands(7) | _scenes(40), tuning=TUNED_SCENES, learned=_SHIPPED)
+    ),
+    "statistics": Experiment(
+        "statistics", ALL, Seeds(_scenes(100), tuning=TUNED_SCENES, learned=_SHIPPED)
+    ),
     "people": Experiment("people.comparison", ALL, _PEOPLE, ("group", "hands")),
     "partners": Experiment("partners", ALL, _PARTNERS, ("data",)),
-    "motion": Experiment("motion", ALL, _OTHERS._replace(evaluation=_FOLLOWED | _hands(Scene().seed)), ("arm",)),
+    "motion": Experiment(
+        "motion", ALL, _OTHERS._replace(evaluation=_FOLLOWED | _hands(Scene().seed)), ("arm",)
+    ),
     "motion-of-others": Experiment("motion", ALL, _OTHERS, ("arm", "hands")),
     "separation": Experiment("separation", CORE, Seeds(_scenes(100), tuning=TUNED_SCENES)),
     "faults": Experiment("load.faults", CORE, Seeds(_hands(Scene().seed)), ("arm",)),

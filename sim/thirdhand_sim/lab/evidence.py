@@ -33,7 +33,15 @@ from thirdhand_sim.lab.results import Array, ExperimentError, Options
 
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "recordings" / "experiments"
-CODE = ("kmp", "service", "sim", "pyproject.toml", "recordings/*.npz", "recordings/people", "recordings/golden.mcap")
+CODE = (
+    "kmp",
+    "service",
+    "sim",
+    "pyproject.toml",
+    "recordings/*.npz",
+    "recordings/people",
+    "recordings/golden.mcap",
+)
 MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
 DECIMALS = 6  # kmp's outputs are rounded to these, on which CPUs agree
 
@@ -44,7 +52,11 @@ USUAL = Options()
 @functools.cache
 def tree() -> dict[str, str]:
     """The digests of this tree, by name."""
-    return {"core": core_digest(recordings() / "golden.mcap"), "learning": _skill_digest(), "kmp": kmp_digest()}
+    return {
+        "core": core_digest(recordings() / "golden.mcap"),
+        "learning": _skill_digest(),
+        "kmp": kmp_digest(),
+    }
 
 
 def core_digest(golden: Path) -> str:
@@ -53,8 +65,13 @@ def core_digest(golden: Path) -> str:
     Where the file has a frame as a whole, its checksum covers the state too, which decides nothing
     by itself: the frame is taken then.
     """
-    recording, sums = Recording.open(golden), hashlib.blake2b(digest_size=16)
-    whole = {step.tick: encode(step.frame) for step in recording.steps(whole=False) if step.frame is not None}
+    recording = Recording.open(golden)
+    sums = hashlib.blake2b(digest_size=16)
+    whole = {
+        step.tick: encode(step.frame)
+        for step in recording.steps(whole=False)
+        if step.frame is not None
+    }
     for tick, number in recording.checksums.items():
         sums.update(whole.get(tick) or number.to_bytes(4, "little"))
     return sums.hexdigest()
@@ -81,25 +98,37 @@ def kmp_outputs() -> Iterable[Array]:
     for inputs in (1, 2):
         u = np.linspace(0.0, 1.0, 40)[:, None]
         lines = [np.hstack([u, u**2][:inputs]) + 0.01 * k for k in range(3)]
-        outputs = [np.hstack([np.sin(3 * u + 0.1 * k), 0.2 * k * np.cos(4 * u) + u]) for k in range(3)]
+        outputs = [
+            np.hstack([np.sin(3 * u + 0.1 * k), 0.2 * k * np.cos(4 * u) + u]) for k in range(3)
+        ]
         samples = np.hstack([np.concatenate(lines), np.concatenate(outputs)])
         mixture = GaussianMixture.fit(samples, components=3, seed=0, regularization=1e-4)
         points = lines[1][::2]
         reference = mixture.regress(points)
-        primitive = KMP.fit(points, reference, kernel=GaussianKernel(6.0), lambda_mean=0.5, lambda_covariance=2.0)
+        primitive = KMP.fit(
+            points, reference, kernel=GaussianKernel(6.0), lambda_mean=0.5, lambda_covariance=2.0
+        )
         through = Gaussians.of([[0.8, 0.2], [0.7, 0.8]], deviation=0.05)
         adapted = primitive.adapt(lines[1][[10, 30]], through, tolerance=0.1)
         yield from (mixture.means, reference.mean, reference.covariance)
         for predictor in (primitive, adapted):
-            predicted, parts = predictor.predict(lines[2]), predictor.uncertainty(lines[2])
-            yield from (predictor.mean(lines[2]), predicted.mean, predicted.covariance, predictor.jacobian(lines[2][7]))
+            predicted = predictor.predict(lines[2])
+            parts = predictor.uncertainty(lines[2])
+            yield from (
+                predictor.mean(lines[2]),
+                predicted.mean,
+                predicted.covariance,
+                predictor.jacobian(lines[2][7]),
+            )
             yield from (parts.variability, parts.distance)
 
 
 def commit() -> str:
     """The commit of this tree, with a `+` if its code is changed; "unknown" without git."""
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        return _git("rev-parse", "--short=12", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *CODE))
+        return _git("rev-parse", "--short=12", "HEAD") + "+" * bool(
+            _git("status", "--porcelain", "--", *CODE)
+        )
     return "unknown"
 
 
@@ -111,14 +140,20 @@ def _git(*arguments: str) -> str:
 
 def origin(name: str, options: Options) -> dict[str, Any]:
     """The origin of a result that is made now, as its JSON names it."""
-    machine_facts, digests = machine(), tree()
+    machine_facts = machine()
+    digests = tree()
     return {
         "commit": commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": {**{part: machine_facts.get(part, "unknown") for part in MACHINE}, "cores": os.cpu_count()},
+        "machine": {
+            **{part: machine_facts.get(part, "unknown") for part in MACHINE},
+            "cores": os.cpu_count(),
+        },
         "seeds": EXPERIMENTS[name].seeds.named(),
         "options": options_of(name, options),
-        "depends_on": {dependency: digests[dependency] for dependency in EXPERIMENTS[name].depends_on},
+        "depends_on": {
+            dependency: digests[dependency] for dependency in EXPERIMENTS[name].depends_on
+        },
     }
 
 
@@ -133,13 +168,16 @@ def options_of(name: str, options: Options) -> dict[str, Any]:
 
 def _folder(folder: Path) -> dict[str, Any]:
     """The recordings in a folder: how many, and a digest of their names and bytes."""
-    files, sums = sorted(folder.glob("*.npz")), hashlib.blake2b(digest_size=16)
+    files = sorted(folder.glob("*.npz"))
+    sums = hashlib.blake2b(digest_size=16)
     for file in files:
         sums.update(f"{file.name} {file.stat().st_size}\n".encode() + file.read_bytes())
     return {"files": len(files), "digest": sums.hexdigest()}
 
 
-def staleness(name: str, result: Mapping[str, Any] | None, here: Mapping[str, str], options: Options = USUAL) -> str:
+def staleness(
+    name: str, result: Mapping[str, Any] | None, here: Mapping[str, str], options: Options = USUAL
+) -> str:
     """The reason why a result is not that of these digests and options; empty if it is.
 
     A folder that the options do not name may have been any.
@@ -151,7 +189,11 @@ def staleness(name: str, result: Mapping[str, Any] | None, here: Mapping[str, st
     for option, value in options_of(name, options).items():
         if value is not None and value != (was := result["options"].get(option)):
             return f"measured with {option} {was}, and {value} is wanted"
-    changed = [dependency for dependency in EXPERIMENTS[name].depends_on if result["depends_on"].get(dependency) != here[dependency]]
+    changed = [
+        dependency
+        for dependency in EXPERIMENTS[name].depends_on
+        if result["depends_on"].get(dependency) != here[dependency]
+    ]
     return f"{' and '.join(changed)} changed since {result['commit']}" if changed else ""
 
 

@@ -29,12 +29,24 @@ from thirdhand_sim.world import pixels
 SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
 NOMINAL = Drawn(Scene(), 1.0, (), SEED)
 MOVED = Drawn(
-    Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)), 1.0, (), SEED
+    Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)),
+    1.0,
+    (),
+    SEED,
 )
 MOVING_M_S = 0.05  # a hand at this speed has started
-SHOWN_HZ, SERVICE_HZ = 20, 500  # rates of the paths in the figure, and of their recordings
-EYE, TARGET, SIZE = (1.45, -0.95, 0.85), (0.57, 0.03, 0.24), (640, 480)
-THINGS = {"board": "board", "glass": "magnifying glass", "iron": "soldering iron", "solder": "solder"}
+# rates of the paths in the figure, and of their recordings
+SHOWN_HZ = 20
+SERVICE_HZ = 500
+EYE = (1.45, -0.95, 0.85)
+TARGET = (0.57, 0.03, 0.24)
+SIZE = (640, 480)
+THINGS = {
+    "board": "board",
+    "glass": "magnifying glass",
+    "iron": "soldering iron",
+    "solder": "solder",
+}
 DRAWN = {"reproduction": "dotted: as learned", "adaptation": "solid: adapted"}
 
 
@@ -61,7 +73,10 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             continue
         ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)
         recording = next(scratch.glob("*.mcap")).replace(results.folder / f"hands-{name}.mcap")
-        convert(recording, results.folder / ("hands.rrd" if name == "adaptation" else f"hands-{name}.rrd"))
+        convert(
+            recording,
+            results.folder / ("hands.rrd" if name == "adaptation" else f"hands-{name}.rrd"),
+        )
         runs[name] = (ran, _recorded(recording))
         tries[name] = attempts
         results.say(f"{name} over Zenoh, attempt {attempts}: {_numbers(ran)}")
@@ -70,7 +85,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     _draw_stages(results)
     numbers = {
         "moved_cm": {
-            n: 100 * float(np.linalg.norm(np.subtract(getattr(MOVED.scene, n), getattr(Scene(), n))))
+            n: 100
+            * float(np.linalg.norm(np.subtract(getattr(MOVED.scene, n), getattr(Scene(), n))))
             for n in ("handover", "glass", "soldering")
         },
         "attempts": tries,
@@ -111,19 +127,26 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
     rehearsal = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
     began = int(np.argmax(rehearsal.time_s > 0))
     stride = 250 // SHOWN_HZ
-    return Traces(rehearsal.hands[began::stride, 0], rehearsal.hands[began::stride, 1], rehearsal.tool[began::stride])
+    return Traces(
+        rehearsal.hands[began::stride, 0],
+        rehearsal.hands[began::stride, 1],
+        rehearsal.tool[began::stride],
+    )
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the paths of hands and tool. That of the stages shows more than the numbers."""
     runs = {
-        name: Traces(*(np.array(paths[part]).T for part in Traces._fields)) for name, paths in numbers["shown"].items()
+        name: Traces(*(np.array(paths[part]).T for part in Traces._fields))
+        for name, paths in numbers["shown"].items()
     }
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.8), subplot_kw={"projection": "3d"})
     everything = []
     for demonstration in demonstrated():
-        traces = Traces(demonstration.hands[:, :3], demonstration.hands[:, 3:], demonstration.tool[:, :3])
+        traces = Traces(
+            demonstration.hands[:, :3], demonstration.hands[:, 3:], demonstration.tool[:, :3]
+        )
         everything += list(traces)
         _trace(left, traces, "-", 1.0)
     left.set_title("(a) five demonstrations", loc="left", fontsize=9)
@@ -143,9 +166,14 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         plt.Line2D([], [], color=c, label=n)
         for c, n in ((LEFT, "left hand"), (RIGHT, "right hand"), (TOOL, "robot's tool"))
     ]
-    handles += [plt.Line2D([], [], color="black", marker=m, lw=0, label=n) for m, n in (("*", "start"), ("+", "end"))]
+    handles += [
+        plt.Line2D([], [], color="black", marker=m, lw=0, label=n)
+        for m, n in (("*", "start"), ("+", "end"))
+    ]
     places = "new places for the tool: handover, glass, over the board"
-    handles.append(plt.Line2D([], [], color="black", marker="o", mfc="none", lw=0, ms=8, label=places))
+    handles.append(
+        plt.Line2D([], [], color="black", marker="o", mfc="none", lw=0, ms=8, label=places)
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     results.figure(figure)
 
@@ -155,7 +183,11 @@ def _mark(ran: dict[str, Any] | None) -> str:
     if ran is None:
         return ", in process"
     skipped = ran["periods_skipped_by_bench"]
-    return "" if is_evidence(skipped) else f"; NO EVIDENCE: {skipped} periods skipped, {SKIPPED} at most"
+    return (
+        ""
+        if is_evidence(skipped)
+        else f"; NO EVIDENCE: {skipped} periods skipped, {SKIPPED} at most"
+    )
 
 
 def _trace(axes: Any, traces: Traces, style: str, width: float) -> None:
@@ -182,12 +214,22 @@ def _draw_stages(results: Results) -> None:
     def look(bench: Bench) -> None:
         observation = bench.observe()
         if bench.time_s > 0:
-            so_far.append(np.stack([observation.hands.left.position, observation.hands.right.position, np.array(observation.tool.position)]))
+            so_far.append(
+                np.stack(
+                    [
+                        observation.hands.left.position,
+                        observation.hands.right.position,
+                        np.array(observation.tool.position),
+                    ]
+                )
+            )
         if len(shots) < len(middle) and bench.time_s > middle[len(shots)]:
             colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
             path = np.array(so_far)
             if not shots:
-                things.extend(bench.world.pose(getattr(bench.world, name)).position for name in THINGS)
+                things.extend(
+                    bench.world.pose(getattr(bench.world, name)).position for name in THINGS
+                )
             shots.append((colours, matrix, Traces(path[:, 0], path[:, 1], path[:, 2])))
             so_far.clear()
 
@@ -204,16 +246,33 @@ def _draw_stages(results: Results) -> None:
                     "",
                     pixel_path[-1],
                     pixel_path[-max(2, len(pixel_path) // 12 + len(pixel_path) // 8)],
-                    arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2, "mutation_scale": 18},
+                    arrowprops={
+                        "arrowstyle": "-|>",
+                        "color": colour,
+                        "lw": 2,
+                        "mutation_scale": 18,
+                    },
                 )
         axes.set_title(title, loc="left")
         axes.set_axis_off()
-    for pixel, name in zip(pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True):
+    for pixel, name in zip(
+        pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True
+    ):
         aside = (-35, 45) if name == "solder" else (25, -38)  # the iron stands behind it
-        grid[0, 0].annotate(name, pixel, pixel + np.array(aside), fontsize=8, arrowprops={"arrowstyle": "-", "lw": 0.8})
+        grid[0, 0].annotate(
+            name,
+            pixel,
+            pixel + np.array(aside),
+            fontsize=8,
+            arrowprops={"arrowstyle": "-", "lw": 0.8},
+        )
     handles = [
         plt.Line2D([], [], color=c, label=n)
-        for c, n in ((LEFT, "path of the left hand"), (RIGHT, "of the right hand"), (TOOL, "of the robot's tool"))
+        for c, n in (
+            (LEFT, "path of the left hand"),
+            (RIGHT, "of the right hand"),
+            (TOOL, "of the robot's tool"),
+        )
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     results.figure(figure, "stages")

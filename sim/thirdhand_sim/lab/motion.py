@@ -51,35 +51,59 @@ from thirdhand_sim.lab.results import (
     pyplot,
     rgb,
 )
-from thirdhand_sim.lab.rivals.followers import Followed, Follower, chase, ours, servo, truth, unsmoothed
+from thirdhand_sim.lab.rivals.followers import (
+    Followed,
+    Follower,
+    chase,
+    ours,
+    servo,
+    truth,
+    unsmoothed,
+)
 from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
 from thirdhand_sim.lab.workers import shared_out
 
 TRIED_LAGS_S = (-0.06, 0.2)  # lags that are tried
 SEEDS = EXPERIMENTS["motion"].seeds
-PEOPLE, STOPS, SCENE, SMALL = (SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small"))
+PEOPLE, STOPS, SCENE, SMALL = (
+    SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small")
+)
 SMALL_HZ = range(1, 13)
 SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
 DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
-CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
+CHASES = (
+    (1.5, 8.0),
+    (2.0, 40.0),
+    (4.0, 40.0),
+)  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
 LABELS = {
     "ours": "ours, by [tool] follow (ringed: the default)",
     "chase": "One-Euro filter, then Ruckig after the target",
     "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
 }
-TRUTH, SMOOTH = "truth", "minimum jerk"  # the follower and the group whose frequencies are shown
+# the follower and the group whose frequencies are shown
+TRUTH = "truth"
+SMOOTH = "minimum jerk"
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-WITH_JUMPS = "recorded, jumps in the truth"  # a group: recorded hands, where a follower should follow jumps
+WITH_JUMPS = (
+    "recorded, jumps in the truth"  # a group: recorded hands, where a follower should follow jumps
+)
 HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
-SHIPPED, OF_SUCH_HANDS = "", ", skill of such hands"  # the skills, appended to a group's name
+# the skills, appended to a group's name
+SHIPPED = ""
+OF_SUCH_HANDS = ", skill of such hands"
 TEACHERS = SEEDS.learned["teachers"].numbers  # people who are not followed
-TAUGHT_S, TAUGHT_EVERY = 20.0, 10  # ticks from one sample to the next
-LEFT_GAIN, RIGHT_GAIN = 0.8, 0.5  # motion of their tool, per motion of a hand
+# ticks from one sample to the next
+TAUGHT_S = 20.0
+TAUGHT_EVERY = 10
+# motion of their tool, per motion of a hand
+LEFT_GAIN = 0.8
+RIGHT_GAIN = 0.5
 
 
 @dataclass(frozen=True)
@@ -128,7 +152,9 @@ def lag_ms(target: Array, tool: Array, period_s: float) -> float:
     end = len(target) - last + 2 * first
     if end <= begin:
         return math.nan
-    target_speed, tool_speed = (np.linalg.norm(derivative(path, period_s, order=1), axis=1) for path in (target, tool))
+    target_speed, tool_speed = (
+        np.linalg.norm(derivative(path, period_s, order=1), axis=1) for path in (target, tool)
+    )
     inner = (target_speed - target_speed.mean())[begin:end]
     tool_speed = tool_speed - tool_speed.mean()
     if not inner.any():
@@ -146,7 +172,10 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
         moved = hands - middle
         tool = centre + LEFT_GAIN * moved[:, :3] + RIGHT_GAIN * moved[:, 3:]
         stamps_ns = np.arange(len(hands)) * round(1e9 * PERIOD_S * TAUGHT_EVERY)
-        poses = [np.hstack([x, np.tile(shipped.orientation, (len(x), 1))]) for x in (hands[:, :3], hands[:, 3:], tool)]
+        poses = [
+            np.hstack([x, np.tile(shipped.orientation, (len(x), 1))])
+            for x in (hands[:, :3], hands[:, 3:], tool)
+        ]
         demonstrations.append(Demonstration(stamps_ns, poses[0], poses[1], poses[2]))
     return learn(demonstrations, name="of such hands", components=10)
 
@@ -159,10 +188,15 @@ def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follo
         tool = msgspec.structs.replace(settings.tool, follow=dial)
         by_name[f"ours, {dial}"] = ours(skill, msgspec.structs.replace(settings, tool=tool))
     for least_hz, beta in CHASES[:first]:
-        by_name[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(skill, settings, least_hz=least_hz, beta=beta)
+        by_name[f"chase, One-Euro {least_hz:g} Hz, {beta:g}"] = chase(
+            skill, settings, least_hz=least_hz, beta=beta
+        )
     for coefficient in SERVOS[:first]:
-        by_name[f"servo, Butterworth {coefficient:g}"] = servo(skill, settings, coefficient=coefficient)
-    by_name["no smoothing"], by_name[TRUTH] = unsmoothed(skill, settings), truth(skill, settings)
+        by_name[f"servo, Butterworth {coefficient:g}"] = servo(
+            skill, settings, coefficient=coefficient
+        )
+    by_name["no smoothing"] = unsmoothed(skill, settings)
+    by_name[TRUTH] = truth(skill, settings)
     return by_name
 
 
@@ -198,7 +232,8 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, skill_key, hands = task
     skill, settings, by_name = _known[skill_key]
-    target, followed = targets(skill, hands.truth, settings), by_name[name](hands)
+    target = targets(skill, hands.truth, settings)
+    followed = by_name[name](hands)
     result = figures(name, replace(hands, group=hands.group + skill_key), target, followed)
     if hands.jumping is None:
         return result
@@ -212,23 +247,27 @@ def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     name, kind, rate_hz, number = task
     skill, settings, by_name = _known[SHIPPED]
     hands = small_motion(skill.hands.mean(axis=0), kind, rate_hz, number)
-    target, followed = targets(skill, hands.truth, settings), by_name[name](hands)
+    target = targets(skill, hands.truth, settings)
+    followed = by_name[name](hands)
     assert followed.setpoint is not None
     return [gains.gain(target, path, rate_hz) for path in (followed.setpoint, followed.tool)]
 
 
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
     """Figures of a path against the truth's target (N, 3) [m], from BEGUN_S on."""
-    tool, begun = seen.tool, round(BEGUN_S / PERIOD_S)
+    tool = seen.tool
+    begun = round(BEGUN_S / PERIOD_S)
     overshoot = settled = math.nan
     if not math.isnan(hands.stop_s):
-        begin, end = round(hands.stop_s / PERIOD_S), round((hands.stop_s + STOP_S) / PERIOD_S)
+        begin = round(hands.stop_s / PERIOD_S)
+        end = round((hands.stop_s + STOP_S) / PERIOD_S)
         velocity = derivative(target, PERIOD_S, order=1)[begin]
         excess_m = (tool[begin:] - target[-1]) @ (velocity / np.linalg.norm(velocity))
         overshoot = max(0.0, 1000 * float(excess_m.max()))
         late = np.flatnonzero(1000 * np.linalg.norm(tool[end:] - target[-1], axis=1) > SETTLED_MM)
         settled = 1000 * PERIOD_S * (int(late[-1]) + 1) if len(late) else 0.0
-    tool, target = tool[begun:], target[begun:]
+    tool = tool[begun:]
+    target = target[begun:]
     off_mm = 1000 * np.linalg.norm(tool - target, axis=1)
     wanted_acceleration, acceleration = (derivative(x, PERIOD_S, order=2) for x in (target, tool))
     return Figures(
@@ -240,7 +279,8 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
         error_p95_mm=float(np.percentile(off_mm, 95)),
         lag_ms=lag_ms(target, tool, PERIOD_S),
         acceleration_ratio=rms(acceleration) / rms(wanted_acceleration),
-        jerk_ratio=rms(derivative(tool, PERIOD_S, order=3)) / rms(derivative(target, PERIOD_S, order=3)),
+        jerk_ratio=rms(derivative(tool, PERIOD_S, order=3))
+        / rms(derivative(target, PERIOD_S, order=3)),
         limited=seen.limited,
         top_speed=seen.top_speed,
         overshoot_mm=overshoot,
@@ -257,15 +297,31 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     if options.hands is not None:
         return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
-    tasks = [(name, SHIPPED, sequence) for name in by_name for sequence in hands if name != TRUTH or sequence.group == SMOOTH]
+    tasks = [
+        (name, SHIPPED, sequence)
+        for name in by_name
+        for sequence in hands
+        if name != TRUTH or sequence.group == SMOOTH
+    ]
     by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
-    tasks += [(name, OF_SUCH_HANDS, sequence) for name in by_both for sequence in hands if sequence.group in FLOOR_GROUPS]
+    tasks += [
+        (name, OF_SUCH_HANDS, sequence)
+        for name in by_both
+        for sequence in hands
+        if sequence.group in FLOOR_GROUPS
+    ]
     measured = _measured(tasks, options)
-    table = {name: _summary([row for row in measured if row.follower == name]) for name in by_name if name != TRUTH}
+    table = {
+        name: _summary([row for row in measured if row.follower == name])
+        for name in by_name
+        if name != TRUTH
+    }
     for name, groups in table.items():
         results.say(f"{name}: {brief(groups)}")
     floors = {
-        group: best_linear([sequence for sequence in hands if sequence.group == group], skill, rate_hz=rate_hz)
+        group: best_linear(
+            [sequence for sequence in hands if sequence.group == group], skill, rate_hz=rate_hz
+        )
         for group, rate_hz in FLOOR_GROUPS.items()
     }
     _record(results, hands[1], by_name["ours"](hands[1]))
@@ -273,11 +329,17 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "hands": "modelled",
         "by_follower": table,
         "by_person": _by_person(results, [row for row in measured if math.isnan(row.overshoot_mm)]),
-        "best_linear_filter": {group: [floor._asdict() for floor in rows] for group, rows in floors.items()},
-        "gain_by_frequency": _gains(results, options, dict(zip(("ours", "chase"), by_both, strict=True))),
+        "best_linear_filter": {
+            group: [floor._asdict() for floor in rows] for group, rows in floors.items()
+        },
+        "gain_by_frequency": _gains(
+            results, options, dict(zip(("ours", "chase"), by_both, strict=True))
+        ),
         "joint_speeds_in_the_scene": _joint_speeds(measured, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(row) for row in measured if row.follower == "ours"],
-        "by_arm": _by_arm(results, options, [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]),
+        "by_arm": _by_arm(
+            results, options, [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
+        ),
     }
     draw_numbers(results, numbers)
     return numbers
@@ -290,10 +352,20 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
         of = [row for row in rows if row.group == group]
         top = max(row.top_speed for row in of)
         if math.isnan(of[0].overshoot_mm):
-            names = ("error_rms_mm", "error_p95_mm", "lag_ms", "acceleration_ratio", "jerk_ratio", "limited")
-            out[group] = {name: float(np.mean([getattr(row, name) for row in of])) for name in names}
+            names = (
+                "error_rms_mm",
+                "error_p95_mm",
+                "lag_ms",
+                "acceleration_ratio",
+                "jerk_ratio",
+                "limited",
+            )
+            out[group] = {
+                name: float(np.mean([getattr(row, name) for row in of])) for name in names
+            }
         else:
-            overshoot, settled = [row.overshoot_mm for row in of], [row.settled_ms for row in of]
+            overshoot = [row.overshoot_mm for row in of]
+            settled = [row.settled_ms for row in of]
             out[group] = {
                 "overshoot_mean_mm": float(np.mean(overshoot)),
                 "overshoot_worst_mm": max(overshoot),
@@ -315,13 +387,19 @@ def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
     return [(name, SHIPPED, sequence) for name in names for sequence in hands]
 
 
-def _by_arm(results: Results, options: Options, hands: list[Moving]) -> dict[str, dict[str, dict[str, float]]]:
+def _by_arm(
+    results: Results, options: Options, hands: list[Moving]
+) -> dict[str, dict[str, dict[str, float]]]:
     """The errors with each shipped arm by group, as of `_compared`."""
-    tasks, out = _beside_chases(hands), {}
+    tasks = _beside_chases(hands)
+    out = {}
     for arm in ARMS:
         prepare(options.share, arm)  # of this process, which measures if there is one worker
         measured = _measured(tasks, replace(options, arm=arm))
-        out[arm] = {group: _compared([row for row in measured if row.group == group]) for group in FLOOR_GROUPS}
+        out[arm] = {
+            group: _compared([row for row in measured if row.group == group])
+            for group in FLOOR_GROUPS
+        }
         results.say(f"{arm}, rms [mm]: {brief(out[arm])}")
     return out
 
@@ -339,12 +417,15 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
     ]
     begin = functools.partial(prepare, options.share, options.arm)
     values = np.array(list(shared_out(measure_gain, tasks, options.workers, prepare=begin)))
-    values = values.reshape(len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS))
+    values = values.reshape(
+        len(SMALL_KINDS), len(names), len(rates), len(numbers), len(gains.PATHS)
+    )
     means = np.sqrt(np.mean(values**2, axis=3))
     out: dict[str, Any] = {"hz": rates}
     for kind, of_kind in zip(SMALL_KINDS, means, strict=True):
         out[kind] = {
-            follower: dict(zip(gains.PATHS, of.T.tolist(), strict=True)) for follower, of in zip(names, of_kind, strict=True)
+            follower: dict(zip(gains.PATHS, of.T.tolist(), strict=True))
+            for follower, of in zip(names, of_kind, strict=True)
         }
         results.say(f"gain of {kind}, by Hz: {brief(out[kind])}")
     return out
@@ -357,7 +438,9 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
     measured = _measured(_beside_chases(hands), options)
     takes = Counter(sequence.person for sequence in hands if sequence.group == "clean")
     measured += [
-        replace(row, group=WITH_JUMPS, error_rms_mm=row.error_with_jumps_mm) for row in measured if row.group == "recorded"
+        replace(row, group=WITH_JUMPS, error_rms_mm=row.error_with_jumps_mm)
+        for row in measured
+        if row.group == "recorded"
     ]
     people = _by_person(results, measured)
     kinds = {person: _usual_tracker(measured, person) for person in takes}
@@ -368,11 +451,15 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
         together[group] = _compared(of)
         results.say(f"{group}, all: {brief(together[group])}")
         trackers[group] = {
-            kind: _compared([row for row in of if kinds[row.person] == kind]) for kind in sorted(set(kinds.values()))
+            kind: _compared([row for row in of if kinds[row.person] == kind])
+            for kind in sorted(set(kinds.values()))
         }
         results.say(f"{group}, by tracker: {brief(trackers[group])}")
-    bound = _bound(results, [sequence for sequence in hands if sequence.group == "recorded"], measured)
-    worse, of_harder = {}, _measured(harder, options)
+    bound = _bound(
+        results, [sequence for sequence in hands if sequence.group == "recorded"], measured
+    )
+    worse = {}
+    of_harder = _measured(harder, options)
     for group in HARDER_GROUPS:
         error_mm = _pooled([row for row in of_harder if row.group == group], "ours")
         worse[group] = {"ours": error_mm, "times_clean": error_mm / together["clean"]["ours"]}
@@ -391,15 +478,21 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
     return numbers
 
 
-def _bound(results: Results, hands: list[Moving], found: list[Figures]) -> dict[str, dict[str, float]]:
+def _bound(
+    results: Results, hands: list[Moving], found: list[Figures]
+) -> dict[str, dict[str, float]]:
     """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
     fitted to each recording; medians over recordings.
     """
     skill = _known[SHIPPED][0]
-    mine = {row.name: row for row in found if row.follower == "ours" and row.group == hands[0].group}
+    mine = {
+        row.name: row for row in found if row.follower == "ours" and row.group == hands[0].group
+    }
     errors: dict[str, list[tuple[float, float]]] = {}
     for sequence in hands:
-        floors = best_linear([sequence], skill, rate_hz=round(1 / float(np.median(np.diff(sequence.stamps)))))
+        floors = best_linear(
+            [sequence], skill, rate_hz=round(1 / float(np.median(np.diff(sequence.stamps))))
+        )
         pair = mine[sequence.name].error_rms_mm, error_at(floors, mine[sequence.name].jerk_ratio)
         for kind in (sequence.tracker, "all"):
             errors.setdefault(kind, []).append(pair)
@@ -417,7 +510,9 @@ def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dic
     for group in dict.fromkeys(row.group for row in rows):
         of = [row for row in rows if row.group == group]
         people = dict.fromkeys(row.person for row in of)
-        out[group] = {person: _compared([row for row in of if row.person == person]) for person in people}
+        out[group] = {
+            person: _compared([row for row in of if row.person == person]) for person in people
+        }
         results.say(f"{group}, rms [mm]: {brief(out[group])}")
     return out
 
@@ -433,8 +528,13 @@ def _compared(rows: list[Figures]) -> dict[str, float]:
         best = min(chases, key=lambda follower: _pooled(mine, follower))
         for family, follower in (("ours", "ours"), ("chase", best)):
             errors[family] += [row.error_rms_mm for row in mine if row.follower == follower]
-    out = {family: float(np.sqrt(np.mean(np.square(errors_mm)))) for family, errors_mm in errors.items()}
-    medians = {f"{family}_median": float(np.median(errors_mm)) for family, errors_mm in errors.items()}
+    out = {
+        family: float(np.sqrt(np.mean(np.square(errors_mm))))
+        for family, errors_mm in errors.items()
+    }
+    medians = {
+        f"{family}_median": float(np.median(errors_mm)) for family, errors_mm in errors.items()
+    }
     ratios = {
         "ratio": out["ours"] / out["chase"],
         "ratio_of_medians": medians["ours_median"] / medians["chase_median"],
@@ -450,9 +550,15 @@ def _usual_tracker(rows: list[Figures], name: str) -> str:
 
 def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """The joints' speeds by frequency and the share of ripple, for each follower."""
-    rows = {row.follower: row.joint_speeds for row in found if row.group == SMOOTH and row.follower in names}
+    rows = {
+        row.follower: row.joint_speeds
+        for row in found
+        if row.group == SMOOTH and row.follower in names
+    }
     kinds = {name.partition(",")[0]: rows[name] for name in names}
-    return {kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()}
+    return {
+        kind: {"bands": bands, "ripple": spectra.ripple(bands)} for kind, bands in kinds.items()
+    }
 
 
 def _pooled(rows: list[Figures], follower: str) -> float:
@@ -467,40 +573,74 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     figure, axes = plt.subplots(1, len(FLOOR_GROUPS), figsize=(10, 4.2), layout="constrained")
     for panel, group in zip(axes, FLOOR_GROUPS, strict=True):
         if "by_follower" in numbers:
-            _draw_followers(panel, numbers["by_follower"], group, numbers["best_linear_filter"][group])
+            _draw_followers(
+                panel, numbers["by_follower"], group, numbers["best_linear_filter"][group]
+            )
             recorded_title = "as a camera sees them, 30 Hz"
         else:
             _draw_people(panel, numbers["by_person"][group])
             recorded_title = "as recorded"
         panel.set_title("clean, 100 Hz" if group == "clean" else recorded_title)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=8,
+    )
     results.figure(figure)
     if "by_follower" in numbers:
-        spectra.draw(results, {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()})
+        spectra.draw(
+            results,
+            {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()},
+        )
     if "gain_by_frequency" in numbers:  # results of an older layout have none
         gains.draw(results, numbers["gain_by_frequency"])
 
 
-def _draw_followers(panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]) -> None:
-    styles = {"ours": (TOOL, "o"), "chase": (ADAPTED, "s"), "servo": (OTHER, "^"), "no smoothing": (REFERENCE, "D")}
+def _draw_followers(
+    panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]
+) -> None:
+    styles = {
+        "ours": (TOOL, "o"),
+        "chase": (ADAPTED, "s"),
+        "servo": (OTHER, "^"),
+        "no smoothing": (REFERENCE, "D"),
+    }
     for family, (colour, marker) in styles.items():
         rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
         points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
         label = LABELS.get(family, family)
-        panel.plot(*zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label)
+        panel.plot(
+            *zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label
+        )
         if family == "ours":
             chosen = rows["ours"]
-            panel.plot(chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour)
+            panel.plot(
+                chosen["jerk_ratio"], chosen["error_rms_mm"], "o", ms=11, mfc="none", color=colour
+            )
     x, y = ([row[name] for row in floor] for name in ("jerk_ratio", "error_rms_mm"))
     panel.plot(x, y, "k--", lw=1, label="best linear filter, without limits and arm")
-    panel.set(xscale="log", xlabel="jerk, multiple of the truth's", ylabel="error, rms [mm]", ylim=(0, None))
+    panel.set(
+        xscale="log",
+        xlabel="jerk, multiple of the truth's",
+        ylabel="error, rms [mm]",
+        ylim=(0, None),
+    )
 
 
 def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
     names = sorted(rows, key=lambda name: rows[name]["chase"])
     ours, chase = ([rows[name][family] for name in names] for family in ("ours", "chase"))
     panel.hlines(range(len(names)), ours, chase, color="0.8", lw=2)
-    panel.plot(chase, range(len(names)), "s", color=ADAPTED, ms=5, label="the best One-Euro filter and Ruckig")
+    panel.plot(
+        chase,
+        range(len(names)),
+        "s",
+        color=ADAPTED,
+        ms=5,
+        label="the best One-Euro filter and Ruckig",
+    )
     panel.plot(ours, range(len(names)), "o", color=TOOL, ms=6, label="ours")
     panel.set(xscale="log", xlabel="error, rms [mm]")
     panel.set_yticks(range(len(names)), names)
@@ -535,5 +675,9 @@ def _record(results: Results, hands: Moving, seen: Followed) -> None:
     ):
         assert path is not None
         points(f"/{name}", times, path, colour, 0.008)
-        stream.log(f"/{name}/way", rr.LineStrips3D([path], colors=[rgb(colour)], radii=[0.0007]), static=True)
+        stream.log(
+            f"/{name}/way",
+            rr.LineStrips3D([path], colors=[rgb(colour)], radii=[0.0007]),
+            static=True,
+        )
     stream.disconnect()

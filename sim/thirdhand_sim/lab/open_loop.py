@@ -23,11 +23,16 @@ def controller(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Con
     """The service's core with an arm that is where it is commanded."""
     arm = msgspec.structs.replace(settings.arm, source="assumed")
     return Controller(
-        msgspec.structs.replace(settings, arm=arm), skill, urdf=robot_description(settings), tuning=tuning
+        msgspec.structs.replace(settings, arm=arm),
+        skill,
+        urdf=robot_description(settings),
+        tuning=tuning,
     )
 
 
-def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING) -> NDArray[np.void]:
+def frames(
+    skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuning = TUNING
+) -> NDArray[np.void]:
     """The service's frames (T,) of ticks."""
     log: list[Frame] = []
     with threadpool_limits(1):
@@ -37,5 +42,11 @@ def frames(skill: Skill, ticks: Iterable[Tick], settings: Settings, tuning: Tuni
 
 def targets(skill: Skill, hands: Array, settings: Settings = USUAL) -> Array:
     """Targets (T, 3) [m] of the service for hands (T, 6) [m] at rest."""
-    still, reach = np.zeros(3), settings.reach
-    return np.array([clamp(target, still, still, box=skill.workspace, reach=reach).position for target in skill.mean(hands)])
+    still = np.zeros(3)
+    reach = settings.reach
+    return np.array(
+        [
+            clamp(target, still, still, box=skill.workspace, reach=reach).position
+            for target in skill.mean(hands)
+        ]
+    )

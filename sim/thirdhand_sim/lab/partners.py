@@ -37,12 +37,23 @@ from thirdhand_sim.lab.people.left_out import (
     read,
 )
 from thirdhand_sim.lab.reached import taught
-from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL, ExperimentError, Options, Results, brief, pyplot
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    OTHER,
+    REFERENCE,
+    TOOL,
+    ExperimentError,
+    Options,
+    Results,
+    brief,
+    pyplot,
+)
 from thirdhand_sim.lab.rivals.partners import RIVALS, left_out_by
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.made_tasks import TASK_KINDS, takes
 
-SERVICE, TOLD = "service", ", told"
+SERVICE = "service"
+TOLD = ", told"
 RECORDED = {  # the beginnings of the files' names
     "robot holds driver": ("robot_hold_driver",),
     "robot hands over plate": ("robot_hand_over_plate",),
@@ -60,7 +71,9 @@ OWN = 3  # takes by which a person refines the skill of the others
 DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
 WANTED_TOLD = 90.0  # [%] of the samples with an error above UNSURE_M should be held or unsure
 ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the others may be
-GIVEN, REFUSED = ", via-points given", "#F6D2BD"  # in the figure: label, and colour of refused skills
+# in the figure: label, and colour of refused skills
+GIVEN = ", via-points given"
+REFUSED = "#F6D2BD"
 SHOWN = {
     SERVICE: ("service", ADAPTED, "o"),
     "same elapsed time": ("same elapsed time", REFERENCE, "|"),
@@ -90,7 +103,9 @@ class Fold(NamedTuple):
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
     again: list[list[Judged]]  # the further rounds of each accepted take, by their rests
-    in_spite: list[Judged]  # each take of a refused fold, with the skill used in spite of the refusal
+    in_spite: list[
+        Judged
+    ]  # each take of a refused fold, with the skill used in spite of the refusal
     take_refusals: list[str]  # via-points that the skill cannot be adapted to
 
 
@@ -102,7 +117,9 @@ class Found(NamedTuple):
     rivals: dict[str, list[Judged]]
     service: dict[str, Fold]
     moved: RigidMap | None = None  # of recorded takes, into the arm's reach
-    own: Fold | None = None  # the skill refined by OWN takes of the person who is left out, on the rest
+    own: Fold | None = (
+        None  # the skill refined by OWN takes of the person who is left out, on the rest
+    )
 
 
 @functools.lru_cache(maxsize=2)
@@ -112,7 +129,9 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
         groups = [
             [
                 left_out(f"person {take.person} take {i % EACH}", "", take.demonstration)
-                for i, take in enumerate(takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed))
+                for i, take in enumerate(
+                    takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed)
+                )
             ]
             for stream in (SEEDS.learned[task], SEEDS.evaluation[task])
         ]
@@ -120,9 +139,15 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
     assert data is not None
     files = [path for path in sorted(data.glob("*.npz")) if path.name.startswith(RECORDED[task])]
     if len(files) < 2:
-        raise ExperimentError(f"{len(files)} recordings of {task!r} in {data}: {RECORDED[task][0]}*.npz needed")
+        raise ExperimentError(
+            f"{len(files)} recordings of {task!r} in {data}: {RECORDED[task][0]}*.npz needed"
+        )
     recordings = [
-        left_out(path.stem, group, read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)))
+        left_out(
+            path.stem,
+            group,
+            read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)),
+        )
         for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
     ]
     return recordings, recordings
@@ -138,7 +163,8 @@ def part(one: Part) -> Found:
     """The fold of one part."""
     training, asked = _takes(one.task, one.people, one.data)
     if one.out:
-        training, asked = [t for t in training if t.group != one.out], [t for t in asked if t.group == one.out]
+        training = [t for t in training if t.group != one.out]
+        asked = [t for t in asked if t.group == one.out]
     named = bool(training[0].demonstration.places)
     result = Found({}, {})
     if one.task not in TASK_KINDS:
@@ -148,7 +174,9 @@ def part(one: Part) -> Found:
     for has_places in [False] * (one.task not in TASK_KINDS) + [True] * named:
         for name, rival in RIVALS.items():
             predictions = left_out_by(rival, training, asked, told=has_places)
-            result.rivals[name + TOLD * has_places] = [judged(*pair) for pair in zip(asked, predictions, strict=True)]
+            result.rivals[name + TOLD * has_places] = [
+                judged(*pair) for pair in zip(asked, predictions, strict=True)
+            ]
         result.service[SERVICE + TOLD * has_places] = served(training, asked, told=has_places)
     if one.task in PEOPLE:
         skill, _ = as_command(training, told=named)
@@ -165,7 +193,10 @@ def as_command(
     """
     try:
         skill = learn(
-            [take.demonstration if told else take.demonstration._replace(places=()) for take in shown],
+            [
+                take.demonstration if told else take.demonstration._replace(places=())
+                for take in shown
+            ],
             names=[take.name for take in shown],
             refined=refined,
         )
@@ -180,7 +211,11 @@ def figures_of(skill: StoredSkill) -> Figures:
 
 
 def served(
-    shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool, refined: StoredSkill | None = None
+    shown: Sequence[LeftOut],
+    asked: Sequence[LeftOut],
+    *,
+    told: bool,
+    refined: StoredSkill | None = None,
 ) -> Fold:
     """The service's skill of the shown takes, on those that are left out.
 
@@ -196,7 +231,9 @@ def served(
         rounds: list[Judged] = []
         try:
             placed_skill = taught(skill, take.demonstration.places) if told else skill
-            predictions = predicted_rounds(placed_skill, take, reach=None if refusals else Settings().reach)
+            predictions = predicted_rounds(
+                placed_skill, take, reach=None if refusals else Settings().reach
+            )
             rounds = [judged(take, prediction) for prediction in predictions]
         except SkillError as error:
             fold.take_refusals.append(str(error))
@@ -212,11 +249,17 @@ def served(
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers of all sets."""
     people = max(2, round(DEMONSTRATORS * options.share))
-    parts = [Part(kind, "", people, None) for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]]
+    parts = [
+        Part(kind, "", people, None)
+        for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]
+    ]
     if options.data is not None:
         for task in RECORDED:
             groups = sorted({take.group for take in _takes(task, 0, options.data)[0]})
-            parts += [Part(task, out, 0, options.data) for out in groups[: max(2, round(len(groups) * options.share))]]
+            parts += [
+                Part(task, out, 0, options.data)
+                for out in groups[: max(2, round(len(groups) * options.share))]
+            ]
     else:
         results.say("made tasks alone: --data DIR adds recordings")
     by_task: dict[str, list[Found]] = {}
@@ -234,7 +277,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "made": {kind: numbers_of(by_task[kind]) for kind in TASK_KINDS if kind in by_task},
     }
     for kind in ("recorded", "made"):
-        folds = [fold for task in numbers[kind] for result in by_task[task] for fold in result.service.values()]
+        folds = [
+            fold
+            for task in numbers[kind]
+            for result in by_task[task]
+            for fold in result.service.values()
+        ]
         numbers[f"all_{kind}"] = summary([row for fold in folds for row in fold.accepted if row])
     draw_numbers(results, numbers)
     return numbers
@@ -245,7 +293,10 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
 
     Those of the service are of accepted takes alone, and `beside_mm` has each rival on these takes.
     """
-    methods = {name: summary([take for part in found for take in part.rivals[name]]) for name in found[0].rivals}
+    methods = {
+        name: summary([take for part in found for take in part.rivals[name]])
+        for name in found[0].rivals
+    }
     for name in found[0].service:
         methods[name] = _service_numbers(found, name)
     numbers: dict[str, Any] = {"folds": len(found), "methods": methods}
@@ -290,7 +341,9 @@ def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:
     }
 
 
-def _beside(found: Sequence[Found], setting: str, accepted: Sequence[bool]) -> dict[str, float | None]:
+def _beside(
+    found: Sequence[Found], setting: str, accepted: Sequence[bool]
+) -> dict[str, float | None]:
     """The error [mm] of each rival on the takes that the service accepted."""
     errors: dict[str, float | None] = {}
     for rival in RIVALS:
@@ -357,7 +410,9 @@ class Verdict(NamedTuple):
     @property
     def some_refused(self) -> bool:
         """True if the errors are of some of the takes only, and rivals are known on the same."""
-        return bool(self.accepted["takes"] and self.accepted["refuses"] and "beside_mm" in self.accepted)
+        return bool(
+            self.accepted["takes"] and self.accepted["refuses"] and "beside_mm" in self.accepted
+        )
 
 
 def verdict(task: Mapping[str, Any], method: str) -> Verdict:
@@ -366,28 +421,48 @@ def verdict(task: Mapping[str, Any], method: str) -> Verdict:
     In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
     or none.
     """
-    numbers, none = task["methods"][method], {"takes": 0}
-    folds_refused, takes = numbers.get("folds_refused", numbers["unsafe"]), numbers["takes"] + numbers["refuses"]
-    refused = f"{folds_refused} of {task['folds']} skills" if folds_refused else f"{numbers['refuses']} of {takes} takes"
+    numbers = task["methods"][method]
+    none = {"takes": 0}
+    folds_refused = numbers.get("folds_refused", numbers["unsafe"])
+    takes = numbers["takes"] + numbers["refuses"]
+    refused = (
+        f"{folds_refused} of {task['folds']} skills"
+        if folds_refused
+        else f"{numbers['refuses']} of {takes} takes"
+    )
     if "in_spite_of_refusal" not in numbers and folds_refused:
         return Verdict(none, numbers, folds_refused, refused)
-    in_spite, at_risk = numbers.get("in_spite_of_refusal", none), numbers.get("folds_at_risk", 0)
-    return Verdict(numbers, in_spite, folds_refused, refused if numbers["refuses"] else "none", at_risk)
+    in_spite = numbers.get("in_spite_of_refusal", none)
+    at_risk = numbers.get("folds_at_risk", 0)
+    return Verdict(
+        numbers, in_spite, folds_refused, refused if numbers["refuses"] else "none", at_risk
+    )
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
     panels = []
-    for title, sets in (("recorded partners", numbers["recorded"]), ("made tasks, via-points given", numbers["made"])):
+    for title, sets in (
+        ("recorded partners", numbers["recorded"]),
+        ("made tasks, via-points given", numbers["made"]),
+    ):
         rows = []
         for name, task in sets.items():
             endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
-            rows += [(name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending) for ending in endings]
+            rows += [
+                (name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending)
+                for ending in endings
+            ]
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
     figure, axes = plt.subplots(
-        len(panels), 1, figsize=(7.5, 1.6 + 0.36 * sum(heights)), height_ratios=heights, squeeze=False, sharex=True
+        len(panels),
+        1,
+        figsize=(7.5, 1.6 + 0.36 * sum(heights)),
+        height_ratios=heights,
+        squeeze=False,
+        sharex=True,
     )
     for ax, (title, rows) in zip(axes[:, 0], panels, strict=True):
         labels = []
@@ -396,22 +471,50 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
             ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
             for method, (_, colour, marker) in SHOWN.items():
-                scores = ours.accepted if method == SERVICE else task["methods"].get(method + ending, {})
+                scores = (
+                    ours.accepted if method == SERVICE else task["methods"].get(method + ending, {})
+                )
                 ax.plot(scores.get("rms_mm", np.nan), y, marker, color=colour, ms=5, ls="")
-            ax.plot(ours.accepted.get("shifted_rms_mm", np.nan), y, "o", mfc="none", color=ADAPTED, ms=6, ls="")
-            ax.plot(ours.in_spite.get("rms_mm", np.nan), y, "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", zorder=4)
+            ax.plot(
+                ours.accepted.get("shifted_rms_mm", np.nan),
+                y,
+                "o",
+                mfc="none",
+                color=ADAPTED,
+                ms=6,
+                ls="",
+            )
+            ax.plot(
+                ours.in_spite.get("rms_mm", np.nan),
+                y,
+                "o",
+                color=ADAPTED,
+                mfc=REFUSED,
+                ms=6,
+                ls="",
+                zorder=4,
+            )
         ax.set_yticks(range(len(rows)), labels)
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
     for label, colour, marker in SHOWN.values():
         axes[0, 0].plot([], [], marker, color=colour, ms=5, ls="", label=label)
     axes[0, 0].plot(
-        [], [], "o", mfc="none", color=ADAPTED, ms=6, ls="", label="service, with the best time shift of each take"
+        [],
+        [],
+        "o",
+        mfc="none",
+        color=ADAPTED,
+        ms=6,
+        ls="",
+        label="service, with the best time shift of each take",
     )
     label = "service, refused by learn, used in spite of it"
     axes[0, 0].plot([], [], "o", color=ADAPTED, mfc=REFUSED, ms=6, ls="", label=label)
     axes[-1, 0].set_xlabel("tool's error on takes that were left out, rms [mm]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8
+    )
     results.figure(figure)
     _draw_reliability(results, numbers)
 
@@ -422,18 +525,29 @@ def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
     figure, (inside, warned) = plt.subplots(1, 2, figsize=(7.5, 3.6))
     inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
     warned.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
-    for part, colour, label in (("recorded", TOOL, "recorded partners"), ("made", ADAPTED, "made tasks")):
+    for part, colour, label in (
+        ("recorded", TOOL, "recorded partners"),
+        ("made", ADAPTED, "made tasks"),
+    ):
         for task in numbers[part].values():
             name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
             scores = task["methods"][name]
             if scores["takes"] and scores["coverage"]:
                 inside.plot(
-                    100 * np.array(numbers["levels"]), 100 * np.array(scores["coverage"]), ".-", color=colour, lw=0.8
+                    100 * np.array(numbers["levels"]),
+                    100 * np.array(scores["coverage"]),
+                    ".-",
+                    color=colour,
+                    lw=0.8,
                 )
             if scores.get("falsely_told") is not None and scores["told"] is not None:
-                warned.plot(100 * scores["falsely_told"], 100 * scores["told"], "o", color=colour, ms=5)
+                warned.plot(
+                    100 * scores["falsely_told"], 100 * scores["told"], "o", color=colour, ms=5
+                )
         inside.plot([], [], ".-", color=colour, label=label)
-    inside.set(xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]")
+    inside.set(
+        xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]"
+    )
     warned.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
     warned.set_ylabel("wrong samples held or unsure [%]")
     inside.legend(fontsize=8)

@@ -49,7 +49,10 @@ def shown() -> list[SessionDemonstration]:
     places = places_in(Scene())
     return [
         SessionDemonstration(
-            np.arange(len(demonstration.tool), dtype=np.float64) * demonstration.period_s, demonstration.hands, demonstration.tool[:, :3], places
+            np.arange(len(demonstration.tool), dtype=np.float64) * demonstration.period_s,
+            demonstration.hands,
+            demonstration.tool[:, :3],
+            places,
         )
         for demonstration in demonstrated()
     ]
@@ -61,7 +64,9 @@ def at_the_events(scene: Scene, seed: int) -> tuple[Array, Array]:
     """
     script = HandScript(scene, seed=seed, offset_std=OFFSET_M)
     motions = [script.truth(end) for _, end in scene.dwells]
-    hands = np.array([np.concatenate([motion.left.position, motion.right.position]) for motion in motions])
+    hands = np.array(
+        [np.concatenate([motion.left.position, motion.right.position]) for motion in motions]
+    )
     return hands, np.array([motions[0].left.position + TOOL_FROM_HAND, scene.glass, scene.carry])
 
 

@@ -27,7 +27,9 @@ from thirdhand_sim.script import Array, HandScript
 from thirdhand_sim.teach import demonstrate
 from thirdhand_sim.world import World
 
-TREMOR_M, NOISE_M = 0.0015, 0.0005  # deviations of hands and tracker, each axis
+# deviations of hands and tracker, each axis
+TREMOR_M = 0.0015
+NOISE_M = 0.0005
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,17 @@ def rehearse(
                 observation = bench.observe()
                 x, y, z, w = observation.tool.orientation
                 axis = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
-                hands = np.stack([observation.hands.left.position, observation.hands.right.position])
+                hands = np.stack(
+                    [observation.hands.left.position, observation.hands.right.position]
+                )
                 joints = (observation.joints, observation.joint_velocities)
                 rows.append((frame, bench.time_s, hands, joints, observation.tool.position, axis))
             look(bench)
 
         loop = ClosedLoop(bench)
-        controller = Controller(settings, skill_for(bench), urdf=robot_description(settings), tuning=tuning)
+        controller = Controller(
+            settings, skill_for(bench), urdf=robot_description(settings), tuning=tuning
+        )
         run(controller, loop.ticks(), [loop.follow, tap])
         arrays = [np.array(column) for column in zip(*rows, strict=True)] or [np.empty(0)] * 6
         return Rehearsed(bench.events(), held * settings.period_s, *arrays)
@@ -93,4 +99,6 @@ def rehearse(
 
 def demonstrated(stream: Stream = SHIPPED) -> list[Demonstration]:
     """Demonstrations of the nominal scene, 100 Hz."""
-    return [demonstrate(Scene(), seed=1000 * stream.seed + n, begin_s=60 * n) for n in stream.numbers]
+    return [
+        demonstrate(Scene(), seed=1000 * stream.seed + n, begin_s=60 * n) for n in stream.numbers
+    ]

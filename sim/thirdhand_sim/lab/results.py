@@ -30,9 +30,15 @@ Array = NDArray[np.float64]
 
 # Okabe and Ito's colours, which people with colour vision deficiencies distinguish. As in the
 # paper, the left hand is red, the right one blue, and the robot green.
-LEFT, RIGHT, TOOL = "#D55E00", "#0072B2", "#009E73"
-ADAPTED, OTHER, DESIRED, REFERENCE = "#D55E00", "#0072B2", "#CC79A7", "#7F7F7F"
-DPI, COLOURS = 110, 256
+LEFT = "#D55E00"
+RIGHT = "#0072B2"
+TOOL = "#009E73"
+ADAPTED = "#D55E00"
+OTHER = "#0072B2"
+DESIRED = "#CC79A7"
+REFERENCE = "#7F7F7F"
+DPI = 110
+COLOURS = 256
 ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
 
 
@@ -45,7 +51,9 @@ class Options:
     """Options of the command line."""
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
-    hands: Path | None = None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
+    hands: Path | None = (
+        None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
+    )
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
     group: Literal["tuning", "test"] = "test"  # the people of `people`
     workers: str = "1"  # as `thirdhand.process.parallel.spread` takes them
@@ -60,7 +68,9 @@ class Results:
     folder: Path
     name: str
     said: bool = True
-    origin: dict[str, Any] = field(default_factory=dict)  # commit, date, machine, seeds, options, digests
+    origin: dict[str, Any] = field(
+        default_factory=dict
+    )  # commit, date, machine, seeds, options, digests
     figures: list[str] = field(default_factory=list)
     began_s: float = field(default_factory=time.monotonic)
 
@@ -70,7 +80,11 @@ class Results:
     def say(self, line: str) -> None:
         """Shows progress."""
         if self.said:
-            print(f"[{self.name} {time.monotonic() - self.began_s:5.1f} s] {line}", file=sys.stderr, flush=True)
+            print(
+                f"[{self.name} {time.monotonic() - self.began_s:5.1f} s] {line}",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def figure(self, figure: Figure, suffix: str = "") -> Path:
         """The path of a figure, saved as PNG."""
@@ -106,10 +120,14 @@ class Results:
 
     def measured(self) -> dict[str, Any]:
         """The numbers in the experiment's JSON, which an earlier run left."""
-        numbers: dict[str, Any] = json.loads((self.folder / f"{self.name}.json").read_text(encoding="utf-8"))
+        numbers: dict[str, Any] = json.loads(
+            (self.folder / f"{self.name}.json").read_text(encoding="utf-8")
+        )
         return numbers
 
-    def series(self, values: Mapping[str, Sequence[Any]], timeline: str, styles: Mapping[str, Any] = {}) -> None:
+    def series(
+        self, values: Mapping[str, Sequence[Any]], timeline: str, styles: Mapping[str, Any] = {}
+    ) -> None:
         """Records numbers by path, one a step of a timeline; a path may have a style of its own."""
         stream = self.recording()
         for path, numbers in values.items():
@@ -132,14 +150,22 @@ def pyplot() -> Any:
         import matplotlib as mpl
     except ImportError:
         raise ExperimentError(
-            "the experiments draw with Matplotlib, which is not installed: pip install 'thirdhand[experiments]'"
+            "the experiments draw with Matplotlib, which is not installed: pip install "
+            "'thirdhand[experiments]'"
         ) from None
     mpl.use("Agg")
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of limits that equal scales change
+    logging.getLogger("matplotlib").setLevel(
+        logging.ERROR
+    )  # it warns of limits that equal scales change
     from matplotlib import pyplot as plt
 
     plt.rcParams.update(
-        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True}
+        {
+            "font.size": 9,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "figure.constrained_layout.use": True,
+        }
     )
     return plt
 
@@ -160,10 +186,13 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 def equal_box(axes: Any, points: Array) -> None:
     """Gives 3-D axes equal scales around points (N, 3)."""
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     half = 0.55 * (high - low).clip(min=1e-3)
     middle = (low + high) / 2
-    axes.set(**{f"{name}lim": (middle[i] - half[i], middle[i] + half[i]) for i, name in enumerate("xyz")})
+    axes.set(
+        **{f"{name}lim": (middle[i] - half[i], middle[i] + half[i]) for i, name in enumerate("xyz")}
+    )
     axes.set_box_aspect(half, zoom=1.1)
 
 

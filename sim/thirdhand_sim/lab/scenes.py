@@ -60,9 +60,13 @@ def draw(number: int, *, seed: int) -> Drawn:
     speed = float(2 ** random.uniform(-1, 1))
     lasts_s = scene.duration_s / speed
     pauses: list[ScriptPause] = []
-    stops, turns = random.random() < 2 / 3, random.random() < 1 / 2
+    stops = random.random() < 2 / 3
+    turns = random.random() < 1 / 2
     halves = [0, 1] if random.random() < 1 / 2 else [1, 0]
-    for half, has_pause, depth, longest_s in ((halves[0], stops, 1.0, 2.0), (halves[1], turns, 2.0, 1.5)):
+    for half, has_pause, depth, longest_s in (
+        (halves[0], stops, 1.0, 2.0),
+        (halves[1], turns, 2.0, 1.5),
+    ):
         if has_pause:
             # Each lies in its own half of the script; the second is delayed by the first.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
@@ -78,7 +82,11 @@ def _never_before_the_start(pauses: list[ScriptPause], speed: float) -> list[Scr
     """The pauses; those in which the hands go back end where they would be at their start."""
     shorter = list(pauses)
     for i in range(len(shorter)):
-        while shorter[i].depth > 1 and shorter[i].lasts_s > 0.6 and _script_s_after(shorter[i], shorter, speed) < 0:
+        while (
+            shorter[i].depth > 1
+            and shorter[i].lasts_s > 0.6
+            and _script_s_after(shorter[i], shorter, speed) < 0
+        ):
             shorter[i] = shorter[i]._replace(lasts_s=max(0.6, shorter[i].lasts_s - 0.1))
     return shorter
 
@@ -87,7 +95,9 @@ def _script_s_after(pause: ScriptPause, pauses: list[ScriptPause], speed: float)
     return Clock(speed=speed, pauses=pauses).at(pause.at_s + pause.lasts_s)[0]
 
 
-def _moved(place: tuple[float, float, float], random: np.random.Generator) -> tuple[float, float, float]:
+def _moved(
+    place: tuple[float, float, float], random: np.random.Generator
+) -> tuple[float, float, float]:
     """A place anywhere in the ball around a place, and high enough."""
     while True:
         step: Array = random.uniform(-1, 1, 3)

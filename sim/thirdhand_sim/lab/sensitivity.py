@@ -45,12 +45,20 @@ CHANGED = 2  # seeds of the sessions at other values
 FACTORS = (0.5, 2.0)
 MOTION_S = 4.0
 STOP_RATES_HZ = {100: 0.0005, 30: 0.002, 15: 0.002}  # noise [m] of the trackers
-UNSEEN_S, TWO_SOURCES_S = (1.7, 2.3), (2.5, 3.5)  # begin and end of the time without a hand, and with two sources
+# begin and end of the time without a hand, and with two sources
+UNSEEN_S = (1.7, 2.3)
+TWO_SOURCES_S = (2.5, 3.5)
 APART_M = 0.04  # between the positions of two sources
-BURSTS, BURST_M = 4, 0.2  # bursts of three outliers, and how far away they are
+# bursts of three outliers, and how far away they are
+BURSTS = 4
+BURST_M = 0.2
 BOX = Box((0.52, -0.2, 0.36), (0.08, 0.04, 0.3))  # on the way to the handover
-TREMBLE_RAD, TREMBLE_S = 0.05, 1.0  # an arm trembles ever less until then
-IMPLAUSIBLE_S, ODD_SHARE = 4.0, 0.02  # length of the session, and share of implausible samples
+# an arm trembles ever less until then
+TREMBLE_RAD = 0.05
+TREMBLE_S = 1.0
+# length of the session, and share of implausible samples
+IMPLAUSIBLE_S = 4.0
+ODD_SHARE = 0.02
 
 
 class Number(NamedTuple):
@@ -86,7 +94,11 @@ class Number(NamedTuple):
 
 def numbers() -> dict[str, Number]:
     """The tuned numbers of all stages by key."""
-    all_numbers = [Number(stage, *item) for stage, tuned in TUNING._asdict().items() for item in tuned._asdict().items()]
+    all_numbers = [
+        Number(stage, *item)
+        for stage, tuned in TUNING._asdict().items()
+        for item in tuned._asdict().items()
+    ]
     return {number.key: number for number in all_numbers}
 
 
@@ -99,28 +111,41 @@ def _skill() -> Skill:
 def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
     """Figures of sequences of hands that the core alone follows."""
     follow = ours(_skill(), Settings(), tuning)
-    return [motion.figures("ours", sequence, targets(_skill(), sequence.truth), follow(sequence)) for sequence in hands]
+    return [
+        motion.figures("ours", sequence, targets(_skill(), sequence.truth), follow(sequence))
+        for sequence in hands
+    ]
 
 
 def _person(seed: int) -> list[Moving]:
     middle = _skill().hands.mean(axis=0)
-    people = moving_hands.modelled(middle, numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S)
+    people = moving_hands.modelled(
+        middle, numbers=[TUNING_STREAMS["people"].numbers[seed]], seconds=MOTION_S
+    )
     return [sequence for sequence in people if sequence.group in motion.FLOOR_GROUPS]
 
 
 def moving(tuning: Tuning, seed: int) -> Figures:
     """Hands as in `motion`, seen by a precise and by a poor tracker."""
     rows = _followed(_person(seed), tuning)
-    return {name: float(np.mean([getattr(row, name) for row in rows])) for name in ("error_rms_mm", "jerk_ratio")}
+    return {
+        name: float(np.mean([getattr(row, name) for row in rows]))
+        for name in ("error_rms_mm", "jerk_ratio")
+    }
 
 
 def stops(tuning: Tuning, seed: int) -> Figures:
     """Overshoot of sudden stops, as in `motion`, by the rate of the tracker."""
     middle = _skill().hands.mean(axis=0)
-    stop = functools.partial(moving_hands.stops, middle, numbers=[TUNING_STREAMS["stops"].numbers[seed]])
+    stop = functools.partial(
+        moving_hands.stops, middle, numbers=[TUNING_STREAMS["stops"].numbers[seed]]
+    )
     hands = [stop(rate_hz=rate_hz, noise=noise)[0] for rate_hz, noise in STOP_RATES_HZ.items()]
     overshoots_mm = [row.overshoot_mm for row in _followed(hands, tuning)]
-    return {f"overshoot_{rate_hz}_hz_mm": mm for rate_hz, mm in zip(STOP_RATES_HZ, overshoots_mm, strict=True)}
+    return {
+        f"overshoot_{rate_hz}_hz_mm": mm
+        for rate_hz, mm in zip(STOP_RATES_HZ, overshoots_mm, strict=True)
+    }
 
 
 def disturbed(tuning: Tuning, seed: int) -> Figures:
@@ -130,14 +155,21 @@ def disturbed(tuning: Tuning, seed: int) -> Figures:
     late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
     late[(hands.stamps > UNSEEN_S[0]) & (hands.stamps < UNSEEN_S[1]), seed % 2] = math.inf
 
-    twice, wrong = hands.samples.copy(), hands.samples.copy()
-    second = np.flatnonzero((hands.stamps > TWO_SOURCES_S[0]) & (hands.stamps < TWO_SOURCES_S[1]))[::2]
+    twice = hands.samples.copy()
+    wrong = hands.samples.copy()
+    second = np.flatnonzero((hands.stamps > TWO_SOURCES_S[0]) & (hands.stamps < TWO_SOURCES_S[1]))[
+        ::2
+    ]
     twice[second, :3] += APART_M
     for begin in random.integers(0, len(wrong) - 3, BURSTS):
         away = random.standard_normal(3)
         wrong[begin : begin + 3, :3] += BURST_M * away / np.linalg.norm(away)
 
-    variants = [replace(hands, late=late), replace(hands, samples=twice), replace(hands, samples=wrong)]
+    variants = [
+        replace(hands, late=late),
+        replace(hands, samples=twice),
+        replace(hands, samples=wrong),
+    ]
     named = list(zip(("late", "twice", "wrong"), _followed(variants, tuning), strict=True))
     errors = {f"{name}_error_rms_mm": row.error_rms_mm for name, row in named}
     return errors | {f"{name}_jerk_ratio": row.jerk_ratio for name, row in named}
@@ -149,7 +181,9 @@ def beside_a_box(tuning: Tuning, seed: int) -> Figures:
     script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=NOISE_M)
     settings = msgspec.structs.replace(Settings(), obstacles=Obstacles(boxes=(BOX,)))
     skill_for = reached.ours(Scene())
-    rehearsal = rehearse(script, skill_for, rate_hz=100, settings=settings, tuning=tuning, keep=True)
+    rehearsal = rehearse(
+        script, skill_for, rate_hz=100, settings=settings, tuning=tuning, keep=True
+    )
     behind_m = np.linalg.norm(rehearsal.frames["setpoint"] - rehearsal.tool, axis=1)
     return {
         "handover_error_mm": rehearsal.errors_mm[0],
@@ -164,7 +198,9 @@ def beside_a_box(tuning: Tuning, seed: int) -> Figures:
 def implausible(tuning: Tuning, seed: int) -> Figures:
     """An arm that trembles ever less, joint states and hands that cannot be, and a fast clock."""
     skill = reached.taught(shipped_skill(), Scene().via_points())
-    settings = msgspec.structs.replace(Settings(), arm=msgspec.structs.replace(Settings().arm, source="state"))
+    settings = msgspec.structs.replace(
+        Settings(), arm=msgspec.structs.replace(Settings().arm, source="state")
+    )
     controller = Controller(settings, skill, urdf=robot_description(settings), tuning=tuning)
     random = np.random.default_rng([TUNING_STREAMS["implausible"].seed, seed])
     joints = np.array(settings.arm.posture)
@@ -174,12 +210,19 @@ def implausible(tuning: Tuning, seed: int) -> Figures:
     for tick in range(1, round(IMPLAUSIBLE_S / settings.period_s)):
         time_s = tick * settings.period_s
         is_odd = time_s > 1.5 * TREMBLE_S and random.random() < ODD_SHARE
-        measured = joints + max(0.0, 1.0 - time_s / TREMBLE_S) * TREMBLE_RAD * random.uniform(-1.0, 1.0, len(joints))
+        measured = joints + max(0.0, 1.0 - time_s / TREMBLE_S) * TREMBLE_RAD * random.uniform(
+            -1.0, 1.0, len(joints)
+        )
         measured[0] += is_odd * random.uniform(0.05, 0.6)
         stamp_ns = START_NS + round(1e9 * time_s)
-        inbox = [joints_event(settings.joints.names, tuple(measured.tolist()), (0.0,) * len(joints), stamp_ns)]
+        inbox = [
+            joints_event(
+                settings.joints.names, tuple(measured.tolist()), (0.0,) * len(joints), stamp_ns
+            )
+        ]
         if tick % 5 == 1:
-            left, right = np.array(via_point.left), np.array(via_point.right) + 0.05 * math.sin(2.0 * time_s)
+            left = np.array(via_point.left)
+            right = np.array(via_point.right) + 0.05 * math.sin(2.0 * time_s)
             left += is_odd * random.uniform(0.0, 12.0)
             hand_ns = stamp_ns - round(1e9 * (clock_drift * time_s + random.exponential(0.003)))
             hands = zip(SIDES, (left, right), strict=True)
@@ -190,7 +233,10 @@ def implausible(tuning: Tuning, seed: int) -> Figures:
         joints = frames[-1]["joints"] if frames[-1]["mode"] == Mode.FOLLOW else joints
     following = np.array([frame["mode"] == Mode.FOLLOW for frame in frames])
     counts = {cause.name.lower(): float(frames[-1]["rejected"][cause]) for cause in Cause}
-    return counts | {"ready_s": settings.period_s * np.argmax(following), "following": float(np.mean(following))}
+    return counts | {
+        "ready_s": settings.period_s * np.argmax(following),
+        "following": float(np.mean(following)),
+    }
 
 
 SESSIONS = (moving, stops, disturbed, beside_a_box, implausible)
@@ -206,7 +252,11 @@ def measured(task: tuple[str, float, int]) -> Figures | str:
         figures = {session.__name__: session(tuning, seed) for session in SESSIONS}
     except (ArithmeticError, ValueError) as error:
         return f"{type(error).__name__}: {error}"
-    return {f"{session}: {name}": float(value) for session, row in figures.items() for name, value in row.items()}
+    return {
+        f"{session}: {name}": float(value)
+        for session, row in figures.items()
+        for name, value in row.items()
+    }
 
 
 def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
@@ -216,10 +266,14 @@ def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
     failures = [row for row in rows if isinstance(row, str)]
     if failures:
         return {"fails": failures[0]}
-    changes, shares, noises = Figures(), Figures(), Figures()
+    changes = Figures()
+    shares = Figures()
+    noises = Figures()
     for name in tuned[0]:
         pairs = zip(rows, tuned, strict=False)
-        changes[name] = float(np.mean([row[name] - before[name] for row, before in pairs if isinstance(row, dict)]))
+        changes[name] = float(
+            np.mean([row[name] - before[name] for row, before in pairs if isinstance(row, dict)])
+        )
         shares[name] = changes[name] / max(float(np.mean([before[name] for before in tuned])), 1e-9)
         noise = float(np.std([before[name] for before in tuned], ddof=1))
         noises[name] = abs(changes[name]) / noise if noise > 0.0 else float(changes[name] != 0.0)
@@ -236,14 +290,20 @@ def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """Effect of each number, by its key and the factor; with fewer seeds for a quick look."""
     all_numbers = numbers().values()
-    seeds, noise_seeds = range(math.ceil(options.share * CHANGED)), range(max(3, round(options.share * SEEDS)))
+    seeds = range(math.ceil(options.share * CHANGED))
+    noise_seeds = range(max(3, round(options.share * SEEDS)))
     tasks = [("", 1.0, seed) for seed in noise_seeds]
-    tasks += [(number.key, factor, seed) for number in all_numbers for factor in FACTORS for seed in seeds]
+    tasks += [
+        (number.key, factor, seed) for number in all_numbers for factor in FACTORS for seed in seeds
+    ]
     outcomes = shared_out(measured, tasks, options.workers)
     tuned = [row for row in itertools.islice(outcomes, len(noise_seeds)) if isinstance(row, dict)]
     out: dict[str, Any] = {}
     for number in all_numbers:
-        effects = {f"{factor:g}": effect(list(itertools.islice(outcomes, len(seeds))), tuned) for factor in FACTORS}
+        effects = {
+            f"{factor:g}": effect(list(itertools.islice(outcomes, len(seeds))), tuned)
+            for factor in FACTORS
+        }
         out[number.key] = {"value": number.value, "effects": effects}
         results.say(f"{number.key}: {brief(effects)}")
         results.numbers({"numbers": out})

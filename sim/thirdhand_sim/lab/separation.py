@@ -31,18 +31,36 @@ from thirdhand_sim.lab.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.scenes import OFFSET_M, Drawn, draw
 from thirdhand_sim.lab.workers import shared_out
-from thirdhand_sim.script import PAUSE_RAMP_S, Clock, HandMotions, HandScript, PointMotion, ScriptPause, Teacher
+from thirdhand_sim.script import (
+    PAUSE_RAMP_S,
+    Clock,
+    HandMotions,
+    HandScript,
+    PointMotion,
+    ScriptPause,
+    Teacher,
+)
 
-SCENES, RATE_HZ = EXPERIMENTS["separation"].seeds.evaluation["scenes"], 250  # half the rate, to save time
+# half the rate, to save time
+SCENES = EXPERIMENTS["separation"].seeds.evaluation["scenes"]
+RATE_HZ = 250
 KINDS = ("random", "thrust", "unheeded")
 EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
 GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
-REACH_S, STAY_S = (0.35, 0.7), 2 * PAUSE_RAMP_S  # durations of a thrust
-AHEAD_M, AHEAD_S = 0.22, 1.5  # a hand is thrust this far ahead of the tool on its path, and at most this time
+# durations of a thrust
+REACH_S = (0.35, 0.7)
+STAY_S = 2 * PAUSE_RAMP_S
+# a hand is thrust this far ahead of the tool on its path, and at most this time
+AHEAD_M = 0.22
+AHEAD_S = 1.5
 THRUST_STEP_S = 0.02  # times at which the path is sampled
-CLEARANCE_TICKS, WITHIN_M = 5, 0.3
-SHOWN_M, STEP_S = 0.3, 1e-6
-SHOWN_SCENES, SHOWN_TICKS = 5, 10  # the figure shows the first scenes, and every tenth tick
+CLEARANCE_TICKS = 5
+WITHIN_M = 0.3
+SHOWN_M = 0.3
+STEP_S = 1e-6
+# the figure shows the first scenes, and every tenth tick
+SHOWN_SCENES = 5
+SHOWN_TICKS = 10
 HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more is hurried
 UNHEEDED_EVERY = 4  # scenes run without separation too, to measure its cost
 
@@ -57,9 +75,12 @@ class ThrustScript(HandScript):
         random = np.random.default_rng([drawn.seed, 7])
         clock = Clock(speed=drawn.speed, pauses=drawn.pauses)
         teacher = Teacher(drawn.scene, seed=drawn.seed, clock=clock)
-        self.side, self.lasts_s = int(random.integers(2)), float(random.uniform(*REACH_S))
+        self.side = int(random.integers(2))
+        self.lasts_s = float(random.uniform(*REACH_S))
         self.away_s = 2 * self.lasts_s + STAY_S
-        self.at_s, self._place = _thrust(random, teacher, drawn, clock.elapsed(drawn.scene.duration_s), self.lasts_s)
+        self.at_s, self._place = _thrust(
+            random, teacher, drawn, clock.elapsed(drawn.scene.duration_s), self.lasts_s
+        )
         there_s = self.at_s + self.lasts_s
         later = [p._replace(at_s=p.at_s + self.away_s * (p.at_s >= there_s)) for p in drawn.pauses]
         back = ScriptPause(there_s, self.lasts_s + STAY_S, 2.0)  # undoes the progress since at_s
@@ -79,7 +100,8 @@ class ThrustScript(HandScript):
         begin = (t - self.at_s) / self.lasts_s
         back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
         share, rate = (a - b for a, b in zip(_reach(begin), _reach(back), strict=True))
-        motion, offset_m = hands[self.side], self._place - hands[self.side].position
+        motion = hands[self.side]
+        offset_m = self._place - hands[self.side].position
         hands[self.side] = PointMotion(
             motion.position + share * offset_m,
             (1.0 - share) * motion.velocity + rate / self.lasts_s * offset_m,
@@ -96,8 +118,14 @@ def _thrust(
     The tool is AHEAD_M from the place and gets there within AHEAD_S. If the tool is never that
     fast, the time and the place are those where it gets farthest.
     """
-    times, count = np.arange(0.5, duration_s - 1.0, THRUST_STEP_S), round(AHEAD_S / THRUST_STEP_S)
-    path = np.array([teacher.truth(times[0] + i * THRUST_STEP_S).position for i in range(len(times) + count - 1)])
+    times = np.arange(0.5, duration_s - 1.0, THRUST_STEP_S)
+    count = round(AHEAD_S / THRUST_STEP_S)
+    path = np.array(
+        [
+            teacher.truth(times[0] + i * THRUST_STEP_S).position
+            for i in range(len(times) + count - 1)
+        ]
+    )
     ahead = sliding_window_view(path, count, axis=0).transpose(0, 2, 1)  # (T, count, 3)
     away_m = np.linalg.norm(ahead - ahead[:, :1], axis=2)
     for pause in drawn.pauses:
@@ -124,7 +152,8 @@ class Outcome(NamedTuple):
     errors_mm: tuple[float, float, float]
     times_s: tuple[float, float, float]  # of the events
     away_s: float  # time in which a hand was thrust in
-    shapes_mm: float  # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
+    shapes_mm: float
     capsules_mm: float  # the same for the capsules of the rule, which are wider
     pushed_mm: float  # path of a part of the arm toward a hand that it touches
     excess_at_once: float  # [m/s] largest excess over the rule
@@ -149,7 +178,10 @@ def run_one(task: tuple[str, int]) -> Outcome:
         if bench.tick % CLEARANCE_TICKS == 0:
             world = bench.world
             clearances.append(
-                (world.clearance(world.left, within=WITHIN_M), world.clearance(world.right, within=WITHIN_M))
+                (
+                    world.clearance(world.left, within=WITHIN_M),
+                    world.clearance(world.right, within=WITHIN_M),
+                )
             )
 
     skill_for = ours(drawn.scene)
@@ -160,10 +192,17 @@ def run_one(task: tuple[str, int]) -> Outcome:
 
 
 def _judged(
-    kind: str, number: int, drawn: Drawn, away_s: float, done: Rehearsed, clearances: list[tuple[float, float]]
+    kind: str,
+    number: int,
+    drawn: Drawn,
+    away_s: float,
+    done: Rehearsed,
+    clearances: list[tuple[float, float]],
 ) -> Outcome:
-    settings, dt = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ), 1 / RATE_HZ
-    people, body = settings.people, body_of(settings, robot_description(settings))
+    settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
+    dt = 1 / RATE_HZ
+    people = settings.people
+    body = body_of(settings, robot_description(settings))
     distance, speed, coming, self_m, table = nearest(settings, body, done.joints, done.hands)
     reaction_s = (settings.hands.stale_ms + people.reaction_ms) / 1000
     allowed = np.empty_like(distance)
@@ -171,10 +210,16 @@ def _judged(
     offered = np.abs(done.hands[:, 0] - drawn.scene.handover).max(axis=1) < 0.05
     links = body.capsules["link"]
     tool = links[links > 0] == len(settings.joints.names)
-    allowed[:, 0] = np.where(offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0])
+    allowed[:, 0] = np.where(
+        offered[:, None] & tool, np.maximum(allowed[:, 0], people.contact_speed), allowed[:, 0]
+    )
     half = round(0.5 * reaction_s / dt)
-    lately, hurried = (_later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming))
-    assumed = hurried <= np.minimum(_later_by(2 * half, coming) + HURRY, TUNING.separation.unknown_speed_mps)
+    lately, hurried = (
+        _later_by(half, maximum_filter1d(x, size=2 * half + 1, axis=0)) for x in (allowed, coming)
+    )
+    assumed = hurried <= np.minimum(
+        _later_by(2 * half, coming) + HURRY, TUNING.separation.unknown_speed_mps
+    )
     over = speed - lately
     began = np.flatnonzero(done.time_s > 0)
     pushed = np.where(distance < 0, np.maximum(speed, 0.0), 0.0).sum(axis=0) * dt
@@ -205,7 +250,8 @@ def _judged(
 
 def _longest(found: NDArray[np.bool_]) -> int:
     """The largest number of consecutive ticks in which something is found, (T, ...)."""
-    run, most = np.zeros(found.shape[1:], np.int64), 0
+    run = np.zeros(found.shape[1:], np.int64)
+    most = 0
     for now in found:
         run = (run + 1) * now
         most = max(most, int(run.max()))
@@ -222,9 +268,11 @@ def nearest(settings: Settings, body: Body, joints: Array, hands: Array) -> tupl
     capsule's nearest point and of the hand [m/s], (T, 2, N) each; then least distances (T,) [m]
     between links, and between links and table. Joints (T, 2, J) [rad, rad/s], hands (T, 2, 3) [m].
     """
-    people, count = settings.people, int((body.capsules["link"] > 0).sum())
+    people = settings.people
+    count = int((body.capsules["link"] > 0).sum())
     moving = np.stack([hands, np.gradient(hands, settings.period_s, axis=0)], axis=2)
-    pairs, least = np.empty((3, len(hands), 2, count)), np.ones((2, len(hands)))
+    pairs = np.empty((3, len(hands), 2, count))
+    least = np.ones((2, len(hands)))
     forearm = people.length / np.linalg.norm(people.toward_elbow) * np.array(people.toward_elbow)
     shape = np.array([people.radius, *forearm, settings.table.centre[2]])
     _measure(np.ascontiguousarray(joints), moving, body, shape, pairs, least)
@@ -232,28 +280,44 @@ def nearest(settings: Settings, body: Body, joints: Array, hands: Array) -> tupl
 
 
 @compiled
-def _measure(joints: Array, hands: Array, body: Body, shape: Array, pairs: Array, least: Array) -> None:
+def _measure(
+    joints: Array, hands: Array, body: Body, shape: Array, pairs: Array, least: Array
+) -> None:
     """`nearest`, with the hands' velocities (T, 2, 2, 3), and the shape (5,) of a forearm and the
     table: radius, way to the elbow, height. Into pairs (3, T, 2, N) and least (2, T).
     """
     frames, axes, capsules, kept_apart = body
-    count, near, arm = len(capsules), np.empty(9), np.empty((2, 3))
-    segments, moved, fixed = np.empty((count, 2, 3)), np.empty((count, 2, 3)), count - pairs.shape[3]
+    count = len(capsules)
+    near = np.empty(9)
+    arm = np.empty((2, 3))
+    segments = np.empty((count, 2, 3))
+    moved = np.empty((count, 2, 3))
+    fixed = count - pairs.shape[3]
     for t in range(len(joints)):
         q = joints[t, 0]
         place(q, frames, axes, capsules, segments)
         place(q + STEP_S * joints[t, 1], frames, axes, capsules, moved)
         for pair in range(len(kept_apart)):
-            capsule, other = kept_apart[pair, 0], kept_apart[pair, 1]
-            distance_m = between_segments(segments[capsule], segments[other], near) - capsules[capsule].radius - capsules[other].radius
+            capsule = kept_apart[pair, 0]
+            other = kept_apart[pair, 1]
+            distance_m = (
+                between_segments(segments[capsule], segments[other], near)
+                - capsules[capsule].radius
+                - capsules[other].radius
+            )
             least[0, t] = min(least[0, t], distance_m)
         for c in range(fixed, count):
             if max(segments[c, 0, 0], segments[c, 1, 0]) > 0.35:
-                least[1, t] = min(least[1, t], min(segments[c, 0, 2], segments[c, 1, 2]) - capsules[c].radius - shape[4])
+                least[1, t] = min(
+                    least[1, t],
+                    min(segments[c, 0, 2], segments[c, 1, 2]) - capsules[c].radius - shape[4],
+                )
             for side in range(2):
                 arm[0] = hands[t, side, 0]
                 arm[1] = arm[0] + shape[1:4]
-                pairs[0, t, side, c - fixed] = between_segments(segments[c], arm, near) - capsules[c].radius - shape[0]
+                pairs[0, t, side, c - fixed] = (
+                    between_segments(segments[c], arm, near) - capsules[c].radius - shape[0]
+                )
                 long = whole = along = coming = 0.0
                 for i in range(3):
                     extent = segments[c, 1, i] - segments[c, 0, i]
@@ -261,32 +325,45 @@ def _measure(joints: Array, hands: Array, body: Body, shape: Array, pairs: Array
                     long += extent * (near[i] - segments[c, 0, i])
                 share = long / whole if whole > 0.0 else 0.0
                 for i in range(3):
-                    first, second = moved[c, 0, i] - segments[c, 0, i], moved[c, 1, i] - segments[c, 1, i]
+                    first = moved[c, 0, i] - segments[c, 0, i]
+                    second = moved[c, 1, i] - segments[c, 1, i]
                     along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
                     coming -= near[6 + i] * hands[t, side, 1, i]
-                pairs[1, t, side, c - fixed], pairs[2, t, side, c - fixed] = along, max(coming, 0.0)
+                pairs[1, t, side, c - fixed] = along
+                pairs[2, t, side, c - fixed] = max(coming, 0.0)
 
 
 @compiled
-def _allow(distance: Array, coming: Array, brake: float, reaction: float, clearance: float, out: Array) -> None:
+def _allow(
+    distance: Array, coming: Array, brake: float, reaction: float, clearance: float, out: Array
+) -> None:
     for t in range(distance.shape[0]):
         for side in range(2):
             for c in range(distance.shape[2]):
-                out[t, side, c] = allowed_speed(distance[t, side, c], coming[t, side, c], brake, reaction, clearance)
+                out[t, side, c] = allowed_speed(
+                    distance[t, side, c], coming[t, side, c], brake, reaction, clearance
+                )
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     scenes = SCENES.share(options.share)
     by_kind: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
-    tasks = [(kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+    tasks = [
+        (kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0
+    ]
     for row in shared_out(run_one, tasks, options.workers):
         by_kind[row.kind].append(row)
         if len(by_kind[row.kind]) % max(1, len(scenes) // 5) == 0:
             results.say(f"{row.kind}: {brief(_summary(by_kind[row.kind]))}")
     recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
     results.series(
-        {f"/{name}/{k}": [getattr(o, name) for o in rows] for k, rows in by_kind.items() for name in recorded}, "scene"
+        {
+            f"/{name}/{k}": [getattr(o, name) for o in rows]
+            for k, rows in by_kind.items()
+            for name in recorded
+        },
+        "scene",
     )
     numbers = {
         "scenes": len(scenes),
@@ -296,10 +373,16 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "later_than_unheeded_s": _later(by_kind["random"], by_kind["unheeded"]),
         "later_for_a_thrust_s": _later_for(by_kind["thrust"], by_kind["random"]),
         "worst_scene": {
-            kind: max(rows, key=lambda one: one.excess_after_reaction).number for kind, rows in by_kind.items()
+            kind: max(rows, key=lambda one: one.excess_after_reaction).number
+            for kind, rows in by_kind.items()
         },
-        "failed_scenes": {kind: [row.number for row in rows if not row.success] for kind, rows in by_kind.items()},
-        "shown": {kind: _shown([row for row in rows if row.number < SHOWN_SCENES]) for kind, rows in by_kind.items()},
+        "failed_scenes": {
+            kind: [row.number for row in rows if not row.success] for kind, rows in by_kind.items()
+        },
+        "shown": {
+            kind: _shown([row for row in rows if row.number < SHOWN_SCENES])
+            for kind, rows in by_kind.items()
+        },
     }
     draw_numbers(results, numbers)
     return numbers
@@ -322,7 +405,9 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
         "successes": sum(row.success for row in rows),
         "closest_of_shapes_mm": {"least": closest.min(), "median": float(np.median(closest))},
         "overlaps": int((closest < 0).sum()),
-        "above_after_reaction": sum(row.excess_after_reaction > TUNING.separation.slip_speed_mps for row in rows),
+        "above_after_reaction": sum(
+            row.excess_after_reaction > TUNING.separation.slip_speed_mps for row in rows
+        ),
         "limited_s": float(np.mean([row.limited_s for row in rows])),
         **{name: max(getattr(row, name) for row in rows) for name in GREATEST},
         **{name: min(getattr(row, name) for row in rows) for name in ("self_mm", "table_mm")},
@@ -332,22 +417,35 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
 def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
     """Delay of the events [s] against the same scenes without separation."""
     late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
-    return {name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())} for i, name in enumerate(EVENTS)}
+    return {
+        name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())}
+        for i, name in enumerate(EVENTS)
+    }
 
 
 def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:
     """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
     both runs succeed.
     """
-    pairs = [(row, other) for row, other in zip(thrust, undisturbed, strict=True) if row.success and other.success]
+    pairs = [
+        (row, other)
+        for row, other in zip(thrust, undisturbed, strict=True)
+        if row.success and other.success
+    ]
     late = np.array([row.times_s[-1] - other.times_s[-1] - row.away_s for row, other in pairs])
     away = float(np.mean([row.away_s for row in thrust]))
-    return {"away": away, "mean": float(late.mean()), "least": float(late.min()), "most": float(late.max())}
+    return {
+        "away": away,
+        "mean": float(late.mean()),
+        "least": float(late.min()),
+        "most": float(late.max()),
+    }
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
-    plt, people = pyplot(), Settings().people
+    plt = pyplot()
+    people = Settings().people
     reaction_s = (Settings().hands.stale_ms + people.reaction_ms) / 1000
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), sharey=True)
     titles = ("random scenes", "a hand thrust into the path", "random scenes, without separation")
@@ -355,11 +453,22 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
         content = numbers["shown"][kind]
         distance_mm, speed_mm_s = np.array(content["points"])
-        ax.scatter(distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True)
+        ax.scatter(
+            distance_mm, speed_mm_s / 1000, s=5, alpha=0.5, color=colour, lw=0, rasterized=True
+        )
         distances = np.linspace(-0.1, SHOWN_M, 200)
         for hand, style in ((0.0, "-"), (0.5, "--")):
-            rule = [allowed_speed(d, hand, people.brake, reaction_s, people.distance) for d in distances]
-            ax.plot(1000 * distances, rule, style, color="black", lw=1, label=f"allowed, hand at {hand:g} m/s")
+            rule = [
+                allowed_speed(d, hand, people.brake, reaction_s, people.distance) for d in distances
+            ]
+            ax.plot(
+                1000 * distances,
+                rule,
+                style,
+                color="black",
+                lw=1,
+                label=f"allowed, hand at {hand:g} m/s",
+            )
         closest = content["closest_of_capsules_mm"]
         ax.axvline(closest, color=colour, lw=1.2, ls=":", label=f"least distance: {closest:.0f} mm")
         ax.axvline(0, color="black", lw=0.6)

@@ -29,9 +29,14 @@ def speeds(tool: Array, joints: Array) -> list[float]:
     above them, while the tool (N, 3) [m] moves.
     """
     moving = np.linalg.norm(np.gradient(tool, PERIOD_S, axis=0), axis=1) > MOVING_MPS
-    low = [sosfiltfilt(butter(4, edge, fs=1 / PERIOD_S, output="sos"), joints, axis=0) for edge in EDGES_HZ]
+    low = [
+        sosfiltfilt(butter(4, edge, fs=1 / PERIOD_S, output="sos"), joints, axis=0)
+        for edge in EDGES_HZ
+    ]
     bands = np.diff(np.stack([np.zeros_like(joints), *low, joints]), axis=0)[:, moving]
-    return [math.sqrt(np.mean(np.sum(band**2, axis=1))) if len(band) else math.nan for band in bands]
+    return [
+        math.sqrt(np.mean(np.sum(band**2, axis=1))) if len(band) else math.nan for band in bands
+    ]
 
 
 def ripple(bands: list[float]) -> float:
@@ -48,8 +53,21 @@ def draw(results: Results, by_follower: dict[str, list[float]]) -> None:
     for name, bands in by_follower.items():
         label, colour, style = LABELS[name]
         middles = np.sqrt(EDGES_HZ[1:] * EDGES_HZ[:-1])
-        panel.plot(middles, 1000 * np.array(bands[1:-1]), style, marker="o", ms=4, color=colour, label=label)
-    panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="joints' speed in a band, rms [mrad/s]")
+        panel.plot(
+            middles,
+            1000 * np.array(bands[1:-1]),
+            style,
+            marker="o",
+            ms=4,
+            color=colour,
+            label=label,
+        )
+    panel.set(
+        xscale="log",
+        yscale="log",
+        xlabel="frequency [Hz]",
+        ylabel="joints' speed in a band, rms [mrad/s]",
+    )
     ticks = (1, 2, 4, 7, 13, 30)
     panel.set_xticks(ticks, [str(tick) for tick in ticks])
     panel.set_xticks([], minor=True)

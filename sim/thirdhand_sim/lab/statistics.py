@@ -30,7 +30,9 @@ from thirdhand_sim.scene import GRASP_DISTANCE
 SEEDS = EXPERIMENTS["statistics"].seeds
 SCENES = SEEDS.evaluation["scenes"]
 ELL = 5.0  # [1/m²] as the shipped skill
-OURS_HZ, RIVALS_HZ = 500, 125  # to save time: the lower rate changes errors by 2 mm at most
+# to save time: the lower rate changes errors by 2 mm at most
+OURS_HZ = 500
+RIVALS_HZ = 125
 METHODS: dict[str, tuple[str, Learn]] = {
     "ours": ("KMP, taught places\n(the service)", lambda shown: LearnedByService(shipped_skill())),
     "none": ("the places and the start,\nno demonstrations", NoDemonstrations(ell=ELL).learn),
@@ -87,9 +89,16 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"scene {row.number} missed: {row.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
             results.say(f"{row.method}: {sum(o.success for o in done)} of {len(done)} scenes")
-    paths = {f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)}
-    styles = {path: rr.SeriesPoints(colors=[rgb(colour_of(method))], names=[method]) for path, (method, _) in paths.items()}
-    values = {path: [row.errors_mm[i] for row in by_method[method]] for path, (method, i) in paths.items()}
+    paths = {
+        f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)
+    }
+    styles = {
+        path: rr.SeriesPoints(colors=[rgb(colour_of(method))], names=[method])
+        for path, (method, _) in paths.items()
+    }
+    values = {
+        path: [row.errors_mm[i] for row in by_method[method]] for path, (method, i) in paths.items()
+    }
     results.series(values, "scene", styles)
     numbers = {
         "scenes": count,
@@ -98,7 +107,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "methods": {method: _summary(rows) for method, rows in by_method.items()},
         "failed_scenes_of_ours": [row.number for row in by_method["ours"] if not row.success],
         "held_s_of_ours": max(row.held_s for row in by_method["ours"]),
-        "errors_mm_by_scene": {method: [row.errors_mm for row in rows] for method, rows in by_method.items()},
+        "errors_mm_by_scene": {
+            method: [row.errors_mm for row in rows] for method, rows in by_method.items()
+        },
     }
     draw_numbers(results, numbers)
     return numbers
@@ -126,19 +137,27 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
 
 def wilson(successes: int, of: int) -> tuple[float, float]:
     """The 95 % interval of a rate of success (Wilson 1927)."""
-    z, p = 1.96, successes / of
-    middle, half = p + z * z / (2 * of), z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    return max(0.0, (middle - half) / (1 + z * z / of)), min(1.0, (middle + half) / (1 + z * z / of))
+    z = 1.96
+    p = successes / of
+    middle = p + z * z / (2 * of)
+    half = z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
+    return max(0.0, (middle - half) / (1 + z * z / of)), min(
+        1.0, (middle + half) / (1 + z * z / of)
+    )
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers: a row a method."""
-    plt, methods = pyplot(), numbers["methods"]
-    figure, (rates, *events) = plt.subplots(1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1))
+    plt = pyplot()
+    methods = numbers["methods"]
+    figure, (rates, *events) = plt.subplots(
+        1, 4, figsize=(11, 4.6), sharey=True, width_ratios=(1.1, 1, 1, 1)
+    )
     random = np.random.default_rng(DRAWING)
     for i, (method, scores) in enumerate(methods.items()):
         colour = colour_of(method)
-        rate, (low, high) = 100 * scores["successes"] / scores["of"], scores["rate_95_percent_interval"]
+        rate = 100 * scores["successes"] / scores["of"]
+        low, high = scores["rate_95_percent_interval"]
         rates.barh(i, rate, color=colour, height=0.6)
         rates.plot((100 * low, 100 * high), (i, i), color="black", lw=1.2)
         rates.text(max(rate, 100 * high) + 2, i, f"{rate:.0f}", va="center")
@@ -146,8 +165,17 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         for axes, name, error in zip(events, EVENTS, errors.T, strict=True):
             y = i + random.uniform(-0.25, 0.25, len(error))
             axes.scatter(np.maximum(error, LEAST_MM), y, s=5, color=colour, alpha=0.5, lw=0)
-            axes.plot([max(scores[f"{name}_mm"]["median"], LEAST_MM)] * 2, (i - 0.38, i + 0.38), color="black", lw=1.6)
-    rates.set(xlim=(0, 116), xticks=range(0, 101, 25), xlabel="scenes in which all three\nevents succeeded [%]")
+            axes.plot(
+                [max(scores[f"{name}_mm"]["median"], LEAST_MM)] * 2,
+                (i - 0.38, i + 0.38),
+                color="black",
+                lw=1.6,
+            )
+    rates.set(
+        xlim=(0, 116),
+        xticks=range(0, 101, 25),
+        xlabel="scenes in which all three\nevents succeeded [%]",
+    )
     rates.set_yticks(range(len(methods)), [METHODS[method][0] for method in methods])
     rates.invert_yaxis()
     titles = (
@@ -162,10 +190,12 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         axes.set_title(title, fontsize=9)
         axes.minorticks_off()
     events[1].set_xlabel(
-        f"smallest distance at the event [mm]\ndots: scenes; bars: medians; dashed: within {numbers['within_mm']:g} mm"
+        "smallest distance at the event [mm]\ndots: scenes; bars: medians; dashed: within "
+        f"{numbers['within_mm']:g} mm"
     )
     figure.suptitle(
-        f"{numbers['scenes']} random scenes: places up to 15 cm away, hands 0.5 to 2 times as fast, pauses, going back",
+        f"{numbers['scenes']} random scenes: places up to 15 cm away, hands 0.5 to 2 times as "
+        "fast, pauses, going back",
         fontsize=10,
     )
     results.figure(figure)

@@ -30,7 +30,9 @@ def shared_out(
     yield from spread(functools.partial(_prepared_work, work, prepare), tasks, workers)
 
 
-def _prepared_work(work: Callable[[Task], Outcome], prepare: Callable[[], None] | None, task: Task) -> Outcome:
+def _prepared_work(
+    work: Callable[[Task], Outcome], prepare: Callable[[], None] | None, task: Task
+) -> Outcome:
     if prepare is not None and _prepared != [key := pickle.dumps(prepare)]:
         prepare()
         _prepared[:] = [key]

@@ -17,7 +17,13 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Vector
-from thirdhand.core.numerics import BOUND_ROUNDS, CONSTRAINT_ROUNDS, LEAST_SLOPE, ROUNDING, TOLERANCE
+from thirdhand.core.numerics import (
+    BOUND_ROUNDS,
+    CONSTRAINT_ROUNDS,
+    LEAST_SLOPE,
+    ROUNDING,
+    TOLERANCE,
+)
 
 
 @compiled
@@ -75,26 +81,31 @@ def least_squares(
     A primal active-set method: joints that would leave their bounds are held there; a held joint is
     released if the cost falls toward the inside.
     """
-    joints, count = len(posture), len(wanted)
-    free, best = np.ones(joints), np.empty(joints)
+    joints = len(posture)
+    count = len(wanted)
+    free = np.ones(joints)
+    best = np.empty(joints)
     _solve(tasks, wanted, posture, damping, free, posture, result)
     inside = True
     for j in range(joints):
         if not bounds[0, j] <= result[j] <= bounds[1, j]:
-            inside, free[j] = False, 0.0
+            inside = False
+            free[j] = 0.0
             result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
     if inside:
         return
     residual = np.empty(count)
     for _ in range(BOUND_ROUNDS):
         _solve(tasks, wanted, posture, damping, free, result, best)
-        blocked, least = -1, 1.0
+        blocked = -1
+        least = 1.0
         for j in range(joints):
             step = best[j] - result[j]
             if step != 0.0:
                 fraction = ((bounds[1, j] if step > 0.0 else bounds[0, j]) - result[j]) / step
                 if fraction < least:
-                    blocked, least = j, fraction
+                    blocked = j
+                    least = fraction
         for j in range(joints):
             result[j] += least * (best[j] - result[j])
         if blocked >= 0:
@@ -107,7 +118,9 @@ def least_squares(
             residual[i] = -wanted[i]
             for j in range(joints):
                 residual[i] += tasks[i, j] * result[j]
-        leaving, most = -1, ROUNDING  # the bound with the steepest descent to its inside
+        # the bound with the steepest descent to its inside
+        leaving = -1
+        most = ROUNDING
         for j in range(joints):
             if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
                 continue
@@ -116,7 +129,8 @@ def least_squares(
                 slope += tasks[i, j] * residual[i]
             gained = slope if result[j] >= bounds[1, j] else -slope
             if gained > most:
-                leaving, most = j, gained
+                leaving = j
+                most = gained
         if leaving < 0:
             return
         free[leaving] = 1.0
@@ -124,7 +138,13 @@ def least_squares(
 
 @compiled
 def _solve(
-    tasks: Vector, wanted: Vector, posture: Vector, damping: float, free: Vector, held: Vector, out: Vector
+    tasks: Vector,
+    wanted: Vector,
+    posture: Vector,
+    damping: float,
+    free: Vector,
+    held: Vector,
+    out: Vector,
 ) -> None:
     """Write into out (J,) the minimum of the cost with some joints held, without bounds.
 
@@ -133,8 +153,11 @@ def _solve(
 
         x = x0 + F tasks^T (tasks F tasks^T + damping I)^-1 (wanted - tasks x0)
     """
-    joints, count = len(posture), len(wanted)
-    part, root, right = np.empty((count, joints)), np.empty((count, count)), np.empty(count)
+    joints = len(posture)
+    count = len(wanted)
+    part = np.empty((count, joints))
+    root = np.empty((count, count))
+    right = np.empty(count)
     for i in range(count):
         right[i] = wanted[i]
         for j in range(joints):
@@ -205,7 +228,8 @@ def _solve_with_rows(
     If neither is possible, not all constraints can be kept, and x remains where it is.
     """
     joints = len(x)
-    transposed, root = np.empty((joints, len(wanted))), np.empty((joints, joints))
+    transposed = np.empty((joints, len(wanted)))
+    root = np.empty((joints, joints))
     for j in range(joints):
         x[j] = damping * posture[j]
         for i in range(len(wanted)):
@@ -214,20 +238,29 @@ def _solve_with_rows(
     factorise(transposed, damping, root)
     substitute(root, x)
     # active constraints: multipliers, normals, and images, the normals times the inverse Hessian
-    active, multiplier, normals = 0, np.zeros(joints), np.zeros((joints, joints))
+    active = 0
+    multiplier = np.zeros(joints)
+    normals = np.zeros((joints, joints))
     images = np.zeros((joints, joints))
-    normal, direction, decrease = np.empty(joints), np.empty(joints), np.empty(joints)
-    entering, entering_multiplier = -1, 0.0
+    normal = np.empty(joints)
+    direction = np.empty(joints)
+    decrease = np.empty(joints)
+    entering = -1
+    entering_multiplier = 0.0
     for _ in range(CONSTRAINT_ROUNDS):
         if entering < 0:
-            entering, entering_multiplier = _farthest(bounds, rows, limits, x, 0.1 * TOLERANCE), 0.0
+            entering = _farthest(bounds, rows, limits, x, 0.1 * TOLERANCE)
+            entering_multiplier = 0.0
             if entering < 0:
                 break
         limit = _constraint(entering, bounds, rows, limits, normal)
         direction[:] = normal
         substitute(root, direction)
         _multiplier_decrease(direction, normals, images, active, decrease)
-        excess, slope, leaving, step = -limit, 0.0, -1, math.inf
+        excess = -limit
+        slope = 0.0
+        leaving = -1
+        step = math.inf
         for j in range(joints):
             for k in range(active):
                 direction[j] -= decrease[k] * images[k, j]
@@ -235,9 +268,11 @@ def _solve_with_rows(
             slope += normal[j] * direction[j]
         for k in range(active):
             if decrease[k] > ROUNDING and multiplier[k] < step * decrease[k]:
-                leaving, step = k, multiplier[k] / decrease[k]
+                leaving = k
+                step = multiplier[k] / decrease[k]
         if slope > LEAST_SLOPE and active < joints and excess <= step * slope:
-            leaving, step = -1, excess / slope
+            leaving = -1
+            step = excess / slope
         elif leaving < 0:
             break  # not all constraints can be kept, or the rest is rounding
         if slope > LEAST_SLOPE:
@@ -247,14 +282,18 @@ def _solve_with_rows(
         for k in range(active):
             multiplier[k] -= step * decrease[k]
         if leaving < 0:
-            normals[active], multiplier[active] = normal, entering_multiplier
+            normals[active] = normal
+            multiplier[active] = entering_multiplier
             images[active] = normal
             substitute(root, images[active])
-            active, entering = active + 1, -1
+            active = active + 1
+            entering = -1
         else:
             active -= 1
             for k in range(leaving, active):
-                multiplier[k], normals[k], images[k] = multiplier[k + 1], normals[k + 1], images[k + 1]
+                multiplier[k] = multiplier[k + 1]
+                normals[k] = normals[k + 1]
+                images[k] = images[k + 1]
 
 
 @compiled
@@ -282,18 +321,23 @@ def _farthest(bounds: Vector, rows: Vector, limits: Vector, x: Vector, least: fl
     Upper bounds have the numbers 0 ... J - 1, lower bounds J ... 2 J - 1, rows the numbers from 2
     J.
     """
-    joints, farthest, most = len(x), -1, least
+    joints = len(x)
+    farthest = -1
+    most = least
     for j in range(joints):
         if x[j] - bounds[1, j] > most:
-            farthest, most = j, x[j] - bounds[1, j]
+            farthest = j
+            most = x[j] - bounds[1, j]
         if bounds[0, j] - x[j] > most:
-            farthest, most = joints + j, bounds[0, j] - x[j]
+            farthest = joints + j
+            most = bounds[0, j] - x[j]
     for k in range(len(limits)):
         beyond = -limits[k]
         for j in range(joints):
             beyond += rows[k, j] * x[j]
         if beyond > most:
-            farthest, most = 2 * joints + k, beyond
+            farthest = 2 * joints + k
+            most = beyond
     return farthest
 
 
@@ -316,7 +360,9 @@ def _constraint(number: int, bounds: Vector, rows: Vector, limits: Vector, norma
 
 
 @compiled
-def _multiplier_decrease(direction: Vector, normals: Vector, images: Vector, active: int, out: Vector) -> None:
+def _multiplier_decrease(
+    direction: Vector, normals: Vector, images: Vector, active: int, out: Vector
+) -> None:
     """Write into out (active,) the change of the active multipliers per unit of the entering one.
 
     With the active normals A (active, J), their images M = A H^-1, the direction H^-1 n of the

@@ -57,7 +57,12 @@ class Arm:
     """
 
     def __init__(
-        self, settings: Settings, urdf: str, closing: Closing | None = None, *, tuning: Tuning = TUNING
+        self,
+        settings: Settings,
+        urdf: str,
+        closing: Closing | None = None,
+        *,
+        tuning: Tuning = TUNING,
     ) -> None:
         numbers = tuning.arm
         self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
@@ -65,25 +70,39 @@ class Arm:
         x, y, z, *quaternion = settings.tool.plate_from_tool
         unit = np.array(quaternion) / math.sqrt(sum(v * v for v in quaternion))
         plate_from_tool = pin.SE3(pin.Quaternion(unit), np.array([x, y, z]))
-        tool = pin.Frame("thirdhand tool", plate.parentJoint, plate.placement * plate_from_tool, pin.FrameType.OP_FRAME)
+        tool = pin.Frame(
+            "thirdhand tool",
+            plate.parentJoint,
+            plate.placement * plate_from_tool,
+            pin.FrameType.OP_FRAME,
+        )
         self._tool = self._model.addFrame(tool)
-        for placement in (*self._model.jointPlacements, *(frame.placement for frame in self._model.frames)):
+        for placement in (
+            *self._model.jointPlacements,
+            *(frame.placement for frame in self._model.frames),
+        ):
             placement.rotation = np.round(placement.rotation, ROTATION_DECIMALS)
         self._turns = np.array([joint.nq == 2 for joint in self._model.joints])[1:]
         self._data = self._model.createData()
-        top, limits, size = settings.tool.max_speed, settings.joints, settings.reach.outer / Reach().outer
+        top = settings.tool.max_speed
+        limits = settings.joints
+        size = settings.reach.outer / Reach().outer
         closing = closing or Closing(
             numbers.closing_brake_share * settings.tool.stop_acceleration,
             min(top, numbers.closing_speed_mps),
             numbers.far_damping_s2,
         )
-        joints, acceleration = len(limits.names), np.array(limits.acceleration)
+        joints = len(limits.names)
+        acceleration = np.array(limits.acceleration)
         scale = acceleration**numbers.sparing_power
         scale /= exp(sum(log(float(factor)) for factor in scale) / len(scale))
         self._jerk = np.array(limits.jerk)
         spared = np.array([limits.velocity, limits.acceleration, limits.jerk], np.float64)
         spared /= spared.mean(axis=1, keepdims=True)
-        gain = min(numbers.position_gain_per_s, numbers.position_gain_rate_share * acceleration_rate(limits))
+        gain = min(
+            numbers.position_gain_per_s,
+            numbers.position_gain_rate_share * acceleration_rate(limits),
+        )
         self.parameters = parameters(
             period_s=settings.period_s,
             closing_braking=closing.braking,
@@ -148,7 +167,9 @@ class Arm:
         """Kinematics of the arm at joints q (J,) [rad, m]."""
         kinematics = RECORDS(1, self._kinematics, bytearray(self._kinematics.itemsize))
         stand(kinematics, self._turns, q)
-        jacobian = pin.computeFrameJacobian(self._model, self._data, kinematics["configuration"][0], self._tool, AXES)
+        jacobian = pin.computeFrameJacobian(
+            self._model, self._data, kinematics["configuration"][0], self._tool, AXES
+        )
         placement = pin.updateFramePlacement(self._model, self._data, self._tool)
         describe(self.parameters, kinematics, jacobian, placement.homogeneous)
         return Kinematics(kinematics)
@@ -176,10 +197,13 @@ class Arm:
         setpoint engages, its lower speed limit holds here too.
         """
         out = np.empty((2, len(self._jerk)))
-        constraints, count = separation.constraints, separation.count
+        constraints = separation.constraints
+        count = separation.count
         states = as_array(state)
         limits = self._engaging if states["engaging"][0] else self.parameters
-        return _solution(out, follow(limits, here.record, states, self._goal, constraints, count, out))
+        return _solution(
+            out, follow(limits, here.record, states, self._goal, constraints, count, out)
+        )
 
     def step(
         self,
@@ -203,17 +227,27 @@ class Arm:
 
         Never raises, and never returns NaN for finite arguments.
         """
-        goal, out = self._goal[0], np.empty((2, len(self._jerk)))
-        goal["position"], goal["velocity"], goal["orientation"] = position, velocity, orientation
-        goal["turning"], goal["acceleration"] = 0.0 if turning is None else turning, 0.0
+        goal = self._goal[0]
+        out = np.empty((2, len(self._jerk)))
+        goal["position"] = position
+        goal["velocity"] = velocity
+        goal["orientation"] = orientation
+        goal["turning"] = 0.0 if turning is None else turning
+        goal["acceleration"] = 0.0
         goal["moving"] = 0.0 if moving is None else moving
         goal["horizon_s"] = math.inf if moving is None else self.parameters["horizon_s"][0]
         constraints, count = (
-            (self._unseparated, 0) if separation is None else (separation.constraints, separation.count)
+            (self._unseparated, 0)
+            if separation is None
+            else (separation.constraints, separation.count)
         )
-        return _solution(out, joint_step(self.parameters, self.at(q).record, self._goal, constraints, count, out))
+        return _solution(
+            out, joint_step(self.parameters, self.at(q).record, self._goal, constraints, count, out)
+        )
 
 
 def _solution(found: Vector, flags: int) -> Solution:
     found.setflags(write=False)
-    return Solution(found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED))
+    return Solution(
+        found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED)
+    )

@@ -30,13 +30,15 @@ def stand(heres: Records, turns: NDArray[np.bool_], q: Vector) -> None:
     """Write joints q (J,) [rad, m], limited to ± MAX_JOINT_RAD, and their configuration: cosine and
     sine of each joint that `turns` (J,), the position of each other one.
     """
-    kinematics, entry = heres[0], 0
+    kinematics = heres[0]
+    entry = 0
     for joint in range(len(q)):
         position = min(max(q[joint], -MAX_JOINT_RAD), MAX_JOINT_RAD)
         kinematics.joints[joint] = kinematics.configuration[entry] = position
         if turns[joint]:
             sine, cosine = sin_cos(position)
-            kinematics.configuration[entry], kinematics.configuration[entry + 1] = cosine, sine
+            kinematics.configuration[entry] = cosine
+            kinematics.configuration[entry + 1] = sine
             entry += 1
         entry += 1
 
@@ -57,9 +59,14 @@ def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> N
 
     With 5 tasks, the last row of R^T Jw is left out.
     """
-    arm, kinematics = arms[0], heres[0]
-    joints, gram, tasks = jacobian.shape[1], np.empty((3, 3)), kinematics.tasks
-    kinematics.jacobian[:], kinematics.position[:], kinematics.rotation[:] = jacobian, pose[:3, 3], pose[:3, :3]
+    arm = arms[0]
+    kinematics = heres[0]
+    joints = jacobian.shape[1]
+    gram = np.empty((3, 3))
+    tasks = kinematics.tasks
+    kinematics.jacobian[:] = jacobian
+    kinematics.position[:] = pose[:3, 3]
+    kinematics.rotation[:] = pose[:3, :3]
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
@@ -91,7 +98,9 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 
     If `forward` alone exceeds `most`, it is first scaled down to it.
     """
-    ff, fc, cc = square(forward), dot(forward, closing), square(closing)
+    ff = square(forward)
+    fc = dot(forward, closing)
+    cc = square(closing)
     if ff > most * most:
         shrink = most / math.sqrt(ff)
         for i in range(3):
@@ -107,18 +116,31 @@ def _add_closing(forward: Vector, closing: Vector, most: float) -> None:
 
 @compiled
 def follow(
-    arms: Records, heres: Records, states: Records, goals: Records, constraints: Records, count: int, out: Vector
+    arms: Records,
+    heres: Records,
+    states: Records,
+    goals: Records,
+    constraints: Records,
+    count: int,
+    out: Vector,
 ) -> int:
     """Run `joint_step` toward the state's setpoint, with the state's joint velocities."""
-    state, goal = states[0], goals[0]
-    goal.position[:], goal.velocity[:] = state.setpoint[0], state.setpoint[1]
-    goal.orientation[:], goal.turning[:] = state.orientation, state.turning
-    goal.acceleration[:], goal.moving[:], goal.horizon_s = state.setpoint[2], state.joints[1], arms[0].horizon_s
+    state = states[0]
+    goal = goals[0]
+    goal.position[:] = state.setpoint[0]
+    goal.velocity[:] = state.setpoint[1]
+    goal.orientation[:] = state.orientation
+    goal.turning[:] = state.turning
+    goal.acceleration[:] = state.setpoint[2]
+    goal.moving[:] = state.joints[1]
+    goal.horizon_s = arms[0].horizon_s
     return joint_step(arms, heres, goals, constraints, count, out)
 
 
 @compiled
-def joint_step(arms: Records, heres: Records, goals: Records, constraints: Records, count: int, out: Vector) -> int:
+def joint_step(
+    arms: Records, heres: Records, goals: Records, constraints: Records, count: int, out: Vector
+) -> int:
     """Write joint velocities and accelerations into out (2, J) [rad/s, rad/s²]; return flags.
 
     The quadratic programme, with T = tasks S and S = diag(scale):
@@ -176,7 +198,11 @@ def joint_step(arms: Records, heres: Records, goals: Records, constraints: Recor
     if is_constrained:
         flags |= SEPARATED
         missing = _missing(scaled, wish, velocity)
-        damping += arm.singular_damping * missing / (missing + arm.constrained_speed * arm.constrained_speed)
+        damping += (
+            arm.singular_damping
+            * missing
+            / (missing + arm.constrained_speed * arm.constrained_speed)
+        )
         solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
 
     # If the joints cannot reach it soon, the turn is reduced, so that the position is kept. A
@@ -249,7 +275,9 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
 
 
 @compiled
-def _bound_joints(arms: Records, heres: Records, scaled: Vector, home: Vector, bounds: Vector) -> int:
+def _bound_joints(
+    arms: Records, heres: Records, scaled: Vector, home: Vector, bounds: Vector
+) -> int:
     """Write T (N, J), h (J,) and the bounds (2, J) on x of `joint_step`; return NEAR if a joint is
     near its limit, else 0.
     """
@@ -304,7 +332,8 @@ def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
 
     |S x| <= max_velocity    and    |S x - moving| <= horizon_s acceleration
     """
-    arm, goal = arms[0], goals[0]
+    arm = arms[0]
+    goal = goals[0]
     for j in range(len(out)):
         velocity = out[j] * arm.scale[j]
         change = goal.horizon_s * arm.acceleration[j]
@@ -323,10 +352,14 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
     in horizon_s, or no further outside than at `free`. `free` is the solution in which the tool may
     turn as it likes.
     """
-    arm, goal, share = arms[0], goals[0], 1.0
+    arm = arms[0]
+    goal = goals[0]
+    share = 1.0
     for j in range(len(out)):
-        free_velocity, more = free[j] * arm.scale[j], (out[j] - free[j]) * arm.scale[j]
-        change, top = goal.horizon_s * arm.acceleration[j], arm.max_velocity[j]
+        free_velocity = free[j] * arm.scale[j]
+        more = (out[j] - free[j]) * arm.scale[j]
+        change = goal.horizon_s * arm.acceleration[j]
+        top = arm.max_velocity[j]
         low = min(max(-top, goal.moving[j] - change), free_velocity)
         high = max(min(top, goal.moving[j] + change), free_velocity)
         if free_velocity + more > high:
@@ -338,7 +371,9 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
 
 
 @compiled
-def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector) -> None:
+def _turn(
+    arms: Records, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector
+) -> None:
     """Write into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,).
 
         turn_gain e + turning, scaled down to max_turn_speed
@@ -346,7 +381,8 @@ def _turn(arms: Records, rotation: Vector, orientation: Vector, turning: Vector,
     e (3,) [rad] is the rotation vector to the orientation or, unless `about` is set, the shortest
     turn of +z to its +z. The result is 0 if it is not finite.
     """
-    quaternion, max_speed = np.empty(4), arms[0].max_turn_speed
+    quaternion = np.empty(4)
+    max_speed = arms[0].max_turn_speed
     if about:
         quaternion_of(rotation, quaternion)
         turn_between(quaternion, orientation, out)

@@ -40,12 +40,16 @@ class WayOut:
         """Start on a planned way out, if the tool is still stuck and the way begins within
         start_rad of the commanded joints.
         """
-        path = np.reshape(json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1]))
+        path = np.reshape(
+            json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1])
+        )
         far = (np.abs(path[:1] - state["joints"][0]) / self._per_rad).max(initial=0.0)
         if state["stuck"] and far < self._start_rad:
             count = state["way_count"] = len(path)
             state["way"][:count] = path
-            state["way_next"], state["stuck"], state["stuck_tick"] = 0, HELD, state["tick"]
+            state["stuck_tick"] = state["tick"]
+            state["stuck"] = HELD
+            state["way_next"] = 0
 
     def velocity(self, state: Record, tasks: Vector) -> Vector | None:
         """Joint velocities (J,) [rad/s] toward the next posture of the way out; None if there is
@@ -64,6 +68,8 @@ class WayOut:
             return None
         difference: Vector = state["way"][state["way_next"]] - state["joints"][0]
         far = float((np.abs(difference) / self._per_rad).max())
-        velocity: Vector = difference * (self._radps * min(1.0, far / self._start_rad) / max(far, self._near_rad))
+        velocity: Vector = difference * (
+            self._radps * min(1.0, far / self._start_rad) / max(far, self._near_rad)
+        )
         state["way_next"] += far < self._near_rad
         return velocity / max(1.0, norm(times(tasks[:3], velocity)) / self._mps)

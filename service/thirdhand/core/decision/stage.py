@@ -7,7 +7,16 @@ from __future__ import annotations
 import numpy as np
 
 from thirdhand.contract.records import Reason
-from thirdhand.core.codes import AMBIGUOUS, BLOCKED, FAR, FAULT, HOLD, NOT_READY, RETURNING, STALE_HAND
+from thirdhand.core.codes import (
+    AMBIGUOUS,
+    BLOCKED,
+    FAR,
+    FAULT,
+    HOLD,
+    NOT_READY,
+    RETURNING,
+    STALE_HAND,
+)
 from thirdhand.core.decision.leave import WayOut, speeds_of_ways
 from thirdhand.core.decision.step import step
 from thirdhand.core.frame import Event, Record, Records, Vector, as_array, parameters
@@ -26,7 +35,8 @@ class Decision:
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
         limits = settings.joints
-        self._lower, self._upper = np.array(limits.lower, np.float64), np.array(limits.upper, np.float64)
+        self._lower = np.array(limits.lower, np.float64)
+        self._upper = np.array(limits.upper, np.float64)
         self._parameters = parameters(
             lower=self._lower,
             upper=self._upper,
@@ -40,7 +50,8 @@ class Decision:
             # The time that a joint needs for 100 times the distance at which a way may begin.
             way_timeout_s=100.0 * tuning.intake.joint_jump_rad / speeds_of_ways(settings)[1],
             end_share=tuning.intake.end_share,
-            jumpy_s=tuning.intake.hand_still_s,  # a hand that comes to rest after a jump does so within this time
+            # a hand that comes to rest after a jump does so within this time
+            jumpy_s=tuning.intake.hand_still_s,
             too_fast_s=1.5 * tuning.intake.confirmed_s,  # one late command is shorter
             **tuning.decision._asdict(),
             freed_share=3.0 * tuning.decision.progress_share,  # more than chance
@@ -53,7 +64,14 @@ class Decision:
         self.measured = (0.0, 0.0)
 
     def step(
-        self, state: Record, frame: Record, here: Records, conditions: int, *, gate_m: float, threshold: float
+        self,
+        state: Record,
+        frame: Record,
+        here: Records,
+        conditions: int,
+        *,
+        gate_m: float,
+        threshold: float,
     ) -> int:
         """Determine mode and reason of this tick from the arm's kinematics `here` (1,) and the
         `conditions`, flags of `codes.Condition`. Returns 0, or STARTS_ASSUMED or STARTS_MEASURED if
@@ -73,7 +91,11 @@ class Decision:
         """Joint velocities (J,) [rad/s] of a holding arm that moves back into its limits or along a
         way out; None for any other. `tasks` is that of `Kinematics`.
         """
-        if state["arm_ready"] == RETURNING and state["reason"] == NOT_READY and not state["operator_hold"]:
+        if (
+            state["arm_ready"] == RETURNING
+            and state["reason"] == NOT_READY
+            and not state["operator_hold"]
+        ):
             q = state["joints"][0]
             inward: Vector = (q < self._lower).astype(np.float64) - (q > self._upper)
             return self._return_speed * inward
@@ -98,17 +120,23 @@ class Decision:
             case "reset":
                 state["leaves"] = not state["arm_ready"]
                 if state["mode"] == FAULT:
-                    state["mode"], state["arm_ready"] = HOLD, 0
+                    state["mode"] = HOLD
+                    state["arm_ready"] = 0
             case "way":
                 if state["mode"] != FAULT:
                     self._way_out.take(state, event)
             case "fault":
                 if state["mode"] != FAULT:
-                    state["mode"], state["reason"] = FAULT, Reason.SERVICE
+                    state["mode"] = FAULT
+                    state["reason"] = Reason.SERVICE
             case _:
-                raise ValueError(f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}")
+                raise ValueError(
+                    f"tick {state['tick']}: nothing is done with an event of kind {event.kind!r}"
+                )
 
-    def fail(self, state: Record, frame: Record, reason: Reason, *, speed: float | None = None) -> None:
+    def fail(
+        self, state: Record, frame: Record, reason: Reason, *, speed: float | None = None
+    ) -> None:
         """Set the mode to fault from this tick on. `speed` [m/s] is that of the tool, for a fault
         that it caused.
         """

@@ -66,26 +66,35 @@ def step(
     Returns STARTS_ASSUMED or STARTS_MEASURED if the arm starts, else 0, and the result of
     `measured_error`, or -1 twice if nothing was measured.
     """
-    state, frame, starts, error, speed = states[0], frames[0], 0, -1.0, -1.0
+    state = states[0]
+    frame = frames[0]
+    starts = 0
+    error = -1.0
+    speed = -1.0
     if state.mode != FAULT:
         starts, fault, error, speed = _arm(states, heres, parameters, conditions)
         if fault != NONE:
-            state.mode, state.reason = FAULT, fault
+            state.mode = FAULT
+            state.reason = fault
         else:
             _note_hold(states, conditions)
             reason = _why_hold(states, parameters, conditions, gate_m, threshold)
             if reason == NONE:
                 state.stuck = _stuck(states, frames, heres, parameters)
                 reason = BLOCKED if state.stuck == HELD else NONE
-            state.mode, state.reason = FOLLOW if reason == NONE else HOLD, reason
+            state.mode = FOLLOW if reason == NONE else HOLD
+            state.reason = reason
             if reason == NONE:
                 state.followed_tick = state.tick
-    frame.mode, frame.reason = state.mode, state.reason
+    frame.mode = state.mode
+    frame.reason = state.reason
     return starts, error, speed
 
 
 @compiled
-def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: float, threshold: float) -> int:
+def _why_hold(
+    states: Records, parameters: Records, conditions: int, gate_m: float, threshold: float
+) -> int:
     """The first reason for a hold in this order, or NONE:
 
     * TWO_SOURCES: a hand or the arm is contested.
@@ -107,7 +116,9 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
         return TWO_SOURCES
     if conditions & ARM_GUIDED and not parameters[0].is_assumed:
         return GUIDED
-    if state.arm_ready != READY and not (state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED):
+    if state.arm_ready != READY and not (
+        state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED
+    ):
         return NOT_READY
     if state.operator_hold:
         return OPERATOR
@@ -122,14 +133,19 @@ def _why_hold(states: Records, parameters: Records, conditions: int, gate_m: flo
         return FAR
     if state.reason == FAR:
         jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
-        is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
+        is_jumpy = (
+            jump_tick > 0
+            and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
+        )
         if is_jumpy or gate_m > parameters[0].end_share * threshold:
             return FAR
     return AMBIGUOUS if conditions & SEGMENT_AMBIGUOUS else NONE
 
 
 @compiled
-def _arm(states: Records, heres: Records, parameters: Records, conditions: int) -> tuple[int, int, float, float]:
+def _arm(
+    states: Records, heres: Records, parameters: Records, conditions: int
+) -> tuple[int, int, float, float]:
     """Update the state of the arm: it starts, is no longer ready, or causes a fault. Returns
     STARTS_ASSUMED, STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or
     -1 twice.
@@ -146,7 +162,10 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than too_fast_s is a fault (TOOL_SPEED).
     """
-    state, config, heard, inside = states[0], parameters[0], conditions & ARM_HEARD, conditions & ARM_INSIDE
+    state = states[0]
+    config = parameters[0]
+    heard = conditions & ARM_HEARD
+    inside = conditions & ARM_INSIDE
     if config.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
@@ -155,7 +174,10 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
     for joint in range(state.joints.shape[1]):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
     if conditions & ARM_GUIDED:
-        state.operator_hold, state.arm_ready, state.leaves, state.guided_tick = 1, 0, 0, state.tick
+        state.operator_hold = 1
+        state.arm_ready = 0
+        state.leaves = 0
+        state.guided_tick = state.tick
         state.stuck = state.way_count = 0
         return 0 if moving else STARTS_MEASURED, NONE, -1.0, -1.0
     if not state.arm_ready:
@@ -177,13 +199,16 @@ def _arm(states: Records, heres: Records, parameters: Records, conditions: int) 
         if moving:
             state.stuck_tick = state.tick
         if not inside or (state.tick - state.stuck_tick) * config.period_s > config.stuck_s:
-            state.arm_ready, state.leaves = READY, 0
+            state.arm_ready = READY
+            state.leaves = 0
     error, speed = measured_error(states, heres, parameters)
     if error > config.max_error_rad:
         return 0, ARM_ERROR, error, speed
     if speed <= config.fault_speed:
         state.slow_tick = state.tick
-    fault = TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > config.too_fast_s else NONE
+    fault = (
+        TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > config.too_fast_s else NONE
+    )
     return 0, fault, error, speed
 
 
@@ -195,8 +220,11 @@ def _note_hold(states: Records, conditions: int) -> None:
     """
     state = states[0]
     if state.operator_hold and not state.held:
-        state.held = HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
-        state.held_tick, state.held_segment = state.tick, -1
+        state.held = (
+            HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
+        )
+        state.held_tick = state.tick
+        state.held_segment = -1
         for side in range(2):
             for axis in range(3):
                 state.held_hands[side, axis] = state.hands[side, 0, axis]
@@ -225,8 +253,12 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     `way_timeout_s` has passed. If no way out was found, it lasts until the target has moved by
     another_target_m.
     """
-    state, frame, tool, config = states[0], frames[0], heres[0].position, parameters[0]
-    gap, moved = distance(frame.target, tool), distance(frame.target, state.stuck_target)
+    state = states[0]
+    frame = frames[0]
+    tool = heres[0].position
+    config = parameters[0]
+    gap = distance(frame.target, tool)
+    moved = distance(frame.target, state.stuck_target)
     passed_s = (state.tick - state.stuck_tick) * config.period_s
     if state.way_next < state.way_count and passed_s < config.way_timeout_s:
         return HELD
@@ -237,9 +269,18 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
         least = config.freed_share * state.stuck_gap
     else:
         max_speed = config.engaging_speed if state.engaging else config.max_speed
-        least = min(config.progress_share * state.stuck_gap, config.freed_share * max_speed * config.stuck_s)
-    if state.mode != FOLLOW or gap < config.stuck_gap_m or state.stuck_gap - gap > least or moved > config.stuck_gap_m:
-        state.stuck_tick, state.stuck_gap, state.stuck_target[:] = state.tick, gap, frame.target
+        least = min(
+            config.progress_share * state.stuck_gap, config.freed_share * max_speed * config.stuck_s
+        )
+    if (
+        state.mode != FOLLOW
+        or gap < config.stuck_gap_m
+        or state.stuck_gap - gap > least
+        or moved > config.stuck_gap_m
+    ):
+        state.stuck_tick = state.tick
+        state.stuck_gap = gap
+        state.stuck_target[:] = frame.target
         return 0
     return NOTICED if passed_s >= config.stuck_s else 0
 
@@ -249,7 +290,9 @@ def _is_outside(joints: Vector, parameters: Records) -> bool:
     """True if a joint (J,) [rad] is outside its limits."""
     outside = False
     for j in range(len(joints)):
-        outside = outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
+        outside = (
+            outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
+        )
     return outside
 
 
@@ -262,10 +305,14 @@ def measured_error(states: Records, heres: Records, parameters: Records) -> tupl
     q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
     Jacobian there.
     """
-    state, kinematics = states[0], heres[0]
+    state = states[0]
+    kinematics = heres[0]
     error = speed = 0.0
     for joint in range(len(kinematics.joints)):
-        error = max(error, abs(kinematics.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint])
+        error = max(
+            error,
+            abs(kinematics.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint],
+        )
     for axis in range(3):
         along = 0.0
         for joint in range(len(kinematics.joints)):

@@ -32,7 +32,9 @@ def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
 
 
 @compiled
-def compared(states: Records, parameters: Records, position: Vector, velocity: Vector) -> tuple[bool, float, float]:
+def compared(
+    states: Records, parameters: Records, position: Vector, velocity: Vector
+) -> tuple[bool, float, float]:
     """Check of joint positions and velocities (J,) [rad, rad/s] against plausible ranges and known
     ones.
 
@@ -40,9 +42,15 @@ def compared(states: Records, parameters: Records, position: Vector, velocity: V
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
-    state, config, near, deviation, moved = states[0], parameters[0], True, 0.0, 0.0
+    state = states[0]
+    config = parameters[0]
+    near = True
+    deviation = 0.0
+    moved = 0.0
     for i in range(len(position)):
-        near = near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
+        near = (
+            near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
+        )
         near = near and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
         deviation = max(deviation, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])

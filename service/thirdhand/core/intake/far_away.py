@@ -9,7 +9,10 @@ from thirdhand.contract.evidence import figures
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.tuning import TUNING
 
-PLAUSIBLE_DISTANCES_M = (0.05, 2.5)  # distances of hands and tool from the tracker's origin, in the unit that was meant
+PLAUSIBLE_DISTANCES_M = (
+    0.05,
+    2.5,
+)  # distances of hands and tool from the tracker's origin, in the unit that was meant
 
 
 def unit_meant(position: Sequence[float], unit: str) -> str:
@@ -36,4 +39,6 @@ def too_far(position: Sequence[float], unit: str, rule: str = "") -> str:
     like = f", which looks like {meant}" if meant else ""
     rule = rule or f"[hands] unit is {unit!r}"
     most_m = TUNING.intake.max_hand_distance_m
-    return f"at {figures(position)}{like}; {rule}, at most {most_m:g} m from the base plate accepted"
+    return (
+        f"at {figures(position)}{like}; {rule}, at most {most_m:g} m from the base plate accepted"
+    )

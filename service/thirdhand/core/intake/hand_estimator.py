@@ -43,7 +43,9 @@ def smoothing(period_s: float, numbers: IntakeTuning = TUNING.intake) -> Vector:
 
 
 @compiled
-def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpass: Vector, stillness: float) -> float:
+def stillness_after(
+    velocity: Vector, changes: Vector, still_speed: float, lowpass: Vector, stillness: float
+) -> float:
     """Stillness s of a hand one period later, at the velocity v (3,) [m/s].
 
     With the gains g of `smoothing` (`changes`), and the velocity without tremor u (`lowpass`, (3,),
@@ -54,7 +56,10 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
     """
     square = 0.0
     for axis in range(3):
-        lowpass[axis] = np.rint((lowpass[axis] + changes[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO) / ROUND_TO
+        lowpass[axis] = (
+            np.rint((lowpass[axis] + changes[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO)
+            / ROUND_TO
+        )
         square += lowpass[axis] * lowpass[axis]
     share = square / still_speed**2
     now = exp(-share * share)
@@ -64,12 +69,16 @@ def stillness_after(velocity: Vector, changes: Vector, still_speed: float, lowpa
 
 def stillness_of(velocities: Vector, period_s: float) -> Vector:
     """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
-    out, stillness = np.empty((len(velocities), 2)), STILL.copy()
-    changes, still_mps = smoothing(period_s), TUNING.intake.hand_still_mps
+    out = np.empty((len(velocities), 2))
+    stillness = STILL.copy()
+    changes = smoothing(period_s)
+    still_mps = TUNING.intake.hand_still_mps
     lowpass = np.zeros((2, 3))
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
-            stillness[side] = stillness_after(velocity[side], changes, still_mps, lowpass[side], stillness[side])
+            stillness[side] = stillness_after(
+                velocity[side], changes, still_mps, lowpass[side], stillness[side]
+            )
         row[:] = stillness
     return out
 
@@ -92,7 +101,11 @@ class HandEstimator:
         interval_s = ticks * self._period_s
         changed = smoothing(interval_s, self._numbers)
         used_s = min(ticks, len(self._models)) * self._period_s
-        return parameters(**model(used_s, self._numbers), smoothing=changed, still_speed=self._numbers.hand_still_mps)
+        return parameters(
+            **model(used_s, self._numbers),
+            smoothing=changed,
+            still_speed=self._numbers.hand_still_mps,
+        )
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
@@ -110,7 +123,9 @@ class HandEstimator:
 
 
 @compiled
-def _update_noise(states: Records, parameters: Records, side: int, position: Vector, interval_s: float) -> None:
+def _update_noise(
+    states: Records, parameters: Records, side: int, position: Vector, interval_s: float
+) -> None:
     """Update the noise variance r [m²] of one hand by a sample x_0 (3,) [m] that follows x_1, x_2,
     x_3:
 
@@ -121,8 +136,11 @@ def _update_noise(states: Records, parameters: Records, side: int, position: Vec
     used: when an interval differs by more than half from the one before, this sample and the next
     do not change r.
     """
-    state, config, history = states[0], parameters[0], states[0].past_samples[side]
-    count, variance = state.even_samples[side], state.noise_variance[side]
+    state = states[0]
+    config = parameters[0]
+    history = states[0].past_samples[side]
+    count = state.even_samples[side]
+    variance = state.noise_variance[side]
     before_s = state.sample_interval_s[side]
     if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
         count = 1
@@ -130,7 +148,9 @@ def _update_noise(states: Records, parameters: Records, side: int, position: Vec
     if count >= 3:
         square = 0.0
         for axis in range(3):
-            third = position[axis] - 3.0 * history[0, axis] + 3.0 * history[1, axis] - history[2, axis]
+            third = (
+                position[axis] - 3.0 * history[0, axis] + 3.0 * history[1, axis] - history[2, axis]
+            )
             square += third * third
         sample_variance = min(square / 60.0, config.outlier_variances * variance)
         samples = min(state.noise_samples[side] + 1, config.noise_samples)
@@ -145,12 +165,15 @@ def _update_noise(states: Records, parameters: Records, side: int, position: Vec
 
 
 @compiled
-def _advance_both(states: Records, ticks: int, stale_ticks: int, one: Records, models: Records) -> None:
+def _advance_both(
+    states: Records, ticks: int, stale_ticks: int, one: Records, models: Records
+) -> None:
     """Advance the state by some ticks: modes, estimate and stillness of both hands. `one` (1,) is
     the record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
     stands still: its velocity, acceleration and tremor are set to zero.
     """
-    state, over = states[0], one[0]
+    state = states[0]
+    over = one[0]
     state.tick += ticks
     for side in range(2):
         hand = state.hands[side]
@@ -160,8 +183,11 @@ def _advance_both(states: Records, ticks: int, stale_ticks: int, one: Records, m
         else:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
-        lowpass, stillness = state.hand_velocity_lowpass[side], state.hand_stillness[side]
-        state.hand_stillness[side] = stillness_after(hand[1], over.smoothing, over.still_speed, lowpass, stillness)
+        lowpass = state.hand_velocity_lowpass[side]
+        stillness = state.hand_stillness[side]
+        state.hand_stillness[side] = stillness_after(
+            hand[1], over.smoothing, over.still_speed, lowpass, stillness
+        )
 
 
 @compiled
@@ -172,9 +198,11 @@ def look_ahead(states: Records, models: Records, side: int) -> None:
     μ_j and m_j (3, 3) are probability and mean of mode j after the newest sample, O_j (3, 3) is
     `onward` of `motion_model.models` for the time since then.
     """
-    state, estimate = states[0], states[0].hands[side]
+    state = states[0]
+    estimate = states[0].hands[side]
     newest = slot(states, side, 0)
-    means, modes = state.kept_means[side, newest], state.kept_probabilities[side, newest]
+    means = state.kept_means[side, newest]
+    modes = state.kept_probabilities[side, newest]
     onward = models[min(state.tick - state.kept_ticks[side, newest], len(models) - 1)].onward
     for row in range(3):
         for axis in range(3):
@@ -199,24 +227,38 @@ def goes_on(states: Records, parameters: Records, side: int, position: Vector) -
 
     p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     square_m2 = squared_distance(position, state.hands[side, 0])
     variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(is_fresh(states, side, config.unseen_ticks) and square_m2 < config.outlier_variances * variance)
+    return bool(
+        is_fresh(states, side, config.unseen_ticks)
+        and square_m2 < config.outlier_variances * variance
+    )
 
 
 @compiled
-def turn_to(states: Records, side: int, turn: tuple[float, float, float, float], frame: Vector) -> None:
+def turn_to(
+    states: Records, side: int, turn: tuple[float, float, float, float], frame: Vector
+) -> None:
     """Store the orientation of one hand as a rotation matrix in frame base, row by row.
 
     `turn` is the quaternion x y z w in the tracker's axes. `frame` (3, 4) maps the tracker's
     coordinates to base: rotation times unit [m], and origin.
     """
-    (x, y, z, w), out = turn, states[0].hand_turns[side]
-    s, matrix = 2.0 / (x * x + y * y + z * z + w * w), np.empty((3, 3))
-    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
-    matrix[1, 0], matrix[1, 1], matrix[1, 2] = s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)
-    matrix[2, 0], matrix[2, 1], matrix[2, 2] = s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)
+    x, y, z, w = turn
+    out = states[0].hand_turns[side]
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    matrix = np.empty((3, 3))
+    matrix[0, 0] = 1.0 - s * (y * y + z * z)
+    matrix[0, 1] = s * (x * y - z * w)
+    matrix[0, 2] = s * (x * z + y * w)
+    matrix[1, 0] = s * (x * y + z * w)
+    matrix[1, 1] = 1.0 - s * (x * x + z * z)
+    matrix[1, 2] = s * (y * z - x * w)
+    matrix[2, 0] = s * (x * z - y * w)
+    matrix[2, 1] = s * (y * z + x * w)
+    matrix[2, 2] = 1.0 - s * (x * x + y * y)
     unit = math.sqrt(frame[0, 0] ** 2 + frame[1, 0] ** 2 + frame[2, 0] ** 2)
     out[:] = 0.0
     for i in range(3):
@@ -229,7 +271,9 @@ def turn_to(states: Records, side: int, turn: tuple[float, float, float, float],
 def seconds_after(stamp_ns: int, other_ns: int) -> float:
     """Difference `stamp_ns` - `other_ns` in seconds, without overflow for any two stamps."""
     apart_ns = float(stamp_ns) - float(other_ns)
-    return 1e-9 * (float(stamp_ns - other_ns) if abs(apart_ns) < MAX_STAMP_DIFFERENCE_NS else apart_ns)
+    return 1e-9 * (
+        float(stamp_ns - other_ns) if abs(apart_ns) < MAX_STAMP_DIFFERENCE_NS else apart_ns
+    )
 
 
 @compiled
@@ -245,13 +289,17 @@ def _later_s(states: Records, side: int, quickest: int, stamp_ns: int, period_s:
 
 
 @compiled
-def ticks_late(states: Records, side: int, stamp_ns: int, period_s: float, max_late_s: float) -> int:
+def ticks_late(
+    states: Records, side: int, stamp_ns: int, period_s: float, max_late_s: float
+) -> int:
     """Whole ticks by which a sample's delay exceeds the smaller minimum delay of the last two
     windows, at most `max_late_s`; 0 while the tracker's clock is not trusted.
     """
     if states[0].clock[side] != TRUSTED:
         return 0
-    late_s = max(_later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s))
+    late_s = max(
+        _later_s(states, side, 0, stamp_ns, period_s), _later_s(states, side, 1, stamp_ns, period_s)
+    )
     return int(min(max(late_s, 0.0), max_late_s) / period_s + TICK_ROUNDING)
 
 
@@ -268,24 +316,37 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
     The longest delay d above the minimum in these two windows determines from which age on the hand
     is stale, between the settings `stale_ms` and `stale_max_ms`: d / end_share.
     """
-    state, config, period_s = states[0], parameters[0], parameters[0].period_s
+    state = states[0]
+    config = parameters[0]
+    period_s = parameters[0].period_s
     longest_late_s = config.longest_late_s
-    stamps, ticks = state.quickest_stamps_ns[side], state.quickest_ticks[side]
+    stamps = state.quickest_stamps_ns[side]
+    ticks = state.quickest_ticks[side]
     has_clock = state.clock_tick[side] >= 0
-    if not has_clock or (not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s):
-        stamps[:], ticks[:] = stamp_ns, state.tick
-        state.clock[side], state.clock_tick[side] = LEARNING, state.tick
+    if not has_clock or (
+        not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s
+    ):
+        stamps[:] = stamp_ns
+        ticks[:] = state.tick
+        state.clock_tick[side] = state.tick
+        state.clock[side] = LEARNING
         state.longest_delay_ticks[side] = 0
     elif (state.tick - state.clock_tick[side]) * period_s >= config.tracker_memory_s:
-        apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(states, side, 0, stamps[0], period_s)
+        apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(
+            states, side, 0, stamps[0], period_s
+        )
         steady = abs(apart_s) <= config.delay_tolerance_s and state.clock[side] != LEARNING
         state.clock[side] = TRUSTED if steady else DOUBTED
-        stamps[1], ticks[1] = stamps[0], ticks[0]
-        stamps[0], ticks[0] = stamp_ns, state.tick
+        stamps[1] = stamps[0]
+        ticks[1] = ticks[0]
+        stamps[0] = stamp_ns
+        ticks[0] = state.tick
         state.clock_tick[side] = state.tick
-        state.longest_delay_ticks[side, 1], state.longest_delay_ticks[side, 0] = state.longest_delay_ticks[side, 0], 0
+        state.longest_delay_ticks[side, 1] = state.longest_delay_ticks[side, 0]
+        state.longest_delay_ticks[side, 0] = 0
     elif _later_s(states, side, 0, stamp_ns, period_s) < 0.0:
-        stamps[0], ticks[0] = stamp_ns, state.tick
+        stamps[0] = stamp_ns
+        ticks[0] = state.tick
     late = ticks_late(states, side, stamp_ns, period_s, longest_late_s)
     state.longest_delay_ticks[side, 0] = max(state.longest_delay_ticks[side, 0], late)
     stale = math.ceil(state.longest_delay_ticks[side].max() / config.end_share)
@@ -328,12 +389,16 @@ def take(
     """
     state = states[0]
     note_clock(states, parameters, side, stamp_ns, fresh)
-    ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
+    ticks = (
+        state.tick - state.kept_ticks[side, slot(states, side, 0)] if state.kept[side] > 0 else -1
+    )
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
     newest = state.kept_newest[side]
-    state.kept_stamps_ns[side, newest], state.kept_ticks[side, newest] = stamp_ns, state.tick
-    state.kept_late[side, newest], state.kept_restarts[side, newest] = 0, restarts
+    state.kept_ticks[side, newest] = state.tick
+    state.kept_stamps_ns[side, newest] = stamp_ns
+    state.kept_late[side, newest] = 0
+    state.kept_restarts[side, newest] = restarts
     state.kept_positions[side, newest] = position
     interval_s = parameters[0].tracker_memory_s if ticks < 0 else ticks * parameters[0].period_s
     filter_in(states, parameters, side, newest, interval_s, restarts or ticks < 0)
@@ -352,27 +417,42 @@ def settle(states: Records, parameters: Records, models: Records, side: int) -> 
 def advance_hand(states: Records, side: int, overs: Records) -> None:
     """Advance all modes of one hand over the interval of the record `overs` (1,)."""
     state = states[0]
-    rate, tremor = state.tremor_rate[side], state.tremors[side]
+    rate = state.tremor_rate[side]
+    tremor = state.tremors[side]
     advance(state.mode_means[side], state.mode_covariances[side], overs, rate, tremor)
 
 
 @compiled
-def filter_in(states: Records, parameters: Records, side: int, at: int, interval_s: float, anew: bool) -> None:
+def filter_in(
+    states: Records, parameters: Records, side: int, at: int, interval_s: float, anew: bool
+) -> None:
     """Filter the retained sample at ring index `at`, and store the filter's state beside it.
 
     The filter must have been advanced to the sample's tick. `anew` starts it from this sample
     alone.
     """
-    state, position = states[0], states[0].kept_positions[side, at]
-    means, covariances = state.mode_means[side], state.mode_covariances[side]
+    state = states[0]
+    position = states[0].kept_positions[side, at]
+    means = state.mode_means[side]
+    covariances = state.mode_covariances[side]
     if anew:
         state.even_samples[side] = 0
     _update_noise(states, parameters, side, position, interval_s)
-    variance, modes = state.noise_variance[side], state.mode_probabilities[side]
+    variance = state.noise_variance[side]
+    modes = state.mode_probabilities[side]
     if anew:
         start(parameters, means, covariances, modes, variance, position, state.tremors[side])
     else:
-        update(parameters, means, covariances, modes, variance, position, interval_s, state.tremors[side])
+        update(
+            parameters,
+            means,
+            covariances,
+            modes,
+            variance,
+            position,
+            interval_s,
+            state.tremors[side],
+        )
     _remember(states, side, at)
 
 
@@ -385,5 +465,7 @@ def _remember(states: Records, side: int, at: int) -> None:
     state.kept_probabilities[side, at] = state.mode_probabilities[side]
     state.kept_past[side, at] = state.past_samples[side]
     noise = state.kept_noise[side, at]
-    noise[0], noise[1] = state.noise_variance[side], state.noise_samples[side]
-    noise[2], noise[3] = state.even_samples[side], state.sample_interval_s[side]
+    noise[0] = state.noise_variance[side]
+    noise[1] = state.noise_samples[side]
+    noise[2] = state.even_samples[side]
+    noise[3] = state.sample_interval_s[side]

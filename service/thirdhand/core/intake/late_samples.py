@@ -35,7 +35,9 @@ from thirdhand.core.vectors import squared_distance
 
 
 @compiled
-def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, period_s: float) -> int:
+def tick_made(
+    states: Records, side: int, stamp_ns: int, order: int, late: int, period_s: float
+) -> int:
     """Tick in which a sample of this `order` was made, between the ticks of its neighbours by
     stamp.
 
@@ -48,7 +50,9 @@ def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, 
         behind = slot(states, side, order - 1)
         if state.clock[side] != TRUSTED:
             passed_s = seconds_after(state.kept_stamps_ns[side, slot(states, side, 0)], stamp_ns)
-            tick = state.kept_ticks[side, slot(states, side, 0)] - int(passed_s / period_s + TICK_ROUNDING)
+            tick = state.kept_ticks[side, slot(states, side, 0)] - int(
+                passed_s / period_s + TICK_ROUNDING
+            )
         tick = min(tick, state.kept_ticks[side, behind])
     if order < state.kept[side]:
         tick = max(tick, state.kept_ticks[side, slot(states, side, order)])
@@ -56,7 +60,9 @@ def tick_made(states: Records, side: int, stamp_ns: int, order: int, late: int, 
 
 
 @compiled
-def expected(states: Records, models: Records, side: int, order: int, tick: int, out: Vector) -> None:
+def expected(
+    states: Records, models: Records, side: int, order: int, tick: int, out: Vector
+) -> None:
     """Predicted position of a hand at a tick, p = Σ_j μ_j F_j[0, :3] m_j, written to `out` (3,)
     [m].
 
@@ -71,7 +77,8 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
         out[:] = state.kept_positions[side, slot(states, side, order - 1)]
     else:
         index = slot(states, side, order)
-        means, modes = state.kept_means[side, index], state.kept_probabilities[side, index]
+        means = state.kept_means[side, index]
+        modes = state.kept_probabilities[side, index]
         over = models[min(tick - state.kept_ticks[side, index], len(models) - 1)].transition
         for axis in range(3):
             total = 0.0
@@ -83,7 +90,13 @@ def expected(states: Records, models: Records, side: int, order: int, tick: int,
 
 @compiled
 def _fits(
-    states: Records, parameters: Records, models: Records, side: int, order: int, tick: int, position: Vector
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    order: int,
+    tick: int,
+    position: Vector,
 ) -> bool:
     """True if a sample x (3,) [m] made at a tick fits a hand's filter as it was after the retained
     sample of this `order`:
@@ -92,19 +105,28 @@ def _fits(
 
     p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
     """
-    state, index, expected_m, variance = states[0], slot(states, side, order), np.empty(3), 0.0
+    state = states[0]
+    index = slot(states, side, order)
+    expected_m = np.empty(3)
+    variance = 0.0
     before = state.kept_covariances[side, index, CHANGE]
     over = models[min(tick - state.kept_ticks[side, index], len(models) - 1)]
     expected(states, models, side, order, tick, expected_m)
     for row in range(3):
         for column in range(3):
-            variance += over.transition[CHANGE, 0, row] * before[row, column] * over.transition[CHANGE, 0, column]
+            variance += (
+                over.transition[CHANGE, 0, row]
+                * before[row, column]
+                * over.transition[CHANGE, 0, column]
+            )
     variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, index, 0]
     return bool(squared_distance(position, expected_m) < parameters[0].outlier_variances * variance)
 
 
 @compiled
-def wrong_samples(states: Records, parameters: Records, models: Records, side: int, tick: int, position: Vector) -> int:
+def wrong_samples(
+    states: Records, parameters: Records, models: Records, side: int, tick: int, position: Vector
+) -> int:
     """Number of the newest retained samples that a sample (3,) [m], which jumped and was made at
     `tick`, shows to be wrong; 0 if none are.
 
@@ -119,7 +141,8 @@ def wrong_samples(states: Records, parameters: Records, models: Records, side: i
         wrong = _fits(states, parameters, models, side, order, tick, position)
         for newer in range(order):
             index = slot(states, side, newer)
-            made_tick, sample = state.kept_ticks[side, index], state.kept_positions[side, index]
+            made_tick = state.kept_ticks[side, index]
+            sample = state.kept_positions[side, index]
             wrong = wrong and not _fits(states, parameters, models, side, order, made_tick, sample)
         if wrong:
             return order
@@ -135,11 +158,20 @@ def drop(states: Records, side: int, count: int) -> None:
     state = states[0]
     state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
     index = slot(states, side, 0)
-    state.kept_past[side, index], state.kept_noise[side, index, 2] = state.past_samples[side], 0.0
+    state.kept_past[side, index] = state.past_samples[side]
+    state.kept_noise[side, index, 2] = 0.0
 
 
 @compiled
-def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, position: Vector, restarts: bool) -> None:
+def insert(
+    states: Records,
+    side: int,
+    order: int,
+    stamp_ns: int,
+    tick: int,
+    position: Vector,
+    restarts: bool,
+) -> None:
     """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
     filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
     them again.
@@ -148,15 +180,18 @@ def insert(states: Records, side: int, order: int, stamp_ns: int, tick: int, pos
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
     for newer in range(order):
-        to, of = slot(states, side, newer), slot(states, side, newer + 1)
+        to = slot(states, side, newer)
+        of = slot(states, side, newer + 1)
         state.kept_stamps_ns[side, to] = state.kept_stamps_ns[side, of]
         state.kept_ticks[side, to] = state.kept_ticks[side, of]
         state.kept_late[side, to] = state.kept_late[side, of]
         state.kept_restarts[side, to] = state.kept_restarts[side, of]
         state.kept_positions[side, to] = state.kept_positions[side, of]
     index = slot(states, side, order)
-    state.kept_stamps_ns[side, index], state.kept_ticks[side, index] = stamp_ns, tick
-    state.kept_late[side, index], state.kept_restarts[side, index] = state.tick - tick, restarts
+    state.kept_stamps_ns[side, index] = stamp_ns
+    state.kept_ticks[side, index] = tick
+    state.kept_late[side, index] = state.tick - tick
+    state.kept_restarts[side, index] = restarts
     state.kept_positions[side, index] = position
 
 
@@ -177,8 +212,10 @@ def take_late(
     ones are then filtered in the order of their stamps, and the filter is advanced to the current
     tick. If the sample `restarts` the filter (a confirmed jump), it starts from this sample alone.
     """
-    state, config = states[0], parameters[0]
-    order, count = order_of(states, side, stamp_ns), state.kept[side]
+    state = states[0]
+    config = parameters[0]
+    order = order_of(states, side, stamp_ns)
+    count = state.kept[side]
     if count > 0:
         _recall(states, side, slot(states, side, min(order, count - 1)))
     first = order == count
@@ -186,11 +223,23 @@ def take_late(
     for newer in range(order, -1, -1):
         index = slot(states, side, newer)
         first = first and newer == order
-        ticks = 0 if first else state.kept_ticks[side, index] - state.kept_ticks[side, slot(states, side, newer + 1)]
+        ticks = (
+            0
+            if first
+            else state.kept_ticks[side, index]
+            - state.kept_ticks[side, slot(states, side, newer + 1)]
+        )
         anew = first or state.kept_restarts[side, index] > 0
         if not anew:
             _advance_by(states, models, side, ticks)
-        filter_in(states, parameters, side, index, config.tracker_memory_s if first else ticks * config.period_s, anew)
+        filter_in(
+            states,
+            parameters,
+            side,
+            index,
+            config.tracker_memory_s if first else ticks * config.period_s,
+            anew,
+        )
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
     settle(states, parameters, models, side)
@@ -208,13 +257,16 @@ def _advance_by(states: Records, models: Records, side: int, ticks: int) -> None
 @compiled
 def _recall(states: Records, side: int, at: int) -> None:
     """Restore one hand's filter to the state stored at ring index `at`."""
-    state, noise = states[0], states[0].kept_noise[side, at]
+    state = states[0]
+    noise = states[0].kept_noise[side, at]
     state.mode_means[side] = state.kept_means[side, at]
     state.mode_covariances[side] = state.kept_covariances[side, at]
     state.mode_probabilities[side] = state.kept_probabilities[side, at]
     state.past_samples[side] = state.kept_past[side, at]
-    state.noise_variance[side], state.noise_samples[side] = noise[0], int(noise[1])
-    state.even_samples[side], state.sample_interval_s[side] = int(noise[2]), noise[3]
+    state.noise_variance[side] = noise[0]
+    state.noise_samples[side] = int(noise[1])
+    state.even_samples[side] = int(noise[2])
+    state.sample_interval_s[side] = noise[3]
 
 
 def lateness_ms(state: Record, side: int, period_s: float) -> tuple[float, float] | None:

@@ -50,7 +50,9 @@ def start(
     mode_prior.
     """
     config = parameters[0]
-    of_acceleration = config.mode_intensities_m2ps5[CHANGE] / (2.0 * config.mode_acceleration_reversions_per_s[CHANGE])
+    of_acceleration = config.mode_intensities_m2ps5[CHANGE] / (
+        2.0 * config.mode_acceleration_reversions_per_s[CHANGE]
+    )
     means[:] = 0.0
     covariances[:] = 0.0
     for mode in range(MODES):
@@ -77,16 +79,22 @@ def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremo
 
 
 @compiled
-def move_on(mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float) -> None:
+def move_on(
+    mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float
+) -> None:
     """Prediction of one filter: m = F m, P = F P Fᵀ + Q, in place.
 
     F and Q (STATES, STATES) have a motion block (3, 3), number `motion` of `motion_model.model`,
     and a tremor block (2, 2), that of the `rate`. That of Q is multiplied by the variance `tremor`
     [m²].
     """
-    moved, product, over = np.empty((STATES, 3)), np.empty((STATES, STATES)), np.empty((STATES, 3))
-    moves, trembles = overs[0].transition[motion], overs[0].tremor[rate]
-    driving, trembling = overs[0].noise[motion], overs[0].tremor_noise[rate]
+    moved = np.empty((STATES, 3))
+    product = np.empty((STATES, STATES))
+    over = np.empty((STATES, 3))
+    moves = overs[0].transition[motion]
+    trembles = overs[0].tremor[rate]
+    driving = overs[0].noise[motion]
+    trembling = overs[0].tremor_noise[rate]
     for row in range(STATES):
         for k in range(3 if row < 3 else 2):
             over[row, k] = moves[row, k] if row < 3 else trembles[row - 3, k]
@@ -125,7 +133,8 @@ def measure(mean: Vector, p: Vector, noise: float, position: Vector) -> tuple[fl
 
     Returns S and |z - H m|² / S before the update.
     """
-    cross, error = np.empty(STATES), 0.0
+    cross = np.empty(STATES)
+    error = 0.0
     for row in range(STATES):
         cross[row] = p[row, 0] + p[row, 3]  # P Hᵀ: a sample measures position plus tremor
     variance = cross[0] + cross[3] + noise
@@ -149,7 +158,8 @@ def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> Non
     mean[3:] = 0.0
     covariance[3:, :] = 0.0
     covariance[:, 3:] = 0.0
-    covariance[3, 3], covariance[4, 4] = tremor[1 + mode], tremor[1 + mode] * tremor[0] ** 2
+    covariance[3, 3] = tremor[1 + mode]
+    covariance[4, 4] = tremor[1 + mode] * tremor[0] ** 2
 
 
 @compiled
@@ -198,7 +208,12 @@ def bounded(parameters: Records, innovation: float) -> float:
 
 @compiled
 def _switched(
-    parameters: Records, means: Vector, covariances: Vector, modes: Vector, interval_s: float, shares: Vector
+    parameters: Records,
+    means: Vector,
+    covariances: Vector,
+    modes: Vector,
+    interval_s: float,
+    shares: Vector,
 ) -> None:
     """Joint probabilities s (MODES, MODES), written to `shares`, of mode i before an interval Δ and
     mode j after it:
@@ -214,7 +229,9 @@ def _switched(
     for i in range(MODES):
         stay = exp(-config.mode_switch_rates_per_s[i] * interval_s)
         for j in range(MODES):
-            shares[i, j] = modes[i] * ((1.0 - stay) * config.mode_prior[j] + (stay if i == j else 0.0))
+            shares[i, j] = modes[i] * (
+                (1.0 - stay) * config.mode_prior[j] + (stay if i == j else 0.0)
+            )
         if i != REST:
             speed = square(means[i, 1])
             variance = covariances[i, 1, 1] + config.rest_speed_std_mps * config.rest_speed_std_mps
@@ -225,7 +242,12 @@ def _switched(
 
 @compiled
 def _mix(
-    parameters: Records, means: Vector, covariances: Vector, shares: Vector, expected: Vector, tremor: Vector
+    parameters: Records,
+    means: Vector,
+    covariances: Vector,
+    shares: Vector,
+    expected: Vector,
+    tremor: Vector,
 ) -> None:
     """Mixed initial condition of each mode j from the `shares` s (MODES, MODES) of `_switched`, in
     place; the predicted probabilities c (MODES,) are written to `expected`.
@@ -237,11 +259,13 @@ def _mix(
     evident tremor (σ = 0 in CHANGE), also after `_leave_rest` (i = REST), and with the tremor of
     mode j reset. Of each P_j, only the upper triangle is computed.
     """
-    of_means, of_covariances = np.empty((MODES, MODES, STATES, 3)), np.empty((MODES, MODES, STATES, STATES))
+    of_means = np.empty((MODES, MODES, STATES, 3))
+    of_covariances = np.empty((MODES, MODES, STATES, STATES))
     is_evident = tremor[1 + CHANGE] > 0.0
     for j in range(MODES):
         for i in range(MODES):
-            of_means[j, i], of_covariances[j, i] = means[i], covariances[i]
+            of_means[j, i] = means[i]
+            of_covariances[j, i] = covariances[i]
             if i != j and j == REST:
                 _come_to_rest(parameters, of_means[j, i], of_covariances[j, i])
             if i != j and not is_evident:
@@ -249,17 +273,21 @@ def _mix(
                     _leave_rest(of_means[j, i], of_covariances[j, i])
                 _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
     for j in range(MODES):
-        expected[j], mixed, spread = 0.0, means[j], covariances[j]
+        expected[j] = 0.0
+        mixed = means[j]
+        spread = covariances[j]
         for i in range(MODES):
             expected[j] += shares[i, j]
-        mixed[:], spread[:] = 0.0, 0.0
+        mixed[:] = 0.0
+        spread[:] = 0.0
         for i in range(MODES):
             share = shares[i, j] / expected[j]
             for a in range(STATES):
                 for b in range(3):
                     mixed[a, b] += share * of_means[j, i, a, b]
         for i in range(MODES):
-            share, mean = shares[i, j] / expected[j], of_means[j, i]
+            share = shares[i, j] / expected[j]
+            mean = of_means[j, i]
             for a in range(STATES):
                 for b in range(a, STATES):
                     between = 0.0
@@ -278,7 +306,8 @@ def _beyond_rest(parameters: Records, mean: Vector, tremor: Vector) -> float:
     σ.
     """
     config = parameters[0]
-    speed, amplitude = square(mean[1]), 0.0
+    speed = square(mean[1])
+    amplitude = 0.0
     for axis in range(3):
         amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
     trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + REST])
@@ -309,14 +338,17 @@ def update(
     The innovation in log L is that before the update. For REST, log L is reduced by half of
     `_beyond_rest`. The probabilities μ stay above about least_mode_probability.
     """
-    shares, expected, likelihood = np.empty((MODES, MODES)), np.empty(MODES), np.empty(MODES)
+    shares = np.empty((MODES, MODES))
+    expected = np.empty(MODES)
+    likelihood = np.empty(MODES)
     if tremor[1 + CHANGE] == 0.0:
         _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
     _switched(parameters, means, covariances, modes, interval_s, shares)
     _mix(parameters, means, covariances, shares, expected, tremor)
     best = -1e300
     for i in range(MODES):
-        mean, p = means[i], covariances[i]
+        mean = means[i]
+        p = covariances[i]
         for row in range(STATES):
             for column in range(row):
                 p[row, column] = p[column, row]

@@ -55,7 +55,9 @@ def models(period_s: float, count: int, numbers: IntakeTuning = TUNING.intake) -
         out[name] = values
     for mode in (REACH, CHANGE):
         fades = numbers.mode_acceleration_reversions_per_s[mode]
-        ending = _over(_motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - kept_on_s)[0]
+        ending = _over(
+            _motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - kept_on_s
+        )[0]
         out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), kept_on_s)[0])
     out["onward"][:, REST] = out["transition"][:, REST]
     return out
@@ -86,7 +88,12 @@ def model(interval_s: float | Vector, numbers: IntakeTuning = TUNING.intake) -> 
         oscillator = np.array([[0.0, 1.0], [-(rate**2), -2.0 * numbers.tremor_damping * rate]])
         tremor[..., k, :, :], driven = _over(oscillator, interval_s)
         tremor_noise[..., k, :, :] = 4.0 * numbers.tremor_damping * rate * rate * rate * driven
-    return {"transition": transition, "noise": noise, "tremor": tremor, "tremor_noise": tremor_noise}
+    return {
+        "transition": transition,
+        "noise": noise,
+        "tremor": tremor,
+        "tremor_noise": tremor_noise,
+    }
 
 
 def _motion(revert_v: float, revert_a: float) -> Vector:
@@ -106,7 +113,9 @@ def _over(dynamics: Vector, interval_s: Vector) -> tuple[Vector, Vector]:
     """
     n = len(dynamics)
     whole = np.zeros((2 * n, 2 * n))
-    whole[:n, :n], whole[n - 1, 2 * n - 1], whole[n:, n:] = -dynamics, 1.0, dynamics.T
+    whole[:n, :n] = -dynamics
+    whole[n - 1, 2 * n - 1] = 1.0
+    whole[n:, n:] = dynamics.T
     grown = _exponential(whole * interval_s[..., None, None])
     transition = np.swapaxes(grown[..., n:, n:], -1, -2)
     return np.ascontiguousarray(transition), _product(transition, grown[..., :n, n:])

@@ -32,8 +32,10 @@ def is_swapped(states: Records, parameters: Records, side: int, position: Vector
     After a silence shorter than `swapped_s`, the sample is the other hand's if it is where that one
     was (`_is_at_other`). Later samples that continue it are rejected until `swapped_s` has passed.
     """
-    state, config = states[0], parameters[0]
-    is_swap, sample_tick = state.jump_is_swap[side], state.hand_ticks[side]
+    state = states[0]
+    config = parameters[0]
+    is_swap = state.jump_is_swap[side]
+    sample_tick = state.hand_ticks[side]
     if is_swap and (state.tick - state.jump_first_tick[side]) * config.period_s >= config.swapped_s:
         return False
     if is_swap and _goes_on(states, parameters, side, position):
@@ -51,18 +53,24 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
     Accepted are at least CONFIRMED_SAMPLES samples that agree over confirmed_s; over `swapped_s` if
     the hand jumped to where the other one was, and that one has not been seen since.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
-        state.jump_first_tick[side], state.jump_count[side], state.jump_is_swap[side] = state.tick, 0, 0
+        state.jump_first_tick[side] = state.tick
+        state.jump_count[side] = 0
+        state.jump_is_swap[side] = 0
     state.jumped_to[side, :] = position
     state.jump_newest_tick[side] = state.tick
     state.jump_count[side] += 1
-    first, count = state.jump_first_tick[side], state.jump_count[side]
+    first = state.jump_first_tick[side]
+    count = state.jump_count[side]
     unseen = state.hand_ticks[1 - side] < first
     if count > 1 and unseen and _is_at_other(states, parameters, side, position):
         state.jump_is_swap[side] = 1
     enough_s = config.swapped_s if state.jump_is_swap[side] else config.confirmed_s
-    return bool(count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * config.period_s >= enough_s)
+    return bool(
+        count >= CONFIRMED_SAMPLES and (state.tick - first + 0.5) * config.period_s >= enough_s
+    )
 
 
 @compiled
@@ -73,11 +81,17 @@ def _is_at_other(states: Records, parameters: Records, side: int, position: Vect
     Near is where the other hand may have moved since it was seen: within jump + jump_speed *
     elapsed time, at most `swapped_s`.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     other_tick = state.hand_ticks[1 - side]
-    hand_m, other_m = state.hands[side, 0], state.hands[1 - side, 0]
-    near = config.jump_m + config.jump_speed_mps * min((state.tick - other_tick) * config.period_s, config.swapped_s)
-    return bool(other_tick >= 0 and distance(position, other_m) < min(near, 0.5 * distance(hand_m, other_m)))
+    hand_m = state.hands[side, 0]
+    other_m = state.hands[1 - side, 0]
+    near = config.jump_m + config.jump_speed_mps * min(
+        (state.tick - other_tick) * config.period_s, config.swapped_s
+    )
+    return bool(
+        other_tick >= 0 and distance(position, other_m) < min(near, 0.5 * distance(hand_m, other_m))
+    )
 
 
 @compiled
@@ -85,7 +99,11 @@ def _goes_on(states: Records, parameters: Records, side: int, position: Vector) 
     """True if a sample (3,) [m] agrees with the newest sample that jumped: it is less than
     `stale_ticks` later and within jump + jump_speed * elapsed time.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
-    near = distance(position, state.jumped_to[side]) <= config.jump_m + config.jump_speed_mps * passed * config.period_s
+    near = (
+        distance(position, state.jumped_to[side])
+        <= config.jump_m + config.jump_speed_mps * passed * config.period_s
+    )
     return bool(passed < config.stale_ticks and near)

@@ -31,13 +31,15 @@ UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
 def z_reversed(sample: PoseStamped) -> PoseStamped:
     """A pose in left-handed axes, as it is in right-handed ones whose z points the other way."""
-    (x, y, z), (i, j, k, w) = sample.position, sample.orientation
+    x, y, z = sample.position
+    i, j, k, w = sample.orientation
     return sample._replace(position=(x, y, -z), orientation=(-i, -j, k, w))
 
 
 def base_from(hands: HandSettings) -> NDArray[np.float64]:
     """The mapping (3, 4) of positions in a tracker's frame and unit to frame `base` [m]."""
-    origin, axes = np.array(hands.base_from_tracker[:3]), rotation(hands.base_from_tracker[3:])
+    origin = np.array(hands.base_from_tracker[:3])
+    axes = rotation(hands.base_from_tracker[3:])
     return np.column_stack((UNIT_M[hands.unit] * axes, origin))
 
 
@@ -69,22 +71,28 @@ class Intake:
     """
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
-        hands, numbers = settings.hands, tuning.intake
+        hands = settings.hands
+        numbers = tuning.intake
         self._stale_ticks = _stale_ticks("hands/left", settings)
         self._silent_ticks = _stale_ticks("joints/state", settings)
         self._still_ticks = still_ticks(settings, tuning)
         self._names = settings.joints.names
-        self._clutch_ticks, self._guided_ticks = (_stale_ticks(key, settings) for key in ("clutch", "joints/guided"))
+        self._clutch_ticks, self._guided_ticks = (
+            _stale_ticks(key, settings) for key in ("clutch", "joints/guided")
+        )
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         longest_s = hands.longest_stale_ms / 1000
         stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
-        unseen_ticks = max(stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s))
+        unseen_ticks = max(
+            stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s)
+        )
         self._unseen_ticks = unseen_ticks
         longest_late_s = max(numbers.max_late_s, longest_s)
         late_ticks = math.ceil(longest_late_s / settings.period_s)
         self._models = models(settings.period_s, unseen_ticks + late_ticks + 1, numbers)
         joints = settings.joints
-        limits, per_rad = np.array([joints.lower, joints.upper]), np.array(joints.per_rad)
+        limits = np.array([joints.lower, joints.upper])
+        per_rad = np.array(joints.per_rad)
         self.parameters = parameters(
             period_s=settings.period_s,
             stale_ticks=self._stale_ticks,
@@ -93,7 +101,9 @@ class Intake:
             unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
-            joint_jump_speed=max(numbers.joint_jump_radps, float((np.array(joints.velocity) / per_rad).max())),
+            joint_jump_speed=max(
+                numbers.joint_jump_radps, float((np.array(joints.velocity) / per_rad).max())
+            ),
             plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
             has_clutch=int(hands.clutch == "key"),
@@ -141,9 +151,13 @@ class Intake:
                 case "joints/state":
                     self.take_arm(state, event.value)
                 case "clutch":
-                    state["clutch_until_tick"] = state["tick"] + self._clutch_ticks if event.value else 0
+                    state["clutch_until_tick"] = (
+                        state["tick"] + self._clutch_ticks if event.value else 0
+                    )
                 case "joints/guided":
-                    state["guided_until_tick"] = state["tick"] + self._guided_ticks if event.value else 0
+                    state["guided_until_tick"] = (
+                        state["tick"] + self._guided_ticks if event.value else 0
+                    )
                 case "gripper/wish":
                     state["gripper_wish"] = event.value
                 case _:
@@ -184,13 +198,25 @@ class Intake:
             state["rejected"][Cause.INCOMPLETE] += 1
             self._note(state, ARM, Cause.INCOMPLETE, sample)
             return
-        cause = take_arm(as_array(state), self.parameters, sample.stamp_ns, np.array(position), np.array(velocity))
+        cause = take_arm(
+            as_array(state),
+            self.parameters,
+            sample.stamp_ns,
+            np.array(position),
+            np.array(velocity),
+        )
         if cause >= 0:
             self._note(state, ARM, cause, sample)
 
-    def _note(self, state: Record, source: int, cause: int, sample: PoseStamped | JointState) -> None:
+    def _note(
+        self, state: Record, source: int, cause: int, sample: PoseStamped | JointState
+    ) -> None:
         """Count a rejected sample, and retain it for reports."""
         newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
         joints = tuple(state["measured"].tolist()) if source == ARM else ()
-        self.refused[SOURCES[source], Cause(cause)] = Refused(Cause(cause), sample, newest_ns, joints)
-        self.rejected[source, cause] += 1  # last, so that another thread that sees the count finds `refused`
+        self.refused[SOURCES[source], Cause(cause)] = Refused(
+            Cause(cause), sample, newest_ns, joints
+        )
+        self.rejected[source, cause] += (
+            1  # last, so that another thread that sees the count finds `refused`
+        )

@@ -24,14 +24,26 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.geometry import ROUND_TO
 from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
 from thirdhand.core.intake.arm_samples import compared, unwrap
-from thirdhand.core.intake.hand_estimator import goes_on, note_clock, order_of, take, ticks_late, turn_to
+from thirdhand.core.intake.hand_estimator import (
+    goes_on,
+    note_clock,
+    order_of,
+    take,
+    ticks_late,
+    turn_to,
+)
 from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
 from thirdhand.core.intake.plausibility import is_confirmed, is_swapped
 from thirdhand.core.vectors import distance, squared_distance
 
-NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE = int(Cause.NOT_FINITE), int(Cause.NOT_A_ROTATION), int(Cause.OUT_OF_RANGE)
-REPEATED, OLDER, AHEAD = int(Cause.REPEATED), int(Cause.OLDER), int(Cause.AHEAD)
-JUMPED, SWAPPED = int(Cause.JUMPED), int(Cause.SWAPPED)
+NOT_FINITE = int(Cause.NOT_FINITE)
+NOT_A_ROTATION = int(Cause.NOT_A_ROTATION)
+OUT_OF_RANGE = int(Cause.OUT_OF_RANGE)
+REPEATED = int(Cause.REPEATED)
+OLDER = int(Cause.OLDER)
+AHEAD = int(Cause.AHEAD)
+JUMPED = int(Cause.JUMPED)
+SWAPPED = int(Cause.SWAPPED)
 
 
 @compiled
@@ -39,14 +51,17 @@ def is_contested(states: Records, parameters: Records) -> bool:
     """True if two sources report the arm: its share of contradicting states is above
     contested_on_share, or above contested_off_share if it was contested at the last tick.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     was_contested = state.reason == TWO_SOURCES
     limit = config.contested_off_share if was_contested else config.contested_on_share
     return bool(state.arm_contested > limit)
 
 
 @compiled
-def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float) -> int:
+def refusal(
+    stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float
+) -> int:
     """Cause for which a stamp is rejected: REPEATED, AHEAD, OLDER; -1 if it is accepted.
 
     The newest sample arrived `passed_s` ago with the stamp `newest_ns`. A stamp may be ahead of
@@ -57,7 +72,9 @@ def refusal(stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_
         return REPEATED
     if not fresh:
         return -1
-    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9  # the difference of two integers may overflow
+    ahead_s = (
+        float(stamp_ns) - float(newest_ns)
+    ) * 1e-9  # the difference of two integers may overflow
     if ahead_s > passed_s + silent_s:
         return AHEAD
     return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
@@ -74,7 +91,8 @@ def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
     arm is silent. So the states of two drivers that take turns have the same weight, however soon
     one follows the other.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     ticks = state.arm_sample_ticks
     passed = float(state.tick - ticks[0])
     if ticks[1] < state.tick:
@@ -89,7 +107,12 @@ def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
 
 @compiled
 def has_jumped(
-    states: Records, parameters: Records, side: int, position: Vector, expected: Vector, interval_s: float
+    states: Records,
+    parameters: Records,
+    side: int,
+    position: Vector,
+    expected: Vector,
+    interval_s: float,
 ) -> bool:
     """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
     than a hand can move and a tracker's noise explains:
@@ -98,7 +121,8 @@ def has_jumped(
 
     `interval_s` is the time since the sample from which p was predicted.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     gate = max(
         config.jump_m + config.jump_speed_mps * interval_s,
         config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
@@ -107,13 +131,17 @@ def has_jumped(
 
 
 @compiled
-def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector) -> int:
+def take_arm(
+    states: Records, parameters: Records, stamp_ns: int, position: Vector, velocity: Vector
+) -> int:
     """Store a sample of the arm's joints (J,) [rad, rad/s] in the state; compiled part of
     `Intake.take_arm`. Returns the cause for which it was rejected, or -1.
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     passed = state.tick - state.arm_tick
-    passed_s, silent_s = passed * config.period_s, config.silent_ticks * config.period_s
+    passed_s = passed * config.period_s
+    silent_s = config.silent_ticks * config.period_s
     fresh = state.arm_tick >= 0 and passed < config.silent_ticks
     if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
         state.rejected[NOT_FINITE] += 1
@@ -137,8 +165,10 @@ def take_arm(states: Records, parameters: Records, stamp_ns: int, position: Vect
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
-    state.measured[:], state.measured_velocities[:] = position, velocity
-    state.arm_stamp_ns, state.arm_tick = stamp_ns, state.tick
+    state.measured[:] = position
+    state.measured_velocities[:] = velocity
+    state.arm_stamp_ns = stamp_ns
+    state.arm_tick = state.tick
     return -1
 
 
@@ -175,8 +205,11 @@ def _in_time(
     The retained samples are forgotten if a hand that is not `fresh` does not continue its filter at
     `in_base` (3,) [m], or its clock was set back.
     """
-    state, config, order = states[0], parameters[0], 0
-    newest_ns, period_s = state.hand_stamps_ns[side], config.period_s
+    state = states[0]
+    config = parameters[0]
+    order = 0
+    newest_ns = state.hand_stamps_ns[side]
+    period_s = config.period_s
     passed_s = (state.tick - state.hand_ticks[side]) * period_s
     stale_s = state.stale_ticks[side] * period_s
     cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.longest_late_s)
@@ -191,7 +224,11 @@ def _in_time(
         return OLDER, 0, state.tick
     if order < 0:
         return REPEATED, order, state.tick
-    made_tick = tick_made(states, side, stamp_ns, order, late, period_s) if order > 0 or late > 0 else state.tick
+    made_tick = (
+        tick_made(states, side, stamp_ns, order, late, period_s)
+        if order > 0 or late > 0
+        else state.tick
+    )
     return -1, order, made_tick
 
 
@@ -223,8 +260,10 @@ def _jump(
     `made`, has jumped; and the number of samples before it that were wrong, if it continues the
     ones before those.
     """
-    state, config = states[0], parameters[0]
-    jumped, wrong = False, 0
+    state = states[0]
+    config = parameters[0]
+    jumped = False
+    wrong = 0
     if fresh:
         prediction = state.hands[side, 0].copy()
         if order > 0 or made != state.tick:
@@ -261,10 +300,16 @@ def take_hand(
     """
     state = states[0]
     in_base = _in_base(position, frame)
-    fresh = state.hand_ticks[side] >= 0 and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
+    fresh = (
+        state.hand_ticks[side] >= 0
+        and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
+    )
 
     # Is the sample accepted?
-    order, made_tick, jumped, wrong = 0, state.tick, False, 0
+    order = 0
+    made_tick = state.tick
+    jumped = False
+    wrong = 0
     cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
         cause, order, made_tick = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
@@ -298,18 +343,24 @@ def take_hand(
 
 
 @compiled
-def _note_correction(states: Records, parameters: Records, side: int, wrong: int, before: Vector) -> None:
+def _note_correction(
+    states: Records, parameters: Records, side: int, wrong: int, before: Vector
+) -> None:
     """Note how far a hand was moved when `wrong` samples were dropped, from the estimate `before`
     (3,) [m].
 
     Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
     confirmed_s, the hand may be as far away from it (`hand_doubt_m`).
     """
-    state, config = states[0], parameters[0]
+    state = states[0]
+    config = parameters[0]
     if wrong > 0:
         moved = distance(before, state.hands[side, 0])
-        state.hand_doubt_m[side] = max(state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO)
-        state.corrected_tick[side], state.doubted_samples[side] = state.tick, CONFIRMED_SAMPLES
+        state.hand_doubt_m[side] = max(
+            state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO
+        )
+        state.corrected_tick[side] = state.tick
+        state.doubted_samples[side] = CONFIRMED_SAMPLES
     elif state.doubted_samples[side] > 0:
         state.doubted_samples[side] -= 1
     passed_s = (state.tick - state.corrected_tick[side]) * config.period_s
@@ -323,19 +374,26 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL,
     ARM_GUIDED, CONTESTED, CLUTCH_RELEASED.
     """
-    frame, state, config = frames[0], states[0], parameters[0]
-    left, right = state.hand_ticks[0], state.hand_ticks[1]
+    frame = frames[0]
+    state = states[0]
+    config = parameters[0]
+    left = state.hand_ticks[0]
+    right = state.hand_ticks[1]
     if left == right:
         frame.hand_stamp_ns = max(state.hand_stamps_ns[0], state.hand_stamps_ns[1])
     else:
         frame.hand_stamp_ns = state.hand_stamps_ns[0 if left > right else 1]
     for side in range(2):
         sample_tick = state.hand_ticks[side]
-        frame.hand_ages[side], frame.stale_ticks[side] = -1 if sample_tick < 0 else state.tick - sample_tick, state.stale_ticks[side]
-        frame.hands[side], frame.hand_velocities[side] = state.hands[side, 0], state.hands[side, 1]
+        frame.hand_ages[side] = -1 if sample_tick < 0 else state.tick - sample_tick
+        frame.stale_ticks[side] = state.stale_ticks[side]
+        frame.hands[side] = state.hands[side, 0]
+        frame.hand_velocities[side] = state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    conditions, ages, stale = 0, frame.hand_ages, frame.stale_ticks
+    conditions = 0
+    ages = frame.hand_ages
+    stale = frame.stale_ticks
     is_seen = ages[0] < stale[0], ages[1] < stale[1]
     if ages.min() >= 0 and ages.max() < config.unseen_ticks and (is_seen[0] or is_seen[1]):
         conditions = HANDS_KNOWN

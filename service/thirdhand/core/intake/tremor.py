@@ -27,8 +27,10 @@ def no_tremor(states: Records, parameters: Records, side: int) -> None:
     """Set the tremor of one hand to that of a hand of which nothing is known: the usual rate, and
     tremor_stds_m.
     """
-    state, config = states[0], parameters[0]
-    state.trembles[side], state.tremor_rate[side] = 0, USUAL_RATE
+    state = states[0]
+    config = parameters[0]
+    state.trembles[side] = 0
+    state.tremor_rate[side] = USUAL_RATE
     state.tremors[side, 0] = config.tremor_rates_per_s[USUAL_RATE]
     for mode in range(MODES):
         state.tremors[side, 1 + mode] = config.tremor_stds_m[mode] ** 2
@@ -48,18 +50,30 @@ def note_tremor(states: Records, parameters: Records, models: Records, side: int
     with y_max = max_tremor_m. |z|² / S in log L is at most outlier_variances: one outlier is no
     evidence.
     """
-    state, config, position = states[0], parameters[0], states[0].kept_positions[side, at]
-    means, covariances, evidence = state.bank_means[side], state.bank_covariances[side], state.bank_evidence[side]
-    ticks, noise = state.kept_ticks[side, at] - state.bank_ticks[side], state.noise_variance[side]
+    state = states[0]
+    config = parameters[0]
+    position = states[0].kept_positions[side, at]
+    means = state.bank_means[side]
+    covariances = state.bank_covariances[side]
+    evidence = state.bank_evidence[side]
+    ticks = state.kept_ticks[side, at] - state.bank_ticks[side]
+    noise = state.noise_variance[side]
     if state.kept_stamps_ns[side, at] <= state.bank_stamps_ns[side] and 0 <= ticks < len(models):
         return
-    state.bank_stamps_ns[side], state.bank_ticks[side] = state.kept_stamps_ns[side, at], state.kept_ticks[side, at]
+    state.bank_stamps_ns[side], state.bank_ticks[side] = (
+        state.kept_stamps_ns[side, at],
+        state.kept_ticks[side, at],
+    )
     if not 0 <= ticks < len(models) or state.kept_restarts[side, at] > 0:
         _start(parameters, means, covariances, noise, position)
         return
-    fade, overs, null = exp(-ticks * config.period_s / config.tracker_memory_s), models[ticks : ticks + 1], 0.0
+    fade = exp(-ticks * config.period_s / config.tracker_memory_s)
+    overs = models[ticks : ticks + 1]
+    null = 0.0
     for k in range(BANK):
-        mean, covariance, rate = means[k], covariances[k], max(k - NO_TREMOR, 0)
+        mean = means[k]
+        covariance = covariances[k]
+        rate = max(k - NO_TREMOR, 0)
         if ticks > 0:
             driven = config.tremor_stds_m[REST] ** 2 if k >= NO_TREMOR else 0.0
             move_on(mean, covariance, overs, CHANGE if k == 1 else STEADY, rate, driven)
@@ -71,7 +85,9 @@ def note_tremor(states: Records, parameters: Records, models: Records, side: int
         if k >= NO_TREMOR:
             amplitude = 0.0
             for axis in range(3):
-                amplitude += mean[3, axis] ** 2 + (mean[4, axis] / config.tremor_rates_per_s[rate]) ** 2
+                amplitude += (
+                    mean[3, axis] ** 2 + (mean[4, axis] / config.tremor_rates_per_s[rate]) ** 2
+                )
             strength = state.bank_variances[side, rate]
             strength += (1.0 - fade) * (min(amplitude, config.max_tremor_m**2) - strength)
             state.bank_variances[side, rate] = strength
@@ -85,31 +101,46 @@ def _choose(states: Records, parameters: Records, side: int) -> None:
 
     The tremor's variance is then at least σ_k² in all modes.
     """
-    state, config, best = states[0], parameters[0], NO_TREMOR
+    state = states[0]
+    config = parameters[0]
+    best = NO_TREMOR
     for k in range(NO_TREMOR, BANK):
         if state.bank_evidence[side, k] > state.bank_evidence[side, best]:
             best = k
     least = config.outlier_variances * (config.end_share if state.trembles[side] else 1.0)
     no_tremor(states, parameters, side)
-    if state.bank_evidence[side, best] - max(state.bank_evidence[side, 0], state.bank_evidence[side, 1]) > least:
-        state.trembles[side], state.tremor_rate[side] = 1, best - NO_TREMOR
+    if (
+        state.bank_evidence[side, best]
+        - max(state.bank_evidence[side, 0], state.bank_evidence[side, 1])
+        > least
+    ):
+        state.trembles[side] = 1
+        state.tremor_rate[side] = best - NO_TREMOR
         state.tremors[side, 0] = config.tremor_rates_per_s[best - NO_TREMOR]
         for mode in range(MODES):
-            variance = max(state.tremors[side, 1 + mode], state.bank_variances[side, best - NO_TREMOR])
+            variance = max(
+                state.tremors[side, 1 + mode], state.bank_variances[side, best - NO_TREMOR]
+            )
             state.tremors[side, 1 + mode] = variance
 
 
 @compiled
-def _start(parameters: Records, means: Vector, covariances: Vector, noise: float, position: Vector) -> None:
+def _start(
+    parameters: Records, means: Vector, covariances: Vector, noise: float, position: Vector
+) -> None:
     """Start all filters of the bank from a sample (3,) [m] with noise variance r [m²]: mean
     (position, 0, 0, 0, 0), and covariance diag(r, σ_v², 0, σ², (ω σ)²), as `mode_filter.start`.
     """
     config = parameters[0]
-    means[:], covariances[:] = 0.0, 0.0
+    means[:] = 0.0
+    covariances[:] = 0.0
     for k in range(BANK):
         for axis in range(3):
             means[k, 0, axis] = position[axis]
-        covariances[k, 0, 0], covariances[k, 1, 1] = noise, config.start_speed_std_mps**2
+        covariances[k, 0, 0] = noise
+        covariances[k, 1, 1] = config.start_speed_std_mps**2
         if k >= NO_TREMOR:
             covariances[k, 3, 3] = config.tremor_stds_m[REST] ** 2
-            covariances[k, 4, 4] = (config.tremor_stds_m[REST] * config.tremor_rates_per_s[k - NO_TREMOR]) ** 2
+            covariances[k, 4, 4] = (
+                config.tremor_stds_m[REST] * config.tremor_rates_per_s[k - NO_TREMOR]
+            ) ** 2

@@ -80,7 +80,14 @@ class Limiter:
         self._input.max_jerk = list(limits.jerk)
         self._trajectory = ruckig.Trajectory(count)
 
-    def step(self, q: Vector, dq: Vector, ddq: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
+    def step(
+        self,
+        q: Vector,
+        dq: Vector,
+        ddq: Vector,
+        velocity: Vector,
+        acceleration: Vector | None = None,
+    ) -> Limited:
         """Joints one period later, on the way to `velocity`, which changes at `acceleration`.
 
         All arguments are (J,) [rad, rad/s, rad/s²]; without `acceleration` the velocity is
@@ -90,9 +97,12 @@ class Limiter:
         """
         return self.advance(np.stack((q, dq, ddq)), velocity, acceleration)
 
-    def advance(self, state: Vector, velocity: Vector, acceleration: Vector | None = None) -> Limited:
+    def advance(
+        self, state: Vector, velocity: Vector, acceleration: Vector | None = None
+    ) -> Limited:
         """`step` of the joints' state (3, J), which is not changed."""
-        moved, target = np.empty(state.shape), np.zeros((2, state.shape[1]))
+        moved = np.empty(state.shape)
+        target = np.zeros((2, state.shape[1]))
         if acceleration is not None:
             target[1] = acceleration
         met = step(state, velocity, self._parameters, target, moved)
@@ -100,7 +110,9 @@ class Limiter:
             return _stuck(state[0])
         if met & CHASED:
             self._chase(state, target, moved)
-            if forget_fast(state, moved, self._parameters):  # joints that become too fast: again, without the ramp
+            if forget_fast(
+                state, moved, self._parameters
+            ):  # joints that become too fast: again, without the ramp
                 target[1] = 0.0
                 self._chase(state, target, moved)
             make_safe(state, moved, self._parameters)
@@ -126,7 +138,9 @@ class Limiter:
         if not is_usable(state):
             return _stuck(q)
         limits = self._parameters[0]
-        moved = stop_together(state[1], state[2], limits["max_acceleration"], limits["max_jerk"], self._period)
+        moved = stop_together(
+            state[1], state[2], limits["max_acceleration"], limits["max_jerk"], self._period
+        )
         moved[0] += q
         make_safe(state, moved, self._parameters)
         return _frozen(moved, limited=bool(moved[1].any()))
@@ -143,15 +157,21 @@ class Limiter:
         frame that moves with them: there it ends at rest, and the acceleration limits are shifted
         by the ramp. If Ruckig finds no profile, the joints stay NaN, and `make_safe` stops them.
         """
-        dt, most, ramp = self._period, self._parameters["max_acceleration"][0], wanted[1]
+        dt = self._period
+        most = self._parameters["max_acceleration"][0]
+        ramp = wanted[1]
         velocity = wanted[0] - dt * ramp  # wanted[0] is the velocity at the end of the period
         self._input.current_position = state[0].tolist()
         self._input.current_velocity = (state[1] - velocity).tolist()
         self._input.current_acceleration = (state[2] - ramp).tolist()
-        self._input.max_acceleration, self._input.min_acceleration = (most - ramp).tolist(), (-most - ramp).tolist()
+        self._input.max_acceleration = (most - ramp).tolist()
+        self._input.min_acceleration = (-most - ramp).tolist()
         try:
             self._ruckig.calculate(self._input, self._trajectory)
-        except (ruckig.RuckigError, ValueError):  # ValueError: a result code that the Python binding lacks
+        except (
+            ruckig.RuckigError,
+            ValueError,
+        ):  # ValueError: a result code that the Python binding lacks
             return
         chased = np.array(self._trajectory.at_time(dt))
         chased[0] += dt * (velocity + 0.5 * dt * ramp)
@@ -190,7 +210,8 @@ class LimiterStage:
     """Joints of the state (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
 
     def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
-        self._arm, self._max_speed = arm, settings.tool.max_speed
+        self._arm = arm
+        self._max_speed = settings.tool.max_speed
         # Speed above which the joints stop: midway between that of closing in and max_speed.
         self._stop_speed = 0.5 * (1.0 + tuning.arm.tool_speed_share) * self._max_speed
         self._limiter = Limiter(settings.joints, settings.period_s)
@@ -201,7 +222,9 @@ class LimiterStage:
         state["joints"] = 0.0
         state["joints"][0] = joints
 
-    def step(self, state: Record, frame: Record, wanted: Vector, ramp: Vector, separation: Separation) -> Moved:
+    def step(
+        self, state: Record, frame: Record, wanted: Vector, ramp: Vector, separation: Separation
+    ) -> Moved:
         """Move the joints one period toward velocities `wanted` (J,), which change at `ramp` (J,).
 
         If the step exceeds an `allowed` limit of separation, the synchronised step
@@ -213,7 +236,8 @@ class LimiterStage:
         `excess_speed`.
         """
         moved = self._limiter.advance(state["joints"], wanted, ramp)
-        limited, excess = moved.limited, separation.excess(moved.velocity, moved.acceleration)
+        limited = moved.limited
+        excess = separation.excess(moved.velocity, moved.acceleration)
         separated = excess > 0.0
         if separated:
             q, dq, ddq = state["joints"]
@@ -222,9 +246,11 @@ class LimiterStage:
                 other = self._brake(state, separation)[0]
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
-        kinematics, excess_speed = self._arm.at(moved.position), 0.0
+        kinematics = self._arm.at(moved.position)
+        excess_speed = 0.0
         if self._largest_speed_in_stop(moved, kinematics) > self._stop_speed:
-            moved, limited = self._limiter.stop(*state["joints"]), True
+            moved = self._limiter.stop(*state["joints"])
+            limited = True
             kinematics = self._arm.at(moved.position)
             speed = tool_speeds(kinematics.record, *moved[1:3], self._jerk)[0]
             excess_speed = speed if speed > self._max_speed else 0.0
@@ -240,9 +266,11 @@ class LimiterStage:
         moved, stop = self._brake(state, separation)
         kinematics = self._arm.at(moved.position)
         if moved is not stop:
-            stop_kinematics, speed = self._arm.at(stop.position), self._largest_speed_in_stop(moved, kinematics)
+            stop_kinematics = self._arm.at(stop.position)
+            speed = self._largest_speed_in_stop(moved, kinematics)
             if speed > max(self._max_speed, self._largest_speed_in_stop(stop, stop_kinematics)):
-                moved, kinematics = stop, stop_kinematics
+                moved = stop
+                kinematics = stop_kinematics
         moving = take(as_array(state), as_array(frame), kinematics.record, *moved[:3])
         return Moved(kinematics, limited=False, separated=False, excess_speed=0.0, moving=moving)
 

@@ -16,12 +16,16 @@ from thirdhand.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited
 CHASED = 2  # flag of a step: a joint cannot reach its velocity in a tick at constant jerk
-UNSAFE = 4  # flag of a step: a joint could not stop within its limits after the step, so it stops now
+UNSAFE = (
+    4  # flag of a step: a joint could not stop within its limits after the step, so it stops now
+)
 UNUSABLE = -1  # result of a step: the state is not finite, or too large
 
 
 @compiled
-def step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
+def step(
+    state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector
+) -> int:
     """Run `_toward`, and `make_safe` if no joint needs Ruckig's profile; return the flags.
 
     Returns UNUSABLE, and changes nothing, if the state cannot be calculated with.
@@ -35,7 +39,9 @@ def step(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, m
 
 
 @compiled
-def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector) -> int:
+def _toward(
+    state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector
+) -> int:
     """Move each joint one period toward its wanted velocity at constant jerk; return flags.
 
     With q, v, a of a joint, u its wanted velocity and r the ramp of u (wanted[1] on entry):
@@ -57,13 +63,18 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
     A smooth input passes without lag: on a ramp, a' = a and v' = aim. A time-optimal profile that
     ends without acceleration would lag behind it by acceleration² / 2 jerk.
     """
-    config, met, stopping = parameters[0], 0, False
+    config = parameters[0]
+    met = 0
+    stopping = False
     dt = config.period_s
     for i in range(len(velocity)):
         stopping = stopping or math.isnan(velocity[i]) or math.isnan(wanted[1, i])
     for i in range(len(velocity)):
-        q, v, a = state[0, i], state[1, i], state[2, i]
-        top, max_jerk = config.max_velocity[i], config.max_jerk[i]
+        q = state[0, i]
+        v = state[1, i]
+        a = state[2, i]
+        top = config.max_velocity[i]
+        max_jerk = config.max_jerk[i]
         highest = min(top, config.approach_gain[i] * max(config.upper[i] - q, 0.0))
         lowest = max(-top, config.approach_gain[i] * min(config.lower[i] - q, 0.0))
         aim = 0.0 if stopping else min(max(velocity[i], lowest), highest)
@@ -71,11 +82,16 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
             met |= BOUNDED
         ramp = 0.0 if stopping else wanted[1, i]
         margin = aim - lowest if ramp < 0.0 else highest - aim
-        most = min(INSIDE_LIMIT_SHARE * config.max_acceleration[i], math.sqrt(2.0 * max_jerk * margin))
-        wanted[0, i], wanted[1, i] = aim, min(max(ramp, -most), most)
+        most = min(
+            INSIDE_LIMIT_SHARE * config.max_acceleration[i], math.sqrt(2.0 * max_jerk * margin)
+        )
+        wanted[0, i] = aim
+        wanted[1, i] = min(max(ramp, -most), most)
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
-        crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)  # speed once the acceleration is 0
+        crest = v_then + acceleration * abs(acceleration) / (
+            2.0 * max_jerk
+        )  # speed once the acceleration is 0
         outside = int(q > config.upper[i]) - int(q < config.lower[i])
         if (
             outside * crest <= 0.0
@@ -84,7 +100,8 @@ def _toward(state: Vector, velocity: Vector, parameters: Records, wanted: Vector
             and max(abs(v_then), abs(crest)) <= top
         ):
             moved[0, i] = q + dt * (v + dt * (a / 3.0 + acceleration / 6.0))
-            moved[1, i], moved[2, i] = v_then, acceleration
+            moved[1, i] = v_then
+            moved[2, i] = acceleration
         else:
             moved[0, i] = moved[1, i] = moved[2, i] = math.nan
             met |= CHASED
@@ -98,9 +115,12 @@ def forget_fast(state: Vector, moved: Vector, parameters: Records) -> bool:
     The velocity counts at the end of the period, on average over it, and once the acceleration has
     been brought to 0.
     """
-    config, is_fast = parameters[0], False
+    config = parameters[0]
+    is_fast = False
     for i in range(moved.shape[1]):
-        v, a, on_the_way = moved[1, i], moved[2, i], (moved[0, i] - state[0, i]) / config.period_s
+        v = moved[1, i]
+        a = moved[2, i]
+        on_the_way = (moved[0, i] - state[0, i]) / config.period_s
         crest = v + a * abs(a) / (2.0 * config.max_jerk[i])
         if max(abs(v), abs(crest), abs(on_the_way)) > config.max_velocity[i]:
             is_fast = True
@@ -120,15 +140,22 @@ def common_share(state: Vector, parameters: Records) -> float:
 
     and 0 <= share <= 1.
     """
-    config, least, most = parameters[0], 0.0, 1.0
+    config = parameters[0]
+    least = 0.0
+    most = 1.0
     dt = config.period_s
     for i in range(state.shape[1]):
-        change, jerk_change = state[3, i] - state[1, i], INSIDE_LIMIT_SHARE * dt * config.max_jerk[i]
+        change = state[3, i] - state[1, i]
+        jerk_change = INSIDE_LIMIT_SHARE * dt * config.max_jerk[i]
         a = state[2, i] if change >= 0.0 else -state[2, i]
         change = max(abs(change), ROUNDING)
         least = max(least, (a - jerk_change) * dt / change)
-        most = min(most, min(a + jerk_change, INSIDE_LIMIT_SHARE * config.max_acceleration[i]) * dt / change)
-        curvature, left = change / (2.0 * jerk_change * dt), max(1.0 - 0.5 * dt * a / change, 0.0)
+        most = min(
+            most,
+            min(a + jerk_change, INSIDE_LIMIT_SHARE * config.max_acceleration[i]) * dt / change,
+        )
+        curvature = change / (2.0 * jerk_change * dt)
+        left = max(1.0 - 0.5 * dt * a / change, 0.0)
         most = min(most, (math.sqrt(0.25 + 4.0 * curvature * left) - 0.5) / (2.0 * curvature))
     return max(least, most) if most >= INSIDE_LIMIT_SHARE * least else -1.0
 
@@ -143,17 +170,25 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
 
     Returns True if no joint was replaced.
     """
-    config, safe, stop = parameters[0], True, np.empty(6)
+    config = parameters[0]
+    safe = True
+    stop = np.empty(6)
     dt = config.period_s
     for i in range(moved.shape[1]):
         moved[0, i] = np.rint(moved[0, i] * ROUND_TO) / ROUND_TO
-        fastest_stop(moved[1, i], moved[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop)
-        lowest, highest = min(config.lower[i], state[0, i]), max(config.upper[i], state[0, i])
+        fastest_stop(
+            moved[1, i], moved[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
+        )
+        lowest = min(config.lower[i], state[0, i])
+        highest = max(config.upper[i], state[0, i])
         if not (moved[0, i] + stop[3] >= lowest and moved[0, i] + stop[4] <= highest):
             safe = False
-            fastest_stop(state[1, i], state[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop)
+            fastest_stop(
+                state[1, i], state[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
+            )
             moved[0, i] = np.rint((state[0, i] + stop[2]) * ROUND_TO) / ROUND_TO
-            moved[1, i], moved[2, i] = stop[0], stop[1]
+            moved[1, i] = stop[0]
+            moved[2, i] = stop[1]
     return safe
 
 
@@ -175,8 +210,12 @@ def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) 
 
     The times are dense at the beginning, where the joints end their accelerations.
     """
-    config, joints = parameters[0], len(dq)
-    braking, stop, displacement, speed = np.empty(joints), np.empty(6), np.empty(joints), np.empty(joints)
+    config = parameters[0]
+    joints = len(dq)
+    braking = np.empty(joints)
+    stop = np.empty(6)
+    displacement = np.empty(joints)
+    speed = np.empty(joints)
     braking_together(dq, ddq, config.max_acceleration, config.max_jerk, braking)
     duration = most = 0.0
     for j in range(joints):
@@ -186,24 +225,37 @@ def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) 
         for j in range(joints):
             time = duration * (sample / STOP_SAMPLES) ** 2
             fastest_stop(dq[j], ddq[j], braking[j], config.max_jerk[j], time, stop)
-            speed[j], displacement[j] = stop[0], stop[2]
+            speed[j] = stop[0]
+            displacement[j] = stop[2]
         most = max(most, tool_speed_after(heres, displacement, speed))
     return most
 
 
 @compiled
 def take(
-    states: Records, frames: Records, heres: Records, position: Vector, velocity: Vector, acceleration: Vector
+    states: Records,
+    frames: Records,
+    heres: Records,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
 ) -> bool:
     """Write the new joints into state and frame, and the tool's pose into the frame.
 
     Returns True if the joints moved before.
     """
-    state, frame, kinematics, moving = states[0], frames[0], heres[0], False
+    state = states[0]
+    frame = frames[0]
+    kinematics = heres[0]
+    moving = False
     for joint in range(len(position)):
         moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
-    state.joints[0, :], state.joints[1, :], state.joints[2, :] = position, velocity, acceleration
-    frame.joints[:], frame.joint_velocities[:], frame.joint_accelerations[:] = position, velocity, acceleration
+    state.joints[0, :] = position
+    state.joints[1, :] = velocity
+    state.joints[2, :] = acceleration
+    frame.joints[:] = position
+    frame.joint_velocities[:] = velocity
+    frame.joint_accelerations[:] = acceleration
     frame.commanded = moving or (state.arm_ready and state.mode != FAULT)
     frame.tool[:] = kinematics.position
     quaternion_of(kinematics.rotation, frame.tool_orientation)

@@ -51,7 +51,8 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
     they are nearer than the arm's own clearance or, around meshes with one link between them, than
     this clearance and planned_margin_m, as capsules exceed meshes by about as much.
     """
-    urdf, names = Urdf(description), settings.joints.names
+    urdf = Urdf(description)
+    names = settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
     frames = np.array([_in_joint(urdf, names, joint.parent, _origin(joint))[1] for joint in chain])
     parts: list[tuple[int, Vector, float]] = []
@@ -66,29 +67,44 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
         if number not in covered:
             end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
             parts.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
-            if number < len(chain) and chain[number].kind == "prismatic":  # the guide of the next link
+            if (
+                number < len(chain) and chain[number].kind == "prismatic"
+            ):  # the guide of the next link
                 travel = np.outer(
-                    [chain[number].lower, chain[number].upper], frames[number][:, :3] @ chain[number].axis
+                    [chain[number].lower, chain[number].upper],
+                    frames[number][:, :3] @ chain[number].axis,
                 )
                 parts.append((number, end + travel, settings.arm.link_radius))
     tool = np.array(settings.tool.plate_from_tool[:3])
     if math.hypot(*tool) > TOLERANCE:
-        parts.append((link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius))
+        parts.append(
+            (link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius)
+        )
     parts.sort(key=lambda one: one[0])
     capsules = structured(len(parts), CAPSULE)
-    capsules[:] = [(number, ends, radius, _max_speed(settings, frames, number, ends)) for number, ends, radius in parts]
+    capsules[:] = [
+        (number, ends, radius, _max_speed(settings, frames, number, ends))
+        for number, ends, radius in parts
+    ]
     axes = np.array([[*joint.axis, float(joint.kind == "prismatic")] for joint in chain])
     body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
     postures = np.array([settings.arm.posture, *_ends_of_motion(settings)])
-    placed, near = np.empty((len(postures), len(capsules), 2, 3)), np.empty(9)
+    placed = np.empty((len(postures), len(capsules), 2, 3))
+    near = np.empty(9)
     for q, ends in zip(postures, placed, strict=True):
         place(q, body.frames, body.axes, capsules, ends)
-    pairs, meshes = [], any(shape.kind == "mesh" for shape in urdf.shapes)
-    links, radii = capsules["link"], capsules["radius"]
+    pairs = []
+    meshes = any(shape.kind == "mesh" for shape in urdf.shapes)
+    links = capsules["link"]
+    radii = capsules["radius"]
     for i, j in itertools.combinations(range(len(links)), 2):
         if links[j] - links[i] > 1:
-            gaps_m = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
-            over = tuning.separation.planned_margin_m if meshes and links[j] - links[i] == 2 else 0.0
+            gaps_m = [
+                between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed
+            ]
+            over = (
+                tuning.separation.planned_margin_m if meshes and links[j] - links[i] == 2 else 0.0
+            )
             if gaps_m[0] > own_clearance(settings, tuning) + over and np.ptp(gaps_m) > TOLERANCE:
                 pairs.append((i, j))
     return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
@@ -102,7 +118,9 @@ def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> f
     lever_j is 1 for a prismatic joint. For a revolute joint it is the largest distance from joint j
     that the link lengths, and the travel of prismatic joints, allow.
     """
-    lever, speed, joints = float(np.linalg.norm(ends, axis=1).max()), 0.0, settings.joints
+    lever = float(np.linalg.norm(ends, axis=1).max())
+    speed = 0.0
+    joints = settings.joints
     for joint in range(link - 1, -1, -1):
         if joints.every_kind[joint] == "prismatic":
             speed += joints.velocity[joint]
@@ -118,8 +136,10 @@ def _ends_of_motion(settings: Settings) -> tuple[Vector, Vector]:
 
     A continuous joint turns by a part of a turn only, because its limits can be the same posture.
     """
-    posture, is_continuous = np.array(settings.arm.posture), np.array(settings.joints.every_kind) == "continuous"
-    lower, upper = np.array(settings.joints.lower), np.array(settings.joints.upper)
+    posture = np.array(settings.arm.posture)
+    is_continuous = np.array(settings.joints.every_kind) == "continuous"
+    lower = np.array(settings.joints.lower)
+    upper = np.array(settings.joints.upper)
     return (
         np.where(is_continuous, np.maximum(posture - 1.9, lower), lower),
         np.where(is_continuous, np.minimum(posture + 2.3, upper), upper),
@@ -141,7 +161,9 @@ def _in_joint(urdf: Urdf, names: tuple[str, ...], link: str, placed: Vector) -> 
         if joint.name in names:
             return names.index(joint.name) + 1, placed
         origin = _origin(joint)
-        placed = np.column_stack((origin[:, :3] @ placed[:, :3], origin[:, :3] @ placed[:, 3] + origin[:, 3]))
+        placed = np.column_stack(
+            (origin[:, :3] @ placed[:, :3], origin[:, :3] @ placed[:, 3] + origin[:, 3])
+        )
         link = joint.parent
     return 0, placed
 
@@ -151,7 +173,9 @@ def _capsule(shape: Shape) -> tuple[Vector, float]:
     if shape.kind == "mesh":
         ends = np.reshape(shape.size[:6], (2, 3))
         return ends @ rotation(shape.rotation).T + shape.translation, shape.size[6]
-    axis, half, radius = 2, 0.0, shape.size[0]
+    axis = 2
+    half = 0.0
+    radius = shape.size[0]
     if shape.kind == "box":
         axis = int(np.argmax(shape.size))
         radius = 0.5 * math.hypot(*(size for i, size in enumerate(shape.size) if i != axis))

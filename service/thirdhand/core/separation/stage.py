@@ -43,25 +43,40 @@ class Separation:
 
     def __init__(self, settings: Settings, urdf: str, *, tuning: Tuning = TUNING) -> None:
         numbers = tuning.separation
-        people, things, table, limits = settings.people, settings.obstacles, settings.table, settings.joints
+        people = settings.people
+        things = settings.obstacles
+        table = settings.table
+        limits = settings.joints
         body = body_of(settings, urdf, tuning)
         self.max_speed = float(body.capsules["max_speed"].max())
-        centre, half = np.array(table.centre), np.array([*table.half_size, 0.0])
+        centre = np.array(table.centre)
+        half = np.array([*table.half_size, 0.0])
         boxes = [[centre - half - [0.0, 0.0, TABLE_DEPTH_M], centre + half]]
-        boxes += [[np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)] for b in things.boxes]
+        boxes += [
+            [np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)]
+            for b in things.boxes
+        ]
         self._boxes = np.array(boxes)
-        self._capsules, self._pairs = body.capsules, body.pairs
-        direction, brake = np.array(people.toward_elbow), np.array([people.brake, things.brake, things.brake])
+        self._capsules = body.capsules
+        self._pairs = body.pairs
+        direction = np.array(people.toward_elbow)
+        brake = np.array([people.brake, things.brake, things.brake])
         late_s = things.reaction_ms / 1000
-        reaction_s = np.array([(settings.hands.longest_stale_ms + people.reaction_ms) / 1000, late_s, late_s])
+        reaction_s = np.array(
+            [(settings.hands.longest_stale_ms + people.reaction_ms) / 1000, late_s, late_s]
+        )
         lookahead_s = 0.5 * numbers.brake_ramp_s * np.arange(5.0)
         self._parameters = parameters(
             brake=brake,
             reaction_s=reaction_s,
             planned_brake=numbers.planned_brake_share
-            * np.minimum(brake, np.array(numbers.planned_brake_limits) * settings.tool.stop_acceleration),
+            * np.minimum(
+                brake, np.array(numbers.planned_brake_limits) * settings.tool.stop_acceleration
+            ),
             planned_reaction_s=np.maximum(reaction_s, numbers.planned_reaction_s),
-            clearance=np.array([people.distance, things.clearance, own_clearance(settings, tuning)]),
+            clearance=np.array(
+                [people.distance, things.clearance, own_clearance(settings, tuning)]
+            ),
             planned_margin=numbers.planned_margin_m,
             planned_brake_share=numbers.planned_brake_share,
             clearance_gain_per_s=numbers.clearance_gain_per_s,
@@ -72,7 +87,8 @@ class Separation:
             # Inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this
             # depth: the arm slips by as much in a reaction time.
             slip_depth_m=numbers.slip_speed_mps * numbers.planned_reaction_s,
-            brake_ramp_s=numbers.brake_ramp_s,  # and the time constant with which a hand's acceleration fades
+            # and the time constant with which a hand's acceleration fades
+            brake_ramp_s=numbers.brake_ramp_s,
             lookahead_s=lookahead_s,
             # A hand approaches at `unknown_speed` until its velocity is better known than after
             # its first sample.
@@ -93,17 +109,25 @@ class Separation:
         )
         self._bare = self._parameters.copy()
         self._bare["clearance"] = 0.0
-        capsules, joints = len(body.capsules), len(limits.names)
+        capsules = len(body.capsules)
+        joints = len(limits.names)
         most = 2 * capsules * len(lookahead_s) + 3 * capsules * len(boxes) + len(body.pairs)
-        self._jerk, self._weights = np.array(limits.jerk), np.square(limits.acceleration)
+        self._jerk = np.array(limits.jerk)
+        self._weights = np.square(limits.acceleration)
         self.constraints = self.constraints_for(joints, most)
         self._contacts = structured(0, CONTACT)
-        self.count, self.nearest_m, self.speed_limit, self.setpoint_share = 0, FARTHEST_REPORTED_M, self.max_speed, 1.0
+        self.count = 0
+        self.nearest_m = FARTHEST_REPORTED_M
+        self.speed_limit = self.max_speed
+        self.setpoint_share = 1.0
 
     @staticmethod
     def constraints_for(joints: int, count: int) -> Records:
         """Allocate `count` constraints for an arm of `joints` joints."""
-        return structured(count, [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)])
+        return structured(
+            count,
+            [("row", np.float64, (joints,)), ("planned", np.float64), ("allowed", np.float64)],
+        )
 
     def set_contacts(self, via_points: Iterable[ViaPoint]) -> None:
         """Allow the tool to touch a hand at the via-points where it goes with that hand."""
@@ -127,7 +151,8 @@ class Separation:
             self._contacts,
             self.constraints,
         )
-        frame["hand_distance"], frame["hand_limit"] = self.nearest_m, self.speed_limit
+        frame["hand_distance"] = self.nearest_m
+        frame["hand_limit"] = self.speed_limit
 
     def clearance(self, joints: Vector, hands: Vector) -> tuple[float, int, int]:
         """Smallest distance [m] beyond the clearances, at joints (J,) [rad, m], hands (H, 3) [m].
@@ -146,7 +171,9 @@ class Separation:
         Also returns the index of the joint that moves this part, and the thing, as `clearance`
         does.
         """
-        clear, part, thing = clearance(joints, NOBODY, self._bare, self._capsules, self._pairs, self._boxes)
+        clear, part, thing = clearance(
+            joints, NOBODY, self._bare, self._capsules, self._pairs, self._boxes
+        )
         return -clear, int(self._capsules["link"][part]) - 1, thing
 
     def share(self, velocity: Vector) -> float:

@@ -15,7 +15,9 @@ from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from thirdhand.core.vectors import norm
 
-NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)  # figures of a step: nearest_m, speed_limit, setpoint_share
+NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(
+    3
+)  # figures of a step: nearest_m, speed_limit, setpoint_share
 
 Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records]
 """States, heres, parameters, capsules, contacts and constraints of a step."""
@@ -25,7 +27,9 @@ Approach: TypeAlias = tuple[bool, Vector, float, float, float, float]
 
 
 @compiled
-def allowed_speed(distance: float, hand_speed: float, brake: float, reaction: float, clearance: float) -> float:
+def allowed_speed(
+    distance: float, hand_speed: float, brake: float, reaction: float, clearance: float
+) -> float:
     """Largest speed v [m/s] toward an object, from which a stop still ends at the clearance.
 
     The object is at the distance d and approaches with constant speed u = `hand_speed`. The arm
@@ -230,12 +234,16 @@ def _keep_part(
         carry_back(near, parts[capsule], placed[0, capsule])
     _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
     if is_tool:
-        figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1]))
+        figures[SETPOINT_SHARE] = min(
+            figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1])
+        )
     return count + _may_pass(constraints, count, planned, config.max_velocity)
 
 
 @compiled
-def _keep_from_boxes(scene: Scene, boxes: Vector, count: int, placed: Vector, figures: Vector) -> int:
+def _keep_from_boxes(
+    scene: Scene, boxes: Vector, count: int, placed: Vector, figures: Vector
+) -> int:
     """Write the constraints of the boxes (B, ...), after the first `count`; return the number of
     all. `placed` (C, 2, 3) [m] has the capsules' ends.
     """
@@ -256,7 +264,9 @@ def _keep_from_boxes(scene: Scene, boxes: Vector, count: int, placed: Vector, fi
                 _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
                 planned = _limit(constraints, count, parameters, THINGS, distance, planned)
                 if part.link == len(heres[0].joints):
-                    figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1]))
+                    figures[SETPOINT_SHARE] = min(
+                        figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1])
+                    )
                 count += _may_pass(constraints, count, planned, config.max_velocity)
     return count
 
@@ -293,11 +303,15 @@ def _along(near: Vector, velocity: Vector) -> float:
 def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
     """Speed [m/s] that the rule (PEOPLE, THINGS or ITSELF) allows at this distance [m]."""
     config = parameters[0]
-    return allowed_speed(distance, coming, config.brake[rule], config.reaction_s[rule], config.clearance[rule])
+    return allowed_speed(
+        distance, coming, config.brake[rule], config.reaction_s[rule], config.clearance[rule]
+    )
 
 
 @compiled
-def _planned(parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float) -> float:
+def _planned(
+    parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float
+) -> float:
     """Speed [m/s] that motion is planned with: lower than what the rule allows.
 
         max(planned_brake_share least, allowed_speed) + planned_brake_share braked
@@ -305,14 +319,19 @@ def _planned(parameters: Records, rule: int, distance: float, coming: float, lea
     with the planned brake and reaction time, and with the planned margin added to the clearance.
     """
     config = parameters[0]
-    brake, reaction_s = config.planned_brake[rule], config.planned_reaction_s[rule]
-    planned = allowed_speed(distance, coming, brake, reaction_s, config.clearance[rule] + config.planned_margin)
+    brake = config.planned_brake[rule]
+    reaction_s = config.planned_reaction_s[rule]
+    planned = allowed_speed(
+        distance, coming, brake, reaction_s, config.clearance[rule] + config.planned_margin
+    )
     share: float = config.planned_brake_share
     return max(share * least, planned) + share * braked
 
 
 @compiled
-def _limit(constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float) -> float:
+def _limit(
+    constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float
+) -> float:
     """Set the limits of constraint k to a thing or another part; return the planned speed [m/s].
 
         left    = distance - clearance
@@ -322,12 +341,15 @@ def _limit(constraints: Records, k: int, parameters: Records, rule: int, distanc
     Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
     move them at retreat_authority_mps.
     """
-    config, constraint = parameters[0], constraints[k]
+    config = parameters[0]
+    constraint = constraints[k]
     left = distance - config.clearance[rule]
     slip = min(max(1.0 + left / config.slip_depth_m, 0.1), 1.0) * config.slip_speed_mps
     constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
     planned = min(planned, max(config.clearance_gain_per_s * left, -config.retreat_speed_mps))
-    if planned < 0.0 and not _may_pass(constraints, k, config.retreat_authority_mps, config.max_velocity):
+    if planned < 0.0 and not _may_pass(
+        constraints, k, config.retreat_authority_mps, config.max_velocity
+    ):
         planned = 0.0
     constraint.planned = planned
     return planned
@@ -387,13 +409,21 @@ def _bring_together(
     v_j and w_j are the linear and angular columns of the tool's Jacobian, n = near[6:9]. A positive
     sign first sets the row to 0.
     """
-    row, tool, jacobian = constraints[k].row, heres[0].position, heres[0].jacobian
+    row = constraints[k].row
+    tool = heres[0].position
+    jacobian = heres[0].jacobian
     if sign > 0.0:
         row[:] = 0.0
-    x, y, z = near[at] - tool[0], near[at + 1] - tool[1], near[at + 2] - tool[2]
-    n0, n1, n2 = near[6], near[7], near[8]
+    x = near[at] - tool[0]
+    y = near[at + 1] - tool[1]
+    z = near[at + 2] - tool[2]
+    n0 = near[6]
+    n1 = near[7]
+    n2 = near[8]
     for j in range(link):
-        wx, wy, wz = jacobian[3, j], jacobian[4, j], jacobian[5, j]
+        wx = jacobian[3, j]
+        wy = jacobian[4, j]
+        wz = jacobian[5, j]
         speed = n0 * (jacobian[0, j] + wy * z - wz * y)
         speed += n1 * (jacobian[1, j] + wz * x - wx * z)
         speed += n2 * (jacobian[2, j] + wx * y - wy * x)
@@ -418,9 +448,12 @@ def share_of(constraints: Records, count: int, velocity: Vector, parameters: Rec
 
 
 @compiled
-def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector) -> tuple[float, int]:
+def excess_of(
+    constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: Vector
+) -> tuple[float, int]:
     """`Separation.excess`, and the number of the constraint with the largest excess."""
-    most, number = -math.inf, 0
+    most = -math.inf
+    number = 0
     for k in range(count):
         constraint = constraints[k]
         now = crest = 0.0
@@ -428,5 +461,6 @@ def excess_of(constraints: Records, count: int, dq: Vector, ddq: Vector, jerk: V
             now += constraint.row[j] * dq[j]
             crest += constraint.row[j] * (dq[j] + ddq[j] * abs(ddq[j]) / (2.0 * jerk[j]))
         if max(now, crest) - constraint.allowed > most:
-            most, number = max(now, crest) - constraint.allowed, k
+            most = max(now, crest) - constraint.allowed
+            number = k
     return most, number

@@ -25,7 +25,14 @@ from typing import TypeAlias
 import numpy as np
 
 from kmp.compiled import compiled
-from thirdhand.core.codes import ACCELERATION_BOUND, FINITE_BOUND, JERK_BOUND, NO_BOUND, POSITION_BOUND, SPEED_BOUND
+from thirdhand.core.codes import (
+    ACCELERATION_BOUND,
+    FINITE_BOUND,
+    JERK_BOUND,
+    NO_BOUND,
+    POSITION_BOUND,
+    SPEED_BOUND,
+)
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from thirdhand.core.setpoint import HULL_SPANS
@@ -48,7 +55,10 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
         if ticks > 0:
             for span in range(HULL_SPANS - 1, 0, -1):
                 for axis in range(3):
-                    hull[span, 0, axis], hull[span, 1, axis] = hull[span - 1, 0, axis], hull[span - 1, 1, axis]
+                    hull[span, 0, axis], hull[span, 1, axis] = (
+                        hull[span - 1, 0, axis],
+                        hull[span - 1, 1, axis],
+                    )
         for axis in range(3):
             hull[0, 0, axis] = hull[0, 1, axis] = position[axis]
         return 1
@@ -60,7 +70,13 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
 
 @compiled
 def bounds_around(
-    hull: Vector, ticks: int, position: Vector, parameters: Records, box: Vector, low: Vector, high: Vector
+    hull: Vector,
+    ticks: int,
+    position: Vector,
+    parameters: Records,
+    box: Vector,
+    low: Vector,
+    high: Vector,
 ) -> int:
     """Add a target (3,) with `remember`, then write the `bounds` into low and high (3,) [m].
 
@@ -83,15 +99,19 @@ def bounds(hull: Vector, box: Vector, parameters: Records, low: Vector, high: Ve
     """
     config = parameters[0]
     for axis in range(3):
-        least, greatest = hull[0, 0, axis], hull[0, 1, axis]
+        least = hull[0, 0, axis]
+        greatest = hull[0, 1, axis]
         for span in range(1, HULL_SPANS):
-            least, greatest = min(least, hull[span, 0, axis]), max(greatest, hull[span, 1, axis])
+            least = min(least, hull[span, 0, axis])
+            greatest = max(greatest, hull[span, 1, axis])
         low[axis] = max(box[0, axis], config.lowest[axis], least - config.hull_margin_m)
         high[axis] = min(box[1, axis], greatest + config.hull_margin_m)
 
 
 @compiled
-def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records) -> int:
+def broken_bound(
+    setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records
+) -> int:
     """The first SetpointBound that a step from `before` breaks; NO_BOUND if it breaks none.
 
     The setpoint and `before` are (3, 3): position, velocity, acceleration; by axis. Norms are over
@@ -105,16 +125,21 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
                       `longest_stop`, which is more than any stop from outside takes
     """
     config = parameters[0]
-    max_speed, longest_stop = config.max_speed, config.longest_stop
+    max_speed = config.max_speed
+    longest_stop = config.longest_stop
     if not np.isfinite(setpoint).all():
         return FINITE_BOUND
-    if norm(setpoint[1]) > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9:
+    if (
+        norm(setpoint[1])
+        > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9
+    ):
         return SPEED_BOUND
     if norm(setpoint[2]) > max(config.max_acceleration, norm(before[2])) + 1e-9:
         return ACCELERATION_BOUND
     if distance(setpoint[2], before[2]) > (config.max_jerk + 1e-6) * config.period_s:
         return JERK_BOUND
-    low, high = np.empty(3), np.empty(3)
+    low = np.empty(3)
+    high = np.empty(3)
     bounds(hull, box, parameters, low, high)
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - longest_stop:
@@ -126,7 +151,13 @@ def broken_bound(setpoint: Vector, before: Vector, hull: Vector, box: Vector, pa
 
 @compiled
 def take_safe(
-    setpoint: Vector, ahead: Vector, parameters: Records, costs: Vector, slow: float, low: Vector, high: Vector
+    setpoint: Vector,
+    ahead: Vector,
+    parameters: Records,
+    costs: Vector,
+    slow: float,
+    low: Vector,
+    high: Vector,
 ) -> bool:
     """Move a setpoint (3, 3) to `ahead` (3, 3) if a stop from there keeps every bound.
 
@@ -144,28 +175,40 @@ def take_safe(
     Returns False if all axes fell back.
     """
     config = parameters[0]
-    max_speed, max_acceleration, max_jerk = config.max_speed, config.stop_acceleration, config.stop_jerk
+    max_speed = config.max_speed
+    max_acceleration = config.stop_acceleration
+    max_jerk = config.stop_jerk
     return_speed = config.return_share * max_speed
     max_joint_cost = 0.0
     for i in range(3):
         for joint in range(costs.shape[2]):
             max_joint_cost = max(max_joint_cost, abs(costs[0, i, joint]))
     required_return_m = return_speed * slow / max(1.0, max_joint_cost * max_speed) * config.period_s
-    is_kept, is_mixed = True, False
+    is_kept = True
+    is_mixed = False
     for i in range(3):
         for side, bound in ((1.0, high[i]), (-1.0, low[i])):
             if farthest(ahead, i, side, max_acceleration, max_jerk, 0.0) <= side * bound:
                 continue
-            if farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0) <= side * bound + TOLERANCE:
+            if (
+                farthest(setpoint, i, side, max_acceleration, max_jerk, 0.0)
+                <= side * bound + TOLERANCE
+            ):
                 is_kept = False
                 continue
             farthest_m = farthest(setpoint, i, side, max_acceleration, max_jerk, return_speed)
-            if farthest(ahead, i, side, max_acceleration, max_jerk, return_speed) > farthest_m - required_return_m + ROUNDING:
+            if (
+                farthest(ahead, i, side, max_acceleration, max_jerk, return_speed)
+                > farthest_m - required_return_m + ROUNDING
+            ):
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
                 is_mixed = True
     if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
         is_kept = is_kept and square(ahead[2]) <= config.max_acceleration**2
-        is_kept = is_kept and squared_distance(ahead[2], setpoint[2]) <= (config.max_jerk * config.period_s) ** 2
+        is_kept = (
+            is_kept
+            and squared_distance(ahead[2], setpoint[2]) <= (config.max_jerk * config.period_s) ** 2
+        )
     if is_kept and speed_to_come(ahead[1], ahead[2], max_jerk, return_speed) <= max_speed:
         setpoint[:] = ahead
         return True
@@ -178,7 +221,13 @@ def take_safe(
 
 @compiled
 def _fall_back(
-    setpoint: Vector, out: Vector, parameters: Records, axis: int, low: float, high: float, return_speed: float
+    setpoint: Vector,
+    out: Vector,
+    parameters: Records,
+    axis: int,
+    low: float,
+    high: float,
+    return_speed: float,
 ) -> None:
     """Write into out (3, 3) one axis one period further along its fastest stop.
 
@@ -186,21 +235,30 @@ def _fall_back(
     `return_speed` [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which
     one counts.
     """
-    max_acceleration, max_jerk, dt = parameters[0].stop_acceleration, parameters[0].stop_jerk, parameters[0].period_s
+    max_acceleration = parameters[0].stop_acceleration
+    max_jerk = parameters[0].stop_jerk
+    dt = parameters[0].period_s
     over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + TOLERANCE
     under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > TOLERANCE - low
     if over and under:  # the stop ends beyond both bounds
         over = setpoint[1, axis] > 0.0
         under = not over
-    frame, stop = return_speed * (under - over), np.empty(6)
+    frame = return_speed * (under - over)
+    stop = np.empty(6)
     fastest_stop(setpoint[1, axis] - frame, setpoint[2, axis], max_acceleration, max_jerk, dt, stop)
     out[0, axis] = setpoint[0, axis] + (stop[2] + frame * dt)
-    out[1, axis], out[2, axis] = stop[0] + frame, stop[1]
+    out[1, axis] = stop[0] + frame
+    out[2, axis] = stop[1]
 
 
 @compiled
 def farthest(
-    setpoint: Vector, axis: int, side: float, max_acceleration: float, max_jerk: float, return_speed: float
+    setpoint: Vector,
+    axis: int,
+    side: float,
+    max_acceleration: float,
+    max_jerk: float,
+    return_speed: float,
 ) -> float:
     """Farthest position [m] of an axis, toward `side` (1 or -1), along its fastest change of speed.
 
@@ -211,7 +269,12 @@ def farthest(
     """
     stop = np.empty(6)
     fastest_stop(
-        side * setpoint[1, axis] + return_speed, side * setpoint[2, axis], max_acceleration, max_jerk, 0.0, stop
+        side * setpoint[1, axis] + return_speed,
+        side * setpoint[2, axis],
+        max_acceleration,
+        max_jerk,
+        0.0,
+        stop,
     )
     return float(side * setpoint[0, axis] + stop[4])
 
@@ -255,7 +318,9 @@ def stop_distance(speed: float, acceleration: float, brake: float, change: float
         speed_then = speed + 0.5 * change * t * t
         length = -(speed_then * t - change * t * t * t / 6.0)
     if speed_then >= brake * brake / change:
-        return length + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+        return (
+            length + speed_then * speed_then / (2.0 * brake) + speed_then * brake / (2.0 * change)
+        )
     return length + speed_then * math.sqrt(speed_then / change)
 
 
@@ -269,7 +334,9 @@ def _stop_after(v: float, a: float, jerk: float, brakes: Pair, dt: float) -> flo
 
 
 @compiled
-def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float) -> float:
+def between(
+    wanted: float, lowest: float, at_wanted: float, at_lowest: float, limit: float
+) -> float:
     """Largest jerk in [lowest, wanted] at which a quantity that is linear in jerk keeps its limit.
 
     The quantity is `at_wanted` at the jerk `wanted` and `at_lowest` at `lowest`, and grows with
@@ -284,7 +351,14 @@ def between(wanted: float, lowest: float, at_wanted: float, at_lowest: float, li
 
 @compiled
 def stopping(
-    length: float, growth: float, v: float, a: float, brakes: Pair, jerks: Pair, retained: float, dt: float
+    length: float,
+    growth: float,
+    v: float,
+    a: float,
+    brakes: Pair,
+    jerks: Pair,
+    retained: float,
+    dt: float,
 ) -> float:
     """Largest jerk [m/s³] in [lowest, wanted] at which a discrete barrier keeps a distance h.
 
@@ -297,9 +371,11 @@ def stopping(
     `growth` [m] is how much the length grows by itself in a period. A secant method finds the
     jerk, to STOP_SECANT_TOLERANCE_M of h'.
     """
-    (brake, change), (top_jerk, chosen) = brakes, jerks
+    brake, change = brakes
+    top_jerk, chosen = jerks
     limit = length + growth - retained * (length - stop_distance(v, a, brake, change))
-    most, passed = _stop_after(v, a, top_jerk, brakes, dt), _stop_after(v, a, chosen, brakes, dt)
+    most = _stop_after(v, a, top_jerk, brakes, dt)
+    passed = _stop_after(v, a, chosen, brakes, dt)
     for _ in range(STOP_SECANTS):
         chosen = between(top_jerk, chosen, most, passed, limit)
         if chosen >= top_jerk:

@@ -19,7 +19,8 @@ class OrientationSetpoint:
     """Orientation setpoint of the state: a quaternion (4,) and an angular velocity (3,) [rad/s]."""
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
-        tool, numbers = settings.tool, tuning.arm
+        tool = settings.tool
+        numbers = tuning.arm
         speed_share, brake_share, _ = numbers.planned_limit_shares
         self._parameters = parameters(
             max_speed=speed_share * tool.max_turn_speed,
@@ -49,7 +50,9 @@ class OrientationSetpoint:
         If the settings say that only a direction is followed, the setpoint turns +z on the shortest
         path.
         """
-        turn_orientation(state["orientation"], state["turning"], orientation, turning, self.limits(state))
+        turn_orientation(
+            state["orientation"], state["turning"], orientation, turning, self.limits(state)
+        )
 
 
 @compiled
@@ -69,8 +72,11 @@ def turn_orientation(
     most max_acceleration * period, and turns the quaternion for one period. If only the direction
     of +z is followed, e is its shortest turn and target_turning loses its component about +z.
     """
-    config, dt = parameters[0], parameters[0].period_s
-    error, desired, axis = np.empty(3), np.empty(3), np.empty(3)
+    config = parameters[0]
+    dt = parameters[0].period_s
+    error = np.empty(3)
+    desired = np.empty(3)
+    axis = np.empty(3)
     axis_of(quaternion, axis)
     along = 0.0
     if config.about:
@@ -80,7 +86,8 @@ def turn_orientation(
         along = dot(target_turning, axis)
     angle = norm(error)
     # rate is constant for small errors; for large ones the turn ends at constant deceleration
-    brake, rate = config.planned_brake_share * config.max_acceleration, config.gain
+    brake = config.planned_brake_share * config.max_acceleration
+    rate = config.gain
     near = brake / config.gain**2
     if angle > near:
         rate = math.sqrt(2.0 * brake * (angle - 0.5 * near)) / angle

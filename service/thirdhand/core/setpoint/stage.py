@@ -46,9 +46,13 @@ class SetpointGenerator:
     """Position setpoint of the state (3, 3): position, velocity and acceleration; by axis."""
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
-        tool, reach, numbers = settings.tool, settings.reach, tuning.setpoint
+        tool = settings.tool
+        reach = settings.reach
+        numbers = tuning.setpoint
         # [m] a stop at full braking, and one second at max_speed: no stop from outside takes more
-        longest_stop = 0.5 * tool.max_speed * tool.max_speed / tool.stop_acceleration + 1.0 * tool.max_speed
+        longest_stop = (
+            0.5 * tool.max_speed * tool.max_speed / tool.stop_acceleration + 1.0 * tool.max_speed
+        )
         # Of the tool's limits, and again of the joints', which `joint_costs` has reduced already.
         speed_share, brake_share, jerk_share = tuning.arm.planned_limit_shares
         self._parameters = parameters(
@@ -73,7 +77,8 @@ class SetpointGenerator:
             planned_brake_share=brake_share,
             # To meet a target that brakes too, the share of the jerk that planning leaves.
             meeting_brake_least_share=1.0 - jerk_share,
-            barrier_rate_per_s=tuning.arm.position_gain_per_s,  # as the tool closes in on its setpoint
+            # as the tool closes in on its setpoint
+            barrier_rate_per_s=tuning.arm.position_gain_per_s,
             # In long periods, where the prediction over one period is less accurate.
             barrier_time_s=1.0 / (6.0 * tuning.arm.position_gain_per_s),
             # Progress that is expected of a tool, from up to 0.75 stuck_s of max_speed away.
@@ -126,7 +131,13 @@ class SetpointGenerator:
         """
         limits = self._parameters[0]["stop_acceleration"], self._parameters[0]["stop_jerk"]
         ends = np.array(
-            [[-farthest(setpoint, i, -1.0, *limits, 0.0), farthest(setpoint, i, 1.0, *limits, 0.0)] for i in range(3)]
+            [
+                [
+                    -farthest(setpoint, i, -1.0, *limits, 0.0),
+                    farthest(setpoint, i, 1.0, *limits, 0.0),
+                ]
+                for i in range(3)
+            ]
         )
         stretched = np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
         stretched.setflags(write=False)
@@ -134,7 +145,9 @@ class SetpointGenerator:
 
     def name_of_broken_bound(self, state: Record, before: Vector, box: Vector) -> str:
         """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
-        bound = SetpointBound(broken_bound(state["setpoint"], before, state["hull"], box, self.limits(state)))
+        bound = SetpointBound(
+            broken_bound(state["setpoint"], before, state["hull"], box, self.limits(state))
+        )
         return bound.name.lower().replace("_", " ") if bound else ""
 
 
@@ -142,7 +155,8 @@ class SetpointStage:
     """Position and orientation setpoints and gripper, in the box (2, 3) [m] of the active skill."""
 
     def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
-        self._arm, self._period_s = arm, settings.period_s
+        self._arm = arm
+        self._period_s = settings.period_s
         self._gap_waiting_m = tuning.setpoint.gap_waiting_m
         self._gap_stopped_m = tuning.setpoint.gap_stopped_m
         self._takes_wishes = settings.hands.gripper == "key"
@@ -150,7 +164,9 @@ class SetpointStage:
         self._position = SetpointGenerator(settings, tuning=tuning)
         self._orientation = OrientationSetpoint(settings, tuning=tuning)
 
-    def begin(self, state: Record, frame: Record, here: Kinematics, *, engages: bool = True) -> None:
+    def begin(
+        self, state: Record, frame: Record, here: Kinematics, *, engages: bool = True
+    ) -> None:
         """Start the setpoints where the commanded joints place the tool, at the tool's velocity."""
         velocities = state["joints"][1]
         moving = np.stack([here.position, times(here.tasks[:3], velocities), np.zeros(3)])
@@ -158,13 +174,23 @@ class SetpointStage:
         self._orientation.begin(state, here.rotation, times(here.jacobian[3:], velocities))
         write(as_array(state), as_array(frame))
 
-    def step(self, state: Record, frame: Record, wanted: Wanted, here: Kinematics, box: Vector, share: float) -> int:
+    def step(
+        self,
+        state: Record,
+        frame: Record,
+        wanted: Wanted,
+        here: Kinematics,
+        box: Vector,
+        share: float,
+    ) -> int:
         """Move the setpoints one period on; return the code of `SetpointGenerator.step`.
 
         `share`: share of the setpoint's speed at which separation lets the tool follow.
         """
-        states, frames = as_array(state), as_array(frame)
-        target, tool = wanted.target, here.record["position"][0]
+        states = as_array(state)
+        frames = as_array(frame)
+        target = wanted.target
+        tool = here.record["position"][0]
         self._position.engage(state, target.position)
         limits = self._position.limits(state)
         slow, gap_m = ready(states, here.record, self._arm.parameters, limits, share, self._costs)
@@ -188,8 +214,10 @@ class SetpointStage:
         the tool is near its target, `off` [m] away.
         """
         states = as_array(state)
-        before, tick = int(states["gripper"][0]), int(states["tick"][0])
+        before = int(states["gripper"][0])
+        tick = int(states["tick"][0])
         since_s = self._period_s * (tick - int(states["gripper_tick"][0]))
         after = decided(before, closure, since_s=since_s, off=off)
         if after != before:
-            state["gripper"], state["gripper_tick"] = after, tick
+            state["gripper"] = after
+            state["gripper_tick"] = tick

@@ -31,7 +31,11 @@ def slow_down(setpoint: Vector, tool: Vector, share: float, parameters: Records)
         ahead = setpoint[0, i] - tool[i]
         along += ahead * setpoint[1, i]
         gap += ahead * ahead
-    slow = 1.0 if along <= 0.0 else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - config.gap_free_m) / config.gap_slow_m)
+    slow = (
+        1.0
+        if along <= 0.0
+        else 1.0 / (1.0 + max(0.0, math.sqrt(gap) - config.gap_free_m) / config.gap_slow_m)
+    )
     if share < 1.0:
         slow = min(slow, share * norm(setpoint[1]) / config.max_speed)
     return slow
@@ -58,14 +62,28 @@ def lead(
 
     `take_safe` accepts this step or replaces it by the fall-back.
     """
-    state, config, setpoint = states[0], parameters[0], states[0].setpoint
-    target, low, high, before = np.empty((3, 3)), np.empty(3), np.empty(3), setpoint.copy()
-    target[0], target[1], target[2] = position, velocity, acceleration
-    state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, parameters, box, low, high)
-    jerk, ahead, dt = np.empty(3), np.empty((3, 3)), config.period_s
+    state = states[0]
+    config = parameters[0]
+    setpoint = states[0].setpoint
+    target = np.empty((3, 3))
+    low = np.empty(3)
+    high = np.empty(3)
+    before = setpoint.copy()
+    target[0] = position
+    target[1] = velocity
+    target[2] = acceleration
+    state.hull_ticks = bounds_around(
+        state.hull, state.hull_ticks, position, parameters, box, low, high
+    )
+    jerk = np.empty(3)
+    ahead = np.empty((3, 3))
+    dt = config.period_s
     met = _track(setpoint, target, parameters, costs, slow, box, jerk)
     for i in range(3):
-        x, v, a, j = setpoint[0, i], setpoint[1, i], setpoint[2, i], jerk[i]
+        x = setpoint[0, i]
+        v = setpoint[1, i]
+        a = setpoint[2, i]
+        j = jerk[i]
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
@@ -79,7 +97,13 @@ def lead(
 
 @compiled
 def _track(
-    setpoint: Vector, target: Vector, parameters: Records, costs: Vector, slow: float, box: Vector, jerk: Vector
+    setpoint: Vector,
+    target: Vector,
+    parameters: Records,
+    costs: Vector,
+    slow: float,
+    box: Vector,
+    jerk: Vector,
 ) -> int:
     """Write the tracker's jerk (3,) [m/s³], reduced along the motion where a barrier requires it.
 
@@ -152,7 +176,9 @@ def _feasible_share(velocity: Vector, max_speed: float) -> float:
 
 
 @compiled
-def _tracking_jerk(setpoint: Vector, target: Vector, parameters: Records, feasible: float, jerk: Vector) -> None:
+def _tracking_jerk(
+    setpoint: Vector, target: Vector, parameters: Records, feasible: float, jerk: Vector
+) -> None:
     """Write the tracker's jerk (3,) [m/s³], see `_track`."""
     gains = parameters[0].gains
     for i in range(3):
@@ -191,7 +217,9 @@ def _barriers(
     # Below the jerk `lowest`, the setpoint would still decelerate at rest, and reverse.
     coasting_now = _coasting(speed, a, 0.0, change, 0.0)
     coasting_least = _coasting(speed, a, -change, change, dt)
-    lowest = between(tracking, -change, _coasting(speed, a, tracking, change, dt), coasting_least, 0.0)
+    lowest = between(
+        tracking, -change, _coasting(speed, a, tracking, change, dt), coasting_least, 0.0
+    )
     retained = 1.0 - min(config.barrier_rate_per_s * dt, config.barrier_time_s / dt)
 
     # Stop: the setpoint can stop where the target will.
@@ -209,7 +237,9 @@ def _barriers(
     if faster_by > 0.0 and _coasting(faster_by, a_faster_by, 0.0, change, 0.0) > 0.0:
         meeting = max(brake + min(target_a, 0.0), config.meeting_brake_least_share * brake)
         gap = distance + config.stop_overshoot_m
-        jerk = stopping(gap, 0.0, faster_by, a_faster_by, (meeting, change), (jerk, lowest), retained, dt)
+        jerk = stopping(
+            gap, 0.0, faster_by, a_faster_by, (meeting, change), (jerk, lowest), retained, dt
+        )
 
     # Speed: the speed after the acceleration has ended stays below the limit.
     limit = top - retained * (top - coasting_now)
@@ -237,10 +267,14 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
     config = parameters[0]
     p = -0.5 * config.gains[4]
     for i in range(3):
-        x, v, a = setpoint[0, i], setpoint[1, i], setpoint[2, i]
+        x = setpoint[0, i]
+        v = setpoint[1, i]
+        a = setpoint[2, i]
         damping = -3.0 * p * (p * v + a)
         highest = max(p * p * p * max(box[1, i] - x, 0.0) + damping, -config.stop_jerk)
-        lowest = min(p * p * p * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk)
+        lowest = min(
+            p * p * p * min(max(box[0, i], config.lowest[i]) - x, 0.0) + damping, config.stop_jerk
+        )
         jerk[i] = min(max(jerk[i], min(lowest, highest)), max(lowest, highest))
 
 
@@ -262,7 +296,9 @@ def _largest(costs: Vector, motion: Vector) -> float:
     """
     largest = 0.0
     for joint in range(costs.shape[1]):
-        needed = costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
+        needed = (
+            costs[0, joint] * motion[0] + costs[1, joint] * motion[1] + costs[2, joint] * motion[2]
+        )
         largest = max(largest, abs(needed))
     return largest
 
@@ -274,7 +310,9 @@ def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: 
     First the acceleration after the period, a + dt jerk, is scaled to its limits, which gives the
     jerk; then the jerk itself is scaled to its own.
     """
-    config, ahead, dt = parameters[0], np.empty(3), parameters[0].period_s
+    config = parameters[0]
+    ahead = np.empty(3)
+    dt = parameters[0].period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
     excess = max(norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
@@ -295,14 +333,16 @@ def ready(
     and the setpoint's distance from the tool [m].
     """
     joint_costs(arms, heres, costs)
-    setpoint, tool = states[0].setpoint, heres[0].position
+    setpoint = states[0].setpoint
+    tool = heres[0].position
     return slow_down(setpoint, tool, share, parameters), distance(setpoint[0], tool)
 
 
 @compiled
 def finish(states: Records, frames: Records, parameters: Records) -> None:
     """Turn the orientation setpoint for one period, and write the setpoints into the frame."""
-    state, frame = states[0], frames[0]
+    state = states[0]
+    frame = frames[0]
     turn_orientation(state.orientation, state.turning, frame.orientation, frame.turning, parameters)
     write(states, frames)
 
@@ -310,8 +350,11 @@ def finish(states: Records, frames: Records, parameters: Records) -> None:
 @compiled
 def write(states: Records, frames: Records) -> None:
     """Write the state's setpoints and gripper into the frame."""
-    state, frame = states[0], frames[0]
-    frame.setpoint[:], frame.setpoint_velocity[:] = state.setpoint[0], state.setpoint[1]
+    state = states[0]
+    frame = frames[0]
+    frame.setpoint[:] = state.setpoint[0]
+    frame.setpoint_velocity[:] = state.setpoint[1]
     frame.setpoint_acceleration[:] = state.setpoint[2]
-    frame.setpoint_orientation[:], frame.setpoint_turning[:] = state.orientation, state.turning
+    frame.setpoint_orientation[:] = state.orientation
+    frame.setpoint_turning[:] = state.turning
     frame.gripper = state.gripper

@@ -31,12 +31,22 @@ def gains_for(settings: Settings, tuning: Tuning = TUNING) -> Vector:
 
     The tracker acts once a tick: it would oscillate at the rate of the loop.
     """
-    tool, numbers = settings.tool, tuning.setpoint
+    tool = settings.tool
+    numbers = tuning.setpoint
     # [1/m] jerk gain / max_jerk of a tool with little jerk
     stiffest_per_m = 3.0 / numbers.hull_margin_m
-    tool_rate = max(numbers.tracker_rate_share * tool.jerk / tool.acceleration, math.cbrt(stiffest_per_m * tool.jerk))
-    quickest = min(numbers.tracker_rate_share * acceleration_rate(settings.joints), tool_rate, 0.5 * settings.rate_hz)
-    return tracker_gains(max(numbers.jerk_weight, max(quickest, SLOWEST_PER_S) ** -6), tuning.intake)
+    tool_rate = max(
+        numbers.tracker_rate_share * tool.jerk / tool.acceleration,
+        math.cbrt(stiffest_per_m * tool.jerk),
+    )
+    quickest = min(
+        numbers.tracker_rate_share * acceleration_rate(settings.joints),
+        tool_rate,
+        0.5 * settings.rate_hz,
+    )
+    return tracker_gains(
+        max(numbers.jerk_weight, max(quickest, SLOWEST_PER_S) ** -6), tuning.intake
+    )
 
 
 def tracker_gains(jerk_weight: float, hands: IntakeTuning = TUNING.intake) -> Vector:
@@ -79,7 +89,8 @@ def waiting(target: Target, setpoint: Vector, tool: Vector, gaps_m: tuple[float,
     approach its tool is returned unchanged.
     """
     gap_waiting_m, gap_stopped_m = gaps_m
-    ahead, to_target = setpoint[0] - tool, target.position - setpoint[0]
+    ahead = setpoint[0] - tool
+    to_target = target.position - setpoint[0]
     gap = norm(ahead)
     if dot(ahead, to_target) <= 0.0:
         return target

@@ -62,13 +62,17 @@ class HandsKMP:
     errors: LocalErrors | None = None
 
     measure: ClassVar[str] = "the target's standard deviation"
-    units: ClassVar[str] = "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
+    units: ClassVar[str] = (
+        "inputs: left x y z, right x y z [m]; outputs: tool x y z [m]; frame base"
+    )
     ranges: ClassVar[Mapping[str, tuple[float, float, str]]] = {
         "error_inputs": (-1e3, 1e3, ""),
         "error_samples": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
         "error_unknown_std": (0.0, MAX_SKILL_DISTANCE_M, "m"),
     }
-    gripper_ell: ClassVar[float] = 1000.0  # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
+    gripper_ell: ClassVar[float] = (
+        1000.0  # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
+    )
     names: ClassVar[tuple[str, ...]] = ()
     delay_s: ClassVar[float] = 0.0
 
@@ -93,7 +97,9 @@ class HandsKMP:
         no input.
         """
         first = 6 * (1 + self.order)
-        return np.asarray(self.primitive.base.inputs[:, first : first + TURN_INPUTS * self.turned].mean(axis=0))
+        return np.asarray(
+            self.primitive.base.inputs[:, first : first + TURN_INPUTS * self.turned].mean(axis=0)
+        )
 
     @property
     def hands(self) -> Vector:
@@ -117,20 +123,25 @@ class HandsKMP:
         The covariance, which takes as long as all else, is computed only if it is not `known`.
         """
         moving = self._moving(seen)
-        motion = self.primitive.predict_motion(moving[0], moving[1], moving[2], covariance=known is None)
+        motion = self.primitive.predict_motion(
+            moving[0], moving[1], moving[2], covariance=known is None
+        )
         covariance = motion.covariance if known is None else known
         assert covariance is not None
         out = np.empty((6, 3))
         deviation = _rounded(motion.mean, motion.velocity, motion.acceleration, covariance, out)
         if known is None and self.errors is not None:
-            errors, inputs = self.errors, np.ascontiguousarray(moving[0])
+            errors = self.errors
+            inputs = np.ascontiguousarray(moving[0])
             local_scatter(inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
         if known is not None and self.errors is not None:
             deviation = math.nan
         return Motion(out[0], out[1], out[2], out[3:], deviation)
 
-    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+    def elsewhere(
+        self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector
+    ) -> float:
         return 0.0
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
@@ -168,7 +179,8 @@ class HandsKMP:
         """Inputs (I,) with their velocity and acceleration, (3, I)."""
         if not self._is_rich:
             return seen.moving
-        turns, out = seen.turns, np.empty((3, self.shape[0]))
+        turns = seen.turns
+        out = np.empty((3, self.shape[0]))
         if self.turned and not len(turns):
             turns = np.tile(self._usual_turns / TURN_WEIGHT_M, (TURNS, 1))
         moving_features(seen.moving, seen.past[: self.order], turns, out)
@@ -176,12 +188,16 @@ class HandsKMP:
             out[:, -1] = self.clock.weight * seen.clock[:3]
         return out
 
-    def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> HandsKMP:
+    def through(
+        self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float
+    ) -> HandsKMP:
         """Model adapted to via-points by Algorithm 1 of Huang et al. 2019."""
         hands, outputs, deviations = neighbourhoods(via_points)
         inputs = self.inputs(hands)
         desired = Gaussians(outputs, weight * deviations[:, None, None] ** 2 * np.eye(3))
-        return replace(self, primitive=self.primitive.base.adapt(inputs, desired, tolerance=tolerance))
+        return replace(
+            self, primitive=self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
+        )
 
     def unadapted(self) -> HandsKMP:
         return replace(self, primitive=self.primitive.base)
@@ -198,23 +214,34 @@ class HandsKMP:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, via_points: tuple[ViaPoint, ...]) -> HandsKMP:
-        primitive, errors = from_arrays(arrays), None
+        primitive = from_arrays(arrays)
+        errors = None
         clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
         if "error_inputs" in arrays:
             count = len(arrays["error_inputs"])
-            shapes = {"error_inputs": (count, primitive.inputs.shape[1]), "error_samples": (count, 3)}
+            shapes = {
+                "error_inputs": (count, primitive.inputs.shape[1]),
+                "error_samples": (count, 3),
+            }
             check_shapes(arrays, shapes)
             unknown_std_m = float(arrays["error_unknown_std"])
-            errors = LocalErrors.of(primitive, arrays["error_inputs"], arrays["error_samples"], unknown_std_m)
+            errors = LocalErrors.of(
+                primitive, arrays["error_inputs"], arrays["error_samples"], unknown_std_m
+            )
         return cls(primitive, "turned" in arrays, clock, errors)
 
 
 @compiled
-def _rounded(mean: Vector, velocity: Vector, acceleration: Vector, covariance: Vector, out: Vector) -> float:
+def _rounded(
+    mean: Vector, velocity: Vector, acceleration: Vector, covariance: Vector, out: Vector
+) -> float:
     """Round a prediction into `out` (6, 3): position, velocity, acceleration and covariance (3, 3).
     Returns the standard deviation [m] of the rounded covariance.
     """
-    out[0], out[1], out[2], out[3:] = mean, velocity, acceleration, covariance
+    out[0] = mean
+    out[1] = velocity
+    out[2] = acceleration
+    out[3:] = covariance
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)
     return standard_deviation(out[3:])

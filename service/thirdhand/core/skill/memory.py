@@ -21,7 +21,12 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.numerics import MEMORY_STEP_S
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.model import Seen
-from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, TURN_LAG_S, TURN_WEIGHT_M
+from thirdhand.core.skill.tuning import (
+    MEMORY_LAG_S,
+    MEMORY_LONGEST_STEP_S,
+    TURN_LAG_S,
+    TURN_WEIGHT_M,
+)
 
 
 @compiled
@@ -69,8 +74,12 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
     """
     width = moving.shape[1]
     for i in range(width):
-        out[0, i], out[1, i], out[2, i] = moving[0, i], moving[1, i], moving[2, i]
-        position, velocity, acceleration = moving[0, i], moving[1, i], moving[2, i]
+        out[0, i] = moving[0, i]
+        out[1, i] = moving[1, i]
+        out[2, i] = moving[2, i]
+        position = moving[0, i]
+        velocity = moving[1, i]
+        acceleration = moving[2, i]
         for row in range(len(memory)):
             value = memory[row, i]
             acceleration = (velocity - (position - value) / MEMORY_LAG_S) / MEMORY_LAG_S
@@ -82,7 +91,9 @@ def moving_features(moving: Vector, memory: Vector, turns: Vector, out: Vector) 
             out[2, column] = acceleration - moving[2, i]
     first = (1 + len(memory)) * width
     for i in range(turns.shape[1] if out.shape[1] - first >= turns.shape[1] else 0):
-        before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
+        before = turns[-3, i]
+        between = turns[-2, i]
+        last = turns[-1, i]
         out[0, first + i] = TURN_WEIGHT_M * last
         out[1, first + i] = TURN_WEIGHT_M * (between - last) / TURN_LAG_S
         out[2, first + i] = TURN_WEIGHT_M * (before - 2.0 * between + last) / TURN_LAG_S**2
@@ -101,7 +112,9 @@ def turning(turns: Vector, lag_s: float, out: Vector) -> None:
     (3, E), from the rows of their filters (TURNS, E) with the time constant `lag_s`.
     """
     for i in range(out.shape[1]):
-        before, between, last = turns[-3, i], turns[-2, i], turns[-1, i]
+        before = turns[-3, i]
+        between = turns[-2, i]
+        last = turns[-1, i]
         out[0, i] = last
         out[1, i] = (between - last) / lag_s
         out[2, i] = (before - 2.0 * between + last) / lag_s**2
@@ -135,7 +148,9 @@ def recall(states: Records, rules: Records, seen: Seen) -> bool:
 
     Returns true if a hand has a new sample in this tick, or if the state has no covariance yet.
     """
-    state, rule, now = states[0], rules[0], seen.now
+    state = states[0]
+    rule = rules[0]
+    now = seen.now
     remember(states, rule.period_s, rule.lag_s, rule.turn_lag_s)
     for n in range(2):
         side = rule.sides[n]
@@ -176,7 +191,8 @@ def along(values: Vector, period_s: float, lag_s: float, rows: int) -> Vector:
     """Rows (T, K, D) of a cascade of K = `rows` filters with the time constant `lag_s` along values
     (T, D).
     """
-    out, steps = np.empty((len(values), rows, values.shape[1])), max(1, math.ceil(period_s / MEMORY_STEP_S))
+    out = np.empty((len(values), rows, values.shape[1]))
+    steps = max(1, math.ceil(period_s / MEMORY_STEP_S))
     _filtered(np.ascontiguousarray(values), 1.0 - exp(-period_s / steps / lag_s), steps, out)
     return out
 
@@ -186,7 +202,10 @@ def features(hands: Vector, period_s: float, order: int, turns: Vector | None = 
     (T, D), offsets of the K = `order` rows of their memory, and their filtered rotation matrices
     (T, E) times TURN_WEIGHT_M, if given.
     """
-    parts = [hands, (along(hands, period_s, MEMORY_LAG_S, order) - hands[:, None]).reshape(len(hands), -1)]
+    parts = [
+        hands,
+        (along(hands, period_s, MEMORY_LAG_S, order) - hands[:, None]).reshape(len(hands), -1),
+    ]
     if turns is not None:
         parts.append(TURN_WEIGHT_M * along(turns, period_s, TURN_LAG_S, TURNS)[:, -1])
     return np.hstack(parts)

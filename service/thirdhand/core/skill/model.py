@@ -20,8 +20,18 @@ if TYPE_CHECKING:
 MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to micrometres
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the calibrated regions
-CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)  # χ² with 3 degrees of freedom
-NORMAL_RATIOS = tuple(square / 3.0 for square in CHI_SQUARE)  # |e|² / tr C of isotropic normal errors
+CHI_SQUARE = (
+    0.5844,
+    1.2125,
+    2.3660,
+    4.1083,
+    6.2514,
+    7.8147,
+    11.3449,
+)  # χ² with 3 degrees of freedom
+NORMAL_RATIOS = tuple(
+    square / 3.0 for square in CHI_SQUARE
+)  # |e|² / tr C of isotropic normal errors
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
 NO_CLOCK = np.zeros(3)
@@ -60,22 +70,28 @@ class Motion(NamedTuple):
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
-    gate_m: float  # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: as before
+    # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: as before
+    gate_m: float
     ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another segment
 
 
 class Seen(NamedTuple):
     """Motion, memory and belief of both hands: all that a model predicts from."""
 
-    moving: Vector  # (3, 6) position, velocity and acceleration of the hands, `delay_s` less the lead ago
+    # (3, 6) position, velocity and acceleration of the hands, `delay_s` less the lead ago
+    moving: Vector
     stillness: Vector  # (2,) stillness of each hand, 0 to 1
     past: Vector  # (ORDER, 6) [m] memory of the hands' positions, see `remember`
-    turns: Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
+    turns: (
+        Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
+    )
     turn_lag_s: float  # time constant of these filters
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
     belief: Vector  # (MOST_SEGMENTS,) probability of each segment; zeros: not yet known
     period_s: float  # time since the belief was updated; 0: it is not updated
-    clock: Vector = NO_CLOCK  # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
+    clock: Vector = (
+        NO_CLOCK  # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
+    )
 
 
 class Target(NamedTuple):
@@ -164,7 +180,9 @@ class Model(Protocol):
         another covariance.
         """
 
-    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
+    def elsewhere(
+        self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector
+    ) -> float:
         """Probability that the task did not begin at its first segment, so that the tool belongs
         elsewhere, for the hands' motion (3, 6); `unprimed` (MOST_SEGMENTS,) is updated in place.
         """

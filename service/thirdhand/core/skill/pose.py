@@ -14,7 +14,12 @@ from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import turn_on
-from thirdhand.core.skill.tuning import GRIPPER_CLOSE_ABOVE, GRIPPER_MOVES_S, GRIPPER_OPEN_BELOW, GRIPPER_THERE_M
+from thirdhand.core.skill.tuning import (
+    GRIPPER_CLOSE_ABOVE,
+    GRIPPER_MOVES_S,
+    GRIPPER_OPEN_BELOW,
+    GRIPPER_THERE_M,
+)
 
 if TYPE_CHECKING:
     from kmp import KMP
@@ -32,7 +37,11 @@ def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: flo
         return gripper
     if gripper == UNKNOWN:
         return CLOSED if closure > 0.5 else OPEN
-    if since_s < GRIPPER_MOVES_S or off > GRIPPER_THERE_M or GRIPPER_OPEN_BELOW <= closure <= GRIPPER_CLOSE_ABOVE:
+    if (
+        since_s < GRIPPER_MOVES_S
+        or off > GRIPPER_THERE_M
+        or GRIPPER_OPEN_BELOW <= closure <= GRIPPER_CLOSE_ABOVE
+    ):
         return gripper
     return CLOSED if closure > GRIPPER_CLOSE_ABOVE else OPEN
 
@@ -41,7 +50,10 @@ TURN_ROUND_TO = 1e6  # [1/rad] orientations and angular velocities are rounded t
 COVARIANCE_ROUND_TO = 1e10  # [1/rad²] covariances are rounded to 1e-10 rad²
 CLOSURE_ROUND_TO = 1e6  # closures are rounded to 1e-6
 NO_GRIPPER = -1.0  # the closure that a skill without a gripper predicts
-UNKNOWN, OPEN, CLOSED = 0, 1, 2  # state of a gripper
+# state of a gripper
+UNKNOWN = 0
+OPEN = 1
+CLOSED = 2
 
 
 class Turn(NamedTuple):
@@ -65,8 +77,11 @@ class LearnedOrientation:
         """Orientation at an input (I,) with its velocity (I,), rounded to 1 µrad. A `covariance`
         (3, 3) [rad²] that was predicted before may be given; it is then returned as it is.
         """
-        motion = self.primitive.predict_motion(at, velocity, np.zeros_like(at), covariance=covariance is None)
-        quaternion, turning = self.auxiliary.copy(), np.empty(3)
+        motion = self.primitive.predict_motion(
+            at, velocity, np.zeros_like(at), covariance=covariance is None
+        )
+        quaternion = self.auxiliary.copy()
+        turning = np.empty(3)
         if motion.covariance is None:
             assert covariance is not None
             _turned(motion.mean, motion.velocity, _NOTHING, quaternion, turning, np.empty((3, 3)))
@@ -84,8 +99,12 @@ class LearnedGripper:
 
     def predict(self, at: Vector) -> float:
         """Closure at an input (I,), clipped to 0 ... 1 and rounded."""
-        motion = self.primitive.predict_motion(at, np.zeros_like(at), np.zeros_like(at), covariance=False)
-        return round(min(max(float(motion.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
+        motion = self.primitive.predict_motion(
+            at, np.zeros_like(at), np.zeros_like(at), covariance=False
+        )
+        return (
+            round(min(max(float(motion.mean[0]), 0.0), 1.0) * CLOSURE_ROUND_TO) / CLOSURE_ROUND_TO
+        )
 
 
 _NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be computed
@@ -93,7 +112,12 @@ _NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be compute
 
 @compiled
 def _turned(
-    zeta: Vector, rate: Vector, covariance: Vector, quaternion: Vector, turning: Vector, turned: Vector
+    zeta: Vector,
+    rate: Vector,
+    covariance: Vector,
+    quaternion: Vector,
+    turning: Vector,
+    turned: Vector,
 ) -> None:
     """Orientation from the primitive's output ζ (3,), its rate (3,) and its covariance C (3, 3), as
     in `kmp.orientation`. `quaternion` (4,) holds q_a, and is changed in place.
@@ -108,22 +132,27 @@ def _turned(
     `turning` (3,) is the angular velocity [rad/s], `turned` (3, 3) the covariance of small
     rotations [rad²], both in frame base.
     """
-    vector, per_zeta, part = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    vector = np.empty(3)
+    per_zeta = np.empty((3, 3))
+    part = np.empty((3, 3))
     square = 0.0
     for i in range(3):
         vector[i] = 2.0 * np.rint(zeta[i] * TURN_ROUND_TO) / TURN_ROUND_TO
         square += vector[i] * vector[i]
     angle = math.sqrt(square)
-    first, second = 0.5, 1.0 / 6.0
+    first = 0.5
+    second = 1.0 / 6.0
     if angle > 1e-3:
         sine, cosine = sin_cos(angle)
-        first, second = (1.0 - cosine) / square, (angle - sine) / (square * angle)
+        first = (1.0 - cosine) / square
+        second = (angle - sine) / (square * angle)
     for i in range(3):
         for j in range(3):
             per_zeta[i, j] = 2.0 * second * vector[i] * vector[j]
         per_zeta[i, i] += 2.0 * (1.0 - second * square)
     for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         per_zeta[j, k] -= 2.0 * first * vector[i]
         per_zeta[k, j] += 2.0 * first * vector[i]
     for i in range(3):

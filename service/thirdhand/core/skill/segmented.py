@@ -102,21 +102,28 @@ class Placed(Immutable):
         from their paths, root mean square; `errors` (M, 3 + 3) the tool's errors [m], after the
         hands' shares and the segment. The primitive's last input is the `clock`, if there is one.
         """
-        sizes, segments = structured(1, PLACED), task.segments(at, off)
+        sizes = structured(1, PLACED)
+        segments = task.segments(at, off)
         if unknown is not None:
             sizes["unknown_std"] = unknown.std_m
             scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
             segments["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
         sizes["scale"], _ = primitive.kernel.coordinates(1)
-        sizes["std"], sizes["prior"] = at.std, primitive.prior_offset
-        inputs, count = primitive.centres, len(off)
+        sizes["std"] = at.std
+        sizes["prior"] = primitive.prior_offset
+        inputs = primitive.centres
+        count = len(off)
         if clock is None or not clock.weight:
             inputs = np.column_stack([inputs, np.zeros(len(inputs))])
         else:
             sizes["clock_weight"] = clock.weight
         centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
         columns = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
-        wrong = error_table(np.hstack([errors[:, :2], columns]), errors[:, 3:]) if len(errors) else NO_ERRORS
+        wrong = (
+            error_table(np.hstack([errors[:, :2], columns]), errors[:, 3:])
+            if len(errors)
+            else NO_ERRORS
+        )
         return cls(segments, sizes, centres, wrong, NO_PULLS)
 
     def pulled(self, pulls: Vector) -> Placed:
@@ -131,9 +138,15 @@ class Placed(Immutable):
         """
         belief = np.zeros(MOST_SEGMENTS)
         belief[segment] = 1.0
-        sharpness, segments = sharpness_between(ends, via_points), self.segments.copy()
+        sharpness = sharpness_between(ends, via_points)
+        segments = self.segments.copy()
         more = np.hstack(
-            pulls_through(lambda hands: self.mean(hands, np.tile(belief, (len(hands), 1))), ends, via_points, sharpness)
+            pulls_through(
+                lambda hands: self.mean(hands, np.tile(belief, (len(hands), 1))),
+                ends,
+                via_points,
+                sharpness,
+            )
         )
         segments["pulled"][segment] = len(self.pulls), len(self.pulls) + len(more)
         segments["sharpness"][segment] = sharpness
@@ -141,7 +154,8 @@ class Placed(Immutable):
 
     def belief(self, hands: Vector) -> Vector:
         """Belief (MOST_SEGMENTS,) in each segment for hands (6,) that have always been at rest."""
-        out, moving = np.zeros(MOST_SEGMENTS), np.zeros((3, 6))
+        out = np.zeros(MOST_SEGMENTS)
+        moving = np.zeros((3, 6))
         out[: len(self.segments)] = 1.0 / len(self.segments)
         moving[0] = hands
         for _ in range(BELIEF_PERIODS):
@@ -164,7 +178,8 @@ class Placed(Immutable):
         LEAST_SEGMENT_PROBABILITY.
         """
         out = np.empty((1, len(self.segments), 3))
-        now, tempos = np.array(hands[None], order="C"), np.array(tempo[None], order="C")
+        now = np.array(hands[None], order="C")
+        tempos = np.array(tempo[None], order="C")
         tools_at(now, tempos, belief, self.segments, self.sizes, self.centres, pulls, out)
         return np.asarray(out[0])
 
@@ -177,7 +192,8 @@ class Placed(Immutable):
         (3,), see `segments.scatter`: errors near these hands, spread of the segments' tools, and
         the via-points' variance.
         """
-        out, hands = np.empty((3, 3)), np.ascontiguousarray(hands)
+        out = np.empty((3, 3))
+        hands = np.ascontiguousarray(hands)
         tools = self._tools(hands, tempo, belief, NO_PULLS)
         scatter(hands, tempo, belief, self.segments, tools, self.errors, self.sizes[0], out)
         return np.asarray(np.rint(out * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO)
@@ -226,7 +242,11 @@ class SegmentedKMP:
 
     @cached_property
     def clock_rows(self) -> Vector | None:
-        return None if self.clock is None else self.clock.rows(self._unpulled.segments["begins"].reshape(-1, 6))
+        return (
+            None
+            if self.clock is None
+            else self.clock.rows(self._unpulled.segments["begins"].reshape(-1, 6))
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -247,7 +267,9 @@ class SegmentedKMP:
         """Segments between the via-points in force; via-points of other names pull the tool."""
         others = [point for point in self.via_points if point.name not in self.names]
         everywhere = [point for point in others if point.segment not in self.names[:-1]]
-        pulls = np.hstack(pulls_through(self._resting, self.hands, everywhere, PULL_SHARPNESS_PER_M2))
+        pulls = np.hstack(
+            pulls_through(self._resting, self.hands, everywhere, PULL_SHARPNESS_PER_M2)
+        )
         placed = self._unpulled.pulled(pulls)
         for k, name in enumerate(self.names[:-1]):
             if of_segment := [point for point in others if point.segment == name]:
@@ -258,11 +280,17 @@ class SegmentedKMP:
     def _unpulled(self) -> Placed:
         """Segments between the via-points in force, without pulls."""
         points = self.nominal.moved(self.via_points)
-        return Placed.of(self.task, points, self.off, self.primitive, self.errors, self.clock, self.unknown)
+        return Placed.of(
+            self.task, points, self.off, self.primitive, self.errors, self.clock, self.unknown
+        )
 
     def _resting(self, hands: Vector) -> Vector:
         """Tool positions (T, 3) [m], without pulls, for hands (T, 6) always at rest."""
-        return self._unpulled.mean(hands, np.array([self._unpulled.belief(sample) for sample in hands]), self._tempos(hands))
+        return self._unpulled.mean(
+            hands,
+            np.array([self._unpulled.belief(sample) for sample in hands]),
+            self._tempos(hands),
+        )
 
     def belief(self, hands: Vector) -> Vector:
         return self.placed.belief(hands)
@@ -271,14 +299,37 @@ class SegmentedKMP:
         """Motion of the tool: equation (8) of Huang et al. 2019, differences along the hands'
         motion, and the covariance of errors in held-out demonstrations, see `segments.predicted`.
         """
-        placed, out = self.placed, np.empty((6, 3))
-        errors = placed.errors if known is None else NO_ERRORS
-        gate_m, ambiguity = predicted(seen, self.turned, placed.segments, placed.sizes, placed.centres, placed.pulls, errors, out)
-        return Motion(out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity)
-
-    def elsewhere(self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector) -> float:
         placed = self.placed
-        return elsewhere(now, stillness, period_s, belief, unprimed, placed.segments, placed.sizes, placed.centres)
+        out = np.empty((6, 3))
+        errors = placed.errors if known is None else NO_ERRORS
+        gate_m, ambiguity = predicted(
+            seen,
+            self.turned,
+            placed.segments,
+            placed.sizes,
+            placed.centres,
+            placed.pulls,
+            errors,
+            out,
+        )
+        return Motion(
+            out[0], out[1], out[2], out[3:] if known is None else known, gate_m, ambiguity
+        )
+
+    def elsewhere(
+        self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector
+    ) -> float:
+        placed = self.placed
+        return elsewhere(
+            now,
+            stillness,
+            period_s,
+            belief,
+            unprimed,
+            placed.segments,
+            placed.sizes,
+            placed.centres,
+        )
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
         return self.placed.mean(hands, self._beliefs(hands, names), self._tempos(hands, names))
@@ -312,30 +363,46 @@ class SegmentedKMP:
         return out
 
     def inputs(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        rows = zip(hands, self._beliefs(hands, names), self._tempos(hands, names)[:, 2], strict=True)
-        return np.array([self._input(sample, belief, clock_s=float(clock_s)) for sample, belief, clock_s in rows]).reshape(
-            -1, self.shape[0]
+        rows = zip(
+            hands, self._beliefs(hands, names), self._tempos(hands, names)[:, 2], strict=True
         )
+        return np.array(
+            [
+                self._input(sample, belief, clock_s=float(clock_s))
+                for sample, belief, clock_s in rows
+            ]
+        ).reshape(-1, self.shape[0])
 
     def moving_inputs(self, seen: Seen) -> tuple[Vector, Vector]:
-        hands, velocity = seen.moving[0], seen.moving[1]
+        hands = seen.moving[0]
+        velocity = seen.moving[1]
         behind, now, ahead = (
-            self._input(hands + step * velocity, seen.belief, seen.stillness, seen.clock[0] + step * seen.clock[1])
+            self._input(
+                hands + step * velocity,
+                seen.belief,
+                seen.stillness,
+                seen.clock[0] + step * seen.clock[1],
+            )
             for step in (-MOTION_STEP_S, 0.0, MOTION_STEP_S)
         )
         return now, (ahead - behind) / (2.0 * MOTION_STEP_S)
 
-    def _input(self, hands: Vector, belief: Vector, still: Vector = STILL, clock_s: float = 0.0) -> Vector:
+    def _input(
+        self, hands: Vector, belief: Vector, still: Vector = STILL, clock_s: float = 0.0
+    ) -> Vector:
         """Input (2 + K,) of orientation and gripper: shares of the most probable segment, and the
         belief times SEGMENT_DISTANCE_BESIDE; with a clock, also that times its weight.
         """
         most = int(belief.argmax())
-        segment, hands = self.placed.segments[most], np.ascontiguousarray(hands)
+        segment = self.placed.segments[most]
+        hands = np.ascontiguousarray(hands)
         along = along_both(hands, still, segment)
         time = [self.clock.weight * clock_s] if self.clock is not None and self.clock.weight else []
         return np.array([*along, *(SEGMENT_DISTANCE_BESIDE * belief[: len(self.off)]), *time])
 
-    def through(self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float) -> SegmentedKMP:
+    def through(
+        self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float
+    ) -> SegmentedKMP:
         """Model in a scene with these via-points. Nothing is solved: those of a known name move the
         segments, the others pull the tool.
         """
@@ -370,10 +437,24 @@ class SegmentedKMP:
         }
         check_shapes(arrays, shapes)
         errors = np.hstack([arrays["seen"], arrays["errors"]])
-        distances_m, delay_s = np.ascontiguousarray(arrays["off_ways"], np.float64), float(arrays["delay"])
-        nominal, unknown = NamedViaPoints(task.names, arrays["nominal"]), None
+        distances_m = np.ascontiguousarray(arrays["off_ways"], np.float64)
+        delay_s = float(arrays["delay"])
+        nominal = NamedViaPoints(task.names, arrays["nominal"])
+        unknown = None
         clock = TaskClock.of(arrays["task_clock"].ravel()) if "task_clock" in arrays else None
         if "unknown_std" in arrays:
             check_shapes(arrays, {"scatters": (count, 3, 3)})
-            unknown = Unknown(float(arrays["unknown_std"]), np.ascontiguousarray(arrays["scatters"], np.float64))
-        return cls(from_arrays(arrays), task, nominal, distances_m, errors, delay_s, via_points, clock, unknown)
+            unknown = Unknown(
+                float(arrays["unknown_std"]), np.ascontiguousarray(arrays["scatters"], np.float64)
+            )
+        return cls(
+            from_arrays(arrays),
+            task,
+            nominal,
+            distances_m,
+            errors,
+            delay_s,
+            via_points,
+            clock,
+            unknown,
+        )

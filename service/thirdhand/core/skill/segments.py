@@ -52,23 +52,47 @@ from thirdhand.core.skill.tuning import (
 from thirdhand.core.vectors import dot, norm, squared_distance
 
 MOST_SEGMENTS = 64  # segments for which the state has room
-STAYS, NONE, LEFT, RIGHT = 0.0, -1, 0, 1  # `square` of a hand that rests; the hand that the tool follows
+# `square` of a hand that rests; the hand that the tool follows
+STAYS = 0.0
+NONE = -1
+LEFT = 0
+RIGHT = 1
 OUTPUTS = 4  # outputs of the primitive: the tool's share of its path, and its offset x y z [m]
 # One segment as compiled functions read it: paths of the left and the right hand and of the tool.
 SEGMENT = np.dtype(
     [
         ("begins", np.float64, (2, 3)),  # [m] each hand's first via-point
-        ("way", np.float64, (2, 3)),  # [m] each hand's path, from the first via-point to the second one
-        ("square", np.float64, (2,)),  # [m²] squared length of the path; STAYS for a hand that rests
+        (
+            "way",
+            np.float64,
+            (2, 3),
+        ),  # [m] each hand's path, from the first via-point to the second one
+        (
+            "square",
+            np.float64,
+            (2,),
+        ),  # [m²] squared length of the path; STAYS for a hand that rests
         ("off", np.float64, (2,)),  # [m] each hand's distance from its path, root mean square
         ("tool", np.float64, (3,)),  # [m] the tool's first via-point
         ("tool_way", np.float64, (3,)),  # [m] the tool's path
         ("leads", np.int64),  # hand whose share alone counts in this segment; NONE: both count
-        ("follow", np.int64, (2,)),  # hand that the tool follows at the begin and at the end of the segment
+        (
+            "follow",
+            np.int64,
+            (2,),
+        ),  # hand that the tool follows at the begin and at the end of the segment
         ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
         ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
-        ("scatter", np.float64, (2, 3, 3)),  # [m²] covariance of the tool's via-points at begin and end; 0: known
-        ("pulled", np.int64, (2,)),  # first row of the pulls of this segment alone, and the row after the last one
+        (
+            "scatter",
+            np.float64,
+            (2, 3, 3),
+        ),  # [m²] covariance of the tool's via-points at begin and end; 0: known
+        (
+            "pulled",
+            np.int64,
+            (2,),
+        ),  # first row of the pulls of this segment alone, and the row after the last one
         ("sharpness", np.float64),  # [1/m²] sharpness of these pulls
     ]
 )
@@ -77,8 +101,14 @@ PLACED = np.dtype(
     [
         ("scale", np.float64),  # scale of the kernel exp(-scale |difference|²)
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
-        ("clock_weight", np.float64),  # as an input, a second in the segment counts as this share of it; 0: no clock
-        ("unknown_std", np.float64),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
+        (
+            "clock_weight",
+            np.float64,
+        ),  # as an input, a second in the segment counts as this share of it; 0: no clock
+        (
+            "unknown_std",
+            np.float64,
+        ),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
         ("pulls", np.int64),  # number of pulls that act in all segments; they are the first rows
     ]
@@ -94,7 +124,9 @@ def on_way(hand: Vector, segment: Record, side: int) -> tuple[float, float]:
 
     A hand that rests in this segment (w = 0) has covered the whole path: the share is 1.
     """
-    begins, path, square = segment["begins"][side], segment["way"][side], segment["square"][side]
+    begins = segment["begins"][side]
+    path = segment["way"][side]
+    square = segment["square"][side]
     along = 0.0
     if square > STAYS:
         for i in range(3):
@@ -124,7 +156,8 @@ def along_way(hand: Vector, still: float, segment: Record, side: int) -> float:
     from_end = min(along, 1.0 - along) * max(math.sqrt(square), FULL_PATH_M)
     near = min(max((PATH_MIDDLE_M - from_end) / (PATH_MIDDLE_M - PATH_END_M), 0.0), 1.0)
     power = 1.0 + (REST_SHARPNESS - 1.0) * near * still
-    covered, other = along**power, (1.0 - along) ** power
+    covered = along**power
+    other = (1.0 - along) ** power
     return float(covered / (covered + other))
 
 
@@ -133,7 +166,8 @@ def along_both(hands: Vector, still: Vector, segment: Record) -> tuple[float, fl
     """Shares of the segment, by `along_way`, of both hands (6 or more,) with the stillness (2,). If
     one hand leads the segment, its share counts for both.
     """
-    left, other = along_way(hands[:3], still[0], segment, 0), along_way(hands[3:6], still[1], segment, 1)
+    left = along_way(hands[:3], still[0], segment, 0)
+    other = along_way(hands[3:6], still[1], segment, 1)
     if segment["leads"] == LEFT:
         other = left
     elif segment["leads"] == RIGHT:
@@ -168,14 +202,21 @@ def _likely(moving: Vector, segment: Record) -> float:
         columns = slice(3 * side, 3 * side + 3)
         _, distance_m = on_way(moving[0, columns], segment, side)
         out -= 0.5 * min((distance_m / segment["off"][side]) ** 2, MAX_SQUARED_DEVIATION)
-        length, velocity = segment["square"][side], moving[1, columns]
-        goes = dot(velocity, segment["way"][side]) / math.sqrt(length) if length > STAYS else -norm(velocity)
+        length = segment["square"][side]
+        velocity = moving[1, columns]
+        goes = (
+            dot(velocity, segment["way"][side]) / math.sqrt(length)
+            if length > STAYS
+            else -norm(velocity)
+        )
         out += tanh(goes / DIRECTION_SPEED_MPS)
     return out
 
 
 @compiled
-def recognise(belief: Vector, moving: Vector, period_s: float, segments: Records, first_odds: float) -> None:
+def recognise(
+    belief: Vector, moving: Vector, period_s: float, segments: Records, first_odds: float
+) -> None:
     """Update the belief (K or more,) in K segments by the hands' motion (3, 6), one period Δ later,
     in place.
 
@@ -193,8 +234,10 @@ def recognise(belief: Vector, moving: Vector, period_s: float, segments: Records
     A belief of zeros starts anew: the first segment is `first_odds` times as probable as any other,
     and c = 1.
     """
-    count, hands = len(segments), moving[0]
-    total, share = 0.0, min(period_s / SAMPLE_CORRELATION_S, 1.0)
+    count = len(segments)
+    hands = moving[0]
+    total = 0.0
+    share = min(period_s / SAMPLE_CORRELATION_S, 1.0)
     for k in range(count):
         total += belief[k]
     if total <= 0.0:
@@ -205,11 +248,14 @@ def recognise(belief: Vector, moving: Vector, period_s: float, segments: Records
         before = belief[0]
         for k in range(count - 1):
             change = min(SEGMENT_CHANGE_PER_S * period_s * _near(hands, segments[k + 1]), 0.5)
-            forward, backward = change * before, change * belief[k + 1]
+            forward = change * before
+            backward = change * belief[k + 1]
             before = belief[k + 1]
             belief[k] += backward - forward
             belief[k + 1] += forward - backward
-        restart = min(SEGMENT_CYCLE_PER_S * period_s * _near(hands, segments[0]), 0.5) * belief[count - 1]
+        restart = (
+            min(SEGMENT_CYCLE_PER_S * period_s * _near(hands, segments[0]), 0.5) * belief[count - 1]
+        )
         belief[count - 1] -= restart
         belief[0] += restart
         for k in range(count):
@@ -270,11 +316,17 @@ def add_followed(hands: Vector, share: float, segment: Record, out: Vector) -> N
                         offset += hands[6 + 9 * side + 3 * i + j] * segment["levers"][end, j]
                     out[i] += goes * offset
                 else:
-                    out[i] += goes * (hands[3 * side + i] - segment["begins"][side, i] - end * segment["way"][side, i])
+                    out[i] += goes * (
+                        hands[3 * side + i]
+                        - segment["begins"][side, i]
+                        - end * segment["way"][side, i]
+                    )
 
 
 @compiled
-def _tool_of(hands: Vector, share: float, offset: Vector, segment: Record, size: Record, pulls: Vector) -> Vector:
+def _tool_of(
+    hands: Vector, share: float, offset: Vector, segment: Record, size: Record, pulls: Vector
+) -> Vector:
     """Tool position (3,) [m] in a segment for hands (6 or 24,), of which the tool has covered a
     `share` s, with an `offset` δ (3,) [m]:
 
@@ -288,7 +340,9 @@ def _tool_of(hands: Vector, share: float, offset: Vector, segment: Record, size:
     add_followed(hands, min(max(share, 0.0), 1.0), segment, out)
     if len(pulls):
         add_weighted(hands[:6], pulls[: size["pulls"]], PULL_SHARPNESS_PER_M2, out)
-        add_weighted(hands[:6], pulls[segment["pulled"][0] : segment["pulled"][1]], segment["sharpness"], out)
+        add_weighted(
+            hands[:6], pulls[segment["pulled"][0] : segment["pulled"][1]], segment["sharpness"], out
+        )
     return out
 
 
@@ -315,8 +369,13 @@ def tools_at(
 
         (s, δ) = prior + Σ_r exp(-scale |x - c_r|²) W_r
     """
-    size, count, padded = sizes[0], len(segments), centres.shape[1]
-    x, outputs, values, room = np.empty(3 + count), np.empty(OUTPUTS), np.empty(padded), np.empty(padded)
+    size = sizes[0]
+    count = len(segments)
+    padded = centres.shape[1]
+    x = np.empty(3 + count)
+    outputs = np.empty(OUTPUTS)
+    values = np.empty(padded)
+    room = np.empty(padded)
     for k in range(count):
         if belief[k] >= LEAST_SEGMENT_PROBABILITY:
             x[:] = 0.0
@@ -380,8 +439,11 @@ def _around(moving: Vector, out: Vector) -> None:
             square += moving[1, i] * moving[1, i]
         goes = 1.0 - exp(-((math.sqrt(square) / CALM_MPS) ** 4))
         for i in range(3 * side, 3 * side + 3):
-            step, curved = MOTION_STEP_S * goes * moving[1, i], 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
-            out[0, i], out[1, i], out[2, i] = moving[0, i] - step + curved, moving[0, i], moving[0, i] + step + curved
+            step = MOTION_STEP_S * goes * moving[1, i]
+            curved = 0.5 * MOTION_STEP_S**2 * goes * moving[2, i]
+            out[0, i] = moving[0, i] - step + curved
+            out[1, i] = moving[0, i]
+            out[2, i] = moving[0, i] + step + curved
 
 
 @compiled
@@ -398,7 +460,8 @@ def _turned_around(turning: Vector, out: Vector) -> None:
 @compiled
 def _tool_share(tool: Vector, segment: Record) -> float:
     """Share, 0 to 1, of its path that a tool (3,) has covered; 1 on a path without length."""
-    along, square = 0.0, 0.0
+    along = 0.0
+    square = 0.0
     for i in range(3):
         along += (tool[i] - segment["tool"][i]) * segment["tool_way"][i]
         square += segment["tool_way"][i] ** 2
@@ -435,8 +498,14 @@ def scatter(
     """
     mass = SUPPORT_MASS if size["unknown_std"] > 0.0 else 0.0
     out[:] = 0.0
-    mean, in_all, count, padded = np.empty(3), 0.0, len(segments), errors.shape[1]
-    x, near, values, room = np.empty(2 + count), np.empty(1 + out.size), np.empty(padded), np.empty(padded)
+    mean = np.empty(3)
+    in_all = 0.0
+    count = len(segments)
+    padded = errors.shape[1]
+    x = np.empty(2 + count)
+    near = np.empty(1 + out.size)
+    values = np.empty(padded)
+    room = np.empty(padded)
     expected(belief, tools, mean)
     for k in range(count):
         if belief[k] < LEAST_SEGMENT_PROBABILITY:
@@ -450,10 +519,13 @@ def scatter(
         share = _tool_share(tools[k], segments[k]) if mass else 0.0
         for i in range(3):
             for j in range(i, 3):
-                covariance = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j]) + near[1 + 3 * i + j] / total
+                covariance = (tools[k, i] - mean[i]) * (tools[k, j] - mean[j]) + near[
+                    1 + 3 * i + j
+                ] / total
                 if mass:
                     covariance += mass * size["unknown_std"] ** 2 / total if i == j else 0.0
-                    begin, end = segments[k]["scatter"][0, i, j], segments[k]["scatter"][1, i, j]
+                    begin = segments[k]["scatter"][0, i, j]
+                    end = segments[k]["scatter"][1, i, j]
                     covariance += (1.0 - share) ** 2 * begin + share**2 * end
                 out[i, j] += belief[k] * covariance
     for i in range(3):
@@ -487,7 +559,9 @@ def elsewhere(
     if unprimed[0] == UNPRIMED_DECIDED:
         return 0.0
     recognise(unprimed, now, period_s, segments, 1.0)
-    count, most, difference = len(segments), 0, 0.0
+    count = len(segments)
+    most = 0
+    difference = 0.0
     for k in range(count):
         difference = max(difference, abs(unprimed[k] - belief[k]))
         if belief[k] > belief[most]:
@@ -495,14 +569,19 @@ def elsewhere(
     if difference < LEAST_SEGMENT_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
-    either, tools, tempos = np.empty(count), np.empty((1, count, 3)), np.zeros((1, 3))
+    either = np.empty(count)
+    tools = np.empty((1, count, 3))
+    tempos = np.zeros((1, 3))
     tempos[0, :2] = still
     for k in range(count):
         either[k] = max(unprimed[k], 1.0 if k == most else 0.0)
     tools_at(now[:1], tempos, either, segments, sizes, centres, np.empty((0, 9)), tools)
     out = 0.0
     for k in range(count):
-        if unprimed[k] >= LEAST_SEGMENT_PROBABILITY and squared_distance(tools[0, k], tools[0, most]) > UNSURE_M**2:
+        if (
+            unprimed[k] >= LEAST_SEGMENT_PROBABILITY
+            and squared_distance(tools[0, k], tools[0, most]) > UNSURE_M**2
+        ):
             out += unprimed[k]
     return out
 
@@ -532,9 +611,13 @@ def predicted(
     Returns the distance [m] of the hands from the task (`off_all`), which the gate compares with
     the threshold, and the probability that the tool belongs elsewhere (`_ambiguity`).
     """
-    belief, clock, steps, tempos = seen.belief, seen.clock, np.empty((3, 3)), np.empty((3, 3))
+    belief = seen.belief
+    clock = seen.clock
+    steps = np.empty((3, 3))
+    tempos = np.empty((3, 3))
     entries = seen.turns.shape[1] if turned and len(seen.turns) else 0
-    hands, tools = np.empty((3, 6 + entries)), np.empty((3, len(segments), 3))
+    hands = np.empty((3, 6 + entries))
+    tools = np.empty((3, len(segments), 3))
     if seen.period_s > 0.0:
         recognise(belief, seen.now, seen.period_s, segments, FIRST_SEGMENT_ODDS)
     _around(seen.moving, hands)

@@ -30,7 +30,9 @@ from thirdhand.settings.config import Reach
 NEVER = -(2**60)  # a tick before any other: filters have forgotten what happened then
 
 
-def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach) -> Target:
+def clamp(
+    position: Vector, velocity: Vector, acceleration: Vector, *, box: Vector, reach: Reach
+) -> Target:
     """Clamp a target (3,) [m], [m/s], [m/s²] to the box (2, 3) [m] and to the reach.
 
     For a position outside, the outward components of velocity and acceleration are removed.
@@ -39,11 +41,14 @@ def clamp(position: Vector, velocity: Vector, acceleration: Vector, *, box: Vect
         return Target(position, velocity, acceleration, clamped=False)
     boxed = np.minimum(np.maximum(position, box[0]), box[1])
     inside = boxed == position
-    velocity, acceleration = velocity * inside, acceleration * inside
+    velocity = velocity * inside
+    acceleration = acceleration * inside
     reached, outward = _nearest(np.minimum(np.maximum(boxed, -MAX_TARGET_M), MAX_TARGET_M), reach)
     if not outward:
         return Target(boxed, velocity, acceleration, not inside.all())
-    return Target(reached, _without(velocity, outward), _without(acceleration, outward), clamped=True)
+    return Target(
+        reached, _without(velocity, outward), _without(acceleration, outward), clamped=True
+    )
 
 
 @functools.cache
@@ -60,7 +65,8 @@ def is_inside(position: Vector, box: Vector, reach: Vector) -> bool:
         if not box[0, i] <= position[i] <= box[1, i]:
             return False
         square += (position[i] - reach[i]) ** 2
-    near, far = reach[3] * reach[3], reach[4] * reach[4]
+    near = reach[3] * reach[3]
+    far = reach[4] * reach[4]
     return bool(near <= square <= far and position[0] >= reach[5] and position[2] >= reach[6])
 
 
@@ -78,28 +84,39 @@ def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
     is reachable, but not always the nearest one.
     """
     x, y, z = (point - reach.centre).tolist()
-    inner, outer, min_x, floor = reach.inner, reach.outer, reach.min_x - reach.centre[0], reach.min_z - reach.centre[2]
-    moved_x, moved_z = x < min_x, z < floor
-    x, z = max(x, min_x), max(z, floor)
+    inner = reach.inner
+    outer = reach.outer
+    min_x = reach.min_x - reach.centre[0]
+    floor = reach.min_z - reach.centre[2]
+    moved_x = x < min_x
+    moved_z = z < floor
+    x = max(x, min_x)
+    z = max(z, floor)
     distance = math.hypot(x, y, z)
     moved_out = distance > outer
     if moved_out:
-        x, y, z = x * outer / distance, y * outer / distance, z * outer / distance
+        x = x * outer / distance
+        y = y * outer / distance
+        z = z * outer / distance
         if x < min_x:
             moved_x = True
             x = min_x
             shrink = math.sqrt(max(outer**2 - x**2, 0.0)) / max(math.hypot(y, z), 1e-12)
-            y, z = y * min(shrink, 1.0), z * min(shrink, 1.0)
+            y = y * min(shrink, 1.0)
+            z = z * min(shrink, 1.0)
     distance = math.hypot(x, y, z)
     moved_in = distance < inner
     if moved_in:
         grow = inner / max(distance, 1e-12)
-        x, y, z = x * grow, y * grow, z * grow
+        x = x * grow
+        y = y * grow
+        z = z * grow
         if z < floor:
             moved_z = True
             z = floor
             grow = math.sqrt(max(inner**2 - z**2, 0.0)) / max(math.hypot(x, y), 1e-12)
-            x, y = x * max(grow, 1.0), y * max(grow, 1.0)
+            x = x * max(grow, 1.0)
+            y = y * max(grow, 1.0)
     if not (moved_x or moved_z or moved_out or moved_in):
         return point, []
     radial = np.array([x, y, z]) / max(math.hypot(x, y, z), 1e-12)
@@ -141,7 +158,9 @@ class Prediction(NamedTuple):
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
     ambiguity: float  # probability that the tool belongs elsewhere, in another segment
     turn: Turn
-    closure: float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
+    closure: (
+        float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +222,15 @@ class Skill(Immutable):
         in all that follows.
         """
         now = self._conducting(np.stack([hands, velocities, accelerations])).reshape(3, 6)
-        behind = np.tile(now[0], (ORDER, 1)) if past is None else self._conducting(past).reshape(ORDER, 6)
+        behind = (
+            np.tile(now[0], (ORDER, 1))
+            if past is None
+            else self._conducting(past).reshape(ORDER, 6)
+        )
         if belief is None:
             belief = self.model.belief(now[0])
-        moving, late_s = now, self.model.delay_s - lead_s
+        moving = now
+        late_s = self.model.delay_s - lead_s
         if late_s:
             moving = np.empty((3, 6))
             delayed(now, behind, late_s, moving)
@@ -214,7 +238,18 @@ class Skill(Immutable):
             stillness = stillness[[self.conductor] * 2]
         rotations = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
         return self.predicted(
-            Seen(moving, stillness, behind, rotations, turn_lag_s(late_s), now, belief, period_s, clock), before
+            Seen(
+                moving,
+                stillness,
+                behind,
+                rotations,
+                turn_lag_s(late_s),
+                now,
+                belief,
+                period_s,
+                clock,
+            ),
+            before,
         )
 
     def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
@@ -227,7 +262,9 @@ class Skill(Immutable):
         inputs, velocity = self.model.moving_inputs(seen)
         turn = self.constant_turn
         if self.turn is not None:
-            turn = self.turn.predict(inputs, velocity, covariance=None if before is None else before[1])
+            turn = self.turn.predict(
+                inputs, velocity, covariance=None if before is None else before[1]
+            )
         if self.gripper is None or before is not None:
             return Prediction(*motion, turn, NO_GRIPPER if before is None else before[2])
         return Prediction(*motion, turn, self.gripper.predict(inputs))

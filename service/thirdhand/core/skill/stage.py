@@ -24,7 +24,9 @@ class SkillStage:
 
     def __init__(self, settings: Settings, skill: Skill, *, tuning: Tuning = TUNING) -> None:
         self._hands = tuning.intake
-        self._reach, self._period_s, self._lead_s = settings.reach, settings.period_s, settings.skill.lead_s
+        self._reach = settings.reach
+        self._period_s = settings.period_s
+        self._lead_s = settings.skill.lead_s
         self._take(skill)
 
     def _take(self, skill: Skill) -> None:
@@ -32,14 +34,24 @@ class SkillStage:
         self.skill = skill
         late_s = skill.model.delay_s - self._lead_s
         delay_s = max(late_s, 0.0)
-        memory, turns, still = np.empty((ORDER, 6)), np.empty((TURNS, 18)), np.empty(2)
+        memory = np.empty((ORDER, 6))
+        turns = np.empty((TURNS, 18))
+        still = np.empty(2)
         # `recall` writes to this; belief and clock are those of the state
         self._seen = Seen(
-            np.empty((3, 6)), still, memory, turns, turn_lag_s(late_s), np.empty((3, 6)), np.empty(0), self._period_s
+            np.empty((3, 6)),
+            still,
+            memory,
+            turns,
+            turn_lag_s(late_s),
+            np.empty((3, 6)),
+            np.empty(0),
+            self._period_s,
         )
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
-        self._clock, side = skill.model.clock_rows, skill.conductor
+        self._clock = skill.model.clock_rows
+        side = skill.conductor
         self._sides = np.array([0, 1] if side is None else [side, side])
         regions = skill.regions
         self._doubts = regions.alarm > 0.0 and bool(skill.model.names)
@@ -66,26 +78,36 @@ class SkillStage:
         """
         if skill.model.names != self.skill.model.names:
             state["segment_belief"] = state["unprimed_belief"] = 0.0
-        before, turn_before_s = self.skill.model, self._turn_lag_s
+        before = self.skill.model
+        turn_before_s = self._turn_lag_s
         if skill.model.clock != before.clock:
             state["task_clock"] = 0.0
         self._take(skill)
-        is_same = skill.model.remembers == before.remembers and skill.model.delay_s == before.delay_s
+        is_same = (
+            skill.model.remembers == before.remembers and skill.model.delay_s == before.delay_s
+        )
         if not is_same or self._turn_lag_s != turn_before_s:
             state["memory_ticks"] = -1
         state["skill"] = np.frombuffer(skill.digest, np.uint8)
-        state["covariance"], state["orientation_covariance"], state["closure"] = 0.0, 0.0, NO_GRIPPER
-        state["trail_tick"], state["sure_tick"] = NEVER, state["tick"]
+        state["covariance"] = 0.0
+        state["orientation_covariance"] = 0.0
+        state["closure"] = NO_GRIPPER
+        state["sure_tick"] = state["tick"]
+        state["trail_tick"] = NEVER
 
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
         """Request of the skill for the hands in the state, which must be known; `unseen` is the
         side of a hand that is not seen now. Covariances and closure are computed at new samples
         only. The doubt is the probability that the task did not begin at its first segment.
         """
-        states, frames, rules = as_array(state), as_array(frame), self.rules
+        states = as_array(state)
+        frames = as_array(frame)
+        rules = self.rules
         self._count(state)
         motion = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
-        is_new, before, covariance = recall(states, rules, motion), None, state["covariance"]
+        is_new = recall(states, rules, motion)
+        before = None
+        covariance = state["covariance"]
         if not is_new:
             before = (
                 covariance,
@@ -99,19 +121,48 @@ class SkillStage:
         error_m = 0.0
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
-            earlier = prediction.covariance, prediction.turn.covariance, prediction.closure, prediction.gate_m  # need not be computed
+            earlier = (
+                prediction.covariance,
+                prediction.turn.covariance,
+                prediction.closure,
+                prediction.gate_m,
+            )  # need not be computed
             deviation = deviation_m(states, rules, unseen)
-            error_m = off_m(lambda hands: self.skill.predicted(hands, earlier).position, motion, columns, deviation)
-        doubt, unprimed = 0.0, state["unprimed_belief"]
+            error_m = off_m(
+                lambda hands: self.skill.predicted(hands, earlier).position,
+                motion,
+                columns,
+                deviation,
+            )
+        doubt = 0.0
+        unprimed = state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
-            doubt = self.skill.model.elsewhere(motion.now, motion.stillness, self._period_s, motion.belief, unprimed)
-        outcome = conclude(states, frames, rules, prediction[:6], prediction.turn, prediction.closure, error_m, doubt)
+            doubt = self.skill.model.elsewhere(
+                motion.now, motion.stillness, self._period_s, motion.belief, unprimed
+            )
+        outcome = conclude(
+            states,
+            frames,
+            rules,
+            prediction[:6],
+            prediction.turn,
+            prediction.closure,
+            error_m,
+            doubt,
+        )
         target = Target(*prediction[:3], clamped=False)
         if outcome & IS_OUTSIDE:
             target = clamp(*prediction[:3], box=self.skill.workspace, reach=self._reach)
             frame["target"], frame["target_velocity"], frame["target_acceleration"] = target[:3]
         is_ambiguous = bool(outcome & IS_AMBIGUOUS)
-        return Wanted(target, prediction.turn.orientation, prediction.turn.velocity, prediction.gate_m, is_ambiguous, error_m > UNSURE_M)
+        return Wanted(
+            target,
+            prediction.turn.orientation,
+            prediction.turn.velocity,
+            prediction.gate_m,
+            is_ambiguous,
+            error_m > UNSURE_M,
+        )
 
     def _count(self, state: Record) -> None:
         """Advance the clock of the task to this tick, if the skill has one. While a hand is not
@@ -128,12 +179,15 @@ class SkillStage:
         via-point, the segment that ends there). Unknown names are ignored.
         """
         if name in (names := self.skill.model.names):
-            state["segment_belief"], state["unprimed_belief"] = 0.0, UNPRIMED_DECIDED
+            state["segment_belief"] = 0.0
+            state["unprimed_belief"] = UNPRIMED_DECIDED
             state["segment_belief"][min(names.index(name), len(names) - 2)] = 1.0
 
     def nothing(self, state: Record, frame: Record) -> None:
         """Write into the frame that nothing is predicted: the target is the setpoint."""
-        state["unsure"], state["sure_tick"] = 0, state["tick"]
-        frame["target"], frame["orientation"] = state["setpoint"][0], state["orientation"]
+        state["sure_tick"] = state["tick"]
+        state["unsure"] = 0
+        frame["target"] = state["setpoint"][0]
+        frame["orientation"] = state["orientation"]
         frame["closure"] = state["closure"]
         tell_segment(as_array(state), as_array(frame))

@@ -18,7 +18,9 @@ from thirdhand.core.skill.support import error_probability
 from thirdhand.core.skill.tuning import AMBIGUOUS_PROBABILITY, AMBIGUOUS_S, TRAIL_S, UNSURE_M
 
 NO_SEGMENT = -1  # segment in a frame while it is not known
-IS_AMBIGUOUS, IS_OUTSIDE = 1, 2  # what `conclude` returns, added
+# what `conclude` returns, added
+IS_AMBIGUOUS = 1
+IS_OUTSIDE = 2
 
 
 @compiled
@@ -28,7 +30,8 @@ def recent(position: Vector, passed_s: float, trail: Vector) -> Vector:
 
         m = m + (1 - exp(-elapsed / T)) (p - m),   v = (p - m) / T
     """
-    out, share = np.empty(3), 1.0 - exp(-passed_s / TRAIL_S)
+    out = np.empty(3)
+    share = 1.0 - exp(-passed_s / TRAIL_S)
     for i in range(3):
         trail[i] += share * (position[i] - trail[i])
         out[i] = (position[i] - trail[i]) / TRAIL_S
@@ -36,7 +39,9 @@ def recent(position: Vector, passed_s: float, trail: Vector) -> Vector:
 
 
 @compiled
-def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, out: Vector) -> float:
+def calibrate(
+    covariance: Vector, velocity: Vector, scale: float, std_s: float, out: Vector
+) -> float:
     """Calibrated covariance C (3, 3) [m²] of a model's covariance Σ, written rounded to `out`, and
     the largest distance [m] of its 95 % region from the mean:
 
@@ -49,9 +54,15 @@ def calibrate(covariance: Vector, velocity: Vector, scale: float, std_s: float, 
         for j in range(3):
             variance = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
             out[i, j] = np.rint(variance * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
-    mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0  # from here on, the largest eigenvalue: Smith 1961
-    a, b, c = out[0, 0] - mean, out[1, 1] - mean, out[2, 2] - mean
-    d, e, f = out[0, 1], out[0, 2], out[1, 2]
+    mean = (
+        out[0, 0] + out[1, 1] + out[2, 2]
+    ) / 3.0  # from here on, the largest eigenvalue: Smith 1961
+    a = out[0, 0] - mean
+    b = out[1, 1] - mean
+    c = out[2, 2] - mean
+    d = out[0, 1]
+    e = out[0, 2]
+    f = out[1, 2]
     spread = math.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
     if spread > 0.0:
         half = 0.5 * (a * b * c + 2.0 * d * e * f - a * f * f - b * e * e - c * d * d) / spread**3
@@ -83,13 +94,21 @@ def conclude(
     than UNSURE_M. Returns IS_AMBIGUOUS if the segment has been ambiguous for longer than
     AMBIGUOUS_S, plus IS_OUTSIDE if the position has to be clamped.
     """
-    state, frame, rule = states[0], frames[0], rules[0]
+    state = states[0]
+    frame = frames[0]
+    rule = rules[0]
     position, velocity, acceleration, covariance, gate_m, ambiguity = motion
-    frame.target[:], frame.target_velocity[:], frame.target_acceleration[:] = position, velocity, acceleration
+    frame.target[:] = position
+    frame.target_velocity[:] = velocity
+    frame.target_acceleration[:] = acceleration
     frame.orientation[:], frame.turning[:], frame.orientation_covariance[:] = turn
-    frame.gate_m, frame.closure = gate_m, closure
-    state.covariance[:], state.orientation_covariance[:], state.closure = covariance, turn[2], closure
-    passed_s, state.trail_tick = (state.tick - state.trail_tick) * rule.period_s, state.tick
+    frame.gate_m = gate_m
+    frame.closure = closure
+    state.covariance[:] = covariance
+    state.orientation_covariance[:] = turn[2]
+    state.closure = closure
+    passed_s = (state.tick - state.trail_tick) * rule.period_s
+    state.trail_tick = state.tick
     moved = recent(position, passed_s, state.trail)
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
     probability = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
@@ -110,7 +129,8 @@ def conclude(
 @compiled
 def tell_segment(states: Records, frames: Records) -> None:
     """Write the most probable segment and its probability into the frame."""
-    belief, frame = states[0].segment_belief, frames[0]
+    belief = states[0].segment_belief
+    frame = frames[0]
     most = belief.argmax()
     frame.segment_belief = belief[most]
     frame.segment = most if belief[most] > 0.0 else NO_SEGMENT

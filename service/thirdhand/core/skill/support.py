@@ -21,7 +21,9 @@ from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.model import LEVELS
 from thirdhand.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
 
-SURVIVAL = np.round(-np.log1p(-np.array(LEVELS)), 12)  # -log of the share of errors beyond each level
+SURVIVAL = np.round(
+    -np.log1p(-np.array(LEVELS)), 12
+)  # -log of the share of errors beyond each level
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,14 +48,18 @@ class LocalErrors(Immutable):
             frozen(part)
 
     @classmethod
-    def of(cls, primitive: KMP, inputs: Vector, errors: Vector, unknown_std_m: float) -> LocalErrors:
+    def of(
+        cls, primitive: KMP, inputs: Vector, errors: Vector, unknown_std_m: float
+    ) -> LocalErrors:
         """Errors (M, 3) [m] at inputs (M, I) of a primitive. Its kernel is made SUPPORT_SHARPNESS
         times as sharp.
         """
         scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
         factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
         table = error_table(inputs * factors, errors)
-        return cls(np.array(inputs, order="C"), np.array(errors, order="C"), factors, table, unknown_std_m)
+        return cls(
+            np.array(inputs, order="C"), np.array(errors, order="C"), factors, table, unknown_std_m
+        )
 
     def covariances(self, inputs: Vector) -> Vector:
         """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
@@ -72,7 +78,9 @@ def error_table(inputs: Vector, errors: Vector) -> Vector:
 
 
 @compiled
-def local_scatter(at: Vector, stretch: Vector, table: Vector, unknown_std_m: float, out: Vector) -> None:
+def local_scatter(
+    at: Vector, stretch: Vector, table: Vector, unknown_std_m: float, out: Vector
+) -> None:
     """Covariance C (3, 3) [m²] of the tool at an input x (I,), written to `out`:
 
         C = (ν σ² I + Σ_m g_m e_m e_mᵀ) / (ν + Σ_m g_m) + LEAST_STD_M² I
@@ -82,7 +90,8 @@ def local_scatter(at: Vector, stretch: Vector, table: Vector, unknown_std_m: flo
     them. It is the posterior mean of a variance whose prior σ² weighs as much as ν errors. `table`
     is the `error_table` of c_i x_mi.
     """
-    near, padded = np.zeros(1 + out.size), table.shape[1]
+    near = np.zeros(1 + out.size)
+    padded = table.shape[1]
     add_table(at * stretch, table, 1.0, np.empty(padded), np.empty(padded), near)
     total = SUPPORT_MASS + near[0]
     for i in range(3):

@@ -17,8 +17,8 @@ from thirdhand.core.skill.tuning import LEAST_PATH_M
 
 MOST_NAMES = MOST_SEGMENTS + 1  # largest number of via-points of a task
 TASK_UNITS = (
-    "inputs: how far along the left and the right hand are, the segment; outputs: how far along the tool is, its "
-    "deviation x y z [m]; frame base"
+    "inputs: how far along the left and the right hand are, the segment; outputs: how far along "
+    "the tool is, its deviation x y z [m]; frame base"
 )
 TASK_RANGES = {
     "corners": (0, MOST_NAMES, ""),
@@ -63,7 +63,8 @@ class Task(NamedTuple):
         rests.
         """
         rows = [points.names.index(name) for name in self.names]
-        positions, is_known = points.at[rows], np.array([not points.known or name in points.known for name in self.names])
+        positions = points.at[rows]
+        is_known = np.array([not points.known or name in points.known for name in self.names])
         hands = np.empty((len(rows), 2, 3))
         for side in (0, 1):
             for corner in range(int(self.corners[:, side].max()) + 1):
@@ -71,15 +72,23 @@ class Task(NamedTuple):
                 averaged = at_corner & is_known if (at_corner & is_known).any() else at_corner
                 hands[at_corner, side] = positions[averaged, 3 * side : 3 * side + 3].mean(axis=0)
         out = structured(len(rows) - 1, SEGMENT)
-        out["begins"], out["way"] = hands[:-1], np.diff(hands, axis=0)
+        out["begins"] = hands[:-1]
+        out["way"] = np.diff(hands, axis=0)
         square = (out["way"] ** 2).sum(axis=2)
         out["square"] = np.where(square > LEAST_PATH_M**2, square, STAYS)
         out["way"] *= (out["square"] > STAYS)[:, :, None]
-        out["off"], out["tool"], out["tool_way"] = off, positions[:-1, 6:], np.diff(positions[:, 6:], axis=0)
-        out["leads"] = NONE if self.leads == NONE else np.where(out["square"][:, self.leads] > STAYS, self.leads, NONE)
+        out["off"] = off
+        out["tool"] = positions[:-1, 6:]
+        out["tool_way"] = np.diff(positions[:, 6:], axis=0)
+        out["leads"] = (
+            NONE
+            if self.leads == NONE
+            else np.where(out["square"][:, self.leads] > STAYS, self.leads, NONE)
+        )
         out["follow"] = np.stack([self.follow[:-1], self.follow[1:]], axis=1)
         if self.levers is not None:
-            out["turned"], out["levers"] = 1, np.stack([self.levers[:-1], self.levers[1:]], axis=1)
+            out["turned"] = 1
+            out["levers"] = np.stack([self.levers[:-1], self.levers[1:]], axis=1)
         return out
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -96,12 +105,21 @@ class Task(NamedTuple):
         count = len(names)
         check_shapes(arrays, {"corners": (count, 2), "follow": (count,)})
         if not 2 <= count <= MOST_NAMES or len(set(names)) < count:
-            raise ValueError(f"via-points {', '.join(names)}: 2 to {MOST_NAMES} different names needed")
-        corners, follow = (np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "follow"))
+            raise ValueError(
+                f"via-points {', '.join(names)}: 2 to {MOST_NAMES} different names needed"
+            )
+        corners, follow = (
+            np.ascontiguousarray(arrays[name], np.int64) for name in ("corners", "follow")
+        )
         for side in (0, 1):
-            if not np.array_equal(np.unique(corners[:, side]), np.arange(corners[:, side].max() + 1)):
-                raise ValueError(f"the hands' positions {corners.tolist()} are not numbered through")
-        levers, leads = None, int(arrays["leads"]) if "leads" in arrays else NONE
+            if not np.array_equal(
+                np.unique(corners[:, side]), np.arange(corners[:, side].max() + 1)
+            ):
+                raise ValueError(
+                    f"the hands' positions {corners.tolist()} are not numbered through"
+                )
+        levers = None
+        leads = int(arrays["leads"]) if "leads" in arrays else NONE
         if "levers" in arrays:
             check_shapes(arrays, {"levers": (count, 3)})
             levers = np.ascontiguousarray(arrays["levers"], np.float64)
@@ -128,9 +146,13 @@ class NamedViaPoints(NamedTuple):
     @staticmethod
     def of(points: Sequence[ViaPoint]) -> NamedViaPoints:
         """Via-points of a list, with the largest of their standard deviations."""
-        positions = np.array([[*point.left, *point.right, *point.tool] for point in points]).reshape(-1, 9)
+        positions = np.array(
+            [[*point.left, *point.right, *point.tool] for point in points]
+        ).reshape(-1, 9)
         return NamedViaPoints(
-            tuple(point.name for point in points), positions, max((point.std for point in points), default=0.0)
+            tuple(point.name for point in points),
+            positions,
+            max((point.std for point in points), default=0.0),
         )
 
     def moved(self, points: Sequence[ViaPoint]) -> NamedViaPoints:

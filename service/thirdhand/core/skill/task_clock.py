@@ -41,9 +41,21 @@ from thirdhand.core.vectors import norm, squared_distance
 
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_SEGMENT, PROGRESS, OWN_BEGIN = range(7)
 CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
-NOT_BEGUN, NEAR_BEGIN, GONE = 0.0, 1.0, 2.0  # progress: hands that rest, that moved, that left where they began
-WAITS_AT, LONGEST_AT, OVER_AT, REST_AT, HOME_AT, NEAR_AT, BEGIN_AT = 0, 2, 3, 4, 5, 6, 7  # of `TaskClock.numbers`
-LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT = 3600.0, 100.0  # limits of what a file may hold
+# progress: hands that rest, that moved, that left where they began
+NOT_BEGUN = 0.0
+NEAR_BEGIN = 1.0
+GONE = 2.0
+# of `TaskClock.numbers`
+WAITS_AT = 0
+LONGEST_AT = 2
+OVER_AT = 3
+REST_AT = 4
+HOME_AT = 5
+NEAR_AT = 6
+BEGIN_AT = 7
+# limits of what a file may hold
+LONGEST_CLOCK_S = 3600.0
+MOST_CLOCK_WEIGHT = 100.0
 
 
 class TaskClock(NamedTuple):
@@ -83,8 +95,13 @@ class TaskClock(NamedTuple):
         largest = (1.0, MOST_CLOCK_WEIGHT, *4 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
         is_in_range = all(abs(value) <= most for value, most in zip(values, largest, strict=True))
         if not is_in_range or min(values[:BEGIN_AT]) < 0.0:
-            raise ValueError(f"task_clock is {values}: numbers from 0 to {largest[:BEGIN_AT]} and a begin [m] needed")
-        return TaskClock(waits > 0.0, weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:]))
+            raise ValueError(
+                f"task_clock is {values}: numbers from 0 to {largest[:BEGIN_AT]} and a begin [m] "
+                "needed"
+            )
+        return TaskClock(
+            waits > 0.0, weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:])
+        )
 
 
 @compiled
@@ -102,12 +119,20 @@ def _have_returned(hands: Vector, numbers: Vector, clock: Vector) -> bool:
     """True if the hands (6,) [m] are where demonstrations begin, or again where they began."""
     if _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
         return True
-    return clock[PROGRESS] == GONE and _are_near(hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M))
+    return clock[PROGRESS] == GONE and _are_near(
+        hands, clock[OWN_BEGIN:], min(numbers[NEAR_AT], OWN_NEAR_M)
+    )
 
 
 @compiled
 def count(
-    hands: Vector, speed: float, still: float, period_s: float, segment: int, rows: Vector, clock: Vector
+    hands: Vector,
+    speed: float,
+    still: float,
+    period_s: float,
+    segment: int,
+    rows: Vector,
+    clock: Vector,
 ) -> bool:
     """Advance a clock (12,) by one period `period_s` [s]; see the equations of this module. The
     faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
@@ -142,7 +167,11 @@ def count(
             begins_again = True
             clock[:CLOCK_SEGMENT] = 0.0
             clock[PROGRESS] = NOT_BEGUN
-        elif before_s > 0.0 and clock[REST_LEFT_S] == 0.0 and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT]):
+        elif (
+            before_s > 0.0
+            and clock[REST_LEFT_S] == 0.0
+            and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT])
+        ):
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
 
     goal = 0.0
@@ -160,7 +189,11 @@ def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vecto
     end where the task begins again. The speeds are those of the hands `sides` (2,) without their
     tremor.
     """
-    state, hands, speed, still, segment = states[0], np.empty(6), 0.0, 1.0, 0
+    state = states[0]
+    hands = np.empty(6)
+    speed = 0.0
+    still = 1.0
+    segment = 0
     for i in range(2):
         hands[3 * i : 3 * i + 3] = state.hands[sides[i], 0]
         speed = max(speed, norm(state.hand_velocity_lowpass[sides[i]]))
@@ -176,7 +209,12 @@ def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vecto
 
 @compiled
 def _counted(
-    moving: Vector, segments: NDArray[np.int64], period_s: float, steps: int, rows: Vector, out: Vector
+    moving: Vector,
+    segments: NDArray[np.int64],
+    period_s: float,
+    steps: int,
+    rows: Vector,
+    out: Vector,
 ) -> None:
     clock = np.zeros(CLOCK_SIZE)
     for t in range(len(moving)):
@@ -198,7 +236,8 @@ def counted(
     those of the faster hand, `stillness` (T,) is that of the less still one. `rows` are those of
     `count`.
     """
-    out, steps = np.empty(len(hands)), max(1, math.ceil(period_s / MEMORY_STEP_S))
+    out = np.empty(len(hands))
+    steps = max(1, math.ceil(period_s / MEMORY_STEP_S))
     if segments is None:
         segments = np.zeros(len(hands), np.int64)
     _counted(np.column_stack([hands, speeds, stillness]), segments, period_s, steps, rows, out)

@@ -25,7 +25,9 @@ def deviation_m(states: Records, rules: Records, side: int) -> float:
     mode_switch_rates_per_s, at which an unseen hand changes its motion: since it was seen, the
     hand may have begun to move, or to rest.
     """
-    state, rule, variance = states[0], rules[0], 0.0
+    state = states[0]
+    rule = rules[0]
+    variance = 0.0
     stay = exp(-rule.mode_switch_rate * (state.tick - state.hand_ticks[side]) * rule.period_s)
     for mode in range(len(rule.mode_prior)):
         share = stay * state.mode_probabilities[side, mode] + (1.0 - stay) * rule.mode_prior[mode]
@@ -33,7 +35,9 @@ def deviation_m(states: Records, rules: Records, side: int) -> float:
     return math.sqrt(variance)
 
 
-def off_m(tool: Callable[[Seen], Vector], seen: Seen, columns: list[int], deviation: float) -> float:
+def off_m(
+    tool: Callable[[Seen], Vector], seen: Seen, columns: list[int], deviation: float
+) -> float:
     """Possible error [m] of the target because one hand is not seen.
 
     With d = sqrt(REGION_95) * `deviation` [m], the prediction of the `tool` (3,) [m] for the hands
@@ -43,7 +47,8 @@ def off_m(tool: Callable[[Seen], Vector], seen: Seen, columns: list[int], deviat
     """
     if not columns:
         return 0.0
-    motion, differences = np.zeros((3, 6)), np.empty((3, 3))
+    motion = np.zeros((3, 6))
+    differences = np.empty((3, 3))
     resting = seen._replace(moving=motion, now=motion, turn_lag_s=turn_lag_s(0.0), period_s=0.0)
     motion[0] = seen.now[0]
     reference_m = tool(resting)

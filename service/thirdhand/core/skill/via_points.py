@@ -25,7 +25,8 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
     outputs: list[Vector] = []
     deviations: list[float] = []
     follow = {"none": np.zeros((3, 6)), "left": np.eye(3, 6), "right": np.eye(3, 6, 3)}
-    centre, around = np.zeros((1, 6)), np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
+    centre = np.zeros((1, 6))
+    around = np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
     for point in via_points:
         steps = point.radius * around if point.radius else centre
         inputs.extend(np.array([*point.left, *point.right]) + steps)

@@ -31,7 +31,8 @@ def arm(args: argparse.Namespace) -> int:
     Raises SettingsError, UrdfError, ExistsError, OSError.
     """
     cell: Path = args.output
-    picture, standing = cell.with_suffix(".png"), cell.with_name(f"{cell.stem}.urdf")
+    picture = cell.with_suffix(".png")
+    standing = cell.with_name(f"{cell.stem}.urdf")
     check_writable(cell, ".toml")
     for file in (cell, picture):
         if file.exists():
@@ -52,12 +53,16 @@ def arm(args: argparse.Namespace) -> int:
                 part.write_text(proposal.text, encoding="utf-8")
         urdf = standing if proposal.text else args.urdf
         with whole(cell) as part:
-            part.write_text(written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8")
+            part.write_text(
+                written(proposal, _named(urdf, cell.parent), args.urdf.name), encoding="utf-8"
+            )
         load(cell)
         draw(proposal, picture)
         undo.pop_all()
     print(text(proposal, args.urdf))
-    print(f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}")
+    print(
+        f"\nwritten: {', '.join(map(str, (cell, picture, *([standing] if proposal.text else []))))}"
+    )
     print(f"next:    thirdhand {'serve --config' if proposal.unmet else 'demo --arm'} {cell}")
     return 0
 
@@ -72,57 +77,80 @@ def _named(urdf: Path, folder: Path) -> str:
 
 def text(proposal: Proposal, path: Path) -> str:
     """The report in text: the arm by its URDF, and the proposed settings."""
-    urdf, settings, body, shell = proposal.urdf, proposal.settings, proposal.body, proposal.shell
+    urdf = proposal.urdf
+    settings = proposal.settings
+    body = proposal.body
+    shell = proposal.shell
     others = [leaf for leaf in urdf.leaves if leaf != proposal.plate]
     lines = [
-        f"{path.name}: {len(urdf.joints) + 1} links, {len(settings.joints.names)} joints before the plate",
-        f"  plate     {proposal.plate}" + (f"; other ends: {', '.join(others[:4])}" if others else ""),
-        f"  units     metres and radians, as a URDF has them: the chain is {_length(proposal):.2f} m long",
+        f"{path.name}: {len(urdf.joints) + 1} links, {len(settings.joints.names)} joints before "
+        "the plate",
+        f"  plate     {proposal.plate}"
+        + (f"; other ends: {', '.join(others[:4])}" if others else ""),
+        f"  units     metres and radians, as a URDF has them: the chain is {_length(proposal):.2f} "
+        "m long",
         "",
-        f"  {'joint':<28} {'kind':<10} {'lower':>8} {'upper':>8} {'velocity':>9} {'acceleration':>13} {'jerk':>6}",
+        f"  {'joint':<28} {'kind':<10} {'lower':>8} {'upper':>8} {'velocity':>9} "
+        f"{'acceleration':>13} {'jerk':>6}",
     ]
     limits = settings.joints
     for joint in proposal.chain:
         if joint.name in limits.names:
             i = limits.names.index(joint.name)
             lines.append(
-                f"  {joint.name:<28} {joint.kind:<10} {limits.lower[i]:8.2f} {limits.upper[i]:8.2f} "
-                f"{limits.velocity[i]:9.2f} {limits.acceleration[i]:13.2f} {limits.jerk[i]:6.0f}"
+                f"  {joint.name:<28} {joint.kind:<10} {limits.lower[i]:8.2f} "
+                f"{limits.upper[i]:8.2f} {limits.velocity[i]:9.2f} {limits.acceleration[i]:13.2f} "
+                f"{limits.jerk[i]:6.0f}"
             )
     lines += ["  prismatic joints are in m, m/s, m/s², m/s³"] if proposal.slides else []
-    lines.append("  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: from rest to full speed in")
-    basis = (
-        f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts" if proposal.efforts else "no efforts in the URDF"
+    lines.append(
+        "  [rad, rad/s, rad/s², rad/s³]; accelerations and jerks are a guess: from rest to full "
+        "speed in"
     )
-    lines.append(f"  {RISE_S:g} s or more, {basis}, jerk = {JERK_RATE:g}/s * acceleration. See the data sheet")
+    basis = (
+        f"at most {100 * TORQUE_SHARE:.0f} % of the URDF's efforts"
+        if proposal.efforts
+        else "no efforts in the URDF"
+    )
+    lines.append(
+        f"  {RISE_S:g} s or more, {basis}, jerk = {JERK_RATE:g}/s * acceleration. See the data "
+        "sheet"
+    )
     revolute = {joint.name for joint in proposal.chain if joint.kind == "revolute"}
     if wide := [
-        name for name, upper in zip(limits.names, limits.upper, strict=True) if name in revolute and upper > DEGREES
+        name
+        for name, upper in zip(limits.names, limits.upper, strict=True)
+        if name in revolute and upper > DEGREES
     ]:
-        lines.append(f"  limits of {', '.join(wide)} exceed a turn: a URDF has radians, not degrees")
+        lines.append(
+            f"  limits of {', '.join(wide)} exceed a turn: a URDF has radians, not degrees"
+        )
     radii = body.capsules["radius"]
-    bare = sorted(set(range(len(limits.names) + 1)) - {_link(proposal, shape.link) for shape in urdf.shapes})
+    bare = sorted(
+        set(range(len(limits.names) + 1)) - {_link(proposal, shape.link) for shape in urdf.shapes}
+    )
     lines += [
         "",
-        f"  body      {len(radii)} capsules with radii from {radii.min():.3f} to {radii.max():.3f} m; "
-        f"{len(body.pairs)} pairs of them are checked for collision",
+        f"  body      {len(radii)} capsules with radii from {radii.min():.3f} to {radii.max():.3f} "
+        f"m; {len(body.pairs)} pairs of them are checked for collision",
     ]
     raw = ElementTree.fromstring(description(path, cover=False))
     if lost := unfound(raw, path, settings.arm.packages, "visual"):
         lines += [
             f"  meshes    {lost}.",
-            "            The service does not need them. Drawings show the capsules of the collision shapes instead.",
+            "            The service does not need them. Drawings show the capsules of the "
+            "collision shapes instead.",
         ]
     if bare:
         lines.append(
-            f"            no collision shape {' and '.join(_bare(limits.names, i) for i in bare)}: a capsule of [arm] "
-            f"link_radius = {settings.arm.link_radius:g} m replaces it"
+            f"            no collision shape {' and '.join(_bare(limits.names, i) for i in bare)}: "
+            f"a capsule of [arm] link_radius = {settings.arm.link_radius:g} m replaces it"
         )
     x, y, z = shell.centre
     posture = ", ".join(f"{value:.3f}" for value in settings.arm.posture)
     lines += [
-        f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), where z ≥ "
-        f"{settings.reach.min_z:g} m and x ≥ {settings.reach.min_x:g} m",
+        f"  reach     {shell.inner:.2f} to {shell.outer:.2f} m from ({x:.2f}, {y:.2f}, {z:.2f}), "
+        f"where z ≥ {settings.reach.min_z:g} m and x ≥ {settings.reach.min_x:g} m",
         f"  posture   [{posture}] rad{', m for prismatic joints' if proposal.slides else ''}",
         f"            the tool is {math.degrees(proposal.tilt):.0f}° from straight down, the arm "
         f"{100 * proposal.clearance[0]:.0f} cm from {proposal.clearance[1]}, and the nearest limit "
@@ -135,18 +163,24 @@ def text(proposal: Proposal, path: Path) -> str:
     lines.append(f"            [tool] allows {allowed}; a joint in brackets allows less")
     if any(settings.tool.plate_from_tool[3:6]):
         lines.append(
-            "  tool      the plate's +z does not point away from the arm: [tool] plate_from_tool turns it, "
-            f"({', '.join(f'{value:g}' for value in settings.tool.plate_from_tool[3:])}) as x y z w"
+            "  tool      the plate's +z does not point away from the arm: [tool] plate_from_tool "
+            f"turns it, ({', '.join(f'{value:g}' for value in settings.tool.plate_from_tool[3:])}) "
+            "as x y z w"
         )
     if proposal.text:
         x, y, z = proposal.stand
         lines.append(
-            f"  base      the URDF's root is at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 puts it at the origin"
+            f"  base      the URDF's root is at ({x:g}, {y:g}, {z:g}) m of frame base; --at 0 0 0 "
+            "puts it at the origin"
         )
     if proposal.unmet:
-        far = ", ".join(f"{name} at {math.dist(DEMO_TOOL_M[name], shell.centre):.2f} m" for name in proposal.unmet)
+        far = ", ".join(
+            f"{name} at {math.dist(DEMO_TOOL_M[name], shell.centre):.2f} m"
+            for name in proposal.unmet
+        )
         lines.append(
-            f"  demo      its scene is out of reach, which needs the tool for {far}. The demo moves things by at most\n"
+            f"  demo      its scene is out of reach, which needs the tool for {far}. The demo "
+            "moves things by at most\n"
             "            15 cm; teach tasks of this arm's size (docs/tutorial.md)"
         )
     return "\n".join(lines)

@@ -27,8 +27,12 @@ from thirdhand.scribe.paths import MB, named_after, stem_of
 from thirdhand.settings.config import Settings, without_secrets
 from thirdhand.settings.whole_file import whole
 
-LOG_BYTES, JOURNAL_LINES, JOURNAL_TIMEOUT_S = 2_000_000, 5000, 20.0
-_KEY = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL)
+LOG_BYTES = 2_000_000
+JOURNAL_LINES = 5000
+JOURNAL_TIMEOUT_S = 20.0
+_KEY = re.compile(
+    r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL
+)
 _PARAMETERS = re.compile(r"""\b([a-z][\w+-]*/[^\s"'#]+)#[^\s"']*[^\s"',]""")
 HEAD = """This archive holds no keys, certificates, parameters of endpoints or files of Zenoh.
 Recordings show how hands and arm moved. Read it before you pass it on.\n\n"""
@@ -36,30 +40,48 @@ Recordings show how hands and arm moved. Read it before you pass it on.\n\n"""
 
 def bundle(args: argparse.Namespace) -> int:
     """Write the archive and print what it holds; exit code 0 also if the daemon does not answer."""
-    settings, now = cell_of(str(args.config)) if args.config else None, datetime.now(UTC)
+    settings = cell_of(str(args.config)) if args.config else None
+    now = datetime.now(UTC)
     args.cell = args.cell or (settings or Settings()).cell
     args.connect = list(reaching(args, settings).connect)
     path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
     check_writable(path)
-    installed = {(package.metadata["Name"], package.version) for package in metadata.distributions()}
+    installed = {
+        (package.metadata["Name"], package.version) for package in metadata.distributions()
+    }
     texts = {
         "status.json": _printed(status, args, json=True, watch=False, exit_code=False),
         "doctor.txt": _printed(doctor, args, json=False, seconds=2.0),
-        "versions.txt": "".join(f"{name}: {value}\n" for name, value in (*machine().items(), *sorted(installed))),
+        "versions.txt": "".join(
+            f"{name}: {value}\n" for name, value in (*machine().items(), *sorted(installed))
+        ),
         "log.txt": _log(args),
     }
     folder = settings.files.record if settings else ""
-    texts |= {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()} if settings else {}
+    texts |= (
+        {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()}
+        if settings
+        else {}
+    )
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
-        folder = folder or str(Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent)
+        folder = folder or str(
+            Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent
+        )
     candidates = named_after(args.cell, Path(folder)) if folder else []
-    recordings = [file for file in candidates if file.stat().st_mtime > time.time() - 60 * args.minutes] or candidates[-1:]
+    recordings = [
+        file for file in candidates if file.stat().st_mtime > time.time() - 60 * args.minutes
+    ] or candidates[-1:]
     about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
-    about += "".join(f"recordings/{file.name}: {file.stat().st_size / MB:.1f} MB\n" for file in recordings)
+    about += "".join(
+        f"recordings/{file.name}: {file.stat().st_size / MB:.1f} MB\n" for file in recordings
+    )
     if not texts["status.json"].startswith("{"):
         about += f"no status: {without_keys(texts['status.json']).strip()}\n"
     if not candidates:
-        unnamed = f"neither a daemon that records nor {'[files] record' if settings else '--config'} names their folder"
+        unnamed = (
+            f"neither a daemon that records nor {'[files] record' if settings else '--config'} "
+            "names their folder"
+        )
         about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
     texts["README.txt"] = HEAD + about
     _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
@@ -72,7 +94,9 @@ def without_keys(text: str) -> str:
     return _PARAMETERS.sub(r"\1#(left out)", _KEY.sub("(a private key, left out)", text))
 
 
-def _printed(command: Callable[[argparse.Namespace], int], args: argparse.Namespace, **more: object) -> str:
+def _printed(
+    command: Callable[[argparse.Namespace], int], args: argparse.Namespace, **more: object
+) -> str:
     """The text that another command prints, or the reason why it failed."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         try:
@@ -89,7 +113,14 @@ def _log(args: argparse.Namespace) -> str:
             file.seek(max(0, file.seek(0, os.SEEK_END) - LOG_BYTES))
             return str(file.read(LOG_BYTES).decode(errors="replace"))
     unit = args.config.stem if args.config else stem_of(args.cell)
-    command = ["journalctl", "--unit", f"thirdhand@{unit}", "--no-pager", "--lines", str(JOURNAL_LINES)]
+    command = [
+        "journalctl",
+        "--unit",
+        f"thirdhand@{unit}",
+        "--no-pager",
+        "--lines",
+        str(JOURNAL_LINES),
+    ]
     try:
         done = subprocess.run(command, capture_output=True, timeout=JOURNAL_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -101,10 +132,15 @@ def _write(path: Path, texts: dict[str, str], recordings: list[Path]) -> None:
     """Write the archive whole or not at all; a recording that still grows is cut."""
     with whole(path) as part:
         private = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with open(private, "wb") as file, tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive:
+        with (
+            open(private, "wb") as file,
+            tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive,
+        ):
             for name, text in texts.items():
-                entry, content = tarfile.TarInfo(name), text.encode()
-                entry.size, entry.mtime = len(content), time.time()
+                entry = tarfile.TarInfo(name)
+                content = text.encode()
+                entry.size = len(content)
+                entry.mtime = time.time()
                 archive.addfile(entry, io.BytesIO(content))
             for recording in recordings:
                 archive.add(recording, f"recordings/{recording.name}")

@@ -62,14 +62,19 @@ def calibrate(args: argparse.Namespace) -> int:
         real_path(file)  # before the arm is led in vain
     settings = cell_of(args.config) if args.config else None
     if only_check and file is None:
-        raise UsageError("--check compares with the last calibration of a cell: give its settings by --config FILE")
+        raise UsageError(
+            "--check compares with the last calibration of a cell: give its settings by --config "
+            "FILE"
+        )
     if args.recording is not None:
         led, settings = from_recording(args.recording, settings)
         if only_check:
             assert file is not None
             return _checked(led, settings, _last(led, file, settings, args.hand), args)
         solution = solved(led, settings, bench_corners(settings), args.hand)
-        record = _record(solution.calibration, solution.side, solution.frame or settings.hands.frame, "held")
+        record = _record(
+            solution.calibration, solution.side, solution.frame or settings.hands.frame, "held"
+        )
         _show(record, args, solution.remarks, lasts_s=float(np.ptp(solution.held.hand_s)))
         _write(file, record, solution.frame, settings)
         return _checked(led, settings, record, args) if args.check else 0
@@ -99,7 +104,8 @@ def _live(
     only_check: bool,
     args: argparse.Namespace,
 ) -> int:
-    pressed, corners = EnterPressed(), bench_corners(settings)
+    pressed = EnterPressed()
+    corners = bench_corners(settings)
     _await(live, args, needs_joints=not given)
     if only_check:
         assert file is not None
@@ -108,12 +114,18 @@ def _live(
         begun_s = time.monotonic()
         side = the_hand(live.arriving, args.hand)
         if given:
-            track, remarks = live.led(most_states=1).hands[side], list[str]()
+            track = live.led(most_states=1).hands[side]
+            remarks = list[str]()
             tracker_of(track, settings)
             frame = track.frame
-            calibration = _touched(live, side, corners, given, pressed, settings.tracker_section(frame))
+            calibration = _touched(
+                live, side, corners, given, pressed, settings.tracker_section(frame)
+            )
         else:
-            say("hold the tool and lead it: up and down, far apart, and turn the wrist; Enter or Ctrl-C ends it")
+            say(
+                "hold the tool and lead it: up and down, far apart, and turn the wrist; Enter or "
+                "Ctrl-C ends it"
+            )
             try:
                 accept_m = args.accept / 1000
                 say(
@@ -132,14 +144,23 @@ def _live(
             except KeyboardInterrupt:
                 say("ended by Ctrl-C")
             solution = solved(live.led(), settings, corners, side)
-            calibration, frame, remarks = solution.calibration, solution.frame, list(solution.remarks)
-        remarks += [f"{count} messages on {key} were not readable" for key, count in live.malformed.items()]
-        record = _record(calibration, side, frame or settings.hands.frame, "points" if given else "held")
+            calibration = solution.calibration
+            frame = solution.frame
+            remarks = list(solution.remarks)
+        remarks += [
+            f"{count} messages on {key} were not readable" for key, count in live.malformed.items()
+        ]
+        record = _record(
+            calibration, side, frame or settings.hands.frame, "points" if given else "held"
+        )
         _show(record, args, remarks, lasts_s=time.monotonic() - begun_s)
         _write(file, record, frame, settings)
     if not args.check:
         return 0
-    say(f"check: {'hold' if record.method == 'held' else 'touch'} the tool as before, for {CHECK_S:g} s")
+    say(
+        f"check: {'hold' if record.method == 'held' else 'touch'} the tool as before, for "
+        f"{CHECK_S:g} s"
+    )
     end_s = time.monotonic() + CHECK_S
     while time.monotonic() < end_s:
         time.sleep(CALIBRATE_POLL_S)
@@ -176,7 +197,10 @@ def _touched(
     try:
         while len(hand) < len(given):
             where = "({:g}, {:g}, {:g}) m".format(*given[len(hand)])
-            say(f"{len(hand) + 1}: touch {where} with the tracked point of the {side} hand, then press Enter")
+            say(
+                f"{len(hand) + 1}: touch {where} with the tracked point of the {side} hand, then "
+                "press Enter"
+            )
             while not pressed():
                 if not pressed.listens:
                     raise KeyboardInterrupt
@@ -192,15 +216,20 @@ def _touched(
             hand.append(position_m)
             if len(hand) >= MIN_POINTS:
                 try:
-                    calibration = solve_points(np.array(hand), np.array(base), corners, section=section)
+                    calibration = solve_points(
+                        np.array(hand), np.array(base), corners, section=section
+                    )
                     say(
-                        f"residual {1e3 * calibration.rms_m:.1f} mm, accuracy {1e3 * calibration.std_m:.1f} mm; Ctrl-C ends it here"
+                        f"residual {1e3 * calibration.rms_m:.1f} mm, accuracy "
+                        f"{1e3 * calibration.std_m:.1f} mm; Ctrl-C ends it here"
                     )
                 except CalibrationError as error:
                     say(f"not enough yet: {error}")
     except KeyboardInterrupt:
         say(f"ended after {len(hand)} points")
-    return solve_points(np.array(hand).reshape(-1, 3), np.array(base).reshape(-1, 3), corners, section=section)
+    return solve_points(
+        np.array(hand).reshape(-1, 3), np.array(base).reshape(-1, 3), corners, section=section
+    )
 
 
 def _shower() -> Callable[[str], None]:
@@ -218,28 +247,47 @@ def _shower() -> Callable[[str], None]:
 
 def _record(calibration: Calibration, hand: str, frame: str, method: str) -> CalibrationRecord:
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    return CalibrationRecord(date=now, method=method, hand=hand, frame=frame, calibration=calibration)  # type: ignore[arg-type]
+    return CalibrationRecord(
+        date=now,
+        method=method,  # type: ignore[arg-type]
+        hand=hand,
+        frame=frame,
+        calibration=calibration,
+    )
 
 
-def _show(record: CalibrationRecord, args: argparse.Namespace, remarks: Sequence[str], *, lasts_s: float) -> None:
+def _show(
+    record: CalibrationRecord, args: argparse.Namespace, remarks: Sequence[str], *, lasts_s: float
+) -> None:
     """Print the calibration. Raises CalibrationError if it is less accurate than accepted."""
-    calibration, stds_mm = record.calibration, [1e3 * std for std in record.calibration.corner_std_m]
+    calibration = record.calibration
+    stds_mm = [1e3 * std for std in record.calibration.corner_std_m]
     for remark in remarks:
         say(f"remark: {remark}")
     kind = "samples" if record.method == "held" else "points"
-    print(f"{record.hand} hand     {record.method}, {lasts_s:.0f} s, {calibration.samples} {kind}, {calibration.outliers} outliers")
-    print(f"residual       {1e3 * calibration.rms_m:.1f} mm rms, {1e3 * calibration.residual_95_m:.1f} mm (95 %)")
     print(
-        f"accuracy       {1e3 * calibration.std_m:.1f} mm: standard deviation at the corners of the bench, "
-        f"{min(stds_mm):.1f} to {max(stds_mm):.1f} mm"
+        f"{record.hand} hand     {record.method}, {lasts_s:.0f} s, {calibration.samples} {kind}, "
+        f"{calibration.outliers} outliers"
+    )
+    print(
+        f"residual       {1e3 * calibration.rms_m:.1f} mm rms, "
+        f"{1e3 * calibration.residual_95_m:.1f} mm (95 %)"
+    )
+    print(
+        f"accuracy       {1e3 * calibration.std_m:.1f} mm: standard deviation at the corners of "
+        f"the bench, {min(stds_mm):.1f} to {max(stds_mm):.1f} mm"
     )
     if record.method == "held":
         print("hand in tool   ({:.3f}, {:.3f}, {:.3f}) m".format(*calibration.hand_in_tool))
-        print(f"delay          {round(1e3 * calibration.delay_s)} ms of the hand's stamps behind the arm's")
+        print(
+            f"delay          {round(1e3 * calibration.delay_s)} ms of the hand's stamps behind the "
+            "arm's"
+        )
     if calibration.std_m > args.accept / 1000:
         raise CalibrationError(
-            f"not accurate enough: {1e3 * calibration.std_m:.1f} mm at the corners of the bench, at most {args.accept:g} mm "
-            f"accepted (--accept). Nothing was written. To improve it, {calibration.remedy}"
+            f"not accurate enough: {1e3 * calibration.std_m:.1f} mm at the corners of the bench, "
+            f"at most {args.accept:g} mm accepted (--accept). Nothing was written. To improve it, "
+            f"{calibration.remedy}"
         )
 
 
@@ -250,11 +298,17 @@ def _write(file: Path | None, record: CalibrationRecord, frame: str, settings: S
     tracker = frame if frame in settings.trackers else ""
     values = hand_settings(record.calibration, "" if frame == BASE or tracker else frame)
     if file is None:
-        print(f"\nWrite this into the cell's settings; --config FILE does it:\n{lines(values, tracker)}", end="")
+        print(
+            "\nWrite this into the cell's settings; --config FILE does "
+            f"it:\n{lines(values, tracker)}",
+            end="",
+        )
         return
     backup = write(file, values, record, tracker)
     print(f"\n{lines(values, tracker)}", end="")
-    print(f"written into {file}; the earlier file is {backup.name}. Start the daemon again to use it")
+    print(
+        f"written into {file}; the earlier file is {backup.name}. Start the daemon again to use it"
+    )
 
 
 def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> CalibrationRecord:
@@ -264,7 +318,8 @@ def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> C
     hands = [track for hand, track in led.hands.items() if side in (None, hand)]
     if not hands:
         return recorded(file, settings)
-    records, errors = dict[str, CalibrationRecord](), list[CalibrationError]()
+    records = dict[str, CalibrationRecord]()
+    errors = list[CalibrationError]()
     for track in hands:
         try:
             tracker = tracker_of(track, settings)
@@ -273,16 +328,22 @@ def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> C
             errors.append(error)
     if len(records) > 1:
         frames = " and ".join(repr(record.frame) for record in records.values())
-        raise CalibrationError(f"the hands are of two trackers, {frames}: give the hand that holds the tool by --hand")
+        raise CalibrationError(
+            f"the hands are of two trackers, {frames}: give the hand that holds the tool by --hand"
+        )
     if not records:
         raise errors[0]
     return next(iter(records.values()))
 
 
-def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace) -> int:
+def _checked(
+    led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace
+) -> int:
     """Print how far the hand is from where the tool has it; 1 if that is more than accepted."""
     if (track := led.hands.get(record.hand)) is None:
-        raise CalibrationError(f"hands/{record.hand} does not arrive, which was calibrated on {record.date}")
+        raise CalibrationError(
+            f"hands/{record.hand} does not arrive, which was calibrated on {record.date}"
+        )
     held, remarks = held_tool(track, led.tool, settings.hands_in(tracker_of(track, settings)))
     if not len(held.hand):
         raise CalibrationError("no samples of hand and arm at the same time")
@@ -291,9 +352,17 @@ def _checked(led: LedTracks, settings: Settings, record: CalibrationRecord, args
     for remark in remarks:
         say(f"remark: {remark}")
     if track.frame not in ("", record.frame):
-        say(f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the tracker was recentred")
+        say(
+            f"remark: the frame is {track.frame!r}, and {record.frame!r} was calibrated: the "
+            "tracker was recentred"
+        )
     is_far = bool(np.median(off_mm) > most_mm)
-    advice = ". Does the hand hold the tool as before? Then the tracker has moved: calibrate again" * is_far
-    text = f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
+    advice = (
+        ". Does the hand hold the tool as before? Then the tracker has moved: calibrate again"
+        * is_far
+    )
+    text = (
+        f"hand at the tool: {np.median(off_mm):.0f} mm (95 %: {np.quantile(off_mm, 0.95):.0f} mm)"
+    )
     print(printable_lines(f"{text}; up to {most_mm:.0f} mm accepted{advice}"))
     return int(is_far)

@@ -36,13 +36,16 @@ DEMO_CELL = "thirdhand"  # of the demo
 SCENE_TIMEOUT_S = 60.0
 DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
 TOO_BUSY = "too-busy"  # folder in --output of what such attempts recorded
-SLOW_RATE_HZ = 100  # at 500 Hz, a browser without a GPU, or a compiler, leaves two cores too little for the arm
+# at 500 Hz, a browser without a GPU, or a compiler, leaves two cores too little for the arm
+SLOW_RATE_HZ = 100
 PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
 OUTCOME_S = 1.0  # the page shows the outcome before its server ends
 NEVER_THERE = "the hands were never at its places"
-REACHED_LINE = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")  # a line of the bench
+REACHED_LINE = re.compile(
+    r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s"
+)  # a line of the bench
 CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
 VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
@@ -107,7 +110,9 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
     """Run the scenario once and return its report. With the address of a `page`, a person plays the
     hands there. Raises DemoError, SettingsError.
     """
-    out, engine, settings = args.output, engine_of(args.engine), cell_of(args.arm, rate_hz=rate_hz)
+    out = args.output
+    engine = engine_of(args.engine)
+    settings = cell_of(args.arm, rate_hz=rate_hz)
     scene = [str(args.scene)] if args.scene else []
     if reason := no_room_to_brake(settings.period_s):
         raise DemoError(reason)
@@ -116,26 +121,41 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
     request = _output("thirdhand_sim.scene", "--arm", args.arm, *scene)
     add = decode_request(request.encode(), Add)
     live = ("--live", "0") if args.open and not page else ()
-    with launched(out, "--joints", "state", *live, settings=settings, record=out, say=say) as service:
+    with launched(
+        out, "--joints", "state", *live, settings=settings, record=out, say=say
+    ) as service:
         say(f"service at {service.endpoint}")
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
             reply = client.add(add.points, tolerance=add.tolerance)
             names = ", ".join(
-                f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)" for point in reply.points or ()
+                f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)"
+                for point in reply.points or ()
             )
             say(f"taught while it runs, in force since tick {reply.tick}: {names}")
-            bench = ["--engine", engine, "--arm", str(service.config), *(["--scene", *scene] if scene else [])]
-            ends: list[tuple[Status, int]] = []  # the service ends before the bench: an arm that disappears is a fault
+            bench = [
+                "--engine",
+                engine,
+                "--arm",
+                str(service.config),
+                *(["--scene", *scene] if scene else []),
+            ]
+            ends: list[
+                tuple[Status, int]
+            ] = []  # the service ends before the bench: an arm that disappears is a fault
             play = functools.partial(
-                played, service.endpoint, *bench, reported=lambda: ends.append((client.status(), service.stop()))
+                played,
+                service.endpoint,
+                *bench,
+                reported=lambda: ends.append((client.status(), service.stop())),
             )
             if page:
                 report = _played_on_page(session, client, play, page, browser=args.open)
             else:
                 with _live_view(session, client) if live else contextlib.nullcontext():
                     report = json.loads(play(say=say))
-        ((status, code),), missing = ends, service.missing()
+        ((status, code),) = ends
+        missing = service.missing()
         if code != 0 and not missing:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
     return _report(report, status) | {"missing": missing}
@@ -208,11 +228,16 @@ def _played_on_page(
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
-    from thirdhand.workbench.report.report import reported  # its import is slow: the first messages must come before
+    from thirdhand.workbench.report.report import (
+        reported,
+    )  # its import is slow: the first messages must come before
 
     recording = status.scribe["recording"]
     if recording is None:
-        raise DemoError(f"nothing was recorded: {'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}")
+        raise DemoError(
+            "nothing was recorded: "
+            f"{'; '.join(status.scribe['errors']) or 'the scribe gave no reason'}"
+        )
     recorded_report = reported(recording)
     timing = recorded_report.columns.timing
     bench = too_busy(report)
@@ -239,7 +264,9 @@ def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
 
 def too_busy(report: dict[str, Any]) -> str:
     """A message on a machine that was too busy for the bench; empty if it was not."""
-    periods, skipped, pause_ms = (report[name] for name in ("periods", "skipped", "longest_pause_ms"))
+    periods, skipped, pause_ms = (
+        report[name] for name in ("periods", "skipped", "longest_pause_ms")
+    )
     messages = []
     if skipped > MISSED_SHARE * periods:
         messages.append(f"the bench missed {skipped} of its {periods} periods")
@@ -255,18 +282,31 @@ def _why(found: Any, begun_s: float, events: dict[str, Any], name: str) -> str:
     names = list(events)
     before = [events[event]["time_s"] for event in names[: names.index(name)]]
     until_s = events[name]["time_s"] + CAUSE_AFTER_S
-    return why_missed(found, VIA_POINT_OF_EVENT[name], begun_s=begun_s, start_s=max(before, default=0.0), end_s=until_s)
+    return why_missed(
+        found,
+        VIA_POINT_OF_EVENT[name],
+        begun_s=begun_s,
+        start_s=max(before, default=0.0),
+        end_s=until_s,
+    )
 
 
 def _percentiles(values: Any) -> dict[str, float]:
     import numpy as np
 
-    return dict(zip(("p50", "p99", "max"), np.percentile(values, (50, 99, 100)).round(1).tolist(), strict=True))
+    return dict(
+        zip(
+            ("p50", "p99", "max"),
+            np.percentile(values, (50, 99, 100)).round(1).tolist(),
+            strict=True,
+        )
+    )
 
 
 def text(report: dict[str, Any]) -> str:
     """The report in text, with each cause of a failure once."""
-    lines, causes = list[str](), list[str]()
+    lines = list[str]()
+    causes = list[str]()
     for name, title in EVENT_TITLES.items():
         event = report["events"][name]
         if event["error_mm"] is None:
@@ -274,12 +314,16 @@ def text(report: dict[str, Any]) -> str:
             lines.append(f"      because {event['why']}")
             continue
         outcome = "reached" if event["reached"] else "MISSED"
-        lines.append(f"  {title:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}")
+        lines.append(
+            f"  {title:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}"
+        )
         if why := event.get("why"):
             lines.append("      for the same reason" if why in causes else f"      because {why}")
             causes.append(why)
     busy = ", ".join(part for part in report["busy"].split(", ") if part not in " ".join(causes))
-    latency, late, work = report["latency_ms"], report["lateness_us"], report["work_us"]
+    latency = report["latency_ms"]
+    late = report["lateness_us"]
+    work = report["work_us"]
     lines += [
         "",
         f"  loop     {report['rate_hz']:.2f} Hz, {report['ticks']} ticks, {report['missed']} missed"
@@ -310,9 +354,13 @@ def _shown(path: str) -> str:
 
 def _output(module: str, *arguments: str) -> str:
     command = python("-m", module, *arguments)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=SCENE_TIMEOUT_S, check=False
+    )
     if done.returncode != 0:
-        raise DemoError(done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}")
+        raise DemoError(
+            done.stderr.strip() or f"{' '.join(command)} ended with code {done.returncode}"
+        )
     for line in done.stderr.splitlines():
         say(line)
     return done.stdout

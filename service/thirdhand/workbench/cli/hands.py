@@ -49,7 +49,9 @@ def _camera(args: argparse.Namespace) -> int:
             begin_of(file)
     mediapipe()  # before the model is downloaded
     with (
-        HandCamera(hand_model(args.model, say), view_deg=args.view, hand_length=args.hand_length) as camera,
+        HandCamera(
+            hand_model(args.model, say), view_deg=args.view, hand_length=args.hand_length
+        ) as camera,
         reached(args, None) as session,
         Tracker(session, args.cell, timeout_s=None) as tracker,
     ):
@@ -63,8 +65,9 @@ def _web(args: argparse.Namespace) -> int:
     certificate = server_certificate(args.https, user_folder("state")) if args.https else None
     if certificate is None and args.web and not is_local(f"tcp/{listen}"):
         raise UsageError(
-            f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: --https NAME with the "
-            "name or address of this machine needed, or 127.0.0.1 and a cable (`adb reverse`)"
+            f"--listen {listen}: browsers track hands by HTTPS only, except on this machine: "
+            "--https NAME with the name or address of this machine needed, or 127.0.0.1 and a "
+            "cable (`adb reverse`)"
         )
     with reached(args, None) as session, Tracker(session, args.cell, timeout_s=None) as tracker:
         client = Client(session, args.cell, timeout_s=ORDER_TIMEOUT_S)
@@ -73,8 +76,12 @@ def _web(args: argparse.Namespace) -> int:
         if args.mouse:
             page = MousePage(tracker, client, Latest(session, args.cell), **served)
         else:
-            pinches = Pinches(session, args.cell, clutch=args.pinch_clutch, gripper=args.pinch_gripper)
-            page = HeadsetPage(tracker, client, Latest(session, args.cell), pinches=pinches, **served)
+            pinches = Pinches(
+                session, args.cell, clutch=args.pinch_clutch, gripper=args.pinch_gripper
+            )
+            page = HeadsetPage(
+                tracker, client, Latest(session, args.cell), pinches=pinches, **served
+            )
 
         def listening(address: Address) -> None:
             page_address = Address(certificate.name, address.port) if certificate else address
@@ -86,14 +93,23 @@ def _web(args: argparse.Namespace) -> int:
             if certificate is None:
                 say(f"for a headset on a cable: adb reverse tcp:{address.port} tcp:{address.port}")
             else:
-                say("the browser will warn of a certificate that it does not know: continue nevertheless")
-            say("open this address in the headset's browser, press Start, and hold both hands in view; Ctrl-C ends it")
+                say(
+                    "the browser will warn of a certificate that it does not know: continue "
+                    "nevertheless"
+                )
+            say(
+                "open this address in the headset's browser, press Start, and hold both hands in "
+                "view; Ctrl-C ends it"
+            )
 
         try:
             serve_page(page.server, "--listen", listen, listening)
         finally:
             counters = page.hands
-            say(f"{counters.published} messages with hands published, {counters.lost} lost, {counters.delayed} too late")
+            say(
+                f"{counters.published} messages with hands published, {counters.lost} lost, "
+                f"{counters.delayed} too late"
+            )
     return 0
 
 
@@ -119,8 +135,14 @@ def _token() -> str:
                 file.write(new)
         token = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        say(f"the token of this start is not kept ({in_words(error)}): open pages need the new address")
+        say(
+            f"the token of this start is not kept ({in_words(error)}): open pages need the new "
+            "address"
+        )
         return new
     if not re.fullmatch(f"[{TOKEN_LETTERS}]{{{TOKEN_LENGTH},}}", token):
-        raise ExplainedError(f"{path}: {TOKEN_LENGTH} or more small letters and digits needed; delete it for a new one")
+        raise ExplainedError(
+            f"{path}: {TOKEN_LENGTH} or more small letters and digits needed; delete it for a new "
+            "one"
+        )
     return token

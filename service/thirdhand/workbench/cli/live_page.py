@@ -54,7 +54,9 @@ class LivePage:
         self.server = WebServer(routes, unknown=UNKNOWN)
 
     async def _front(self, _: web.Request) -> web.Response:
-        text = filled(PAGE, token=self.server.token, page=self._page, viewer=self._viewer, cell=self._cell)
+        text = filled(
+            PAGE, token=self.server.token, page=self._page, viewer=self._viewer, cell=self._cell
+        )
         policy = f"connect-src 'self'; frame-src {self._viewer}; {INLINE}; frame-ancestors 'none'"
         return answer(200, text, kind=HTML, policy=policy)
 
@@ -90,7 +92,9 @@ def live_url(scribe: Callable[[], Mapping[str, Any]]) -> str:
 def live_page(session: zenoh.Session, client: Client, cell: str, url: str) -> Iterator[LivePage]:
     """The page of a live view, with its viewer while the context lasts. Raises ViewerError."""
     with web_viewer(url) as viewer:
-        yield LivePage(client=client, latest=Latest(session, cell, client.status()), cell=cell, viewer=viewer)
+        yield LivePage(
+            client=client, latest=Latest(session, cell, client.status()), cell=cell, viewer=viewer
+        )
 
 
 @contextlib.contextmanager
@@ -102,14 +106,24 @@ def web_viewer(stream: str) -> Iterator[str]:
     is another site, which runs in a process of its own, so that the buttons always respond.
     """
     port = free_port()
-    command = [str(rerun_program()), "--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), stream]
+    command = [
+        str(rerun_program()),
+        "--serve-web",
+        "--bind",
+        "127.0.0.1",
+        "--web-viewer-port",
+        str(port),
+        stream,
+    ]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet) as viewer:
         try:
             deadline_s = time.monotonic() + START_S
             while not _is_listening(port):
                 if viewer.poll() is not None or time.monotonic() > deadline_s:
-                    raise ViewerError(f"the web viewer did not start on port {port} within {START_S:g} s")
+                    raise ViewerError(
+                        f"the web viewer did not start on port {port} within {START_S:g} s"
+                    )
                 time.sleep(0.1)
             yield f"http://localhost:{port}/"
         finally:

@@ -16,7 +16,11 @@ Found = TypeVar("Found")
 
 
 def of_each(
-    args: argparse.Namespace, what: str, work: Callable[[Path], Found], *, alone: Callable[[Path], Found] | None = None
+    args: argparse.Namespace,
+    what: str,
+    work: Callable[[Path], Found],
+    *,
+    alone: Callable[[Path], Found] | None = None,
 ) -> list[tuple[Path, Found]]:
     """The files of a command line for which there is an outcome, with it, in the given order. The
     others are named on standard error. The error of a single file is raised.
@@ -38,5 +42,8 @@ def of_each(
             else:
                 results.append((path, outcome))
     if len(results) < len(paths):
-        say(f"thirdhand {args.command}: {len(paths) - len(results)} of {len(paths)} files cannot be used")
+        say(
+            f"thirdhand {args.command}: {len(paths) - len(results)} of {len(paths)} files cannot "
+            "be used"
+        )
     return results

@@ -23,7 +23,9 @@ from thirdhand.contract.requests import Status
 from thirdhand.process.progress import say
 from thirdhand.workbench.cli.web_address import web_address
 
-SCRAPE_TIMEOUT_S = 2.0  # a cell that does not answer within this time is down, and so is a silent client
+SCRAPE_TIMEOUT_S = (
+    2.0  # a cell that does not answer within this time is down, and so is a silent client
+)
 MOST_REQUESTS = 64  # threads at once, of which each request takes one
 Figure = tuple[str, str, float | None, dict[str, str]]  # name, explanation, value, labels
 
@@ -55,10 +57,14 @@ class CellCollector(Collector):
     """The metrics of all cells at each scrape; a cell that no longer answers is down."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._session, self._seen = session, set[str]()
+        self._session = session
+        self._seen = set[str]()
 
     def collect(self) -> Iterable[Metric]:
-        statuses = {cell.name: cell.status for cell in served_cells(self._session, timeout_s=SCRAPE_TIMEOUT_S)}
+        statuses = {
+            cell.name: cell.status
+            for cell in served_cells(self._session, timeout_s=SCRAPE_TIMEOUT_S)
+        }
         self._seen |= statuses.keys()
         return exposed({name: statuses.get(name) for name in sorted(self._seen)})
 
@@ -71,36 +77,68 @@ def exposed(statuses: Mapping[str, Status | None]) -> Iterable[Metric]:
         for name, about, value, labels in (up, *([] if now is None else _figures(now))):
             if value is not None:
                 kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
-                family = families.setdefault(name, kind(f"thirdhand_{name}", about, labels=("cell", *labels)))
+                family = families.setdefault(
+                    name, kind(f"thirdhand_{name}", about, labels=("cell", *labels))
+                )
                 family.add_metric((cell, *labels.values()), float(value))
     return families.values()
 
 
 def _figures(now: Status) -> Iterator[Figure]:
     """The figures of a status, with 0 for modes, reasons and flags that are not present."""
-    yield "info", "Version and skill of the daemon.", 1, {"version": now.version, "skill": now.skill}
-    present: dict[str, tuple[Any, Any]] = {"mode": ([now.mode], Mode), "reason": ([now.reason], Reason)}
+    yield (
+        "info",
+        "Version and skill of the daemon.",
+        1,
+        {"version": now.version, "skill": now.skill},
+    )
+    present: dict[str, tuple[Any, Any]] = {
+        "mode": ([now.mode], Mode),
+        "reason": ([now.reason], Reason),
+    }
     for kind, (words, codes) in (present | {"flag": (now.flags, Flag)}).items():
         for name in filter(None, map(word, codes)):
             yield kind, f"1 for each {kind} that is present.", name in words, {kind: name}
     if now.segment:
         segment = dict(zip(("begin", "end"), now.segment, strict=False))
-        yield "segment_probability", "Probability of the segment between two via-points.", now.segment_belief, segment
+        yield (
+            "segment_probability",
+            "Probability of the segment between two via-points.",
+            now.segment_belief,
+            segment,
+        )
     for name in ("lateness_us", "work_us", "latency_ms"):
-        unit_s, values = 1e-3 if name.endswith("_ms") else 1e-6, getattr(now, name)
-        about = "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over 10 s."
-        for percentile, value in zip(("50", "99", "100"), msgspec.structs.astuple(values), strict=True):
+        unit_s = 1e-3 if name.endswith("_ms") else 1e-6
+        values = getattr(now, name)
+        about = (
+            "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over "
+            "10 s."
+        )
+        for percentile, value in zip(
+            ("50", "99", "100"), msgspec.structs.astuple(values), strict=True
+        ):
             yield f"{name[:-3]}_seconds", about, unit_s * value, {"percentile": percentile}
     for cause, count in now.rejected.items():
         yield "rejected_samples_total", "Rejected samples of all sources.", count, {"cause": cause}
     for name, source in now.sources.items():
-        yield "source_rate_hertz", "Messages of a source in the last second.", source.rate_hz, {"source": name}
+        yield (
+            "source_rate_hertz",
+            "Messages of a source in the last second.",
+            source.rate_hz,
+            {"source": name},
+        )
         age_s = None if source.age_ms is None else 1e-3 * source.age_ms
-        yield "source_age_seconds", "Age of a source's newest accepted sample.", age_s, {"source": name}
+        yield (
+            "source_age_seconds",
+            "Age of a source's newest accepted sample.",
+            age_s,
+            {"source": name},
+        )
     for process, memory_mb in now.memory_mb.items():
         yield "memory_bytes", "Resident memory of a process.", 1e6 * memory_mb, {"process": process}
     scribe = now.scribe
-    free_mb, mb_per_hour = scribe.get("free_mb"), scribe.get("mb_per_hour")
+    free_mb = scribe.get("free_mb")
+    mb_per_hour = scribe.get("mb_per_hour")
     for name, about, value in (
         ("ticks_total", "Ticks since the start, with missed ones.", now.tick + 1),
         ("missed_deadlines_total", "Deadlines that the loop skipped.", now.missed),
@@ -109,12 +147,32 @@ def _figures(now: Status) -> Iterator[Figure]:
         ("memory_locked", "1 if memory is not paged out.", now.memory_locked),
         ("busy", "1 if the machine is too busy, or was when the arm stopped.", bool(now.busy)),
         ("command_heard", "1 if anybody subscribes to joint commands.", now.command_heard),
-        ("hand_distance_meters", "Distance of the nearest hand from the arm, up to 3 m.", now.hand_distance_m),
-        ("error_probability", "Probability that the tool is more than 10 cm off.", now.error_probability),
+        (
+            "hand_distance_meters",
+            "Distance of the nearest hand from the arm, up to 3 m.",
+            now.hand_distance_m,
+        ),
+        (
+            "error_probability",
+            "Probability that the tool is more than 10 cm off.",
+            now.error_probability,
+        ),
         ("recording", "1 while a recording is written.", scribe.get("state") == "recording"),
         ("lost_ticks_total", "Ticks that are not recorded.", scribe.get("lost", 0)),
-        ("recorder_restarts_total", "Starts of the recorder after the first.", scribe.get("restarts", 0)),
-        ("disk_free_bytes", "Free space where it records.", None if free_mb is None else 1e6 * free_mb),
-        ("recording_bytes_per_hour", "Recent growth.", None if mb_per_hour is None else 1e6 * mb_per_hour),
+        (
+            "recorder_restarts_total",
+            "Starts of the recorder after the first.",
+            scribe.get("restarts", 0),
+        ),
+        (
+            "disk_free_bytes",
+            "Free space where it records.",
+            None if free_mb is None else 1e6 * free_mb,
+        ),
+        (
+            "recording_bytes_per_hour",
+            "Recent growth.",
+            None if mb_per_hour is None else 1e6 * mb_per_hour,
+        ),
     ):
         yield name, about, value, {}

@@ -6,7 +6,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from thirdhand.cli.usage import CONNECT_TIMEOUT_S, UsageError, check_writable, inputs_session, places_in
+from thirdhand.cli.usage import (
+    CONNECT_TIMEOUT_S,
+    UsageError,
+    check_writable,
+    inputs_session,
+    places_in,
+)
 from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.process.progress import say
 from thirdhand.recordings.mcap_file import RecordingError
@@ -56,7 +62,8 @@ def record(args: argparse.Namespace) -> int:
         start_s, end_s = args.trim
         if not 0 <= start_s < end_s:
             raise UsageError(
-                f"--trim {start_s:g} {end_s:g}: two times [s] from the start needed, the first below the second"
+                f"--trim {start_s:g} {end_s:g}: two times [s] from the start needed, the first "
+                "below the second"
             )
         print(trim(existing_path(args.folder, args.name), start_s, end_s), file=sys.stderr)
     elif not args.show:
@@ -73,9 +80,11 @@ def _list(folder: Path, settings: Settings | None) -> int:
     """List the takes; exit code 1 if one of them is not usable for learning."""
     if not folder.is_dir():
         raise DemonstrationNameError(
-            f"{folder} {'is no folder' if folder.exists() else 'does not exist'}: a folder of takes needed (--folder)"
+            f"{folder} {'is no folder' if folder.exists() else 'does not exist'}: a folder of "
+            "takes needed (--folder)"
         )
-    paths, unusable = demonstration_paths(folder), 0
+    paths = demonstration_paths(folder)
+    unusable = 0
     for path in paths:
         try:
             take_summary = summary(path, settings=settings)
@@ -83,23 +92,35 @@ def _list(folder: Path, settings: Settings | None) -> int:
             unusable += 1
             print(printable(f"{path.stem:<20} {error}"))
             continue
-        rates = ", ".join(f"{stream.name} {stream.rate_hz:.0f} Hz" for stream in take_summary.streams)
+        rates = ", ".join(
+            f"{stream.name} {stream.rate_hz:.0f} Hz" for stream in take_summary.streams
+        )
         gap = f"longest gap {1e3 * max(stream.gap_s for stream in take_summary.streams):.0f} ms"
-        print(printable(f"{path.stem:<20} {take_summary.lasts_s:6.1f} s   {'; '.join((rates, gap, *take_summary.remarks))}"))
+        print(
+            printable(
+                f"{path.stem:<20} {take_summary.lasts_s:6.1f} s   "
+                f"{'; '.join((rates, gap, *take_summary.remarks))}"
+            )
+        )
     print(f"{len(paths)} take{'' if len(paths) == 1 else 's'} in {folder}", file=sys.stderr)
     return 1 if unusable else 0
 
 
 def _capture(args: argparse.Namespace, settings: Settings) -> None:
     if len(args.person or "") > LONGEST_PERSON:
-        raise UsageError(f"--person of {len(args.person)} characters: up to {LONGEST_PERSON} accepted")
+        raise UsageError(
+            f"--person of {len(args.person)} characters: up to {LONGEST_PERSON} accepted"
+        )
     path = path_of(args.folder, args.name)
     if path.exists():
-        raise DemonstrationNameError(f"{path} exists already: give another name, or --delete it first")
+        raise DemonstrationNameError(
+            f"{path} exists already: give another name, or --delete it first"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
     places = places_in(args.places) if args.places else ()
-    cell, ended = args.cell or settings.cell, EnterPressed()
+    cell = args.cell or settings.cell
+    ended = EnterPressed()
     with inputs_session(args, CONNECT_TIMEOUT_S, settings) as session:
         if args.until == "key":
             say("Enter or Ctrl-C ends it")
@@ -124,7 +145,9 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
     for key, count in captured.of_others.items():
         print(
-            f"{count} messages on {key} are left out: a second tracker publishes this hand; stop one", file=sys.stderr
+            f"{count} messages on {key} are left out: a second tracker publishes this hand; stop "
+            "one",
+            file=sys.stderr,
         )
 
 

@@ -41,12 +41,16 @@ COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within th
 def play(args: argparse.Namespace) -> int:
     """Publish the hands of a recording; exit code 0 once all are published."""
     hands = hand_samples(args.file, say=say)
-    start_ns, last_ns = hands[0][0], hands[-1][0]
+    start_ns = hands[0][0]
+    last_ns = hands[-1][0]
     if ends_early(args.file):
         print(f"{args.file} was cut: its end is missing, the rest is played", file=sys.stderr)
     with reached(args, None) as session, Tracker(session, args.cell) as tracker:
         client = Client(session, args.cell)
-        print(f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}", file=sys.stderr)
+        print(
+            f"{len(hands)} hand poses over {(last_ns - start_ns) / 1e9:.1f} s from {args.file}",
+            file=sys.stderr,
+        )
         while True:
             before = client.wait_until_ready(timeout_s=None)
             begin = time.monotonic()
@@ -69,11 +73,16 @@ def _arrived(client: Client, before: Status, played: Mapping[str, int]) -> str:
     until = time.monotonic() + COUNTED_WITHIN_S
     while True:
         now = client.status()
-        came = {side: now.received.get(f"hands/{side}", 0) - before.received.get(f"hands/{side}", 0) for side in played}
+        came = {
+            side: now.received.get(f"hands/{side}", 0) - before.received.get(f"hands/{side}", 0)
+            for side in played
+        }
         if all(came[side] >= played[side] for side in played) or time.monotonic() > until:
             break
         time.sleep(0.1)
-    counts = ", ".join(f"{max(0, came[side])} of {played[side]} of the {side} hand" for side in played)
+    counts = ", ".join(
+        f"{max(0, came[side])} of {played[side]} of the {side} hand" for side in played
+    )
     refused = {cause: now.rejected[cause] - before.rejected.get(cause, 0) for cause in now.rejected}
     if any(came[side] <= 0 for side in played):
         raise ExplainedError(f"the daemon received {counts}: was it restarted, or is it stalled?")
@@ -88,7 +97,10 @@ def replay(args: argparse.Namespace) -> int:
     if args.each:
         return _replay_each(args)
     if args.workers:
-        raise UsageError("--workers: --each needed with it, since recordings that follow each other are one replay")
+        raise UsageError(
+            "--workers: --each needed with it, since recordings that follow each other are one "
+            "replay"
+        )
     if args.output:
         check_writable(args.output, ".mcap")
     counts = [Recording.open(path).ticks() for path in args.files]
@@ -107,7 +119,10 @@ def _replay_each(args: argparse.Namespace) -> int:
     for path, result in results:
         print(printable_lines(f"{path}: " + result.text().replace("\n", "\n  ")))
     passing = sum(result.passes(exact=args.exact) for _, result in results)
-    print(f"{passing} of {len(args.files)} recordings replay {'exactly' if args.exact else 'within tolerance'}")
+    print(
+        f"{passing} of {len(args.files)} recordings replay "
+        f"{'exactly' if args.exact else 'within tolerance'}"
+    )
     return 0 if passing == len(args.files) else 1
 
 
@@ -118,7 +133,9 @@ def learn(args: argparse.Namespace) -> int:
         check_writable(args.plot, ".png")
     accepted_by = (args.accept_residual_risk or "").strip()
     if len(accepted_by) > LONGEST_NAME:
-        raise UsageError(f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted")
+        raise UsageError(
+            f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted"
+        )
     name = args.output.stem if args.name is None else args.name
     if lacking := unusable_name(name):
         raise UsageError(f"--{lacking}")
@@ -134,8 +151,13 @@ def learn(args: argparse.Namespace) -> int:
         demonstration = read_demonstration(path, topics=topics, settings=settings, say=say)
         count = len(demonstration.stamps_ns)
         lasts_s = demonstration.period_s * count
-        print(f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s", file=sys.stderr)
-        demonstrations.append(demonstration if demonstration.places else demonstration._replace(places=places))
+        print(
+            f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s",
+            file=sys.stderr,
+        )
+        demonstrations.append(
+            demonstration if demonstration.places else demonstration._replace(places=places)
+        )
     evidence: list[Evidence] = []
     with steps("learning") as doing:
         skill = learned(
@@ -150,7 +172,9 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))  # the error lists what is unsafe
+    print(
+        printable_lines(table(msgspec.structs.replace(figures, unsafe=())))
+    )  # the error lists what is unsafe
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:
@@ -160,15 +184,16 @@ def learn(args: argparse.Namespace) -> int:
     primitive = skill.model.primitive
     over = " over a mean that is linear in the hands" * isinstance(primitive.prior_mean, AffineMean)
     print(
-        f"{args.output}: {len(primitive.inputs)} reference points{over}; it holds as far_from_demonstrations "
-        f"where {skill.model.measure} is above {1000 * skill.threshold:.0f} mm"
+        f"{args.output}: {len(primitive.inputs)} reference points{over}; it holds as "
+        f"far_from_demonstrations where {skill.model.measure} is above "
+        f"{1000 * skill.threshold:.0f} mm"
     )
     if figures.residual:
         print(
             f"its residual risk is accepted by {printable(figures.accepted_by)}"
             if figures.accepted_by
-            else "it is not served until somebody accepts its residual risk, named above: learn it again with "
-            f"{OPTION} NAME",
+            else "it is not served until somebody accepts its residual risk, named above: learn it "
+            f"again with {OPTION} NAME",
             file=sys.stderr,
         )
     return 0

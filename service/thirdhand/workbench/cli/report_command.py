@@ -24,7 +24,15 @@ from thirdhand.settings.whole_file import whole
 from thirdhand.workbench.cli.many_files import of_each
 from thirdhand.workbench.report.columns import KEPT
 from thirdhand.workbench.report.report import Report, overview, reported
-from thirdhand.workbench.report.tables import Table, comparison, every_figure, names_of, overviews, summary, tables
+from thirdhand.workbench.report.tables import (
+    Table,
+    comparison,
+    every_figure,
+    names_of,
+    overviews,
+    summary,
+    tables,
+)
 
 BAR = 72  # [characters] length of the line that shows the modes over time
 MARKS = {Mode.HOLD: ("▒", "yellow"), Mode.FOLLOW: ("█", "green"), Mode.FAULT: ("X", "red")}
@@ -57,14 +65,19 @@ def report(args: argparse.Namespace) -> int:
         from thirdhand.workbench.report import lerobot
 
         columns = [report.columns for report in reports]
-        task = args.task or ", ".join({change.skill.name: change.tick for recording in columns for change in recording.skills})
+        task = args.task or ", ".join(
+            {change.skill.name: change.tick for recording in columns for change in recording.skills}
+        )
         with whole(args.lerobot) as part:
             parts, rows = lerobot.write(columns, part, fps=args.fps, task=task)
         console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
     if args.html and reports:
         from thirdhand.workbench.report.page import page  # its import is slow
 
-        with progress("drawing", unit="recordings", total=len(reports)) as done, whole(args.html) as part:
+        with (
+            progress("drawing", unit="recordings", total=len(reports)) as done,
+            whole(args.html) as part,
+        ):
             part.write_text(page(reports, progress=done), encoding="utf-8")
         console.print(Text(printable(f"page {args.html}")))
     return 0 if len(reports) == len(args.files) else 1
@@ -116,15 +129,20 @@ def _print(console: Console, one: Report) -> None:
 
 def _bar(one: Report) -> Text:
     """A line that shows the modes over time, and its legend."""
-    bar, cells = Text(), [one.lasts_s * (i + 0.5) / BAR for i in range(BAR)]
+    bar = Text()
+    cells = [one.lasts_s * (i + 0.5) / BAR for i in range(BAR)]
     for at_s in cells if one.lasts_s else ():
-        modes = [span.mode for span in one.spans if span.start_s <= at_s < span.start_s + span.lasts_s]
+        modes = [
+            span.mode for span in one.spans if span.start_s <= at_s < span.start_s + span.lasts_s
+        ]
         mark, style = MARKS[modes[0]] if modes else (" ", "")
         bar.append(mark, style)
     legend_modes = {span.mode for span in one.spans}
     for mode, (mark, style) in MARKS.items():
         if mode in legend_modes:
-            bar.append("  ").append(mark, style).append(f" {str(mode.name).lower()} {one.seconds(mode):.1f} s")
+            bar.append("  ").append(mark, style).append(
+                f" {str(mode.name).lower()} {one.seconds(mode):.1f} s"
+            )
     return bar
 
 
@@ -132,14 +150,18 @@ def print_table(console: Console, table: Table) -> None:
     """Print a table with its title after an empty line."""
     drawn = RichTable(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for i, head in enumerate(table.heads):
-        drawn.add_column(escape(head), justify="right" if table.is_number(i) else "left", overflow="fold")
+        drawn.add_column(
+            escape(head), justify="right" if table.is_number(i) else "left", overflow="fold"
+        )
     for row in table.rows[:MOST_ROWS]:
         drawn.add_row(*map(escape, row))
     console.print()
     console.print(Text(table.title, style="bold"))
     console.print(drawn)
     if len(table.rows) > MOST_ROWS:
-        console.print(f"... and {len(table.rows) - MOST_ROWS} more rows; --csv and --html write all")
+        console.print(
+            f"... and {len(table.rows) - MOST_ROWS} more rows; --csv and --html write all"
+        )
 
 
 def write_csv(reports: Sequence[Report], folder: Path) -> None:
@@ -167,7 +189,9 @@ def _write(path: Path, table: Table) -> None:
 def _write_ticks(path: Path, one: Report) -> None:
     """Write every field of the report's frames in SI units, with a row for each tick."""
     frames = one.columns.frames
-    heads, formats, columns = ["time_s"], ["%.4f"], [one.columns.times[:, None]]
+    heads = ["time_s"]
+    formats = ["%.4f"]
+    columns = [one.columns.times[:, None]]
     for name in KEPT:
         count = math.prod(frames.dtype[name].shape)
         column = frames[name].reshape(len(frames), count)
@@ -176,4 +200,11 @@ def _write_ticks(path: Path, one: Report) -> None:
         formats += ["%d" if is_whole else "%.7g"] * count
         columns.append(column.astype(np.float64))
     with whole(path) as part:
-        np.savetxt(part, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(heads), comments="")
+        np.savetxt(
+            part,
+            np.hstack(columns),
+            fmt=formats,
+            delimiter=",",
+            header=",".join(heads),
+            comments="",
+        )

@@ -48,7 +48,9 @@ TITLE_BAR = 30  # [pixels] minimum height of a window's title bar
 CAPTION_MARGIN_PX = 14  # distance of the caption from the corner of a picture
 CAPTION_PX = 15  # height of its letters
 BAR_TINT = 40  # maximum difference of colour channels in the grey title bar
-NO_VULKAN = "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
+NO_VULKAN = (
+    "a picture without a screen needs a Vulkan driver (on Debian: apt install mesa-vulkan-drivers)"
+)
 FRESH_S = 1.0  # the age of a live view's picture is printed if it is larger
 FRESH_TIMEOUT_S = 10.0
 
@@ -63,7 +65,8 @@ def view(args: argparse.Namespace) -> int:
     kinds = [_kind(path) for path in paths]
     if args.screenshot and len(paths) > 1:
         say(f"the picture shows {paths[-1]}, the last of {len(paths)} files")
-        paths, kinds = paths[-1:], kinds[-1:]
+        paths = paths[-1:]
+        kinds = kinds[-1:]
     _check_drawing(args)  # before long work
     with tempfile.TemporaryDirectory() as folder:
         drawings = []
@@ -83,7 +86,10 @@ def _live(args: argparse.Namespace) -> str:
     for a daemon without one.
     """
     now = ask(args, "status")
-    say(f"{now['cell']}: {now['mode']}" + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else ""))
+    say(
+        f"{now['cell']}: {now['mode']}"
+        + (f": {now['reason'].replace('_', ' ')}" if now["reason"] else "")
+    )
     return live_url(lambda: ask(args, "status")["scribe"])
 
 
@@ -93,31 +99,45 @@ def _kind(path: Path) -> bytes:
         path.stat()  # reports a link that leads to itself
     except (FileNotFoundError, NotADirectoryError):
         recording = path.with_suffix(".mcap")
-        hint = f"; `thirdhand view {shlex.quote(str(recording))}` draws the recording" if recording.is_file() else ""
+        hint = (
+            f"; `thirdhand view {shlex.quote(str(recording))}` draws the recording"
+            if recording.is_file()
+            else ""
+        )
         raise ExplainedError(f"no such file: {path}{hint}") from None
     if path.is_dir():
         raise ExplainedError(f"{path} is a folder; an .rrd or .mcap file in it needed")
     if not path.is_file():  # reading a pipe could wait forever
-        raise ExplainedError(f"{path} is not a file; a recording (.mcap) or a drawing of Rerun's (.rrd) needed")
+        raise ExplainedError(
+            f"{path} is not a file; a recording (.mcap) or a drawing of Rerun's (.rrd) needed"
+        )
     begins = begin_of(path)
     for magic in (RRD_MAGIC, MCAP0_MAGIC):
         if begins.startswith(magic):
             return magic
-    raise ExplainedError(f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed")
+    raise ExplainedError(
+        f"{path} is neither a recording (.mcap) nor a drawing of Rerun's (.rrd); one of them needed"
+    )
 
 
 def check_usage(args: argparse.Namespace) -> None:
     """Raise UsageError for invalid arguments, before anything is drawn."""
     if args.screenshot:
         check_writable(args.screenshot, ".png")
-    if args.time is not None and not (args.screenshot and math.isfinite(args.time) and args.time >= 0):
-        raise UsageError(f"--time {args.time:g}: a time [s] from 0 on, together with --screenshot, needed")
+    if args.time is not None and not (
+        args.screenshot and math.isfinite(args.time) and args.time >= 0
+    ):
+        raise UsageError(
+            f"--time {args.time:g}: a time [s] from 0 on, together with --screenshot, needed"
+        )
     if "live" in args.files and len(args.files) > 1:
         raise UsageError(f"live and {len(args.files) - 1} files given; either live or files needed")
     if args.tab is not None and not args.screenshot:
         raise UsageError("--tab chooses the tab of a picture; --screenshot PNG needed with it")
     if args.web is not None and args.screenshot:
-        raise UsageError("--web and --screenshot given; one of them accepted: a page for browsers, or a picture")
+        raise UsageError(
+            "--web and --screenshot given; one of them accepted: a page for browsers, or a picture"
+        )
     if args.web is not None and args.files != ["live"]:
         raise UsageError("--web shows a running daemon, not files: `thirdhand view live --web`")
 
@@ -125,7 +145,10 @@ def check_usage(args: argparse.Namespace) -> None:
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serve the page until Ctrl-C."""
     listen = web_address("--web", args.web)
-    with reached(args) as session, live_page(session, Client(session, args.cell), args.cell, url) as page:
+    with (
+        reached(args) as session,
+        live_page(session, Client(session, args.cell), args.cell, url) as page,
+    ):
 
         def listening(address: Address) -> None:
             print(f"http://{address}/", flush=True)
@@ -143,18 +166,28 @@ def _show(sources: list[str], args: argparse.Namespace) -> int:
     _check_drawing(args)
     if args.screenshot:
         age_s = screenshot(sources[0], args.screenshot, time=args.time, tab=args.tab or TABS[0])
-        print(args.screenshot if age_s is None or age_s <= FRESH_S else f"{args.screenshot}: {age_s:.1f} s old")
+        print(
+            args.screenshot
+            if age_s is None or age_s <= FRESH_S
+            else f"{args.screenshot}: {age_s:.1f} s old"
+        )
         return 0
-    return subprocess.run([rerun_program(), "--bind", "127.0.0.1", *sources], check=False).returncode
+    return subprocess.run(
+        [rerun_program(), "--bind", "127.0.0.1", *sources], check=False
+    ).returncode
 
 
 def _check_drawing(args: argparse.Namespace) -> None:
     """Raise ViewerError without a screen for a window, or without Vulkan for a picture."""
     if args.screenshot and not vulkan.is_there():
         raise ViewerError(f"{NO_VULKAN}: no Vulkan device was found")
-    has_none = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    has_none = sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
     if has_none and not args.screenshot:
-        raise ViewerError("there is no screen to open the viewer on; --screenshot PNG makes a picture without one")
+        raise ViewerError(
+            "there is no screen to open the viewer on; --screenshot PNG makes a picture without one"
+        )
 
 
 def convert(
@@ -176,7 +209,9 @@ def convert(
         urdf.write_text(recording.urdf, encoding="utf-8")
         try:
             with whole(Path(rrd_path)) as part:
-                viewer = Viewer(urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=part)
+                viewer = Viewer(
+                    urdf=urdf, settings=recording.settings, skill=recording.skill, rrd=part
+                )
                 if viewer.models.remark:
                     say(viewer.models.remark)
                 count, missing = _draw(recording, viewer, progress)
@@ -191,7 +226,9 @@ def convert(
     return count
 
 
-def _draw(recording: Recording, viewer: Viewer, progress: Callable[[int], None]) -> tuple[int, list[str]]:
+def _draw(
+    recording: Recording, viewer: Viewer, progress: Callable[[int], None]
+) -> tuple[int, list[str]]:
     """Draw a whole recording. Returns the number of its ticks, and messages on missing parts."""
     notes = recording.notes("requests", "log", OBJECTS_NOTE)
     note = next(notes, None)
@@ -233,7 +270,9 @@ def _draw(recording: Recording, viewer: Viewer, progress: Callable[[int], None])
     return count, missing
 
 
-def screenshot(source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]) -> float | None:
+def screenshot(
+    source: str | Path, png: str | Path, *, time: float | None = None, tab: str = TABS[0]
+) -> float | None:
     """Take a picture of a Rerun file or a live view. Returns the age of a live view's newest data
     [s]; None for a file.
 
@@ -246,10 +285,15 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
     if not live and not Path(source).is_file():
         raise ViewerError(f"no picture: there is no file {source}")
     os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
-    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())  # else its graphics library logs errors
+    os.environ.setdefault(
+        "XDG_RUNTIME_DIR", tempfile.gettempdir()
+    )  # else its graphics library logs errors
     try:
         with ViewerClient.spawn(
-            headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(rerun_program())
+            headless=True,
+            port=free_port(),
+            hide_welcome_screen=True,
+            executable_path=str(rerun_program()),
         ) as client:
             client.open(str(source if live else Path(source).absolute()))
             _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
@@ -260,15 +304,23 @@ def screenshot(source: str | Path, png: str | Path, *, time: float | None = None
             if time is None and live:
                 client.set_time(TIMELINE, play_state="following")
                 return _fresh(client, Path(png).absolute())
-            time_ns = moment(extent, time) if time is not None or live else last_followed(Path(source), extent[1])
+            time_ns = (
+                moment(extent, time)
+                if time is not None or live
+                else last_followed(Path(source), extent[1])
+            )
             client.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"), play_state="paused")
-            caption = f"{(time_ns - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
+            caption = (
+                f"{(time_ns - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
+            )
             _settled(client, Path(png).absolute(), caption)
             return None
     except ViewerError:
         raise
     except TimeoutError as error:
-        raise ViewerError(f"no picture of {source}: {in_words(error)}; try again when the machine is idle") from error
+        raise ViewerError(
+            f"no picture of {source}: {in_words(error)}; try again when the machine is idle"
+        ) from error
     except (RuntimeError, OSError) as error:
         raise ViewerError(f"no picture of {source}: {in_words(error)}") from error
 
@@ -280,13 +332,16 @@ def moment(extent: tuple[int, int], time: float | None) -> int:
     start, end = extent
     time_ns = end if time is None else start + round(time * 1e9)
     if time_ns > end:
-        raise UsageError(f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed")
+        raise UsageError(
+            f"--time {time:g}: seconds from 0 to {math.floor((end - start) / 1e7) / 100:g} needed"
+        )
     return time_ns
 
 
 def last_followed(rrd: Path, end: int) -> int:
     """The last time [ns] in mode `follow` in a drawing that ends at `end` [ns], or `end`."""
-    times, modes = [], []
+    times = []
+    modes = []
     for chunk in rr.chunk.RrdReader(rrd).stream():
         if chunk.entity_path == "/mode" and not chunk.is_static:
             rows = chunk.to_record_batch()
@@ -304,7 +359,9 @@ def _select_tab(client: Any, tab: str) -> None:
         root = blueprint.get("/viewport", {}).get("ViewportBlueprint", {}).get("root_container", "")
         for path, parts in blueprint.items():
             container = parts.get("ContainerBlueprint", {})
-            if container.get("container_kind") == "Tabs" and (path == root or path.endswith(f"/{root}")):
+            if container.get("container_kind") == "Tabs" and (
+                path == root or path.endswith(f"/{root}")
+            ):
                 container["active_tab"] = container["contents"][TABS.index(tab)]
                 client.set_blueprint(blueprint, of="recording")
                 return True
@@ -324,7 +381,8 @@ def _picture(client: Any) -> Image.Image:
 
 def _save(picture: Image.Image, png: Path, said: str) -> None:
     """Save a picture with a caption at its top."""
-    corner_px, font = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX), ImageFont.load_default(CAPTION_PX)
+    corner_px = (picture.width - CAPTION_MARGIN_PX, CAPTION_MARGIN_PX)
+    font = ImageFont.load_default(CAPTION_PX)
     ImageDraw.Draw(picture).text(corner_px, said, fill=palette.ARM_BODY, anchor="rm", font=font)
     picture.save(png)
 
@@ -333,7 +391,8 @@ def _fresh(client: Any, png: Path) -> float:
     """Take pictures of a live view until one is recent, save it, and return the data's age [s]."""
     until = clock.monotonic() + FRESH_TIMEOUT_S
     while True:
-        newest, picture = _extent(client, "time"), _picture(client)
+        newest = _extent(client, "time")
+        picture = _picture(client)
         age_s = clock.time() - (newest[1] if newest else 0) / 1e9
         if age_s <= FRESH_S or clock.monotonic() > until:
             _save(picture, png, f"{age_s:.1f} s old")
@@ -344,9 +403,19 @@ def _fresh(client: Any, png: Path) -> float:
 def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
     """Start and end [ns] of the loaded data; None without data."""
     lines = [
-        line for recording in client.get_state().recordings for line in recording.timelines if line.name == timeline
+        line
+        for recording in client.get_state().recordings
+        for line in recording.timelines
+        if line.name == timeline
     ]
-    return next(((line.start, line.end) for line in lines if line.start is not None and line.end is not None), None)
+    return next(
+        (
+            (line.start, line.end)
+            for line in lines
+            if line.start is not None and line.end is not None
+        ),
+        None,
+    )
 
 
 def _settled(client: Any, png: Path, said: str) -> None:

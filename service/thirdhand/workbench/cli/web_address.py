@@ -48,7 +48,9 @@ def page_served(server: WebServer, option: str, listen: Address) -> Iterator[Add
         thread.join(END_TIMEOUT_S)
 
 
-def serve_page(server: WebServer, option: str, listen: Address, listening: Callable[[Address], object]) -> None:
+def serve_page(
+    server: WebServer, option: str, listen: Address, listening: Callable[[Address], object]
+) -> None:
     """Serve until SIGTERM, Ctrl-C or the server's `end`; call `listening` with the address taken.
 
     Raises UsageError if it is not available.

@@ -26,11 +26,16 @@ from thirdhand.settings.config import Settings, converted, robot_description
 from thirdhand.settings.mesh_cover import found_meshes
 from thirdhand.settings.reachable import Shell, Workspace, workspace_of
 from thirdhand.settings.urdf import Urdf, UrdfJoint
-from thirdhand.workbench.first_cell.first_posture import first_posture, limit_margins, middle_of_range
+from thirdhand.workbench.first_cell.first_posture import (
+    first_posture,
+    limit_margins,
+    middle_of_range,
+)
 from thirdhand.workbench.first_cell.plate import plate_of, turn_of_tool
 from thirdhand.workbench.first_cell.rates import RISE_S, rates, velocities
 
-DEMO_TOOL_M = {  # [m] tool positions of the demo in frame base: the begin of the shipped skill, and its via-points
+# [m] tool positions of the demo in frame base: the begin of the shipped skill, and its via-points
+DEMO_TOOL_M = {
     "start": (0.45, -0.05, 0.35),
     "handover": (0.54, -0.28, 0.38),
     "glass": (0.50, 0.38, 0.16),
@@ -103,11 +108,13 @@ def proposed(
     }
     settings = converted(values, origin=str(path))
     position_m = stand or _stand(settings)
-    robot, text = robot_description(settings), ""
+    robot = robot_description(settings)
+    text = ""
     if any(position_m):
         robot, text = (standing(xml, path, packages, position_m) for xml in (robot, raw))
     urdf = Urdf(robot, origin=str(path))
-    chain, limits = urdf.chain(plate), settings.joints
+    chain = urdf.chain(plate)
+    limits = settings.joints
     workspace = workspace_of(chain, limits.lower, limits.upper, settings.tool.plate_from_tool)
     if text:
         settings = _with_reach_of(settings, workspace)
@@ -138,10 +145,15 @@ def proposed(
 
 def _limits(settings: Settings, robot: str, *, is_demo: bool) -> dict[str, ToolLimits]:
     """Limits of the tool on the way through DEMO_TOOL_M, or in the posture alone."""
-    arm, posture = Arm(settings, robot), np.array(settings.arm.posture)
+    arm = Arm(settings, robot)
+    posture = np.array(settings.arm.posture)
     orientation = np.empty(4)
     quaternion_of(arm.at(posture).rotation, orientation)
-    limits = limits_of_task(settings, robot, np.array([*DEMO_TOOL_M.values()]), orientation) if is_demo else {}
+    limits = (
+        limits_of_task(settings, robot, np.array([*DEMO_TOOL_M.values()]), orientation)
+        if is_demo
+        else {}
+    )
     return limits or {ANY_DIRECTION: tool_limits(arm, settings, posture[None])}
 
 
@@ -149,13 +161,20 @@ def _with_reach_of(settings: Settings, workspace: Workspace) -> Settings:
     """The settings with the reach of a workspace."""
     shell = workspace.shell(settings.reach.min_x, settings.reach.min_z)
     reach = msgspec.structs.replace(
-        settings.reach, centre=shell.centre, inner=shell.inner, outer=min(shell.outer, settings.reach.outer)
+        settings.reach,
+        centre=shell.centre,
+        inner=shell.inner,
+        outer=min(shell.outer, settings.reach.outer),
     )
     return msgspec.structs.replace(settings, reach=reach)
 
 
 def _is_in(position: Sequence[float], shell: Shell) -> bool:
-    return shell.inner + REACH_MARGIN_M <= math.dist(position, shell.centre) <= shell.outer - REACH_MARGIN_M
+    return (
+        shell.inner + REACH_MARGIN_M
+        <= math.dist(position, shell.centre)
+        <= shell.outer - REACH_MARGIN_M
+    )
 
 
 def _stand(settings: Settings) -> tuple[float, float, float]:
@@ -163,14 +182,24 @@ def _stand(settings: Settings) -> tuple[float, float, float]:
     all of DEMO_TOOL_M; the origin if there is none.
     """
     x, y, z = settings.reach.centre
-    inner, outer = settings.reach.inner, settings.reach.outer
+    inner = settings.reach.inner
+    outer = settings.reach.outer
     tried = sorted((STAND_STEP_M * i for i in range(-STAND_STEPS, STAND_STEPS + 1)), key=abs)
     shells = {offset_m: Shell((x + offset_m, y, z), inner, outer) for offset_m in tried}
-    best = next((offset_m for offset_m in tried if all(_is_in(place, shells[offset_m]) for place in DEMO_TOOL_M.values())), 0.0)
+    best = next(
+        (
+            offset_m
+            for offset_m in tried
+            if all(_is_in(place, shells[offset_m]) for place in DEMO_TOOL_M.values())
+        ),
+        0.0,
+    )
     return (round(best, 3), 0.0, 0.0)
 
 
-def standing(text: str, path: Path, packages: tuple[str, ...], at: tuple[float, float, float]) -> str:
+def standing(
+    text: str, path: Path, packages: tuple[str, ...], at: tuple[float, float, float]
+) -> str:
     """The URDF with a fixed joint that puts its root at a point [m] of frame base, and with
     absolute paths of mesh files.
     """
@@ -190,27 +219,42 @@ def standing(text: str, path: Path, packages: tuple[str, ...], at: tuple[float, 
 
 def written(proposal: Proposal, urdf: str, source: str) -> str:
     """The configuration as TOML text, with `urdf` as the path of the URDF."""
-    settings, arm = proposal.settings, proposal.settings.arm
+    settings = proposal.settings
+    arm = proposal.settings.arm
     offset = settings.tool.plate_from_tool
-    is_known = all(math.isfinite(joint.velocity) for joint in proposal.chain if joint.kind != "fixed")
+    is_known = all(
+        math.isfinite(joint.velocity) for joint in proposal.chain if joint.kind != "fixed"
+    )
     rad, rate, acceleration, jerk = (
-        f"[rad{per}; m{per} if prismatic]" if proposal.slides else f"[rad{per}]" for per in ("", "/s", "/s²", "/s³")
+        f"[rad{per}; m{per} if prismatic]" if proposal.slides else f"[rad{per}]"
+        for per in ("", "/s", "/s²", "/s³")
     )
     velocity = "" if is_known else f"velocity = {list(settings.joints.velocity)}  # {rate}\n"
-    tool = f"[tool]  # its +z leaves the plate\nplate_from_tool = {list(offset)}\n\n" if any(offset[3:6]) else ""
-    basis = "the URDF's velocities, masses and efforts" if proposal.efforts else "the URDF's velocities"
+    tool = (
+        f"[tool]  # its +z leaves the plate\nplate_from_tool = {list(offset)}\n\n"
+        if any(offset[3:6])
+        else ""
+    )
+    basis = (
+        "the URDF's velocities, masses and efforts" if proposal.efforts else "the URDF's velocities"
+    )
+    remark = "" if Path(urdf).is_absolute() else "  # beside this file"
     packages = f"packages = {json.dumps(list(arm.packages))}\n" if arm.packages else ""
     return (
-        f"# A first cell for {source}, made by `thirdhand arm`. All values are proposals: check them for your arm.\n"
+        f"# A first cell for {source}, made by `thirdhand arm`. All values are proposals: check "
+        "them for your arm.\n"
         "[arm]\n"
-        f"urdf = {json.dumps(urdf, ensure_ascii=False)}{'' if Path(urdf).is_absolute() else '  # beside this file'}\n"
+        f"urdf = {json.dumps(urdf, ensure_ascii=False)}{remark}\n"
         f"plate = {json.dumps(arm.plate, ensure_ascii=False)}  # the link that carries the tool\n"
         f"{packages}"
-        f"posture = {list(arm.posture)}  # {rad} the tool over the table, pointing down and forward\n"
+        f"posture = {list(arm.posture)}  # {rad} the tool over the table, pointing down and "
+        "forward\n"
         'start = "held"  # after every start the arm waits for `thirdhand resume`\n'
         "\n"
-        f"# The URDF's own, else a guess from {basis}: from rest to full speed in {RISE_S:g} s or more.\n"
-        "# Take the values of the maker's data sheet if you have it; begin with a tenth on a real arm.\n"
+        f"# The URDF's own, else a guess from {basis}: from rest to full speed in {RISE_S:g} s or "
+        "more.\n"
+        "# Take the values of the maker's data sheet if you have it; begin with a tenth on a real "
+        "arm.\n"
         "[joints]\n"
         f"{velocity}"
         f"acceleration = {list(settings.joints.acceleration)}  # {acceleration}\n"
@@ -218,9 +262,11 @@ def written(proposal: Proposal, urdf: str, source: str) -> str:
         "\n"
         f"{tool}"
         "[people]\n"
-        "# Lower it while `thirdhand report` shows a distance of a stop beyond [people] above 1 mm.\n"
+        "# Lower it while `thirdhand report` shows a distance of a stop beyond [people] above 1 "
+        "mm.\n"
         f"brake = {settings.people.brake:g}  # [m/s²]\n"
         "\n"
-        f"# [reach] follows from the kinematics: {proposal.shell.inner:g} to {proposal.shell.outer:g} m from "
+        f"# [reach] follows from the kinematics: {proposal.shell.inner:g} to "
+        f"{proposal.shell.outer:g} m from "
         f"{list(proposal.shell.centre)}; the arm is {proposal.workspace.extent:.2f} m long.\n"
     )

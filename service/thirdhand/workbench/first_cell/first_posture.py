@@ -17,14 +17,23 @@ from thirdhand.settings.urdf import Urdf, UrdfJoint
 
 LOW_SHARE = 0.15  # the tool is at least this share of the reach above min_z
 HIGH_SHARE = 0.2  # the tool is at most this share of the reach above the shoulder
-WELL_WITHIN = (0.4, 0.75)  # the tool is within these shares of the way from the inner to the outer end of the reach
+WELL_WITHIN = (
+    0.4,
+    0.75,
+)  # the tool is within these shares of the way from the inner to the outer end of the reach
 TILTS = (0.2, 0.5, 0.785)  # [rad] tried angles of the tool between straight down and forward
 POSTURE_STARTS = 20  # the inverse kinematics start from this many postures
-UNIT_ERROR_M, UNIT_ERROR_RAD = 0.01, 0.1  # these errors of position and direction cost 1
-MIDDLE_WEIGHT = 0.2  # cost of a joint at its limit, proportional to its distance from the middle of its range
+# these errors of position and direction cost 1
+UNIT_ERROR_M = 0.01
+UNIT_ERROR_RAD = 0.1
+MIDDLE_WEIGHT = (
+    0.2  # cost of a joint at its limit, proportional to its distance from the middle of its range
+)
 END_WEIGHT = 10.0  # cost per half range, within the last fifth before a limit
 POSTURE_MARGIN_RAD = 0.001  # the posture keeps this distance from the limits, because of rounding
-MAX_POSTURE_ERROR_M, MAX_POSTURE_ERROR_RAD = 0.02, 0.2  # a posture with a larger error is not a solution
+# a posture with a larger error is not a solution
+MAX_POSTURE_ERROR_M = 0.02
+MAX_POSTURE_ERROR_RAD = 0.2
 ENOUGH_MARGIN = 0.3  # a larger margin to the limits, as a share of half a range, scores no more
 ENOUGH_M = 0.08  # a larger distance from table and arm scores no more
 
@@ -36,7 +45,8 @@ def middle_of_range(joint: UrdfJoint) -> float:
 
 def limit_margins(q: Vector, settings: Settings) -> Vector:
     """Distances of joints (J,) to their nearer limits, as shares of half the range."""
-    lower, upper = np.array(settings.joints.lower), np.array(settings.joints.upper)
+    lower = np.array(settings.joints.lower)
+    upper = np.array(settings.joints.upper)
     return np.asarray(np.minimum(q - lower, upper - q) / (0.5 * (upper - lower)))
 
 
@@ -50,20 +60,31 @@ def first_posture(
     of the inverse kinematics the best is taken, by margin to the limits, clearance from the table
     and itself, manipulability, and distance from the middle of the joints' ranges.
     """
-    arm, separation = Arm(settings, robot), Separation(settings, robot)
+    arm = Arm(settings, robot)
+    separation = Separation(settings, robot)
     place = _over_the_table(settings, shell, start)
-    lower, upper = np.array(settings.joints.lower), np.array(settings.joints.upper)
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    lower = np.array(settings.joints.lower)
+    upper = np.array(settings.joints.upper)
+    middle = 0.5 * (lower + upper)
+    half = 0.5 * (upper - lower)
     best: tuple[float, Vector, float] | None = None
     away = np.linalg.norm(workspace.positions - place, axis=1)
-    forward = (place - shell.centre)[:2] / max(float(np.linalg.norm((place - shell.centre)[:2])), 1e-9)
+    forward = (place - shell.centre)[:2] / max(
+        float(np.linalg.norm((place - shell.centre)[:2])), 1e-9
+    )
 
     def errors(q: Vector, direction: Vector) -> Vector:
         pose = arm.at(q)
-        position, turn = (pose.position - place) / UNIT_ERROR_M, (pose.rotation[:, 2] - direction) / UNIT_ERROR_RAD
+        position = (pose.position - place) / UNIT_ERROR_M
+        turn = (pose.rotation[:, 2] - direction) / UNIT_ERROR_RAD
         shares = (q - middle) / half
         return np.concatenate(
-            (position, turn, MIDDLE_WEIGHT * shares, END_WEIGHT * np.maximum(np.abs(shares) - 0.8, 0))
+            (
+                position,
+                turn,
+                MIDDLE_WEIGHT * shares,
+                END_WEIGHT * np.maximum(np.abs(shares) - 0.8, 0),
+            )
         )
 
     for tilt in TILTS:
@@ -71,7 +92,9 @@ def first_posture(
         turned = np.linalg.norm(workspace.directions - direction, axis=1)
         for i in np.argsort(away / (0.1 * workspace.extent) + turned)[:POSTURE_STARTS]:
             start = np.clip(workspace.postures[i], lower + 1e-6, upper - 1e-6)
-            q = least_squares(errors, start, bounds=(lower, upper), max_nfev=60, args=(direction,)).x
+            q = least_squares(
+                errors, start, bounds=(lower, upper), max_nfev=60, args=(direction,)
+            ).x
             pose = arm.at(q)
             if (
                 np.linalg.norm(pose.position - place) > MAX_POSTURE_ERROR_M
@@ -90,16 +113,19 @@ def first_posture(
                 best = (score, q, float(np.arccos(np.clip(-pose.rotation[2, 2], -1.0, 1.0))))
     if best is None:
         raise SettingsError(
-            f"no posture found with the tool at {place.round(2).tolist()} m, pointing down: give another --plate "
-            f"(the last links are {', '.join(Urdf(robot).leaves)}), or another position of the base by --at"
+            f"no posture found with the tool at {place.round(2).tolist()} m, pointing down: give "
+            f"another --plate (the last links are {', '.join(Urdf(robot).leaves)}), or another "
+            "position of the base by --at"
         )
     return np.clip(best[1], lower + POSTURE_MARGIN_RAD, upper - POSTURE_MARGIN_RAD), best[2]
 
 
 def _over_the_table(settings: Settings, shell: Shell, start: Point) -> Vector:
     """The position (3,) [m] nearest to `start` that is well within the reach."""
-    place, centre = np.array(start), np.array(shell.centre)
-    lowest, highest = settings.reach.min_z + LOW_SHARE * shell.outer, centre[2] + HIGH_SHARE * shell.outer
+    place = np.array(start)
+    centre = np.array(shell.centre)
+    lowest = settings.reach.min_z + LOW_SHARE * shell.outer
+    highest = centre[2] + HIGH_SHARE * shell.outer
     place[2] = max(min(place[2], highest), lowest)
     away = place - centre
     inner, outer = (shell.inner + share * (shell.outer - shell.inner) for share in WELL_WITHIN)

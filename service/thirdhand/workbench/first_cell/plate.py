@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from thirdhand.settings.urdf import Urdf, UrdfError, UrdfJoint
 
-LEAST_ALONG = 0.1  # the last axis points toward the plate if at least this share of the way to it is along the axis
+# the last axis points toward the plate if at least this share of the way to it is along the axis
+LEAST_ALONG = 0.1
 ALIGNED = 0.9  # two axes are the same from this cosine of their angle on
 
 
@@ -19,8 +20,8 @@ def plate_of(urdf: Urdf) -> str:
     if len(urdf.leaves) == 1:
         return urdf.leaves[0]
     raise UrdfError(
-        f"the arm has {len(urdf.leaves)} ends: name the link that carries the tool by --plate; the ends are "
-        f"{', '.join(urdf.leaves)}, and every link before them is accepted too"
+        f"the arm has {len(urdf.leaves)} ends: name the link that carries the tool by --plate; the "
+        f"ends are {', '.join(urdf.leaves)}, and every link before them is accepted too"
     )
 
 
@@ -29,11 +30,17 @@ def turn_of_tool(chain: Sequence[UrdfJoint]) -> tuple[float, float, float, float
 
     It is the identity if the plate's +z does so. The tool points along the axis of the last joint.
     """
-    turn, position_m, turns, points, axis = Rotation.identity(), np.zeros(3), Rotation.identity(), [], np.zeros(3)
+    turn = Rotation.identity()
+    position_m = np.zeros(3)
+    turns = Rotation.identity()
+    points = []
+    axis = np.zeros(3)
     for joint in chain:
-        position_m, turn = position_m + turn.apply(joint.translation), turn * Rotation.from_quat(joint.rotation)
+        position_m = position_m + turn.apply(joint.translation)
+        turn = turn * Rotation.from_quat(joint.rotation)
         if joint.kind != "fixed":
-            turns, axis = turn, np.array(joint.axis)
+            turns = turn
+            axis = np.array(joint.axis)
             points.append(position_m)
     axis = turn.inv().apply(turns.apply(axis))  # the last axis in the plate's frame
     away = turn.inv().apply(position_m - points[max(len(points) - 2, 0)])

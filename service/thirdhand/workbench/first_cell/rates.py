@@ -33,8 +33,16 @@ def rates(text: str, moving: Sequence[UrdfJoint]) -> tuple[list[float], list[flo
     guess = nominal * min(max(LEAST_SCALE, 1.0 if share is None else share), 1.0)
     urdf_rates = np.array([(joint.acceleration, joint.jerk) for joint in moving])
     acceleration = np.where(np.isfinite(urdf_rates[:, 0]), urdf_rates[:, 0], guess)
-    jerk = np.where(np.isfinite(urdf_rates[:, 1]), urdf_rates[:, 1], np.minimum(JERK_RATE * acceleration, MAX_JERK))
-    return [float(f"{a:.3g}") for a in acceleration], [float(f"{j:.3g}") for j in jerk], share is not None
+    jerk = np.where(
+        np.isfinite(urdf_rates[:, 1]),
+        urdf_rates[:, 1],
+        np.minimum(JERK_RATE * acceleration, MAX_JERK),
+    )
+    return (
+        [float(f"{a:.3g}") for a in acceleration],
+        [float(f"{j:.3g}") for j in jerk],
+        share is not None,
+    )
 
 
 def velocities(moving: Sequence[UrdfJoint]) -> dict[str, list[float]]:
@@ -62,11 +70,16 @@ def _torque_share(text: str, moving: Sequence[UrdfJoint], acceleration: Vector) 
     try:
         model = pin.buildModelFromXML(text)
         numbers = [model.joints[model.getJointId(joint.name)].idx_v for joint in moving]
-        data, neutral = model.createData(), pin.neutral(model)
+        data = model.createData()
+        neutral = pin.neutral(model)
         inertia = pin.crba(model, data, neutral)
         gravity = np.abs(pin.computeGeneralizedGravity(model, data, neutral))
         efforts = np.array(model.effortLimit)[numbers]
-    except (ValueError, IndexError, RuntimeError):  # Pinocchio rejects masses that other readers accept
+    except (
+        ValueError,
+        IndexError,
+        RuntimeError,
+    ):  # Pinocchio rejects masses that other readers accept
         return None
     inertia = np.triu(inertia) + np.triu(inertia, 1).T
     needed = np.abs(inertia[np.ix_(numbers, numbers)]) @ acceleration

@@ -15,9 +15,12 @@ from thirdhand.workbench.learning.records import HeldOut
 
 COMPARED = 100  # samples of a take that are compared with those of all takes
 ROWS = 256  # samples that are compared with all others at once, which bounds the memory
-ALIKE_M = 0.02  # hands up to this distance are the same if predictions cannot tell their tools apart either
-SAME_M = 0.003  # hands up to this distance are the same with any tracker, as nobody holds still any better
-NOISES = 7.0  # two measurements of the same hands are nearer than 7 standard deviations in 99.9 % of all cases
+# hands up to this distance are the same if predictions cannot tell their tools apart either
+ALIKE_M = 0.02
+# hands up to this distance are the same with any tracker, as nobody holds still any better
+SAME_M = 0.003
+# two measurements of the same hands are nearer than 7 standard deviations in 99.9 % of all cases
+NOISES = 7.0
 WINDOW_S = 0.1  # hands move along a parabola in windows of this length
 LEAST_SAMPLES = 7  # samples of a window
 
@@ -45,7 +48,8 @@ def tracker_noise_m(demonstrations: Iterable[Demonstration]) -> float:
     """
     variances = [np.zeros(0)]
     for demonstration in demonstrations:
-        hands, count = demonstration.hands, max(LEAST_SAMPLES, round(WINDOW_S / demonstration.period_s))
+        hands = demonstration.hands
+        count = max(LEAST_SAMPLES, round(WINDOW_S / demonstration.period_s))
         parts = hands[: len(hands) // count * count].reshape(-1, count, 6)
         parabolas, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 3))
         left = parts - parabolas @ (parabolas.T @ parts)
@@ -70,26 +74,41 @@ def contradictions(
     the tool (T,) by more than half of `different`. `distances` (M, N) are those between tools
     (M, O) and (N, O).
     """
-    sampled_rows = [np.linspace(0, len(result.known) - 1, min(COMPARED, len(result.known))).round().astype(int) for result in held_out]
+    sampled_rows = [
+        np.linspace(0, len(result.known) - 1, min(COMPARED, len(result.known))).round().astype(int)
+        for result in held_out
+    ]
     known_m, outputs, errors = (
         np.concatenate([values[rows] for values, rows in zip(column, sampled_rows, strict=True)])
         for column in ([result.known for result in held_out], tools, missed)
     )
-    owner = [f"{result.take.name} (sample {i})" for result, rows in zip(held_out, sampled_rows, strict=True) for i in rows]
+    owner = [
+        f"{result.take.name} (sample {i})"
+        for result, rows in zip(held_out, sampled_rows, strict=True)
+        for i in rows
+    ]
     squares = (known_m**2).sum(axis=1)
-    worst, pair, count = -1.0, (0, 0), 0
+    worst = -1.0
+    pair = (0, 0)
+    count = 0
     for first in range(0, len(known_m), ROWS):
         rows = slice(first, first + ROWS)
         hands = squares[rows, None] + squares - 2 * known_m[rows] @ known_m.T
-        is_alike = (hands < near_m**2) | ((hands < ALIKE_M**2) & (errors[rows] > different / 2)[:, None])
+        is_alike = (hands < near_m**2) | (
+            (hands < ALIKE_M**2) & (errors[rows] > different / 2)[:, None]
+        )
         differences = distances(outputs[rows], outputs) * is_alike
         count += int((differences.max(axis=1) > different).sum())
         if differences.max() > worst:
-            worst, (row, column) = float(differences.max()), divmod(int(differences.argmax()), len(known_m))
+            worst = float(differences.max())
+            row, column = divmod(int(differences.argmax()), len(known_m))
             pair = first + row, column
     i, j = pair
     return Contradictions(
-        count / len(known_m), f"{owner[i]} and {owner[j]}", float(np.linalg.norm(known_m[i] - known_m[j])), worst
+        count / len(known_m),
+        f"{owner[i]} and {owner[j]}",
+        float(np.linalg.norm(known_m[i] - known_m[j])),
+        worst,
     )
 
 

@@ -11,7 +11,10 @@ from thirdhand.core.frame import Vector
 from thirdhand.workbench.learning.records import Take
 
 Predictor = Callable[[Vector, Vector, Vector], Vector]
-LINEAR, LOOK_UP, SAME_TIME = "linear", "look-up", "same elapsed time"  # in a skill's figures
+# in a skill's figures
+LINEAR = "linear"
+LOOK_UP = "look-up"
+SAME_TIME = "same elapsed time"
 
 
 def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
@@ -23,7 +26,10 @@ def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
     return {
         LINEAR: held_out_errors(takes, linear),
         LOOK_UP: held_out_errors(takes, look_up),
-        SAME_TIME: [take.demonstration.tool[:, :3] - same_time(take, others) for take, others in _with_others(takes)],
+        SAME_TIME: [
+            take.demonstration.tool[:, :3] - same_time(take, others)
+            for take, others in _with_others(takes)
+        ],
     }
 
 
@@ -53,16 +59,23 @@ def held_out_errors(takes: Sequence[Take], predict: Predictor) -> list[Vector]:
     """The errors (T, 3) [m] of each take, predicted from other persons' takes."""
     errors = []
     for take, others in _with_others(takes):
-        hands, tool = (np.concatenate(parts) for parts in zip(*((o.hands, o.position) for o in others), strict=True))
+        hands, tool = (
+            np.concatenate(parts)
+            for parts in zip(*((o.hands, o.position) for o in others), strict=True)
+        )
         errors.append(take.position - predict(hands, tool, take.hands))
     return errors
 
 
 def same_time(take: Take, others: Sequence[Take]) -> Vector:
     """The mean position (T, 3) [m] of the other takes' tool after the same time."""
-    seconds, demonstrations = take.demonstration.seconds, [other_take.demonstration for other_take in others]
+    seconds = take.demonstration.seconds
+    demonstrations = [other_take.demonstration for other_take in others]
     means = [
-        np.mean([np.interp(seconds, other.seconds, other.tool[:, axis]) for other in demonstrations], axis=0)
+        np.mean(
+            [np.interp(seconds, other.seconds, other.tool[:, axis]) for other in demonstrations],
+            axis=0,
+        )
         for axis in range(3)
     ]
     return np.stack(means, axis=1)

@@ -13,12 +13,18 @@ from kmp.criteria.direct import DirectSelection, Scales
 from thirdhand.core.frame import Vector
 from thirdhand.skills.via_points import MAX_GAIN
 
-RIDGE_M = 0.005  # an input that varies by less, as trembling hands do, does not move the affine mean
+RIDGE_M = (
+    0.005  # an input that varies by less, as trembling hands do, does not move the affine mean
+)
 NOISE_M = 0.001  # noise of a good tracker on each axis
-DWELL_SHARE = 0.25  # this share of the reference points is even in time, the rest along the hands' path
+DWELL_SHARE = (
+    0.25  # this share of the reference points is even in time, the rest along the hands' path
+)
 LEAST_POINTS = 4  # reference points of a demonstration
 POSITION_SCALES = Scales(
-    ells=(2.0 ** np.arange(-1.0, 4.0)).tolist(),  # [1/m²] beyond these, via-points bend everything or nothing
+    ells=(
+        2.0 ** np.arange(-1.0, 4.0)
+    ).tolist(),  # [1/m²] beyond these, via-points bend everything or nothing
     ridges=(RIDGE_M,),
     linear_share=0.9,  # an affine mean extrapolates, so it must be clearly better
     max_gain=MAX_GAIN,
@@ -26,7 +32,9 @@ POSITION_SCALES = Scales(
     noise=NOISE_M,
 )
 RICH_SCALES = POSITION_SCALES._replace(
-    ells=(2.0 ** np.arange(-1.0, 6.0)).tolist(),  # [1/m²] inputs with memory or turns are farther from each other
+    ells=(
+        2.0 ** np.arange(-1.0, 6.0)
+    ).tolist(),  # [1/m²] inputs with memory or turns are farther from each other
     ridges=(RIDGE_M, 0.05),  # [m] the second one suppresses inputs that repeat what others tell
     linear_share=1.0,
 )
@@ -50,14 +58,19 @@ def selection_of(
     noise, and are not judged.
     """
     counts = shared_counts(points, len(pairs) - earlier, earlier, LEAST_POINTS)
-    parts = [(even_in_time if rich else thinned)(*pair, count) for pair, count in zip(pairs, counts, strict=True)]
+    parts = [
+        (even_in_time if rich else thinned)(*pair, count)
+        for pair, count in zip(pairs, counts, strict=True)
+    ]
     numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     group = np.repeat(numbers, [len(values) for values, _ in parts])
     scales = RICH_SCALES if rich else POSITION_SCALES
     if not earlier:
         return DirectSelection(inputs, outputs, group, scales, isotropic, joint=rich)
-    is_new = np.repeat(np.arange(len(pairs)) < len(pairs) - earlier, [len(values) for values, _ in parts])
+    is_new = np.repeat(
+        np.arange(len(pairs)) < len(pairs) - earlier, [len(values) for values, _ in parts]
+    )
     factors = np.where(is_new, 1.0, factor)
     return DirectSelection(inputs, outputs, group, scales, isotropic, rich, factors, is_new)
 
@@ -77,7 +90,9 @@ def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
     """
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(hands, axis=0), axis=1))])
     along = path / max(path[-1], 1e-9) + DWELL_SHARE * np.linspace(0.0, 1.0, len(path))
-    rows = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1))
+    rows = np.unique(
+        np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1)
+    )
     return hands[rows], tool[rows]
 
 

@@ -32,7 +32,9 @@ from thirdhand.skills.recognition import all_followed, covered
 from thirdhand.skills.skill_file import SkillError
 
 SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
-SAME_M = 0.05  # positions of a hand that are this near to each other in all demonstrations are the same
+SAME_M = (
+    0.05  # positions of a hand that are this near to each other in all demonstrations are the same
+)
 OFF_M = 0.06  # unit of the distances d_i
 FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
 DIRECTED = 2.0  # gain of moving along the path
@@ -42,25 +44,39 @@ ANOTHER = 12.0  # cost of any other change
 LATER = 3.0  # cost of each segment that is left out at the beginning
 NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
-LEAST_WEIGHT = 1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
+LEAST_WEIGHT = (
+    1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
+)
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     """The task of demonstrations, and why there is none although they name via-points."""
-    named = [tuple(point.name for point in demonstration.places) for demonstration in demonstrations]
+    named = [
+        tuple(point.name for point in demonstration.places) for demonstration in demonstrations
+    ]
     if not any(named):
         return None, ""
     if len(set(map(frozenset, named))) > 1:
         return None, (
-            "not all demonstrations name the same via-points, so it is learned where the hands are, not between them"
+            "not all demonstrations name the same via-points, so it is learned where the hands "
+            "are, not between them"
         )
     names = Counter(named).most_common(1)[0][0]
     if not 2 <= len(names) <= MOST_SEGMENTS + 1:
         return None, f"{len(names)} named via-points: 2 to {MOST_SEGMENTS + 1} are learned between"
-    hands_m = np.array([[[*p.left, *p.right] for p in ordered(demonstration.places, names)] for demonstration in demonstrations])
+    hands_m = np.array(
+        [
+            [[*p.left, *p.right] for p in ordered(demonstration.places, names)]
+            for demonstration in demonstrations
+        ]
+    )
     corners = np.stack([_corners(hands_m[:, :, :3]), _corners(hands_m[:, :, 3:])], axis=1)
-    return Task(names, corners, np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)])), ""
+    return Task(
+        names,
+        corners,
+        np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].places, names)]),
+    ), ""
 
 
 def _corners(at: Vector) -> Indices:
@@ -69,7 +85,9 @@ def _corners(at: Vector) -> Indices:
     """
     out: list[int] = []
     for i in range(at.shape[1]):
-        alike = [out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M]
+        alike = [
+            out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M
+        ]
         out.append(alike[0] if alike else max(out, default=-1) + 1)
     return np.array(out, np.int64)
 
@@ -80,23 +98,39 @@ def ordered(points: Sequence[ViaPoint], names: Sequence[str]) -> Iterator[ViaPoi
     return (by_name[name] for name in names)
 
 
-def via_points_never_reached(task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]) -> list[str]:
+def via_points_never_reached(
+    task: Task, demonstrations: Sequence[Demonstration], names: Sequence[str]
+) -> list[str]:
     """Warnings about via-points that the tool never came near in some demonstrations.
 
     Raises SkillError if it came near in none.
     """
     warned = []
     for named, follow in zip(task.names, task.follow.tolist(), strict=True):
-        distances_m = [float(off_via_point(demonstration, next(ordered(demonstration.places, (named,))), follow).min()) for demonstration in demonstrations]
+        distances_m = [
+            float(
+                off_via_point(
+                    demonstration, next(ordered(demonstration.places, (named,))), follow
+                ).min()
+            )
+            for demonstration in demonstrations
+        ]
         if min(distances_m) > FAR_M:
             raise SkillError(
-                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(distances_m):.0f} mm "
-                f"({names[int(np.argmin(distances_m))]}), {1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, "
-                "where it was in these demonstrations?"
+                f"via-point {named!r}: the tool never came nearer to it than "
+                f"{1000 * min(distances_m):.0f} mm ({names[int(np.argmin(distances_m))]}), "
+                f"{1000 * FAR_M:.0f} mm needed: is it given in metres, in frame base, where it was "
+                "in these demonstrations?"
             )
-        missed = [f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, distances_m, strict=True) if m > FAR_M]
+        missed = [
+            f"{name} ({1000 * m:.0f} mm)"
+            for name, m in zip(names, distances_m, strict=True)
+            if m > FAR_M
+        ]
         if missed:
-            warned.append(f"via-point {named!r}: the tool never came near it in {', '.join(missed)}")
+            warned.append(
+                f"via-point {named!r}: the tool never came near it in {', '.join(missed)}"
+            )
     return warned
 
 
@@ -133,13 +167,16 @@ class Divided:
             for x in (demonstration.hands, demonstration.tool[:, :3])
         )
         velocities, tool_velocities = (
-            demonstration.by_pieces(lambda x: np.gradient(x, period_s, axis=0), x) for x in (hands, smooth_tool)
+            demonstration.by_pieces(lambda x: np.gradient(x, period_s, axis=0), x)
+            for x in (hands, smooth_tool)
         )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
         via_points = NamedViaPoints.of(demonstration.places)
         segments = _segments(task, via_points)
         labels = _divided(segments, moving, (smooth_tool, tool_velocities), period_s)
-        return Divided(demonstration, via_points, segments, moving, stillness_of(velocities, period_s), labels)
+        return Divided(
+            demonstration, via_points, segments, moving, stillness_of(velocities, period_s), labels
+        )
 
     @property
     def tool(self) -> Vector:
@@ -166,17 +203,27 @@ class Divided:
 
     def late(self, late_s: float) -> Encoded:
         """The shares of the segments, for a teacher whose tool is late by `late_s`."""
-        steps, labels, segments, tool = round(late_s / self.period_s), self.labels, self.segments, self.tool
+        steps = round(late_s / self.period_s)
+        labels = self.labels
+        segments = self.segments
+        tool = self.tool
         hands, rested = (
-            self.demonstration.by_pieces(lambda x: _delayed(x, steps), x) for x in (self.moving[:, 0], self.stillness)
+            self.demonstration.by_pieces(lambda x: _delayed(x, steps), x)
+            for x in (self.moving[:, 0], self.stillness)
         )
         hands = np.hstack([hands, self.turns(late_s)])
         coverage = covered(hands, rested, labels, segments)
-        along, distances_m = coverage[:, :2], coverage[:, 2:]
-        begins, way_m = segments["tool"][labels], segments["tool_way"][labels]
+        along = coverage[:, :2]
+        distances_m = coverage[:, 2:]
+        begins = segments["tool"][labels]
+        way_m = segments["tool_way"][labels]
         square = (way_m**2).sum(axis=1)
         goes = square > SAME_M**2
-        share = np.where(goes, ((tool - begins) * way_m).sum(axis=1) / np.where(goes, square, 1.0), along.min(axis=1))
+        share = np.where(
+            goes,
+            ((tool - begins) * way_m).sum(axis=1) / np.where(goes, square, 1.0),
+            along.min(axis=1),
+        )
         outputs = np.column_stack([share.clip(0.0, 1.0), np.zeros_like(tool)])
         encoded = Encoded(**vars(self), hands=hands, along=along, off=distances_m, wanted=outputs)
         outputs[:, 1:] = tool - encoded.tools(np.arange(len(tool)), outputs)
@@ -187,25 +234,36 @@ class Divided:
 class Encoded(Divided):
     """A divided demonstration in shares of its segments."""
 
-    hands: Vector  # (T, 6) [m] positions of the hands, delayed as the tool is; (T, 24) with their turns
+    # (T, 6) [m] positions of the hands, delayed as the tool is; (T, 24) with their turns
+    hands: Vector
     along: Vector  # (T, 2) shares of the segment that the hands have covered
     off: Vector  # (T, 2) [m] distances of the hands from their paths
-    wanted: Vector  # (T, OUTPUTS) share of the segment that the tool has covered, and its offset (3,) [m]
+    # (T, OUTPUTS) share of the segment that the tool has covered, and its offset (3,) [m]
+    wanted: Vector
 
     def tools(self, rows: Indices, outputs: Vector) -> Vector:
         """Tool positions (M, 3) [m] for outputs (M, OUTPUTS) of the primitive at rows (M,)."""
-        labels, share = self.labels[rows], outputs[:, 0]
-        out = self.segments["tool"][labels] + share[:, None] * self.segments["tool_way"][labels] + outputs[:, 1:]
+        labels = self.labels[rows]
+        share = outputs[:, 0]
+        out = (
+            self.segments["tool"][labels]
+            + share[:, None] * self.segments["tool_way"][labels]
+            + outputs[:, 1:]
+        )
         all_followed(self.hands[rows], share.clip(0.0, 1.0), labels, self.segments, out)
         return np.asarray(out)
 
     def near(self, corner: tuple[float, float], segments: Sequence[int]) -> NDArray[np.bool_]:
         """Return whether the hands' shares are near these in one of these segments (T,)."""
-        return np.asarray(np.isin(self.labels, segments) & (np.abs(self.along - corner).max(axis=1) < NEAR))
+        return np.asarray(
+            np.isin(self.labels, segments) & (np.abs(self.along - corner).max(axis=1) < NEAR)
+        )
 
     def rows(self, count: int) -> Indices:
         """About `count` rows, evenly along the path of hands and tool, and a little along time."""
-        steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(axis=1)
+        steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(
+            axis=1
+        )
         path = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
         rows = np.searchsorted(path, np.linspace(0.0, path[-1], count)).clip(0, len(path) - 1)
         return np.asarray(np.unique(rows), np.int64)
@@ -215,14 +273,18 @@ def _segments(task: Task, at: NamedViaPoints) -> Records:
     return task.segments(at, np.full((len(task.names) - 1, 2), OFF_M))
 
 
-def encode(task: Task, shown: Sequence[Divided], late_s: Sequence[float]) -> tuple[Task, list[Encoded]]:
+def encode(
+    task: Task, shown: Sequence[Divided], late_s: Sequence[float]
+) -> tuple[Task, list[Encoded]]:
     """The demonstrations encoded for teachers who are late by `late_s` in each, and the task; if
     the tool turns with the hands there, with the levers that the demonstrations lead to.
     """
     out = [demo.in_task(task).late(s) for demo, s in zip(shown, late_s, strict=True)]
     if task.levers is None:
         return task, out
-    task = task._replace(levers=np.array([_lever(out, i, side) for i, side in enumerate(task.follow.tolist())]))
+    task = task._replace(
+        levers=np.array([_lever(out, i, side) for i, side in enumerate(task.follow.tolist())])
+    )
     return task, [demo.in_task(task).late(s) for demo, s in zip(shown, late_s, strict=True)]
 
 
@@ -238,36 +300,53 @@ def _lever(shown: Sequence[Encoded], number: int, side: int) -> Vector:
     """
     if side == NONE:
         return np.zeros(3)
-    total, weight = np.zeros(3), 0.0
+    total = np.zeros(3)
+    weight = 0.0
     for demo in shown:
         share = demo.wanted[:, 0]
-        near = np.where(demo.labels == number, 1.0 - share, np.where(demo.labels == number - 1, share, 0.0))
+        near = np.where(
+            demo.labels == number, 1.0 - share, np.where(demo.labels == number - 1, share, 0.0)
+        )
         weights = near**WITH_HAND_POWER + LEAST_WEIGHT
         turned = demo.hands[:, 6 + 9 * side :][:, :9].reshape(-1, 3, 3)
-        total += np.einsum("t,tji,tj->i", weights, turned, demo.tool - demo.hands[:, 3 * side : 3 * side + 3])
+        total += np.einsum(
+            "t,tji,tj->i", weights, turned, demo.tool - demo.hands[:, 3 * side : 3 * side + 3]
+        )
         weight += float(weights.sum())
     return np.asarray(total / weight)
 
 
-def _divided(segments: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float) -> Indices:
+def _divided(
+    segments: Records, moving: Vector, tool: tuple[Vector, Vector], period_s: float
+) -> Indices:
     """The segments (T,) of least cost, for the motion (T, 3, 6) of the hands and the positions and
     velocities (T, 3) of the tool.
     """
-    count, cost = len(segments), np.zeros((len(moving), len(segments)))
-    ways = [(segments["begins"][:, i], segments["way"][:, i], moving[:, 0], moving[:, 1], 3 * i) for i in (0, 1)]
+    count = len(segments)
+    cost = np.zeros((len(moving), len(segments)))
+    ways = [
+        (segments["begins"][:, i], segments["way"][:, i], moving[:, 0], moving[:, 1], 3 * i)
+        for i in (0, 1)
+    ]
     ways.append((segments["tool"], segments["tool_way"], *tool, 0))
     for begins, way_m, points, velocities, first in ways:
-        position_m, velocity = points[:, None, first : first + 3], velocities[:, first : first + 3]
+        position_m = points[:, None, first : first + 3]
+        velocity = velocities[:, first : first + 3]
         square = (way_m**2).sum(axis=1)
         moves = square > SAME_M**2
-        along = (((position_m - begins) * way_m).sum(axis=2) / np.where(moves, square, 1.0)).clip(0.0, 1.0) * moves
+        along = (((position_m - begins) * way_m).sum(axis=2) / np.where(moves, square, 1.0)).clip(
+            0.0, 1.0
+        ) * moves
         distance_m2 = ((position_m - begins - along[:, :, None] * way_m) ** 2).sum(axis=2)
         goes = np.where(moves, velocity @ way_m.T / np.sqrt(np.where(moves, square, 1.0)), 0.0)
         goes -= 0.7 * ~moves * np.linalg.norm(velocity, axis=1)[:, None]
-        cost += np.minimum(distance_m2 / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(goes / DIRECTION_SPEED_MPS)
+        cost += np.minimum(distance_m2 / OFF_M**2, FARTHEST) / 2.0 - DIRECTED * np.tanh(
+            goes / DIRECTION_SPEED_MPS
+        )
     cost *= period_s / CORRELATED_S
     change = np.where(np.eye(count, k=1) > 0, NEXT, ANOTHER) * (1.0 - np.eye(count))
-    total, back = cost[0] + LATER * np.arange(count), []
+    total = cost[0] + LATER * np.arange(count)
+    back = []
     for row in cost[1:]:
         through = total[:, None] + change
         back.append(through.argmin(axis=0))
@@ -287,4 +366,6 @@ def _smoothed(hands: Vector, samples: int) -> Vector:
     window = np.hanning(samples + 2)[1:-1] if samples else np.ones(1)
     before = len(window) // 2
     padded = [np.pad(column, (before, len(window) - 1 - before), mode="edge") for column in hands.T]
-    return np.stack([np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1)
+    return np.stack(
+        [np.convolve(column, window / window.sum(), mode="valid") for column in padded], axis=1
+    )

@@ -19,8 +19,11 @@ import numpy as np
 from thirdhand.core.frame import Vector
 
 HELD_OUT_TIMES = 2.0  # the gate is at most this multiple of the largest held-out value
-CEILING_M = 0.15  # no target with a larger deviation on each axis is followed: objects have about this size
-FLOOR_M = 0.02  # twice the standard deviation of the noisiest tracker, whose noise must not look like a detour
+CEILING_M = (
+    0.15  # no target with a larger deviation on each axis is followed: objects have about this size
+)
+# twice the standard deviation of the noisiest tracker, whose noise must not look like a detour
+FLOOR_M = 0.02
 MISSED_SHARE = 0.05  # this share of the wrong samples may pass
 HOLD_SHARE = 0.02  # a gate that does not separate both holds at most this share of the time
 BESIDE_M = 0.3  # wrong samples are displaced by this distance along each axis, in either direction
@@ -45,7 +48,12 @@ class Gate(NamedTuple):
 
 
 def gate_between(
-    held_out: Vector, wrong: Sequence[Vector], *, ceiling: float, floor: float = 0.0, hold_share: float = HOLD_SHARE
+    held_out: Vector,
+    wrong: Sequence[Vector],
+    *,
+    ceiling: float,
+    floor: float = 0.0,
+    hold_share: float = HOLD_SHARE,
 ) -> Gate:
     """The gate between the values [m] of held-out takes (T,) and of each kind of wrong samples."""
     most = float(held_out.max())
@@ -54,8 +62,15 @@ def gate_between(
         threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
     else:
         threshold = min(max(least, float(np.quantile(held_out, 1 - hold_share))), most)
-    capped, floored, threshold = threshold > ceiling, threshold < floor, max(min(threshold, ceiling), floor)
-    return Gate(threshold, Caught(*(float((values > threshold).mean()) for values in wrong)), capped, floored)
+    capped = threshold > ceiling
+    floored = threshold < floor
+    threshold = max(min(threshold, ceiling), floor)
+    return Gate(
+        threshold,
+        Caught(*(float((values > threshold).mean()) for values in wrong)),
+        capped,
+        floored,
+    )
 
 
 def every_few(samples: Vector) -> Vector:
@@ -70,8 +85,11 @@ def nonsense(hands: Vector) -> tuple[Vector, Vector, Vector]:
     """
     steps = BESIDE_M * np.concatenate([np.eye(3), -np.eye(3)])
     none = np.zeros_like(steps)
-    both_steps, single_steps = np.hstack([steps, steps]), np.concatenate([np.hstack([steps, none]), np.hstack([none, steps])])
-    both_beside, one_beside = ((hands[:, None] + moved).reshape(-1, 6) for moved in (both_steps, single_steps))
+    both_steps = np.hstack([steps, steps])
+    single_steps = np.concatenate([np.hstack([steps, none]), np.hstack([none, steps])])
+    both_beside, one_beside = (
+        (hands[:, None] + moved).reshape(-1, 6) for moved in (both_steps, single_steps)
+    )
     if np.array_equal(hands[:, :3], hands[:, 3:]):
         return both_beside, both_beside, both_beside
     return np.roll(hands, 3, axis=1), both_beside, one_beside

@@ -17,8 +17,21 @@ from thirdhand.core.skill.skill import is_reachable
 from thirdhand.settings.config import Reach
 from thirdhand.workbench.learning.ambiguity import COMPARED, contradictions, lengths
 from thirdhand.workbench.learning.baselines import baselines, constant_errors
-from thirdhand.workbench.learning.records import Figures, Fitted, HeldOut, Pose, Row, TimedErrors, persons_of
-from thirdhand.workbench.learning.regions import calibrated, calibrated_without, timed_errors, unknown_std
+from thirdhand.workbench.learning.records import (
+    Figures,
+    Fitted,
+    HeldOut,
+    Pose,
+    Row,
+    TimedErrors,
+    persons_of,
+)
+from thirdhand.workbench.learning.regions import (
+    calibrated,
+    calibrated_without,
+    timed_errors,
+    unknown_std,
+)
 from thirdhand.workbench.learning.takes import Division, conductor_of
 from thirdhand.workbench.learning.verdicts import Subject, verdicts
 
@@ -35,14 +48,19 @@ class Judgement(NamedTuple):
     inside: Vector
 
 
-def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, accepted_by: str = "") -> Judgement:
+def judged(
+    division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, accepted_by: str = ""
+) -> Judgement:
     """The judgement of a model and pose that were learned from takes; `accepted_by` is the person
     who accepts its residual risks.
 
     With the errors e of held-out takes and d those of the mean position of the other persons' tool,
     the explained share of the variance is 1 - Σ |e|² / Σ |d|².
     """
-    takes, held_out, gate, delay = division.takes, fitted.held_out, fitted.gate, fitted.delay
+    takes = division.takes
+    held_out = fitted.held_out
+    gate = fitted.gate
+    delay = fitted.delay
     persons = persons_of(takes)
     timed = [result.timed or timed_errors(result) for result in held_out]
     checked = calibrated_without(timed, persons)
@@ -88,7 +106,9 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
         tried_mm={name: 1000 * error_m for name, error_m in fitted.tried_m.items()},
         taken=fitted.taken if fitted.tried_m else "",
         weight=fitted.weights.taken if fitted.weights else "",
-        weights_mm={name: 1000 * error_m for name, error_m in fitted.weights.tried_m.items()} if fitted.weights else {},
+        weights_mm={name: 1000 * error_m for name, error_m in fitted.weights.tried_m.items()}
+        if fitted.weights
+        else {},
         by_person=len(np.unique(persons)) < len(takes),
         delay_s=delay.mean_s if delay else None,
         delay_std_s=delay.std_s if delay else 0.0,
@@ -98,14 +118,15 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
         figures,
         gate,
         sorted({take.demonstration.frame for take in takes}),
-        f"{contradicting.pair} have the hands {1000 * contradicting.hands_m:.0f} mm from each other and the tools "
-        f"{1000 * contradicting.tools:.0f} mm",
+        f"{contradicting.pair} have the hands {1000 * contradicting.hands_m:.0f} mm from each "
+        f"other and the tools {1000 * contradicting.tools:.0f} mm",
         float(np.median([row.error_mm for row in rows])),
         1000 * math.sqrt(3.0) * unknown_std(takes),
     )
     findings = [*verdicts(subject), *pose.verdicts]
     warnings, residual, unsafe = (
-        tuple(finding.text for finding in findings if finding.severity == kind) for kind in ("warning", "residual", "unsafe")
+        tuple(finding.text for finding in findings if finding.severity == kind)
+        for kind in ("warning", "residual", "unsafe")
     )
     figures = msgspec.structs.replace(
         figures,
@@ -121,7 +142,11 @@ def judged(division: Division, fitted: Fitted, pose: Pose, reach: Reach, *, acce
 def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:
     """The share of the tool's positions that are out of the arm's reach."""
     paths = (result.take.position[:: max(1, len(result.errors) // COMPARED)] for result in held_out)
-    return float(np.mean([not is_reachable(position, reach) for positions in paths for position in positions]))
+    return float(
+        np.mean(
+            [not is_reachable(position, reach) for positions in paths for position in positions]
+        )
+    )
 
 
 def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float | None:
@@ -131,7 +156,8 @@ def _explained(held_out: Sequence[HeldOut], constant: Sequence[Vector]) -> float
     if not constant:
         return None
     missed, varies = (
-        float(sum((errors**2).sum() for errors in take_errors)) for take_errors in ([result.errors for result in held_out], constant)
+        float(sum((errors**2).sum() for errors in take_errors))
+        for take_errors in ([result.errors for result in held_out], constant)
     )
     return 100 * (1 - missed / varies) if varies > 0.0 else None
 
@@ -147,7 +173,9 @@ def _row(
     inside = 100 * np.mean([timed.inside(regions) for timed, regions in checked], axis=0)
     expected_m = np.concatenate([timed.expected_m(regions) for timed, regions in checked])
     is_wrong = np.concatenate([timed.is_wrong for timed, _ in checked])
-    is_unsure = np.concatenate([timed.probabilities(regions) > (regions.alarm or 1.0) for timed, regions in checked])
+    is_unsure = np.concatenate(
+        [timed.probabilities(regions) > (regions.alarm or 1.0) for timed, regions in checked]
+    )
     return Row(
         name=name,
         error_mm=1000 * rms(errors),

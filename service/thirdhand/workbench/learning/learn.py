@@ -19,7 +19,9 @@ from thirdhand.workbench.learning.records import Evidence, Fitted, Options, Pose
 from thirdhand.workbench.learning.store import stored
 from thirdhand.workbench.learning.takes import Division, divided, standing_out
 
-EXCHANGED_SHARE = 0.5  # a take fits with its hands exchanged if that reduces its error to less than this share
+EXCHANGED_SHARE = (
+    0.5  # a take fits with its hands exchanged if that reduces its error to less than this share
+)
 
 
 def learn(
@@ -65,8 +67,12 @@ def learn(
     fitted, pose = _fitted(division, progress)
     if odd_m := standing_out(fitted.held_out):
         named = {take.name: take.demonstration for take in division.takes}
-        remarks = [_remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()]
-        inliers = {name: demonstration for name, demonstration in named.items() if name not in odd_m}
+        remarks = [
+            _remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()
+        ]
+        inliers = {
+            name: demonstration for name, demonstration in named.items() if name not in odd_m
+        }
         division = divided(list(inliers.values()), list(inliers), options, before)
         division = division._replace(remarks=[*remarks, *division.remarks])
         fitted, pose = _fitted(division, progress)
@@ -76,16 +82,26 @@ def learn(
     return skill
 
 
-def _remark(name: str, error_m: float, named: dict[str, Demonstration], options: Options, progress: Progress) -> str:
+def _remark(
+    name: str, error_m: float, named: dict[str, Demonstration], options: Options, progress: Progress
+) -> str:
     """The remark on a take that stands out, and whether it fits with its hands exchanged."""
     progress(f"trying {name} with its hands exchanged")
     errors_m = []
     for other in exchanged(named[name]):
-        fitted, _ = _fitted(divided([*(named | {name: other}).values()], list(named), options), progress)
+        fitted, _ = _fitted(
+            divided([*(named | {name: other}).values()], list(named), options), progress
+        )
         errors_m += [rms(result.errors) for result in fitted.held_out if result.take.name == name]
-    text = f"{name} stands out, and is left out: its tool is {1000 * error_m:.0f} mm from where the others have it"
+    text = (
+        f"{name} stands out, and is left out: its tool is {1000 * error_m:.0f} mm from where the "
+        "others have it"
+    )
     if min(errors_m) < EXCHANGED_SHARE * error_m:
-        text += f", and {1000 * min(errors_m):.0f} mm with its hands exchanged: put each tracker on its own hand"
+        text += (
+            f", and {1000 * min(errors_m):.0f} mm with its hands exchanged: put each tracker on "
+            "its own hand"
+        )
     return f"{text}; record it again"
 
 

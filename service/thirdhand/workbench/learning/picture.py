@@ -19,9 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TOOL, TARGET, OFF, GATE = map(palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE))
+TOOL, TARGET, OFF, GATE = map(
+    palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE)
+)
 GREYS = {"wrong: swapped": "0.7", "wrong: both beside": "0.5", "wrong: one beside": "0.3"}
-BANDS = [palette.written(colour) for colour in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)]
+BANDS = [
+    palette.written(colour)
+    for colour in (palette.SKY, palette.ORANGE, palette.YELLOW, palette.GREY)
+]
 MOST_NAMED = 12  # segments in the legend
 LEAST_BAND = 0.02  # a segment's band has its number if it lasts for this share of the time
 
@@ -39,7 +44,8 @@ def drawn(evidence: Evidence) -> Figure:
     from matplotlib.figure import Figure  # loads slowly, and few need it
     from matplotlib.ticker import LogFormatter
 
-    skill, held_out = evidence.skill, evidence.held_out
+    skill = evidence.skill
+    held_out = evidence.held_out
     is_segmented = held_out[0].belief is not None
     mosaic = "ae;rg;ss" if is_segmented else "ae;rg"
     figure = Figure(figsize=(11, 3.75 * len(mosaic.split(";"))), layout="constrained", dpi=110)
@@ -52,7 +58,9 @@ def drawn(evidence: Evidence) -> Figure:
     for i, result in enumerate(held_out):
         tool = result.take.position
         predicted = tool - result.errors
-        above.plot(tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None)
+        above.plot(
+            tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None
+        )
         label = "predicted from the others" if i == 0 else None
         above.plot(predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label=label)
     above.set_aspect("equal", adjustable="datalim")
@@ -63,16 +71,28 @@ def drawn(evidence: Evidence) -> Figure:
     expected = np.array([_along(_deviation(result), grid) for result in held_out])
     errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
     errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
-    errors.plot(grid, 1000 * np.sqrt((lengths**2).mean(axis=0)), color=TOOL, lw=2, label="root mean square of all")
+    errors.plot(
+        grid,
+        1000 * np.sqrt((lengths**2).mean(axis=0)),
+        color=TOOL,
+        lw=2,
+        label="root mean square of all",
+    )
     expected_mm = 1000 * np.sqrt((expected**2).mean(axis=0))
     errors.plot(grid, expected_mm, color=TARGET, ls="--", lw=2, label="expected before calibration")
-    errors.set(title="error of the predicted tool", xlabel="share of the demonstration's time", ylabel="[mm]")
+    errors.set(
+        title="error of the predicted tool",
+        xlabel="share of the demonstration's time",
+        ylabel="[mm]",
+    )
     errors.set(xlim=(0, 1), ylim=(0, None))
     errors.legend(frameon=False)
 
     regions.plot((0, 100), (0, 100), color="0.6", lw=1, label="exact")
     inside = 100 * evidence.inside
-    regions.plot(100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations")
+    regions.plot(
+        100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations"
+    )
     regions.set(title="share of the samples inside each predicted region")
     regions.set(xlabel="the region should contain [%]", ylabel="samples inside [%]")
     regions.set(xlim=(0, 100), ylim=(0, 100))
@@ -83,19 +103,30 @@ def drawn(evidence: Evidence) -> Figure:
     for (name, colour), wrong in zip(GREYS.items(), nonsense(hands), strict=True):
         curves[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in curves.items():
-        gate.plot(1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name)
-    gate.axvline(1000 * skill.threshold, color=GATE, ls="--", lw=1, label=f"gate, {1000 * skill.threshold:.0f} mm")
+        gate.plot(
+            1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name
+        )
+    gate.axvline(
+        1000 * skill.threshold,
+        color=GATE,
+        ls="--",
+        lw=1,
+        label=f"gate, {1000 * skill.threshold:.0f} mm",
+    )
     gate.set(title="the arm holds right of the gate", ylabel="samples up to this distance [%]")
     gate.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
     gate.xaxis.set_major_formatter("{x:g}")
     gate.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     gate.legend(frameon=False, fontsize=8, loc="upper left")
 
-    overall, count = evidence.figures.all, len(held_out)
+    overall = evidence.figures.all
+    count = len(held_out)
     basis = (
-        f"{count} demonstrations, each predicted from the others with an error of {overall.error_mm:.0f} mm rms"
+        f"{count} demonstrations, each predicted from the others with an error of "
+        f"{overall.error_mm:.0f} mm rms"
         if count > 1
-        else f"one demonstration, none held out: error of {overall.error_mm:.0f} mm rms in what was learned"
+        else f"one demonstration, none held out: error of {overall.error_mm:.0f} mm rms in what "
+        "was learned"
     )
     figure.suptitle(f"{skill.name}: {basis}, {overall.predicted_mm:.0f} mm expected as calibrated")
     return figure
@@ -105,7 +136,8 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
     """Draw the held-out demonstration with the median error over time: its most probable segments
     as bands, and the tool's error.
     """
-    names, rows = evidence.skill.model.names, evidence.figures.demonstrations
+    names = evidence.skill.model.names
+    rows = evidence.figures.demonstrations
     h = int(np.argsort([row.error_mm for row in rows])[len(rows) // 2])
     result = evidence.held_out[h]
     assert result.belief is not None
@@ -114,19 +146,40 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
     changes = np.flatnonzero(np.diff(most)) + 1
     labelled: set[int] = set()
     for first, end in zip([0, *changes], [*changes, len(most)], strict=True):
-        k, until = int(most[first]), float(times[min(end, len(times) - 1)])
+        k = int(most[first])
+        until = float(times[min(end, len(times) - 1)])
         colour = BANDS[k % len(BANDS)]
-        label = None if k in labelled or k >= MOST_NAMED else f"{k + 1}: {names[k]} \N{RIGHTWARDS ARROW} {names[k + 1]}"
+        label = (
+            None
+            if k in labelled or k >= MOST_NAMED
+            else f"{k + 1}: {names[k]} \N{RIGHTWARDS ARROW} {names[k + 1]}"
+        )
         axes.axvspan(float(times[first]), until, color=colour, alpha=0.3, lw=0, label=label)
         if until - times[first] > LEAST_BAND * times[-1]:
             middle = 0.5 * (float(times[first]) + until)
-            axes.text(middle, 0.97, str(k + 1), transform=axes.get_xaxis_transform(), ha="center", va="top")
+            axes.text(
+                middle,
+                0.97,
+                str(k + 1),
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="top",
+            )
         labelled.add(k)
-    off_mm, predicted_mm = 1000 * np.linalg.norm(result.errors, axis=1), 1000 * _deviation(result)
+    off_mm = 1000 * np.linalg.norm(result.errors, axis=1)
+    predicted_mm = 1000 * _deviation(result)
     axes.plot(times, off_mm, color=TOOL, lw=2, label="error of the predicted tool")
-    axes.plot(times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration")
-    highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))  # the first predictions are uncertain
-    axes.set(title=f"{rows[h].name}, held out: its most probable segment, and the error", xlabel="[s]", ylabel="[mm]")
+    axes.plot(
+        times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration"
+    )
+    highest_mm = max(
+        float(off_mm.max()), float(np.percentile(predicted_mm, 98))
+    )  # the first predictions are uncertain
+    axes.set(
+        title=f"{rows[h].name}, held out: its most probable segment, and the error",
+        xlabel="[s]",
+        ylabel="[mm]",
+    )
     axes.set(xlim=(0, times[-1]), ylim=(0, 1.15 * highest_mm))
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=4)
 

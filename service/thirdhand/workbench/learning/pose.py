@@ -25,24 +25,43 @@ from thirdhand.workbench.learning.ambiguity import contradictions
 from thirdhand.workbench.learning.choice import selection_of
 from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, persons_of
 
-CONSTANT_RAD = math.radians(5.0)  # an orientation that stays this near to its mean counts as constant
-DIFFERENT_RAD = math.radians(30.0)  # orientations this far from each other contradict each other at the same hands
-NOTED_SHARE, UNSAFE_SHARE = 0.01, 0.10  # limits of the share of samples that contradict others
-NOTED_DEG, UNSAFE_DEG = 15.0, 60.0  # limits of the held-out error
+CONSTANT_RAD = math.radians(
+    5.0
+)  # an orientation that stays this near to its mean counts as constant
+DIFFERENT_RAD = math.radians(
+    30.0
+)  # orientations this far from each other contradict each other at the same hands
+# limits of the share of samples that contradict others
+NOTED_SHARE = 0.01
+UNSAFE_SHARE = 0.10
+# limits of the held-out error
+NOTED_DEG = 15.0
+UNSAFE_DEG = 60.0
 SIGN_SAMPLES = 100  # samples of a take by which its quaternions' sign is chosen
-MOST_TURN_DEG = 480.0  # a tool that turns farther comes too near to the opposite of the mean orientation
-SINGLE_TAKE = Parameters(8.0, 1e-2, 1e-2, 0.2)  # hyper-parameters if there is one person, and nothing to choose by
+MOST_TURN_DEG = (
+    480.0  # a tool that turns farther comes too near to the opposite of the mean orientation
+)
+SINGLE_TAKE = Parameters(
+    8.0, 1e-2, 1e-2, 0.2
+)  # hyper-parameters if there is one person, and nothing to choose by
 GRIPPER_WRONG_SHARE = 0.15  # a gripper that is wrong in a larger share of held-out samples is noted
 
 
-def learned_pose(held_out: Sequence[HeldOut], *, points: int, gripper_ell: float, near_m: float) -> Pose:
+def learned_pose(
+    held_out: Sequence[HeldOut], *, points: int, gripper_ell: float, near_m: float
+) -> Pose:
     """The orientation and the gripper of held-out takes, over their inputs (T, I), from about
     `points` samples; `near_m` as in `contradictions`.
 
     Raises ValueError if primitives cannot be fitted.
     """
-    unit = [result.take.tool[:, 3:] / np.linalg.norm(result.take.tool[:, 3:], axis=1)[:, None] for result in held_out]
-    mean, signed = _signed(mean_orientation(np.concatenate([result.take.tool[:, 3:] for result in held_out])), unit)
+    unit = [
+        result.take.tool[:, 3:] / np.linalg.norm(result.take.tool[:, 3:], axis=1)[:, None]
+        for result in held_out
+    ]
+    mean, signed = _signed(
+        mean_orientation(np.concatenate([result.take.tool[:, 3:] for result in held_out])), unit
+    )
     turn, turn_error_deg, missed = _learned_turn(mean, held_out, signed, points)
     verdicts: list[Verdict] = []
     if turn is not None:
@@ -56,18 +75,24 @@ def learned_pose(held_out: Sequence[HeldOut], *, points: int, gripper_ell: float
         )
         if conflicts.share > NOTED_SHARE:
             text = (
-                f"the tool's orientation contradicts itself in {100 * conflicts.share:.0f} % of the samples, up to "
-                f"{100 * UNSAFE_SHARE:.0f} % accepted: {conflicts.pair} have the hands {1000 * conflicts.hands_m:.0f} mm from "
-                f"each other and the tools turned by {math.degrees(conflicts.tools):.0f}°"
+                f"the tool's orientation contradicts itself in {100 * conflicts.share:.0f} % of "
+                f"the samples, up to {100 * UNSAFE_SHARE:.0f} % accepted: {conflicts.pair} have "
+                f"the hands {1000 * conflicts.hands_m:.0f} mm from each other and the tools turned "
+                f"by {math.degrees(conflicts.tools):.0f}°"
             )
-            verdicts.append(Verdict("unsafe" if conflicts.share > UNSAFE_SHARE else "warning", text))
+            verdicts.append(
+                Verdict("unsafe" if conflicts.share > UNSAFE_SHARE else "warning", text)
+            )
     if turn_error_deg is not None and turn_error_deg > NOTED_DEG:
-        text = f"the tool's orientation in held-out demonstrations is missed by {turn_error_deg:.0f}° rms"
+        text = (
+            f"the tool's orientation in held-out demonstrations is missed by {turn_error_deg:.0f}° "
+            "rms"
+        )
         if turn_error_deg > UNSAFE_DEG:
             turned_deg = max(math.degrees(turned_rad(q)) for q in unit)
             text += (
-                f", up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one of them; let it "
-                f"turn by less than {MOST_TURN_DEG:.0f}°, the same way in each"
+                f", up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one "
+                f"of them; let it turn by less than {MOST_TURN_DEG:.0f}°, the same way in each"
             )
         verdicts.append(Verdict("unsafe" if turn_error_deg > UNSAFE_DEG else "warning", text))
     gripper, right, remarks = _learned_gripper(held_out, points=points, ell=gripper_ell)
@@ -109,7 +134,9 @@ def _learned_turn(
     error_deg = math.degrees(2.0 * rms(residuals)) if several else None
     missed = []
     for result, zeta in zip(held_out, zetas, strict=True):
-        others = choice.primitive(parameters, residuals, without=result.take.person if several else None)
+        others = choice.primitive(
+            parameters, residuals, without=result.take.person if several else None
+        )
         missed.append(2.0 * np.linalg.norm(zeta - others.mean(result.inputs), axis=1))
     return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
 
@@ -125,7 +152,10 @@ def _signed(mean: Vector, unit: Sequence[Vector]) -> tuple[Vector, list[Vector]]
     if all((q @ mean > 0.0).all() for q in near):
         return mean, near
     along = [q[np.linspace(0, len(q) - 1, SIGN_SAMPLES).round().astype(int)] for q in smooth]
-    signed = [q if (samples * along[0]).sum() >= 0.0 else -q for q, samples in zip(smooth, along, strict=True)]
+    signed = [
+        q if (samples * along[0]).sum() >= 0.0 else -q
+        for q, samples in zip(smooth, along, strict=True)
+    ]
     total = np.concatenate(signed).sum(axis=0)
     size = float(np.linalg.norm(total))
     return (total / size, signed) if size > 0.0 else (mean, near)
@@ -135,17 +165,29 @@ def _learned_gripper(
     held_out: Sequence[HeldOut], *, points: int, ell: float
 ) -> tuple[LearnedGripper | None, float | None, list[str]]:
     """The gripper, the share of held-out samples [%] in which it is right, and warnings."""
-    pairs = [(result.inputs, result.take.closure[:, None]) for result in held_out if result.take.closure is not None]
+    pairs = [
+        (result.inputs, result.take.closure[:, None])
+        for result in held_out
+        if result.take.closure is not None
+    ]
     if not pairs:
         return None, None, []
     unknown = [result.take.name for result in held_out if result.take.closure is None]
-    remarks = [f"{', '.join(unknown)} without gripper: it is learned from the others"] * bool(unknown)
+    remarks = [f"{', '.join(unknown)} without gripper: it is learned from the others"] * bool(
+        unknown
+    )
     choice = selection_of(pairs, points)
-    right, prior = None, np.array([UNDECIDED])
+    right = None
+    prior = np.array([UNDECIDED])
     if len(pairs) > 1:
-        right = 100.0 * float(np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(pairs))]).mean())
+        right = 100.0 * float(
+            np.concatenate([_is_right(choice, i, prior, ell) for i in range(len(pairs))]).mean()
+        )
         if right < 100.0 * (1.0 - GRIPPER_WRONG_SHARE):
-            remarks.append(f"the gripper is right in {right:.0f} % of held-out samples only: teach it via-points")
+            remarks.append(
+                f"the gripper is right in {right:.0f} % of held-out samples only: teach it "
+                "via-points"
+            )
     primitive = even(choice.inputs, choice.outputs, GaussianKernel(ell), prior)
     return LearnedGripper(primitive), right, remarks
 
@@ -154,7 +196,8 @@ def _is_right(choice: DirectSelection, take: int, prior: Vector, ell: float) -> 
     """Return whether the gripper that the other takes lead to is right at a take's points (N,)."""
     mine = choice.group == take
     others = even(choice.inputs[~mine], choice.outputs[~mine], GaussianKernel(ell), prior)
-    gripper, is_closed = UNKNOWN, []
+    gripper = UNKNOWN
+    is_closed = []
     for closure in others.mean(choice.inputs[mine])[:, 0].tolist():
         gripper = decided(gripper, closure)
         is_closed.append(gripper == CLOSED)

@@ -99,7 +99,9 @@ class TimedErrors(NamedTuple):
 
     def with_timing(self, std_s: float) -> Vector:
         """The covariances (S, 3, 3) [m²] for this deviation of the timing: C + std_s² v vᵀ."""
-        return np.asarray(self.covariance + std_s**2 * self.velocity[:, :, None] * self.velocity[:, None, :])
+        return np.asarray(
+            self.covariance + std_s**2 * self.velocity[:, :, None] * self.velocity[:, None, :]
+        )
 
     def squares(self, std_s: float) -> Vector:
         """The squared Mahalanobis distances (S,) for this standard deviation of the timing."""
@@ -122,7 +124,9 @@ class TimedErrors(NamedTuple):
 
     def expected_m(self, regions: Regions) -> Vector:
         """The expected distances (S,) [m] of tool and prediction, root mean square."""
-        return np.asarray(np.sqrt(3 * regions.scale) * standard_deviations(self.with_timing(regions.std_s)))
+        return np.asarray(
+            np.sqrt(3 * regions.scale) * standard_deviations(self.with_timing(regions.std_s))
+        )
 
     def inside(self, regions: Regions) -> Vector:
         """The shares (L,) of the samples inside the regions of each of LEVELS."""
@@ -145,7 +149,9 @@ class HeldOut(NamedTuple):
     gate_m: Vector
     inputs: Vector
     known: Vector
-    belief: Vector | None = None  # (T, K) probability of each of K segments; None if there are no segments
+    belief: Vector | None = (
+        None  # (T, K) probability of each of K segments; None if there are no segments
+    )
     timed: TimedErrors | None = None  # None: they follow from the errors
 
 
@@ -166,7 +172,9 @@ class Fitted(NamedTuple):
     conductor: int | None = None  # the side of the only hand that the model depends on
     taken: str = ""  # the name of the inputs that were chosen among those tried
     tried_m: Mapping[str, float] = {}  # held-out error of each kind of inputs
-    baselines: Mapping[str, Sequence[Vector]] = {}  # errors (T, 3) [m] of each take by simpler predictions
+    baselines: Mapping[
+        str, Sequence[Vector]
+    ] = {}  # errors (T, 3) [m] of each take by simpler predictions
     remarks: Sequence[str] = ()
     weights: Weights | None = None  # None if the skill refines no other
 
@@ -198,11 +206,15 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     error_mm: float
     worst_mm: float
     moment_mm: float = 0.0  # error with hyper-parameters that were chosen without its block
-    predicted_mm: float  # `moment_mm` as the covariance predicts it, calibrated without this demonstration
+    predicted_mm: (
+        float  # `moment_mm` as the covariance predicts it, calibrated without this demonstration
+    )
     within_50: float  # [%] of the samples inside the region that should contain 50 %
     within_95: float
     held: float  # [%] of the time in which the gate would hold
-    wrong: float = 0.0  # [%] of the samples at which the tool is more than 10 cm from its prediction
+    wrong: float = (
+        0.0  # [%] of the samples at which the tool is more than 10 cm from its prediction
+    )
     told: float | None = None  # [%] of these at which the skill is unsure; None if there are none
     falsely_told: float = 0.0  # [%] of the other samples at which it is
     other_mm: dict[str, float] = {}  # errors of baselines
@@ -220,11 +232,17 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     one_beside: float  # the same with one hand displaced by 30 cm
     ambiguous: float  # share of the samples that contradict another: same hands, other tool
     beyond_reach: float  # share of the tool's path
-    explained: float | None = None  # share of the tool's variance that held-out predictions explain, see `judged`
-    orientation_error_deg: float | None = None  # held out, root mean square; None if it was not learned
+    explained: float | None = (
+        None  # share of the tool's variance that held-out predictions explain, see `judged`
+    )
+    orientation_error_deg: float | None = (
+        None  # held out, root mean square; None if it was not learned
+    )
     gripper_right: float | None = None  # share of held-out samples
     warnings: tuple[str, ...] = ()
-    residual: tuple[str, ...] = ()  # residual risks: the skill is not served unless somebody accepts them
+    residual: tuple[
+        str, ...
+    ] = ()  # residual risks: the skill is not served unless somebody accepts them
     accepted_by: str = ""  # who accepted them; empty if nobody did, or there are none
     unsafe: tuple[str, ...] = ()  # reasons not to use the skill
     tried_mm: dict[str, float] = {}  # held-out error of each kind of inputs
@@ -234,7 +252,9 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     by_person: bool = False  # true if all demonstrations of a person were held out at once
     delay_s: float | None = None  # the teacher's delay; None if it was not learned
     delay_std_s: float = 0.0  # its standard deviation over the demonstrations
-    alone: bool | msgspec.UnsetType = msgspec.UNSET  # true if one hand conducts alone, and `beside` refers to it
+    alone: bool | msgspec.UnsetType = (
+        msgspec.UNSET
+    )  # true if one hand conducts alone, and `beside` refers to it
 
 
 class Evidence(NamedTuple):
@@ -243,4 +263,6 @@ class Evidence(NamedTuple):
     skill: StoredSkill
     figures: Figures
     held_out: Sequence[HeldOut]
-    inside: Vector  # (L,) shares of the samples inside the regions of LEVELS, calibrated without them
+    inside: (
+        Vector  # (L,) shares of the samples inside the regions of LEVELS, calibrated without them
+    )

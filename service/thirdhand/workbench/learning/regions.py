@@ -42,7 +42,8 @@ from thirdhand.skills.via_points import check_agreement
 from thirdhand.workbench.learning.records import HeldOut, Take, TimedErrors, persons_of
 
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
-BLOCKS = 6  # takes that follow each other, often of one person or hour, are held out in so many blocks at most
+# takes that follow each other, often of one person or hour, are held out in so many blocks at most
+BLOCKS = 6
 SAMPLES = 150  # samples of a take that are judged, at most
 # Candidates for the timing's standard deviation. A larger one explains few large errors by making
 # all motion uncertain.
@@ -50,10 +51,17 @@ TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
 WIDEST = 100.0  # a region's squared radius is widened at most by this factor
 LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as this one
 LEAST_RADIUS = 1e-9  # a squared radius is at least this large
-FALSE_ALARM_SHARE, ALARM_SHARE = 0.12, 0.95  # shares of the right and of the wrong moments at which the skill is unsure
+# shares of the right and of the wrong moments at which the skill is unsure
+FALSE_ALARM_SHARE = 0.12
+ALARM_SHARE = 0.95
 LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
-ALARMS = (0.005, 0.5)  # what is that improbable is no alarm, and what is more probable than not is one
-LOCAL_ERRORS_RETAINED = 300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
+ALARMS = (
+    0.005,
+    0.5,
+)  # what is that improbable is no alarm, and what is more probable than not is one
+LOCAL_ERRORS_RETAINED = (
+    300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
+)
 LEAST_RETAINED = 4  # errors of a demonstration
 
 
@@ -102,16 +110,27 @@ def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regi
     radii = np.maximum.accumulate([_radius(squares, blocks, level) for level in LEVELS])
     scale = float(radii[LEVELS.index(0.95)]) / REGION_95
     regions = Regions(scale, std_s, tuple((radii / scale).tolist()))
-    relative = [(take_errors.errors**2).sum(axis=1) / np.trace(take_errors.published(regions), axis1=1, axis2=2) for take_errors in errors]
-    ratios = np.maximum.accumulate([max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS])
+    relative = [
+        (take_errors.errors**2).sum(axis=1)
+        / np.trace(take_errors.published(regions), axis1=1, axis2=2)
+        for take_errors in errors
+    ]
+    ratios = np.maximum.accumulate(
+        [max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS]
+    )
     regions = regions._replace(ratios=tuple(ratios.tolist()))
     return regions._replace(alarm=_alarm(errors, regions))
 
 
 def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
     """The error probability above which a skill with these errors is unsure."""
-    probabilities, wrong = [take_errors.probabilities(regions) for take_errors in errors], [take_errors.is_wrong for take_errors in errors]
-    right = [values[~is_wrong] for values, is_wrong in zip(probabilities, wrong, strict=True) if not is_wrong.all()]
+    probabilities = [take_errors.probabilities(regions) for take_errors in errors]
+    wrong = [take_errors.is_wrong for take_errors in errors]
+    right = [
+        values[~is_wrong]
+        for values, is_wrong in zip(probabilities, wrong, strict=True)
+        if not is_wrong.all()
+    ]
     alarm = _quantile(right, 1.0 - FALSE_ALARM_SHARE) if right else ALARMS[0]
     among = np.concatenate(probabilities)[np.concatenate(wrong)]
     if len(among) >= LEAST_WRONG:
@@ -125,14 +144,19 @@ def local_errors(
     """The errors of takes with inputs (T, I), each with covariances by the errors of the other
     blocks; and those that a model with this primitive keeps.
     """
-    count, persons = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes)), persons_of(takes)
+    count = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes))
+    persons = persons_of(takes)
     used_inputs = [values[_rows(len(values))] for values in inputs]
-    retained_rows = [np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int)) for values in used_inputs]
+    retained_rows = [
+        np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
+        for values in used_inputs
+    ]
     unknown_std_m = unknown_std(takes)
 
     def of(numbers: Sequence[int]) -> LocalErrors:
         retained_inputs, errors = (
-            np.concatenate([values[i][retained_rows[i]] for i in numbers]) for values in (used_inputs, [take_errors.errors for take_errors in timed])
+            np.concatenate([values[i][retained_rows[i]] for i in numbers])
+            for values in (used_inputs, [take_errors.errors for take_errors in timed])
         )
         return LocalErrors.of(primitive, retained_inputs, errors, unknown_std_m)
 
@@ -149,7 +173,9 @@ def unknown_std(takes: Sequence[Take]) -> float:
     return float(np.sqrt(np.concatenate([take.position for take in takes]).var(axis=0).mean()))
 
 
-def calibrated_without(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> list[tuple[TimedErrors, Regions]]:
+def calibrated_without(
+    errors: Sequence[TimedErrors], persons: NDArray[np.intp]
+) -> list[tuple[TimedErrors, Regions]]:
     """The errors of each take, and the regions that the other blocks lead to."""
     out: dict[int, tuple[TimedErrors, Regions]] = {}
     for block in blocks_of(persons):
@@ -165,7 +191,9 @@ def _rows(count: int) -> NDArray[np.intp]:
 
 def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
     """The errors of a mean (T, 3) [m], with covariances (S, 3, 3) [m²] at the judged samples."""
-    rows, trail, velocity = _rows(len(mean)), mean[0].copy(), np.empty_like(mean)
+    rows = _rows(len(mean))
+    trail = mean[0].copy()
+    velocity = np.empty_like(mean)
     begins = take.demonstration.begins if len(mean) == len(take.demonstration.tool) else ()
     for i, position in enumerate(mean):
         if i in begins:
@@ -190,7 +218,13 @@ def _through_places(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:
 
 def _cost(errors: Sequence[TimedErrors], std_s: float) -> float:
     """The negative log likelihood of the errors at the best scale, but for constants."""
-    terms = [(np.linalg.slogdet(take_errors.with_timing(std_s))[1].mean(), take_errors.squares(std_s).mean()) for take_errors in errors]
+    terms = [
+        (
+            np.linalg.slogdet(take_errors.with_timing(std_s))[1].mean(),
+            take_errors.squares(std_s).mean(),
+        )
+        for take_errors in errors
+    ]
     size, square = np.mean(terms, axis=0)
     return float(size + 3.0 * np.log(max(square, LEAST_SQUARE)))
 
@@ -210,5 +244,7 @@ def _quantile(groups: Sequence[Vector], level: float) -> float:
     """The quantile of values (T,) in groups that count equally."""
     values = np.concatenate(groups)
     order = np.argsort(values)
-    share = np.cumsum(np.concatenate([np.full(len(group), 1.0 / len(group)) for group in groups])[order])
+    share = np.cumsum(
+        np.concatenate([np.full(len(group), 1.0 / len(group)) for group in groups])[order]
+    )
     return float(np.interp(level, share / share[-1], values[order]))

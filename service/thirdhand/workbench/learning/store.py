@@ -16,7 +16,9 @@ from thirdhand.workbench.learning.takes import Division, conductor_of
 BOX_MARGIN_M = 0.25  # targets may leave the box of the demonstrated positions by this distance
 
 
-def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement: Judgement) -> StoredSkill:
+def stored(
+    name: str, division: Division, fitted: Fitted, pose: Pose, judgement: Judgement
+) -> StoredSkill:
     """The skill of a model and pose with its figures."""
     takes = [*division.takes, *division.earlier]
     positions = np.concatenate([take.position for take in takes])
@@ -27,10 +29,14 @@ def stored(name: str, division: Division, fitted: Fitted, pose: Pose, judgement:
         orientation=pose.orientation,
         turn=pose.turn,
         gripper=pose.gripper,
-        workspace=np.stack([positions.min(axis=0) - BOX_MARGIN_M, positions.max(axis=0) + BOX_MARGIN_M]),
+        workspace=np.stack(
+            [positions.min(axis=0) - BOX_MARGIN_M, positions.max(axis=0) + BOX_MARGIN_M]
+        ),
         threshold=fitted.gate.threshold,
         learned_from=fingerprint(take.demonstration for take in takes),
-        demonstrations=packed([NamedDemonstration(take.name, take.demonstration) for take in takes]),
+        demonstrations=packed(
+            [NamedDemonstration(take.name, take.demonstration) for take in takes]
+        ),
         components=division.options.components or 0,
         figures=figures,
         conductor=conductor_of(division, fitted),

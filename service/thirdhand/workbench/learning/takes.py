@@ -12,7 +12,14 @@ from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Hands
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.tuning import UNSURE_M
-from thirdhand.skills.demonstration import LEAST_M, Demonstration, NamedDemonstration, check, moved_m, persons
+from thirdhand.skills.demonstration import (
+    LEAST_M,
+    Demonstration,
+    NamedDemonstration,
+    check,
+    moved_m,
+    persons,
+)
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import of_one
 from thirdhand.workbench.learning.ambiguity import same_hands_m
@@ -53,15 +60,21 @@ def divided(
     ones count as new ones. Raises SkillError if nothing can be learned from them.
     """
     if refined and (options.components is not None or options.ell is not None):
-        raise SkillError("a skill is refined with parameters that are chosen: neither a number of components nor ell")
+        raise SkillError(
+            "a skill is refined with parameters that are chosen: neither a number of components "
+            "nor ell"
+        )
     if not demonstrations:
         raise SkillError("no demonstrations given, at least 1 needed")
     if options.components is None and options.penalty is not None:
         raise SkillError("a penalty goes with a number of components: without them it is chosen")
     names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
     # In the order of recording, so that the order of the files makes no difference.
-    in_order = sorted(zip(names, demonstrations, strict=True), key=lambda one: (int(one[1].stamps_ns[0]), one[0]))
-    names, demonstrations = [name for name, _ in in_order], [demonstration for _, demonstration in in_order]
+    in_order = sorted(
+        zip(names, demonstrations, strict=True), key=lambda one: (int(one[1].stamps_ns[0]), one[0])
+    )
+    names = [name for name, _ in in_order]
+    demonstrations = [demonstration for _, demonstration in in_order]
     for name, demonstration in zip(names, demonstrations, strict=True):
         try:
             check(demonstration)
@@ -69,37 +82,69 @@ def divided(
             raise SkillError(f"{name}: {error}") from None
     named = [*refined, *map(NamedDemonstration, names, demonstrations)]
     repeats = _repeats([entry.demonstration for entry in named])
-    repeated = [f"{named[i].name} repeats {named[j].name}, and is left out" for i, j in repeats.items()]
+    repeated = [
+        f"{named[i].name} repeats {named[j].name}, and is left out" for i, j in repeats.items()
+    ]
     new_persons = {demonstration.person for demonstration in demonstrations if demonstration.person}
-    of_others = [i for i, entry in enumerate(refined) if entry.demonstration.person not in new_persons]
+    of_others = [
+        i for i, entry in enumerate(refined) if entry.demonstration.person not in new_persons
+    ]
     earlier = [named[i] for i in of_others if i not in repeats]
-    names, demonstrations = _columns([entry for i, entry in enumerate(named) if i not in {*repeats, *of_others}])
+    names, demonstrations = _columns(
+        [entry for i, entry in enumerate(named) if i not in {*repeats, *of_others}]
+    )
     if not demonstrations:
-        raise SkillError("all demonstrations repeat those of the skill that is refined: there is nothing new to learn")
+        raise SkillError(
+            "all demonstrations repeat those of the skill that is refined: there is nothing new to "
+            "learn"
+        )
     if max(map(moved_m, demonstrations)) < LEAST_M:
         raise SkillError(
-            f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm teach nothing"
+            f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm "
+            "teach nothing"
         )
     check_count(names, options.components, "".join(f"; {remark}" for remark in repeated))
     before_names, before = _columns(earlier)
-    single = "one demonstration: none was held out, so its error is of what was learned, and judges nothing"
+    single = (
+        "one demonstration: none was held out, so its error is of what was learned, and judges "
+        "nothing"
+    )
     remarks = [*repeated, *[single] * (len(names) == 1)]
     hand = _conducting([*demonstrations, *before], [*names, *before_names])
     conductor = None if hand == "both" else SIDES.index(hand)
     if conductor is not None:
         demonstrations, before = (
-            [demonstration._replace(places=tuple(of_one(point, conductor) for point in demonstration.places)) for demonstration in group]
+            [
+                demonstration._replace(
+                    places=tuple(of_one(point, conductor) for point in demonstration.places)
+                )
+                for demonstration in group
+            ]
             for group in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
     if options.delay_s is not None and not isinstance(method, Segmented):
-        raise SkillError("a delay goes with via-points that all demonstrations name; without them it is learned too")
+        raise SkillError(
+            "a delay goes with via-points that all demonstrations name; without them it is learned "
+            "too"
+        )
     if before:
         _check_alike(demonstrations, names, before)
     takes = takes_of(demonstrations, names)
     first = 1 + max(take.person for take in takes)
-    before_takes = [take._replace(person=first + take.person) for take in takes_of(before, before_names)]
-    return Division(takes, before_takes, method, options, same_hands_m(demonstrations), conductor, repeated, remarks)
+    before_takes = [
+        take._replace(person=first + take.person) for take in takes_of(before, before_names)
+    ]
+    return Division(
+        takes,
+        before_takes,
+        method,
+        options,
+        same_hands_m(demonstrations),
+        conductor,
+        repeated,
+        remarks,
+    )
 
 
 def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[str], list[Demonstration]]:
@@ -117,8 +162,9 @@ def _check_alike(
         point_names = [point.name for point in demonstration.places]
         if set(point_names) != set(needed):
             raise SkillError(
-                f"{name} has the via-points {', '.join(point_names) or '(none)'}: {', '.join(needed)} needed, as in "
-                "the skill that is refined; take them with the demonstration (record --places), or name them (--places)"
+                f"{name} has the via-points {', '.join(point_names) or '(none)'}: "
+                f"{', '.join(needed)} needed, as in the skill that is refined; take them with the "
+                "demonstration (record --places), or name them (--places)"
             )
 
 
@@ -130,8 +176,8 @@ def _conducting(demonstrations: Sequence[Demonstration], names: Sequence[str]) -
     if len(by_hand) > 1:
         groups = "; ".join(f"{hand}: {', '.join(by_hand[hand])}" for hand in sorted(by_hand))
         raise SkillError(
-            f"demonstrations that are conducted by different hands: {', '.join(sorted(by_hand))}; take them alike, or "
-            f"leave out those of one kind ({groups})"
+            f"demonstrations that are conducted by different hands: {', '.join(sorted(by_hand))}; "
+            f"take them alike, or leave out those of one kind ({groups})"
         )
     return demonstrations[0].conducts
 
@@ -145,8 +191,8 @@ def check_count(names: Sequence[str], components: int | None = None, remark: str
     """Raise SkillError if the demonstrations of these names are too few to hold one out."""
     if len(names) == 1 and components is None:
         raise SkillError(
-            f"1 demonstration given ({names[0]}): at least 2 needed, as what is learned from the others must predict "
-            f"each; record another{remark}"
+            f"1 demonstration given ({names[0]}): at least 2 needed, as what is learned from the "
+            f"others must predict each; record another{remark}"
         )
 
 
@@ -163,14 +209,27 @@ def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> l
     if count > BLOCKS:
         means_m = np.zeros((count, 3))
         for person in range(count):
-            theirs = [demonstration for demonstration, number in zip(demonstrations, person_of, strict=True) if number == person]
-            means_m[person] = np.mean([demonstration.tool[:, :3].mean(axis=0) for demonstration in theirs], axis=0)
+            theirs = [
+                demonstration
+                for demonstration, number in zip(demonstrations, person_of, strict=True)
+                if number == person
+            ]
+            means_m[person] = np.mean(
+                [demonstration.tool[:, :3].mean(axis=0) for demonstration in theirs], axis=0
+            )
         along = np.argsort(means_m[:, means_m.var(axis=0).argmax()], kind="stable").tolist()
         dealt = sorted(range(count), key=lambda rank: (rank % BLOCKS, rank))
         for number, rank in enumerate(dealt):
             number_of[along[rank]] = number
     return [
-        Take(name, number_of[person], demonstration, demonstration.hands, demonstration.tool, demonstration.gripper)
+        Take(
+            name,
+            number_of[person],
+            demonstration,
+            demonstration.hands,
+            demonstration.tool,
+            demonstration.gripper,
+        )
         for name, person, demonstration in zip(names, person_of, demonstrations, strict=True)
     ]
 
@@ -191,7 +250,8 @@ def _repeats(demonstrations: Sequence[Demonstration]) -> dict[int, int]:
     out: dict[int, int] = {}
     for i, demonstration in enumerate(demonstrations):
         motion = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
-        grid, shares = np.linspace(0.0, 1.0, COMPARED_TIMES), np.linspace(0.0, 1.0, len(motion))
+        grid = np.linspace(0.0, 1.0, COMPARED_TIMES)
+        shares = np.linspace(0.0, 1.0, len(motion))
         paths.append(np.stack([np.interp(grid, shares, column) for column in motion.T], axis=1))
         twins = (j for j in range(i) if j not in out and rms(paths[i] - paths[j]) < REPEATED_M)
         if (twin := next(twins, None)) is not None:

@@ -18,17 +18,32 @@ from thirdhand.workbench.learning.gate import Gate
 from thirdhand.workbench.learning.records import Figures, Row, Severity, Verdict
 
 ADVISED = 5  # demonstrations
-OUTLIER_TIMES, OUTLIER_MM = 2.5, 25.0  # an outlier's error is above this multiple of the median, and above this error
-NOTED_MM, RESIDUAL_MM = 50.0, 100.0  # limits of the held-out error
-EXPLAINED = 50.0  # [%] of the tool's variance: if the hands explain less, the mean position predicts nearly as well
-AMBIGUOUS, AMBIGUOUS_RESIDUAL, AMBIGUOUS_UNSAFE = 1.0, 10.0, 20.0  # [%] limits of the samples that contradict others
+# an outlier's error is above this multiple of the median, and above this error
+OUTLIER_TIMES = 2.5
+OUTLIER_MM = 25.0
+# limits of the held-out error
+NOTED_MM = 50.0
+RESIDUAL_MM = 100.0
+# [%] of the tool's variance: if the hands explain less, the mean position predicts nearly as well
+EXPLAINED = 50.0
+# [%] limits of the samples that contradict others
+AMBIGUOUS = 1.0
+AMBIGUOUS_RESIDUAL = 10.0
+AMBIGUOUS_UNSAFE = 20.0
 BEYOND_UNSAFE = 20.0  # [%] limit of the tool's path that is out of reach
 HELD = 5.0  # [%] limit of the time that the gate holds in demonstrations
-CAUGHT, CAUGHT_RESIDUAL = 95.0, 50.0  # [%] limits of the wrong samples that the gate must hold
-COVERAGE = {"50": (30.0, 80.0), "95": (88.0, 100.0)}  # [%] ranges of the samples inside the regions of 50 and 95 %
+# [%] limits of the wrong samples that the gate must hold
+CAUGHT = 95.0
+CAUGHT_RESIDUAL = 50.0
+COVERAGE = {
+    "50": (30.0, 80.0),
+    "95": (88.0, 100.0),
+}  # [%] ranges of the samples inside the regions of 50 and 95 %
 
 
-WRONG, LEAST_TOLD = 0.5, 80.0  # [%] from this share of wrong samples on, the skill must be unsure at this share of them
+# [%] from this share of wrong samples on, the skill must be unsure at this share of them
+WRONG = 0.5
+LEAST_TOLD = 80.0
 
 
 class Subject(NamedTuple):
@@ -59,7 +74,11 @@ class Subject(NamedTuple):
             return {"50": figures.all.within_50, "95": figures.all.within_95}
         if of == "wrong samples" and figures.alone is True:
             return {"the hand 30 cm beside": figures.beside}
-        return {"hands swapped": figures.swapped, "hands 30 cm beside": figures.beside} if of else {"": 0.0}
+        return (
+            {"hands swapped": figures.swapped, "hands 30 cm beside": figures.beside}
+            if of
+            else {"": 0.0}
+        )
 
 
 MORE = "; more demonstrations along the same paths, or named via-points (record --places), help"
@@ -113,68 +132,87 @@ RULES = (
     ),
     Rule(
         lambda s: len(s.frames) == 1 and s.frames[0] not in ("", BASE),
-        f"the demonstrations are in frame {{frames}}: it is taken to be {BASE!r}, the arm's base plate",
+        f"the demonstrations are in frame {{frames}}: it is taken to be {BASE!r}, the arm's base "
+        "plate",
         remedy=". If it is not, name the cell that maps this frame (--config)",
     ),
     Rule(
         lambda s: len(s.figures.demonstrations) < 3,
-        f"{{count}} demonstration(s) are too few to estimate the skill's errors; {ADVISED} or more advised",
-        severity=lambda s: "unsafe" if len(s.figures.demonstrations) > 1 and s.all.error_mm > NOTED_MM else "warning",
+        f"{{count}} demonstration(s) are too few to estimate the skill's errors; {ADVISED} or more "
+        "advised",
+        severity=lambda s: (
+            "unsafe"
+            if len(s.figures.demonstrations) > 1 and s.all.error_mm > NOTED_MM
+            else "warning"
+        ),
         remedy=", as they miss each other by {s.all.error_mm:.0f} mm: record more",
     ),
     Rule(
         lambda s: s.gate.floored or s.all.error_mm < 1000 * NOISE_M,
-        "the demonstrations have less noise than any tracker: were they computed? The gate allows for a tracker's "
-        "noise, and is {s.figures.gate_mm:.1f} mm",
-        remedy=". If they were recorded, nothing is wrong; learn what is to be served from recordings of the tracker",
+        "the demonstrations have less noise than any tracker: were they computed? The gate allows "
+        "for a tracker's noise, and is {s.figures.gate_mm:.1f} mm",
+        remedy=(
+            ". If they were recorded, nothing is wrong; learn what is to be served from recordings "
+            "of the tracker"
+        ),
     ),
     Rule(
         _is_unexplained,
-        "the hands explain too little of the tool's motion: {s.figures.explained:.0f} % of its variance in held-out "
-        f"demonstrations, at least {EXPLAINED:.0f} % needed; the error is {{s.all.error_mm:.0f}} mm",
+        "the hands explain too little of the tool's motion: {s.figures.explained:.0f} % of its "
+        f"variance in held-out demonstrations, at least {EXPLAINED:.0f} % needed; the error is "
+        "{s.all.error_mm:.0f} mm",
         severity=lambda s: "unsafe",
-        remedy=": name the via-points of the task (record --places, learn --places), let the hands lead the tool in "
-        "each demonstration, or record more that are alike",
+        remedy=": name the via-points of the task (record --places, learn --places), let the hands "
+        "lead the tool in each demonstration, or record more that are alike",
     ),
     Rule(
         lambda s: s.all.error_mm > NOTED_MM and not _is_unexplained(s),
-        f"held-out demonstrations are missed by {{s.all.error_mm:.0f}} mm, up to {RESIDUAL_MM:.0f} mm accepted",
+        f"held-out demonstrations are missed by {{s.all.error_mm:.0f}} mm, up to {RESIDUAL_MM:.0f} "
+        "mm accepted",
         severity=lambda s: "residual" if s.all.error_mm > RESIDUAL_MM else "warning",
     ),
     Rule(
         lambda s: _is_better(s) and not _is_timetable(s),
-        "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not {s.all.error_mm:.0f}",
-        remedy=". The hands say less about the tool than it seems, or the demonstrations are too few: name the "
-        "via-points of the task (record --places), or record more",
+        "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not "
+        "{s.all.error_mm:.0f}",
+        remedy=". The hands say less about the tool than it seems, or the demonstrations are too "
+        "few: name the via-points of the task (record --places), or record more",
         of="baselines",
     ),
     Rule(
         _is_timetable,
-        "the task is a timetable: the elapsed time predicts the tool with an error of {s.value:.0f} mm, the hands "
-        "with {s.all.error_mm:.0f} mm",
-        remedy=". Keep to the pace of the demonstrations, or let the hands lead the tool in each of them",
+        "the task is a timetable: the elapsed time predicts the tool with an error of "
+        "{s.value:.0f} mm, the hands with {s.all.error_mm:.0f} mm",
+        remedy=". Keep to the pace of the demonstrations, or let the hands lead the tool in each "
+        "of them",
         of="baselines",
     ),
     Rule(
-        lambda s: len(s.figures.demonstrations) > 2 and s.value > max(OUTLIER_TIMES * s.median_mm, OUTLIER_MM),
-        "{s.part} differs from the others: its error is {s.value:.0f} mm, the median {s.median_mm:.0f} mm",
-        remedy=": look at it (record NAME --show), and leave it out or record it again if it is wrong",
+        lambda s: (
+            len(s.figures.demonstrations) > 2
+            and s.value > max(OUTLIER_TIMES * s.median_mm, OUTLIER_MM)
+        ),
+        "{s.part} differs from the others: its error is {s.value:.0f} mm, the median "
+        "{s.median_mm:.0f} mm",
+        remedy=": look at it (record NAME --show), and leave it out or record it again if it is "
+        "wrong",
         of="demonstrations",
     ),
     Rule(
         lambda s: s.figures.ambiguous > AMBIGUOUS,
-        f"{{s.figures.ambiguous:.0f}} % of the samples contradict others, up to {AMBIGUOUS_RESIDUAL:.0f} % accepted: "
-        "{s.contradiction}",
+        "{s.figures.ambiguous:.0f} % of the samples contradict others, up to "
+        f"{AMBIGUOUS_RESIDUAL:.0f} % accepted: {{s.contradiction}}",
         severity=_of_contradictions,
-        remedy=". Leave out the demonstration that differs, or name the via-points between which the hands come by the "
-        "same position twice (record --places, learn --places)",
+        remedy=". Leave out the demonstration that differs, or name the via-points between which "
+        "the hands come by the same position twice (record --places, learn --places)",
     ),
     Rule(
         lambda s: s.figures.beyond_reach > 0,
-        f"{{s.figures.beyond_reach:.1f}} % of the tool's path is out of the arm's reach, up to {BEYOND_UNSAFE:.0f} % "
-        "accepted: is it in metres, in frame base?",
+        "{s.figures.beyond_reach:.1f} % of the tool's path is out of the arm's reach, up to "
+        f"{BEYOND_UNSAFE:.0f} % accepted: is it in metres, in frame base?",
         severity=lambda s: "unsafe" if s.figures.beyond_reach > BEYOND_UNSAFE else "warning",
-        remedy=" If it is, demonstrate nearer to the arm, move the arm, or name the cell of a longer one (--config)",
+        remedy=" If it is, demonstrate nearer to the arm, move the arm, or name the cell of a "
+        "longer one (--config)",
     ),
     Rule(
         lambda s: s.all.held > HELD,
@@ -182,21 +220,22 @@ RULES = (
     ),
     Rule(
         lambda s: s.gate.capped,
-        "hands are followed up to the largest deviation that is allowed, {s.figures.gate_mm:.0f} mm: the "
-        "demonstrations differ too much for a smaller one",
+        "hands are followed up to the largest deviation that is allowed, {s.figures.gate_mm:.0f} "
+        "mm: the demonstrations differ too much for a smaller one",
         severity=lambda s: "residual",
     ),
     Rule(
         lambda s: s.all.predicted_mm > s.scatter_mm > 0.0,
-        "the skill expects an error of {s.all.predicted_mm:.0f} mm, more than the tool moves about its mean position, "
-        "{s.scatter_mm:.0f} mm",
+        "the skill expects an error of {s.all.predicted_mm:.0f} mm, more than the tool moves about "
+        "its mean position, {s.scatter_mm:.0f} mm",
         severity=lambda s: "residual",
-        remedy=": a demonstration may be wrong, look at those with the largest errors (record NAME --show)",
+        remedy=": a demonstration may be wrong, look at those with the largest errors (record NAME "
+        "--show)",
     ),
     Rule(
         lambda s: s.value < CAUGHT_RESIDUAL,
-        f"the gate holds {{s.value:.1f}} % of {{s.part}}, {CAUGHT_RESIDUAL:.0f} % wanted: the arm follows hands "
-        "there, as those of the demonstrations go as far",
+        f"the gate holds {{s.value:.1f}} % of {{s.part}}, {CAUGHT_RESIDUAL:.0f} % wanted: the arm "
+        "follows hands there, as those of the demonstrations go as far",
         severity=lambda s: "residual",
         of="wrong samples",
     ),
@@ -212,8 +251,8 @@ RULES = (
     ),
     Rule(
         lambda s: s.all.wrong > WRONG and s.all.told is not None and s.all.told < LEAST_TOLD,
-        "{s.all.wrong:.1f} % of held-out samples are missed by more than 10 cm, and the skill is unsure at "
-        f"{{s.all.told:.0f}} % of these, {LEAST_TOLD:.0f} % wanted",
+        "{s.all.wrong:.1f} % of held-out samples are missed by more than 10 cm, and the skill "
+        f"is unsure at {{s.all.told:.0f}} % of these, {LEAST_TOLD:.0f} % wanted",
     ),
 )
 

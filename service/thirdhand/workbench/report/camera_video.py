@@ -19,8 +19,12 @@ from thirdhand.contract.images import CompressedImage
 from thirdhand.process.progress import say
 from thirdhand.recordings.recording import Recording
 
-CODEC, PIXELS = "h264", "yuv420p"
-OPTIONS = {"g": "2", "crf": "23"}  # a key frame at every second picture, as training reads at random
+CODEC = "h264"
+PIXELS = "yuv420p"
+OPTIONS = {
+    "g": "2",
+    "crf": "23",
+}  # a key frame at every second picture, as training reads at random
 SAMPLED = 10  # the statistics are those of one picture in this number
 
 
@@ -38,15 +42,24 @@ class _Video:
         import av  # an extra, as its libraries are large
 
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.path, self.fps, self.sampled, self.has_damaged = path, fps, list[list[NDArray[np.float64]]](), False
-        self.container, self._encoded = av.open(path, "w"), av.VideoFrame.from_image
+        self.path = path
+        self.fps = fps
+        self.sampled = list[list[NDArray[np.float64]]]()
+        self.has_damaged = False
+        self.container = av.open(path, "w")
+        self._encoded = av.VideoFrame.from_image
         self._stream: Any = self.container.add_stream(CODEC, rate=fps, options=OPTIONS)
-        self._stream.pix_fmt, self._stream.time_base = PIXELS, Fraction(1, fps)
+        self._stream.pix_fmt = PIXELS
+        self._stream.time_base = Fraction(1, fps)
         self._size: tuple[int, int] | None = None
 
     def begin(self, episodes: Sequence[CameraRows]) -> None:
         """Begin a recording with these episodes, whose images follow."""
-        self.rows = [(time_ns, i) for episode in episodes for i, time_ns in enumerate(episode.times_ns.tolist())][::-1]
+        self.rows = [
+            (time_ns, i)
+            for episode in episodes
+            for i, time_ns in enumerate(episode.times_ns.tolist())
+        ][::-1]
         self._newest: CompressedImage | None = None
         self._picture: Image.Image | None = None  # the last one that could be decoded
 
@@ -55,7 +68,8 @@ class _Video:
         ends the recording. In place of an image that cannot be decoded, the one before it is
         written, or else the next one.
         """
-        newest, picture = self._newest or image, None
+        newest = self._newest or image
+        picture = None
         if newest is not None and self.rows and self.rows[-1][0] < at_ns:
             picture = _opened(newest.data)
             self.has_damaged = self.has_damaged or picture is None
@@ -66,13 +80,18 @@ class _Video:
 
     def _write(self, picture: Image.Image, row: int) -> None:
         if self._size is None:
-            self._size = max(2, picture.width // 2 * 2), max(2, picture.height // 2 * 2)  # even, for the colours
+            self._size = (
+                max(2, picture.width // 2 * 2),
+                max(2, picture.height // 2 * 2),
+            )  # even, for the colours
             self._stream.width, self._stream.height = self._size
         frame = picture if picture.size == self._size else picture.resize(self._size)
         if row == 0:
             self.sampled.append([])
         if row % SAMPLED == 0:
-            self.sampled[-1].append(np.asarray(frame, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255)
+            self.sampled[-1].append(
+                np.asarray(frame, np.float64).reshape(-1, 3)[:: SAMPLED**2] / 255
+            )
         self.container.mux(self._stream.encode(self._encoded(frame)))
 
     def feature(self) -> dict[str, Any]:
@@ -80,10 +99,22 @@ class _Video:
         self.container.mux(self._stream.encode(None))
         assert self._size is not None
         width, height = self._size
-        about = {"height": height, "width": width, "channels": 3, "codec": CODEC, "pix_fmt": PIXELS, "fps": self.fps}
+        about = {
+            "height": height,
+            "width": width,
+            "channels": 3,
+            "codec": CODEC,
+            "pix_fmt": PIXELS,
+            "fps": self.fps,
+        }
         info = {f"video.{name}": value for name, value in about.items()}
         info |= {"video.is_depth_map": False, "has_audio": False}
-        return {"dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"], "info": info}
+        return {
+            "dtype": "video",
+            "shape": (height, width, 3),
+            "names": ["height", "width", "channels"],
+            "info": info,
+        }
 
 
 def _opened(file: bytes) -> Image.Image | None:
@@ -106,8 +137,11 @@ def write_videos(
     """
     videos: dict[str, _Video] = {}
     with contextlib.ExitStack() as closing:
-        for number, (_, group) in enumerate(itertools.groupby(episodes, lambda one: id(one.recording))):
-            parts, begun_keys = list(group), set[str]()
+        for number, (_, group) in enumerate(
+            itertools.groupby(episodes, lambda one: id(one.recording))
+        ):
+            parts = list(group)
+            begun_keys = set[str]()
             for key, image, at_ns in parts[0].recording.images():
                 if number == 0 and key not in videos:
                     videos[key] = _Video(path_of(key), fps)
@@ -127,5 +161,8 @@ def write_videos(
                     say(f"images of {key} cannot be decoded; it has no video")
         for key, video in videos.items():
             if video.has_damaged:
-                say(f"images of {key} cannot be decoded; in their place, its video has those beside them")
+                say(
+                    f"images of {key} cannot be decoded; in their place, its video has those "
+                    "beside them"
+                )
         return {key: (video.feature(), video.sampled) for key, video in sorted(videos.items())}

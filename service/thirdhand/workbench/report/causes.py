@@ -22,7 +22,8 @@ def why(columns: Columns, begin: int, end: int) -> Explanation:
     """Reason of frames [begin, end) in words, and what to do: from the first status among them, or,
     if none was recorded, from the first frame.
     """
-    frame, last = columns.frames[begin], int(columns.frames["tick"][end - 1])
+    frame = columns.frames[begin]
+    last = int(columns.frames["tick"][end - 1])
     named = word(Mode(int(frame["mode"]))), word(Reason(int(frame["reason"])))
     explanation = _by_frame(columns, begin)
     first = bisect.bisect_left(columns.statuses, int(frame["tick"]), key=lambda said: said.tick)
@@ -34,8 +35,11 @@ def why(columns: Columns, begin: int, end: int) -> Explanation:
 
 def _by_frame(columns: Columns, row: int) -> Explanation:
     frame = columns.frames[row]
-    tick, settings = int(frame["tick"]), columns.recording.settings
-    ages_ms = [None if age < 0 else age * columns.period_s * 1e3 for age in frame["hand_ages"].tolist()]
+    tick = int(frame["tick"])
+    settings = columns.recording.settings
+    ages_ms = [
+        None if age < 0 else age * columns.period_s * 1e3 for age in frame["hand_ages"].tolist()
+    ]
     stale_ms = (columns.stale_ticks[row] * columns.period_s * 1e3).tolist()
     sources = {
         side: Source(age_ms=age_ms, fresh=age_ms is not None and age_ms < limit_ms)
@@ -47,7 +51,14 @@ def _by_frame(columns: Columns, row: int) -> Explanation:
         settings=settings,
         gate_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
         measure="" if skill is None else skill.model.measure,
-        failure=next((order.text for order in reversed(columns.orders) if order.kind == "fault" and order.tick <= tick), ""),
+        failure=next(
+            (
+                order.text
+                for order in reversed(columns.orders)
+                if order.kind == "fault" and order.tick <= tick
+            ),
+            "",
+        ),
     )
     return explained(Reason(int(frame["reason"])), evidence)
 
@@ -58,18 +69,25 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
         yield "the fault is older than the recording"
         return
     yield _was_doing(columns, begin)
-    frames, tick = columns.frames, int(columns.frames["tick"][begin])
+    frames = columns.frames
+    tick = int(columns.frames["tick"][begin])
     first = max(0, begin - round(BEFORE_S / columns.period_s))
     more = frames["rejected"][begin].astype(np.int64) - frames["rejected"][first]
     if rejected := ", ".join(f"{more[cause]} {word(cause)}" for cause in Cause if more[cause] > 0):
         yield f"rejected in the second before: {rejected}"
     for name, cause, refused in _refused(columns, int(frames["tick"][first]), tick):
         yield f"{input_name(name)}: rejected as {cause}: {refused}"
-    timing = columns.timing[(columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)]
+    timing = columns.timing[
+        (columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)
+    ]
     if len(timing):
-        missed, late_us = int(timing["missed"][-1] - timing["missed"][0]), float(timing["lateness_us"].max())
+        missed = int(timing["missed"][-1] - timing["missed"][0])
+        late_us = float(timing["lateness_us"].max())
         if missed or late_us >= LATE_US:
-            yield f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} ms late"
+            yield (
+                f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} "
+                "ms late"
+            )
     for order in columns.orders:
         ago_s = (tick - order.tick) * columns.period_s
         if order.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
@@ -93,12 +111,17 @@ def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, st
 def _was_doing(columns: Columns, begin: int) -> str:
     frames = columns.frames
     last = frames[begin - 1]
-    mode, reason = Mode(int(last["mode"])), Reason(int(last["reason"]))
+    mode = Mode(int(last["mode"]))
+    reason = Reason(int(last["reason"]))
     differs = (frames["mode"][:begin] != mode) | (frames["reason"][:begin] != reason)
     since = begin - 1 - int(np.argmax(differs[::-1])) if differs.any() else 0
     lasts_s = (int(frames["tick"][begin]) - int(frames["tick"][since])) * columns.period_s
     doing = "it followed" if mode is Mode.FOLLOW else f"it held ({word(reason)})"
     flags = ", ".join(map(word, Flag(int(last["flags"]))))
     near = float(last["hand_distance"])
-    distance = f", the nearest hand {100 * near:.0f} cm from the arm" if (last["hand_ages"] >= 0).any() else ""
+    distance = (
+        f", the nearest hand {100 * near:.0f} cm from the arm"
+        if (last["hand_ages"] >= 0).any()
+        else ""
+    )
     return f"before it: {doing} for {lasts_s:.2f} s{f' with {flags}' if flags else ''}{distance}"

@@ -28,10 +28,37 @@ from thirdhand.recordings.steps import Gap, Step
 from thirdhand.skills.skill_file import SkillError, decoded
 
 KEPT = (
-    *("tick", "hands", "hand_velocities", "target", "gate_m", "setpoint", "setpoint_velocity", "setpoint_acceleration"),
-    *("tool", "joints", "joint_velocities", "joint_accelerations", "hand_distance", "hand_limit", "hand_ages"),
+    *(
+        "tick",
+        "hands",
+        "hand_velocities",
+        "target",
+        "gate_m",
+        "setpoint",
+        "setpoint_velocity",
+        "setpoint_acceleration",
+    ),
+    *(
+        "tool",
+        "joints",
+        "joint_velocities",
+        "joint_accelerations",
+        "hand_distance",
+        "hand_limit",
+        "hand_ages",
+    ),
     "stale_ticks",
-    *("rejected", "mode", "reason", "flags", "commanded", "segment", "segment_belief", "error_probability", "closure"),
+    *(
+        "rejected",
+        "mode",
+        "reason",
+        "flags",
+        "commanded",
+        "segment",
+        "segment_belief",
+        "error_probability",
+        "closure",
+    ),
 )
 MOTION = (
     "setpoint",
@@ -83,14 +110,22 @@ class Columns:
     recording: Recording
     frames: Records = field(default_factory=lambda: np.empty(0, TIMING))
     timing: Records = field(default_factory=lambda: np.empty(0, TIMING))
-    ticks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # of all ticks with a decision
-    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # their system clock's times
+    ticks: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, np.int64)
+    )  # of all ticks with a decision
+    times_ns: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, np.int64)
+    )  # their system clock's times
     gaps: list[str] = field(default_factory=list)
-    breaks: list[int] = field(default_factory=list)  # rows of `frames` before which some are missing
+    breaks: list[int] = field(
+        default_factory=list
+    )  # rows of `frames` before which some are missing
     orders: list[Order] = field(default_factory=list)
     skills: list[InForce] = field(default_factory=list)
     statuses: list[Said] = field(default_factory=list)
-    stops: dict[int, list[Any]] = field(default_factory=dict)  # measured joints by the last tick before
+    stops: dict[int, list[Any]] = field(
+        default_factory=dict
+    )  # measured joints by the last tick before
     samples: Counter[str] = field(default_factory=Counter)  # events by kind
     remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
 
@@ -112,7 +147,9 @@ class Columns:
     def stale_ticks(self) -> Records:
         """Age from which each hand is stale (T, 2); `stale_ms` where it was not recorded."""
         settings = self.recording.settings
-        ticks: Records = np.maximum(self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000))
+        ticks: Records = np.maximum(
+            self.frames["stale_ticks"], settings.ticks_in(settings.hands.stale_ms / 1000)
+        )
         return ticks
 
     @property
@@ -124,7 +161,9 @@ class Columns:
 
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
     """The columns of a recording. Raises RecordingError if it cannot be read."""
-    columns, last, gaps = Columns(recording), None, list[Gap]()
+    columns = Columns(recording)
+    last = None
+    gaps = list[Gap]()
     layout = frame_layout(len(recording.settings.joints.names))
     blocks: list[Records] = []
     block: list[Record] = []
@@ -161,12 +200,16 @@ def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks
             block.clear()
         if len(ticks) % BLOCK == 0:
             progress(len(ticks))
-    columns.frames, columns.timing = np.concatenate([*blocks, kept()]), np.array(timing, TIMING)
-    columns.ticks, columns.times_ns = np.array(ticks, np.int64), np.array(times_ns, np.int64)
+    columns.frames = np.concatenate([*blocks, kept()])
+    columns.timing = np.array(timing, TIMING)
+    columns.ticks = np.array(ticks, np.int64)
+    columns.times_ns = np.array(times_ns, np.int64)
     _fill(columns, columns.ticks)
     for _, text, _ in recording.notes("status"):
         with contextlib.suppress(msgspec.MsgspecError):  # of another version
-            columns.statuses.append(msgspec.convert(printable_values(msgspec.json.decode(text)), Said))
+            columns.statuses.append(
+                msgspec.convert(printable_values(msgspec.json.decode(text)), Said)
+            )
     columns.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
     if columns.skills and len(columns.frames):
         columns.skills[0] = columns.skills[0]._replace(tick=int(columns.frames["tick"][0]))
@@ -179,24 +222,32 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
     Such a row has the newest frame's decisions, as frames that change a decision are recorded. The
     arm's motion is interpolated up to the next frame, and other numbers if that decides the same.
     """
-    frames, parts = found.frames, np.zeros(len(ticks), np.int64)
+    frames = found.frames
+    parts = np.zeros(len(ticks), np.int64)
     if len(frames) == len(ticks) or not len(frames):
         return
     parts[found.breaks] = 1
     parts = np.cumsum(parts)
     part_of = parts[np.searchsorted(ticks, frames["tick"])]
     row = np.searchsorted(frames["tick"], ticks, side="right") - 1
-    is_known = (row >= 0) & (part_of[row] == parts)  # after damage, those before the next frame are unknown
+    is_known = (row >= 0) & (
+        part_of[row] == parts
+    )  # after damage, those before the next frame are unknown
     found.breaks = (np.flatnonzero(np.diff(parts[is_known])) + 1).tolist()
-    ticks, row = ticks[is_known], row[is_known]
+    ticks = ticks[is_known]
+    row = row[is_known]
     after = np.minimum(row + 1, len(frames) - 1)
-    begin, end = frames["tick"][row], frames["tick"][after]
-    motion = np.where(part_of[row] == part_of[after], (ticks - begin) / np.maximum(end - begin, 1), 0.0)
+    begin = frames["tick"][row]
+    end = frames["tick"][after]
+    motion = np.where(
+        part_of[row] == part_of[after], (ticks - begin) / np.maximum(end - begin, 1), 0.0
+    )
     alike = np.all([frames[name][row] == frames[name][after] for name in DECISIONS], axis=0)
     found.frames = frames[row]
     for name in KEPT:
         if frames.dtype[name].base.kind == "f":
-            values, to = frames[name][row], frames[name][after]
+            values = frames[name][row]
+            to = frames[name][after]
             share = motion if name in MOTION else motion * alike
             found.frames[name] += share.reshape(-1, *(1,) * (values.ndim - 1)) * (to - values)
     found.frames["tick"] = ticks

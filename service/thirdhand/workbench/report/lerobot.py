@@ -39,27 +39,49 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
     Joints are those of the newest joint state; before the first one, the previous command.
     """
     joint_settings = found.recording.settings.joints
-    frames, names = found.frames, joint_settings.names
+    frames = found.frames
+    names = joint_settings.names
     states = {-1: [np.nan] * len(names)}
     for step in found.recording.steps(outputs=False):
-        for state in (cdr.decode_joints(payload) for kind, payload in step.events if kind == "joints/state"):
+        for state in (
+            cdr.decode_joints(payload) for kind, payload in step.events if kind == "joints/state"
+        ):
             by_name = dict(zip(state.names, state.position, strict=False))
             states[step.tick] = [by_name.get(name, np.nan) for name in names]
-    ticks, joints = np.array([*states]), np.array([*states.values()])
+    ticks = np.array([*states])
+    joints = np.array([*states.values()])
     parts = np.repeat(np.arange(len(found.breaks) + 1), np.diff([0, *found.breaks, len(frames)]))
     ready = (frames["commanded"] != 0) & (frames["hand_ages"] >= 0).all(axis=1)
     for begin, end in runs(np.where(ready, parts, -1)):
         if ready[begin]:
             times = found.times[begin:end] - found.times[begin]
-            rows = begin - 1 + times.searchsorted(np.arange(0.0, times[-1] + 1e-6, 1 / fps) + 1e-6, side="right")
+            rows = (
+                begin
+                - 1
+                + times.searchsorted(np.arange(0.0, times[-1] + 1e-6, 1 / fps) + 1e-6, side="right")
+            )
             measured_joints = joints[ticks.searchsorted(frames["tick"][rows], side="right") - 1]
-            measured_joints = np.where(np.isnan(measured_joints), frames["joints"][np.maximum(rows - 1, begin)], measured_joints)
+            measured_joints = np.where(
+                np.isnan(measured_joints),
+                frames["joints"][np.maximum(rows - 1, begin)],
+                measured_joints,
+            )
             measured_joints = in_turn(joint_settings, measured_joints, frames["joints"][rows])
-            values = (measured_joints, frames["hands"][rows].reshape(-1, len(HANDS)), frames["joints"][rows])
-            part: Episode = {name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)}
+            values = (
+                measured_joints,
+                frames["hands"][rows].reshape(-1, len(HANDS)),
+                frames["joints"][rows],
+            )
+            part: Episode = {
+                name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)
+            }
             part["action.gripper"] = frames["closure"][rows].astype(np.float32)
-            part["observation.segment"] = np.where(frames["segment_belief"][rows] > 0, frames["segment"][rows], -1)
-            yield part | {"times_ns": found.times_ns[found.ticks.searchsorted(frames["tick"][rows])]}
+            part["observation.segment"] = np.where(
+                frames["segment_belief"][rows] > 0, frames["segment"][rows], -1
+            )
+            yield part | {
+                "times_ns": found.times_ns[found.ticks.searchsorted(frames["tick"][rows])]
+            }
 
 
 def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:
@@ -67,18 +89,30 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
 
     Raises ExplainedError if arms differ, or if there is no episode.
     """
-    pairs = [(columns.recording, part) for columns in recordings for part in episodes(columns, fps=fps)]
+    pairs = [
+        (columns.recording, part) for columns in recordings for part in episodes(columns, fps=fps)
+    ]
     parts = [part for _, part in pairs]
-    camera_rows = [CameraRows(recording, part.pop("times_ns").astype(np.int64)) for recording, part in pairs]
-    arm_specs = [(columns.recording.urdf, columns.recording.settings.joints.names) for columns in recordings]
+    camera_rows = [
+        CameraRows(recording, part.pop("times_ns").astype(np.int64)) for recording, part in pairs
+    ]
+    arm_specs = [
+        (columns.recording.urdf, columns.recording.settings.joints.names) for columns in recordings
+    ]
     arms = {(ElementTree.fromstring(urdf).get("name"), names) for urdf, names in arm_specs}
     if len(arms) > 1 or not parts:
-        why = "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
+        why = (
+            "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
+        )
         raise ExplainedError(f"no data set is written: {why}")
     ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
     for i, part in enumerate(parts):
         row = np.arange(ends[i + 1] - ends[i])
-        part |= {"timestamp": (row / fps).astype(np.float32), "frame_index": row, "episode_index": np.full_like(row, i)}
+        part |= {
+            "timestamp": (row / fps).astype(np.float32),
+            "frame_index": row,
+            "episode_index": np.full_like(row, i),
+        }
         part |= {"index": row + ends[i], "task_index": np.zeros_like(row)}
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     ((arm, joints),) = arms
@@ -88,21 +122,40 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     def video_of(key: str) -> Path:
         return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)
 
-    videos = {_named(key): video for key, video in write_videos(camera_rows, video_of, fps=fps).items()}
+    videos = {
+        _named(key): video for key, video in write_videos(camera_rows, video_of, fps=fps).items()
+    }
     info = {
-        "codebase_version": "v3.0", "robot_type": arm, "fps": fps, "splits": {"train": f"0:{len(parts)}"},
-        "total_episodes": len(parts), "total_frames": ends[-1], "total_tasks": 1, "chunks_size": 1000,
-        "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "data_path": f"data/{FILE}",
+        "codebase_version": "v3.0",
+        "robot_type": arm,
+        "fps": fps,
+        "splits": {"train": f"0:{len(parts)}"},
+        "total_episodes": len(parts),
+        "total_frames": ends[-1],
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "data_path": f"data/{FILE}",
         "video_path": VIDEO if videos else None,
         "features": {
-            name: {"dtype": str(column.dtype), "shape": column.shape[1:] or (1,), "names": names.get(name)}
+            name: {
+                "dtype": str(column.dtype),
+                "shape": column.shape[1:] or (1,),
+                "names": names.get(name),
+            }
             for name, column in whole.items()
-        } | {name: feature for name, (feature, _) in videos.items()},
-    }  # fmt: skip
+        }
+        | {name: feature for name, (feature, _) in videos.items()},
+    }
     about = [
         {"episode_index": i, "tasks": [task], "length": len(part["action"])}
         | {"dataset_from_index": ends[i], "dataset_to_index": ends[i + 1]}
-        | {f"{of}/{number}_index": 0 for of in ("data", "meta/episodes") for number in ("chunk", "file")}
+        | {
+            f"{of}/{number}_index": 0
+            for of in ("data", "meta/episodes")
+            for number in ("chunk", "file")
+        }
         | {f"videos/{name}/{number}_index": 0 for name in videos for number in ("chunk", "file")}
         | {
             f"videos/{name}/{side}_timestamp": ends[i + k] / fps
@@ -111,14 +164,26 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
         }
         | {
             f"stats/{name}/{kind}": value
-            for name, kinds in (_statistics(part) | _video_statistics(videos, slice(i, i + 1))).items()
+            for name, kinds in (
+                _statistics(part) | _video_statistics(videos, slice(i, i + 1))
+            ).items()
             for kind, value in kinds.items()
         }
         for i, part in enumerate(parts)
     ]
-    text = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    as_index = msgspec.json.encode({"index_columns": ["task"], "columns": [text], "column_indexes": []})  # for pandas
-    tasks = pa.table({"task_index": [0], "task": [task]}).replace_schema_metadata({"pandas": as_index})
+    text = {
+        "name": "task",
+        "field_name": "task",
+        "pandas_type": "unicode",
+        "numpy_type": "object",
+        "metadata": None,
+    }
+    as_index = msgspec.json.encode(
+        {"index_columns": ["task"], "columns": [text], "column_indexes": []}
+    )  # for pandas
+    tasks = pa.table({"task_index": [0], "task": [task]}).replace_schema_metadata(
+        {"pandas": as_index}
+    )
     meta = folder / "meta"
     _write(folder / "data" / first, *(_table(part) for part in parts))
     _write(meta / "episodes" / first, pa.Table.from_pylist(about))
@@ -144,7 +209,11 @@ def _write(path: Path, *groups: pa.Table) -> None:
 def _table(part: Episode) -> pa.Table:
     flat = {name: pa.array(column.ravel()) for name, column in part.items()}
     return pa.table(
-        flat | {name: pa.FixedSizeListArray.from_arrays(flat[name], part[name].shape[1]) for name in FEATURES}
+        flat
+        | {
+            name: pa.FixedSizeListArray.from_arrays(flat[name], part[name].shape[1])
+            for name in FEATURES
+        }
     )
 
 
@@ -152,13 +221,19 @@ def _statistics(columns: Episode) -> dict[str, dict[str, list[float]]]:
     statistics: dict[str, dict[str, list[float]]] = {}
     for name, column in columns.items():
         rows = column.reshape(len(column), -1).astype(np.float64)
-        statistics[name] = {kind: getattr(rows, kind)(axis=0).tolist() for kind in ("min", "max", "mean", "std")}
-        statistics[name] |= {f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0).tolist() for q in QUANTILES}
+        statistics[name] = {
+            kind: getattr(rows, kind)(axis=0).tolist() for kind in ("min", "max", "mean", "std")
+        }
+        statistics[name] |= {
+            f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0).tolist() for q in QUANTILES
+        }
         statistics[name]["count"] = [len(rows)]
     return statistics
 
 
-def _video_statistics(videos: Mapping[str, tuple[Any, list[Any]]], episodes: slice) -> dict[str, dict[str, Any]]:
+def _video_statistics(
+    videos: Mapping[str, tuple[Any, list[Any]]], episodes: slice
+) -> dict[str, dict[str, Any]]:
     """Statistics of the colours, 0 to 1, as (3, 1, 1) of sampled pictures."""
     statistics: dict[str, dict[str, Any]] = {}
     for name, (_, sampled) in videos.items():

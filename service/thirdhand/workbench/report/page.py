@@ -18,13 +18,17 @@ from thirdhand.settings import palette
 from thirdhand.workbench.report.report import Report
 from thirdhand.workbench.report.tables import Table, comparison, names_of, summary, tables
 
-LEFT, RIGHT, TOOL, TARGET = map(palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET))
+LEFT, RIGHT, TOOL, TARGET = map(
+    palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET)
+)
 NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
 LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.BY_MODE.items()}
 LETTER_SHARE = 0.011  # width of a letter / width of a plot
 POINTS = 1500  # most points of a curve
-LEAST_US, LEAST_MM = 10.0, 0.1  # smaller values are not shown
+# smaller values are not shown
+LEAST_US = 10.0
+LEAST_MM = 0.1
 SHOWN_PERCENT = 99.5  # an axis holds this share of the values; a note tells of the rest
 TINT = 0.08  # opacity of the background where the arm does not follow; gives palette.PAPER
 STYLE = """
@@ -55,7 +59,10 @@ def page(reports: Sequence[Report], *, progress: Callable[[int], None] = lambda 
         parts.append(f"<p><strong>{escape(verdict)}</strong></p>")
         parts += [f"<p>{escape(line)}</p>" for line in (printable(str(report.path)), *lines)]
         if len(report.columns.frames):
-            parts += [_svg(_over_time(report), f"{name}-time-"), _svg(_from_above(report), f"{name}-above-")]
+            parts += [
+                _svg(_over_time(report), f"{name}-time-"),
+                _svg(_from_above(report), f"{name}-above-"),
+            ]
         parts += [_table(table) for table in tables(report)]
         progress(i + 1)
     return _document(title, parts)
@@ -70,7 +77,8 @@ def page_of_many(shown: Sequence[Table]) -> str:
 def _document(title: str, parts: Sequence[str]) -> str:
     body = "\n".join(parts)
     return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta '
+        f'charset="utf-8">\n<title>{escape(title)}</title>\n'
         f'<meta name="viewport" content="width=device-width">\n<style>{STYLE}</style>\n</head>\n'
         f"<body>\n{body}\n</body>\n</html>\n"
     )
@@ -78,18 +86,28 @@ def _document(title: str, parts: Sequence[str]) -> str:
 
 def _table(table: Table) -> str:
     classes = [' class="number"' if table.is_number(i) else "" for i in range(len(table.heads))]
-    heads = "".join(f"<th{c}>{escape(head)}</th>" for c, head in zip(classes, table.heads, strict=True))
+    heads = "".join(
+        f"<th{c}>{escape(head)}</th>" for c, head in zip(classes, table.heads, strict=True)
+    )
     rows = (
-        "<tr>" + "".join(f"<td{c}>{escape(cell)}</td>" for c, cell in zip(classes, row, strict=True)) + "</tr>"
+        "<tr>"
+        + "".join(f"<td{c}>{escape(cell)}</td>" for c, cell in zip(classes, row, strict=True))
+        + "</tr>"
         for row in table.rows
     )
-    return f"<h3>{escape(table.title)}</h3>\n<table>\n<tr>{heads}</tr>\n" + "\n".join(rows) + "\n</table>"
+    return (
+        f"<h3>{escape(table.title)}</h3>\n<table>\n<tr>{heads}</tr>\n"
+        + "\n".join(rows)
+        + "\n</table>"
+    )
 
 
 def _svg(figure: Figure, salt: str) -> str:
     """The figure as an element of the page; `salt` makes its identifiers unique."""
     text = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
+    with mpl.rc_context(
+        {"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}
+    ):
         figure.savefig(text, format="svg", metadata={"Date": None})
     drawn = text.getvalue()
     return drawn[drawn.index("<svg") :]
@@ -97,7 +115,9 @@ def _svg(figure: Figure, salt: str) -> str:
 
 def _over_time(report: Report) -> Figure:
     """Modes, distances, errors, speeds and timing over time, one above the other."""
-    frames, times, timing = report.columns.frames, report.columns.times, report.columns.timing
+    frames = report.columns.frames
+    times = report.columns.times
+    timing = report.columns.timing
     rows = 6 if len(timing) else 5
     figure = Figure(figsize=(10.5, 2 * rows), layout="constrained")
     modes, *others = figure.subplots(rows, 1, sharex=True, height_ratios=(0.35, *(1,) * (rows - 1)))
@@ -107,16 +127,31 @@ def _over_time(report: Report) -> Figure:
         modes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, lw=0)
         if span.mode is not Mode.FOLLOW:
             for axes in others:
-                axes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, alpha=TINT, lw=0)
+                axes.axvspan(
+                    span.start_s, span.start_s + span.lasts_s, color=colour, alpha=TINT, lw=0
+                )
         if span.lasts_s > LETTER_SHARE * max(map(len, span.doing.split(": "))) * report.lasts_s:
-            modes.text(span.start_s + span.lasts_s / 2, 0.5, span.doing.replace(": ", "\n"), ha="center", va="center",
-                       color="white", fontsize=8)  # fmt: skip
+            modes.text(
+                span.start_s + span.lasts_s / 2,
+                0.5,
+                span.doing.replace(": ", "\n"),
+                ha="center",
+                va="center",
+                color="white",
+                fontsize=8,
+            )
     modes.set(yticks=[], ylim=(0, 1), xlim=(0, max(report.lasts_s, 1e-3)))
     for mode, colour in MODE_COLOURS.items():
         modes.plot([], [], color=colour, lw=6, label=str(mode.name).lower())
 
     is_seen = (frames["hand_ages"] >= 0).any(axis=1)
-    _curve(near, times, np.where(is_seen, 100 * frames["hand_distance"], np.nan), NEAREST, "nearest hand to the arm")
+    _curve(
+        near,
+        times,
+        np.where(is_seen, 100 * frames["hand_distance"], np.nan),
+        NEAREST,
+        "nearest hand to the arm",
+    )
     near.set(ylabel="distance [cm]", ylim=(0, None))
 
     following = frames["mode"] == Mode.FOLLOW
@@ -125,7 +160,11 @@ def _over_time(report: Report) -> Figure:
     measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
     gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
     _curve(errors, times, gate_m, OFF, " / ".join(measures))
-    errors.set(ylabel="error, deviation [mm]", yscale="log", ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)))
+    errors.set(
+        ylabel="error, deviation [mm]",
+        yscale="log",
+        ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)),
+    )
     errors.yaxis.set_major_formatter("{x:g}")
 
     predicted = following | (frames["error_probability"] > 0)
@@ -136,7 +175,9 @@ def _over_time(report: Report) -> Figure:
     for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
         hand_speed = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
         _curve(speed, times, hand_speed, colour, f"{side} hand")
-    _curve(speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint")
+    _curve(
+        speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint"
+    )
     speed.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
@@ -176,7 +217,9 @@ def _from_above(report: Report) -> Figure:
         axes.plot(x, y, "D", color=PLACE, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
     axes.plot(0, 0, "s", color=PLACE, ms=10)
-    axes.annotate("arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4")
+    axes.annotate(
+        "arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4"
+    )
     axes.set(xlabel="x [m]", ylabel="y [m]", title="From above")
     axes.set_aspect("equal", adjustable="datalim")
     axes.spines[["top", "right"]].set_visible(False)
@@ -195,7 +238,8 @@ def _path(axes: Any, points: Vector, colour: str, label: str) -> None:
 
 def _bounded(axes: Any, values: Vector) -> None:
     """Limit the axis, so that a few outliers do not flatten the rest."""
-    usual, largest = np.percentile(values, SHOWN_PERCENT), values.max(initial=0.0)
+    usual = np.percentile(values, SHOWN_PERCENT)
+    largest = values.max(initial=0.0)
     if largest > 2 * usual > 0:
         axes.set_ylim(0, 1.2 * usual)
         axes.set_title(f"up to {largest:.1f}, cut off", fontsize=8, loc="right")
@@ -211,5 +255,9 @@ def thinned(x: Vector, y: Vector, *, points: int = POINTS) -> tuple[Vector, Vect
     rows = []
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         valid = np.flatnonzero(~np.isnan(y[begin:end])) + begin
-        rows += sorted((int(valid[y[valid].argmin()]), int(valid[y[valid].argmax()]))) if len(valid) else [begin, begin]
+        rows += (
+            sorted((int(valid[y[valid].argmin()]), int(valid[y[valid].argmax()])))
+            if len(valid)
+            else [begin, begin]
+        )
     return x[rows], y[rows]

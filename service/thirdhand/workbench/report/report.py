@@ -149,16 +149,23 @@ class Report:
     """The report on one recording, made from its `columns`."""
 
     def __init__(self, columns: Columns) -> None:
-        recording, frames, timing = columns.recording, columns.frames, columns.timing
+        recording = columns.recording
+        frames = columns.frames
+        timing = columns.timing
         following = frames[frames["mode"] == Mode.FOLLOW]
         sent = frames[frames["commanded"] > 0]
         lasts_s = columns.seconds(int(frames["tick"][-1]) + 1) if len(frames) else 0.0
         begins = datetime.fromtimestamp(columns.start_ns / 1e9, tz=UTC)  # by the system clock
-        self.path, self.columns = recording.path, columns
-        self.begins = begins.strftime("%Y-%m-%d %H:%M:%S UTC") if len(frames) else "never: it holds no tick"
+        self.path = recording.path
+        self.columns = columns
+        self.begins = (
+            begins.strftime("%Y-%m-%d %H:%M:%S UTC") if len(frames) else "never: it holds no tick"
+        )
         self.week = begins.strftime("%G-W%V") if len(frames) else "never"
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
-        self.offer = offer_of(columns.skills[-1].skill) if columns.skills else ""  # of its last skill
+        self.offer = (
+            offer_of(columns.skills[-1].skill) if columns.skills else ""
+        )  # of its last skill
         self.lasts_s = lasts_s
         self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))
@@ -168,13 +175,21 @@ class Report:
         self.work_us = Percentiles.of(timing["work_us"])
         self.latency_ms = Percentiles.of(timing["latency_us"][timing["latency_us"] > 0] / 1000.0)
         lag_mm = 1000 * np.linalg.norm(following["tool"] - following["target"], axis=1)
-        reached = int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
-        self.initial_mm = Percentiles.of(lag_mm[:reached])  # tool to target, before it reached the first target
+        reached = (
+            int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
+        )
+        self.initial_mm = Percentiles.of(
+            lag_mm[:reached]
+        )  # tool to target, before it reached the first target
         self.initial_s = reached * columns.period_s
         engaging = following["flags"][reached:] & int(Flag.ENGAGING) > 0
-        self.lag_mm = Percentiles.of(lag_mm[reached:][~engaging])  # tool to target afterwards, once it has engaged
+        self.lag_mm = Percentiles.of(
+            lag_mm[reached:][~engaging]
+        )  # tool to target afterwards, once it has engaged
         self.approach = _approach(columns, self.spans)
-        self.stop_mm, self.stop_excess_mm = map(Percentiles.of, np.array([*_stops_mm(columns)]).reshape(-1, 2).T)
+        self.stop_mm, self.stop_excess_mm = map(
+            Percentiles.of, np.array([*_stops_mm(columns)]).reshape(-1, 2).T
+        )
         self.places = tuple(places(columns))
         self.segments = tuple(segments(columns))
         self.limits = tuple(_limits(columns))
@@ -183,8 +198,12 @@ class Report:
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
         is_seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] < columns.stale_ticks)
-        seen_s = np.maximum(is_seen.sum(axis=0), 1) * columns.period_s  # time in which each hand was seen
-        self.hands_hz = {side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)}
+        seen_s = (
+            np.maximum(is_seen.sum(axis=0), 1) * columns.period_s
+        )  # time in which each hand was seen
+        self.hands_hz = {
+            side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)
+        }
 
     @property
     def faults(self) -> tuple[Span, ...]:
@@ -197,12 +216,20 @@ class Report:
 
     def best_m(self, name: str) -> float | None:
         """The tool's least distance from a via-point of this name [m]; None without a visit."""
-        return min((p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None)
+        return min(
+            (p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None
+        )
 
     def overview(self) -> Overview:
         """The figures of this recording, and where they belong among those of many."""
         cell = self.columns.recording.settings.cell
-        return Overview(Path(self.path), cell, self.week, self.begins, {figure.name: figure for figure in self.figures()})
+        return Overview(
+            Path(self.path),
+            cell,
+            self.week,
+            self.begins,
+            {figure.name: figure for figure in self.figures()},
+        )
 
     def figures(self) -> Iterator[Figure]:
         """The numbers for a comparison of recordings."""
@@ -222,7 +249,9 @@ class Report:
             ("tool to target, initial approach", self.initial_mm, "mm", 1),
             ("tool to target", self.lag_mm, "mm", 1),
         ):
-            for share, value in zip(("median", "99 %", "largest"), percentiles or (None,) * 3, strict=False):
+            for share, value in zip(
+                ("median", "99 %", "largest"), percentiles or (None,) * 3, strict=False
+            ):
                 yield Figure(f"{name}, {share}", value, unit, digits)
         yield Figure("closest approach", self.approach and 1000 * self.approach.distance_m, "mm", 0)
         touched = {limit.name: limit.lasts_s for limit in self.limits}
@@ -248,14 +277,23 @@ def reported(path: str | Path, *, progress: Callable[[int], None] = lambda ticks
 
 def _spans(columns: Columns) -> Iterator[Span]:
     """The times in one mode and reason, in order."""
-    frames, times, period_s = columns.frames, columns.times, columns.period_s
+    frames = columns.frames
+    times = columns.times
+    period_s = columns.period_s
     pieces = np.zeros(len(frames), np.int64)
     pieces[columns.breaks] = 1
     for begin, end in runs((np.cumsum(pieces) * 256 + frames["mode"]) * 256 + frames["reason"]):
-        mode, reason = Mode(int(frames["mode"][begin])), Reason(int(frames["reason"][begin]))
+        mode = Mode(int(frames["mode"][begin]))
+        reason = Reason(int(frames["reason"][begin]))
         whole = end == len(frames) or end in columns.breaks
         until = float(times[end - 1]) + period_s if whole else float(times[end])
-        span = Span(float(times[begin]), until - float(times[begin]), mode, reason, *why(columns, begin, end))
+        span = Span(
+            float(times[begin]),
+            until - float(times[begin]),
+            mode,
+            reason,
+            *why(columns, begin, end),
+        )
         if mode is Mode.FAULT:
             span = span._replace(before=tuple(before(columns, begin)), ended=_ended(columns, span))
         yield span
@@ -265,7 +303,11 @@ def _ended(columns: Columns, fault: Span) -> str:
     if fault.end_s > columns.times[-1]:
         return "not ended in this recording"
     resets = [columns.seconds(order.tick) for order in columns.orders if order.kind == "reset"]
-    by = "a `reset`" if any(abs(reset_s - fault.end_s) < 0.1 for reset_s in resets) else "a cause that is not recorded"
+    by = (
+        "a `reset`"
+        if any(abs(reset_s - fault.end_s) < 0.1 for reset_s in resets)
+        else "a cause that is not recorded"
+    )
     return f"ended by {by} after {fault.lasts_s:.1f} s"
 
 
@@ -279,7 +321,9 @@ def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
     row = int(seen_rows[frames["hand_distance"][seen_rows].argmin()])
     at_s = float(columns.times[row])
     doing = next(span.doing for span in reversed(spans) if span.start_s <= at_s)
-    return Approach(float(frames["hand_distance"][row]), at_s, doing, float(frames["hand_limit"][row]))
+    return Approach(
+        float(frames["hand_distance"][row]), at_s, doing, float(frames["hand_limit"][row])
+    )
 
 
 def _stops_mm(columns: Columns) -> Iterator[tuple[float, float]]:
@@ -295,7 +339,9 @@ def _stops_mm(columns: Columns) -> Iterator[tuple[float, float]]:
     for tick, joints in columns.stops.items():
         tool_m = np.array([arm.at(np.array(q)).position for q in joints])
         distance_m = np.linalg.norm(tool_m - tool_m[0], axis=1).max()
-        speed_mps = np.linalg.norm(columns.frames["setpoint_velocity"][columns.frames["tick"] == tick])
+        speed_mps = np.linalg.norm(
+            columns.frames["setpoint_velocity"][columns.frames["tick"] == tick]
+        )
         assumed_m = speed_mps * (people.reaction_ms / 1000 + speed_mps / people.brake / 2)
         yield 1000 * distance_m, 1000 * (distance_m - assumed_m)
 
@@ -310,14 +356,20 @@ def _limits(columns: Columns) -> Iterator[Limit]:
 def _limit(columns: Columns, name: str, met: NDArray[np.bool_]) -> Limit:
     """A limit that was met at some frames (T,)."""
     begins = [begin for begin, _ in runs(met) if met[begin]]
-    return Limit(name, float(met.sum()) * columns.period_s, len(begins), float(columns.times[begins[0]]))
+    return Limit(
+        name, float(met.sum()) * columns.period_s, len(begins), float(columns.times[begins[0]])
+    )
 
 
 def _binding(columns: Columns) -> Iterator[Limit]:
     """The limits that the motion met, the one that bound longest first."""
-    from thirdhand.core.tool_limits import binding  # its import is slow, and other parts of this module need none
+    from thirdhand.core.tool_limits import (
+        binding,
+    )  # its import is slow, and other parts of this module need none
 
-    limits = [_limit(columns, *entry) for entry in binding(columns.recording.settings, columns.frames)]
+    limits = [
+        _limit(columns, *entry) for entry in binding(columns.recording.settings, columns.frames)
+    ]
     yield from sorted(limits, key=lambda limit: -limit.lasts_s)
 
 
@@ -331,8 +383,10 @@ def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
     moving = moving[:: -(-len(moving) // JUDGED_POSTURES) or 1]
     if not len(moving) or not columns.recording.urdf:
         return {}
-    settings, velocities = columns.recording.settings, moving["setpoint_velocity"]
-    arm, directions = Arm(settings, columns.recording.urdf), velocities / np.linalg.norm(velocities, axis=1)[:, None]
+    settings = columns.recording.settings
+    velocities = moving["setpoint_velocity"]
+    arm = Arm(settings, columns.recording.urdf)
+    directions = velocities / np.linalg.norm(velocities, axis=1)[:, None]
     return {
         ANY_DIRECTION: tool_limits(arm, settings, moving["joints"]),
         ALONG_TASK: tool_limits(arm, settings, moving["joints"], directions),
@@ -341,7 +395,8 @@ def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
 
 def _joints(columns: Columns, sent: Any) -> Iterator[Joint]:
     limits = columns.recording.settings.joints
-    low, high = sent["joints"] - np.array(limits.lower), np.array(limits.upper) - sent["joints"]
+    low = sent["joints"] - np.array(limits.lower)
+    high = np.array(limits.upper) - sent["joints"]
     margin = np.minimum(low, high).min(axis=0)
     speed = np.abs(sent["joint_velocities"]).max(axis=0) / np.array(limits.velocity)
     acceleration = np.abs(sent["joint_accelerations"]).max(axis=0) / np.array(limits.acceleration)
@@ -356,7 +411,9 @@ def _rejections(columns: Columns) -> Iterator[Rejection]:
     for cause in Cause:
         more = counts[:, cause] - counts[0, cause]
         if more[-1]:
-            yield Rejection(word(cause), int(more[-1]), float(columns.times[int(np.argmax(more > 0))]))
+            yield Rejection(
+                word(cause), int(more[-1]), float(columns.times[int(np.argmax(more > 0))])
+            )
 
 
 def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]:
@@ -388,16 +445,30 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
     """A sentence on what kept the tool from a via-point between two times [s], which count from
     `begun_s` of the recording.
     """
-    begin_s, until_s = begun_s + start_s, begun_s + end_s
-    stops = [s for s in found.spans if s.mode is not Mode.FOLLOW and s.start_s < until_s and s.end_s > begin_s]
+    begin_s = begun_s + start_s
+    until_s = begun_s + end_s
+    stops = [
+        s
+        for s in found.spans
+        if s.mode is not Mode.FOLLOW and s.start_s < until_s and s.end_s > begin_s
+    ]
     if stops:
         worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
-        outcome, at_s = "was at fault" if worst.mode is Mode.FAULT else "held", worst.start_s - begun_s
+        outcome = "was at fault" if worst.mode is Mode.FAULT else "held"
+        at_s = worst.start_s - begun_s
         since = f"from {at_s:.1f} s on" if at_s > 0 else "from before the script began"
-        return f"the arm {outcome} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: {worst.why}"
+        return (
+            f"the arm {outcome} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: "
+            f"{worst.why}"
+        )
     hands_m = [point.hands_m for point in found.places if point.name == place]
     if not hands_m:
         return f"no place {place!r} was taught"
     if best := found.best_m(place):
-        return f"with the hands where {place!r} was taught, the tool came no nearer than {1000 * best:.0f} mm"
-    return f"the hands came no nearer than {100 * min(hands_m):.0f} cm to where {place!r} was taught"
+        return (
+            f"with the hands where {place!r} was taught, the tool came no nearer than "
+            f"{1000 * best:.0f} mm"
+        )
+    return (
+        f"the hands came no nearer than {100 * min(hands_m):.0f} cm to where {place!r} was taught"
+    )

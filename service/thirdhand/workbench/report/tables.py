@@ -11,7 +11,15 @@ from typing import NamedTuple
 from thirdhand.contract.incidents import what_happened, what_to_do, word
 from thirdhand.contract.printable import printable
 from thirdhand.contract.records import Mode
-from thirdhand.workbench.report.report import Figure, Joint, Overview, Percentiles, Report, Span, differing_settings
+from thirdhand.workbench.report.report import (
+    Figure,
+    Joint,
+    Overview,
+    Percentiles,
+    Report,
+    Span,
+    differing_settings,
+)
 
 NONE = "-"
 IN_A_ROW = {  # figures of a recording among many, with the heads of their columns
@@ -46,9 +54,15 @@ def tables(report: Report) -> Iterator[Table]:
 
 
 def _tables(report: Report) -> Iterator[Table]:
-    yield Table("missing", "Missing in the recording", ("what",), tuple((line,) for line in report.lacks))
-    spans = tuple((_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans)
-    yield Table("modes", "Modes of the arm", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0)
+    yield Table(
+        "missing", "Missing in the recording", ("what",), tuple((line,) for line in report.lacks)
+    )
+    spans = tuple(
+        (_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans
+    )
+    yield Table(
+        "modes", "Modes of the arm", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0
+    )
     yield Table(
         "faults",
         "Faults",
@@ -60,7 +74,15 @@ def _tables(report: Report) -> Iterator[Table]:
         "segments",
         "Segments of the task",
         ("from [s]", "for [s]", "segment", "probability [%]"),
-        tuple((_s(segment.start_s), _s(segment.lasts_s), segment.name, f"{100 * segment.probable:.0f}") for segment in report.segments),
+        tuple(
+            (
+                _s(segment.start_s),
+                _s(segment.lasts_s),
+                segment.name,
+                f"{100 * segment.probable:.0f}",
+            )
+            for segment in report.segments
+        ),
         numbers=0,
     )
     yield Table(
@@ -91,7 +113,12 @@ def _tables(report: Report) -> Iterator[Table]:
         "Timing and accuracy",
         ("what", "median", "99 %", "largest", "unit", "values"),
         tuple(
-            (name, *(f"{value:.{digits}f}" for value in percentiles[:3]), unit, str(percentiles.samples))
+            (
+                name,
+                *(f"{value:.{digits}f}" for value in percentiles[:3]),
+                unit,
+                str(percentiles.samples),
+            )
             for name, percentiles, unit, digits in _times(report)
             if percentiles is not None
         ),
@@ -102,7 +129,14 @@ def _tables(report: Report) -> Iterator[Table]:
             "approach",
             "Closest approach of the arm to a hand",
             ("distance [cm]", "at [s]", "mode then", "allowed speed toward it [m/s]"),
-            ((f"{100 * near.distance_m:.1f}", _s(near.at_s), near.doing, f"{near.allowed_m_s:.2f}"),),
+            (
+                (
+                    f"{100 * near.distance_m:.1f}",
+                    _s(near.at_s),
+                    near.doing,
+                    f"{near.allowed_m_s:.2f}",
+                ),
+            ),
             numbers=0,
         )
     yield Table(
@@ -110,7 +144,13 @@ def _tables(report: Report) -> Iterator[Table]:
         "Active limits",
         ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
         tuple(
-            (limit.name, _s(limit.lasts_s), str(limit.times), _s(limit.first_s), what_happened(limit.name))
+            (
+                limit.name,
+                _s(limit.lasts_s),
+                str(limit.times),
+                _s(limit.first_s),
+                what_happened(limit.name),
+            )
             for limit in report.limits
         ),
         numbers=0,
@@ -121,7 +161,13 @@ def _tables(report: Report) -> Iterator[Table]:
         "What limited the tool while it followed",
         ("limit", "for [s]", "share [%]", "times", "first at [s]"),
         tuple(
-            (limit.name, _s(limit.lasts_s), f"{100 * limit.lasts_s / followed_s:.1f}", str(limit.times), _s(limit.first_s))
+            (
+                limit.name,
+                _s(limit.lasts_s),
+                f"{100 * limit.lasts_s / followed_s:.1f}",
+                str(limit.times),
+                _s(limit.first_s),
+            )
             for limit in report.binding
         ),
     )
@@ -146,14 +192,28 @@ def _tables(report: Report) -> Iterator[Table]:
         "Use of the joints' limits",
         ("joint", "from a limit [rad]", "speed [% of limit]", "acceleration [% of limit]"),
         tuple(
-            (joint.name, _margin(joint), f"{100 * joint.speed:.0f}", f"{100 * joint.acceleration:.0f}") for joint in report.joints
+            (
+                joint.name,
+                _margin(joint),
+                f"{100 * joint.speed:.0f}",
+                f"{100 * joint.acceleration:.0f}",
+            )
+            for joint in report.joints
         ),
     )
     yield Table(
         "rejections",
         "Rejected samples",
         ("cause", "count [samples]", "first at [s]", "what to do"),
-        tuple((rejection.cause, str(rejection.samples), _s(rejection.first_s), what_to_do(rejection.cause)) for rejection in report.rejections),
+        tuple(
+            (
+                rejection.cause,
+                str(rejection.samples),
+                _s(rejection.first_s),
+                what_to_do(rejection.cause),
+            )
+            for rejection in report.rejections
+        ),
         numbers=0,
     )
 
@@ -188,29 +248,51 @@ def verdict(report: Report) -> str:
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
     following = [span for span in report.spans if span.mode is Mode.FOLLOW]
-    first_s, last_s = (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
+    first_s, last_s = (
+        (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
+    )
     holds = [span for span in report.spans if span.mode is Mode.HOLD]
     waited = [span for span in holds if span.start_s < first_s]
     ended = [span for span in holds if span.start_s >= last_s]
     if report.spans[-1].mode is Mode.FAULT:
         ended = []  # a fault is no end of a session
-    stops = [span for span in report.spans if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)]
+    stops = [
+        span
+        for span in report.spans
+        if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)
+    ]
     faults = len(report.faults)
     counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
     if stops:
         worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
         most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
     else:
-        most = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+        most = (
+            f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+        )
         if initial := report.initial_mm:
-            approach = f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
-            most = f"{most}, after an {approach}" if report.lag_mm else f"an {approach} and did not reach the target"
+            approach = (
+                f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
+            )
+            most = (
+                f"{most}, after an {approach}"
+                if report.lag_mm
+                else f"an {approach} and did not reach the target"
+            )
     lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
     since = f", from {first_s:.1f} s on" if waited else ""
     since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
-    end = f" It ended with {ended[0].doing}, {report.lasts_s - ended[0].start_s:.1f} s before the end." if ended else ""
+    end = (
+        f" It ended with {ended[0].doing}, {report.lasts_s - ended[0].start_s:.1f} s before the "
+        "end."
+        if ended
+        else ""
+    )
     followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
-    return f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was {most}.{end}"
+    return (
+        f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was "
+        f"{most}.{end}"
+    )
 
 
 def _times_of(count: int, what: str) -> str:
@@ -224,7 +306,9 @@ def summary(report: Report) -> list[str]:
     return [
         verdict(report),
         f"{report.begins}, {report.lasts_s:.1f} s, skill {report.skill}",
-        f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}." if lacks else NOTHING_MISSING,
+        f"Something is missing in it, {'once' if lacks == 1 else f'{lacks} times'}."
+        if lacks
+        else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
         *([f"{report.offer[0].upper()}{report.offer[1:]}."] if report.offer else []),
     ]
@@ -238,12 +322,22 @@ def comparison(reports: Sequence[Report]) -> Iterator[Table]:
     first, other = reports
     names = names_of([first.path, other.path])
     yield side_by_side(names, first.overview().figures, other.overview().figures)
-    settings = tuple((name, _short(a), _short(b)) for name, a, b in differing_settings(first, other))
+    settings = tuple(
+        (name, _short(a), _short(b)) for name, a, b in differing_settings(first, other)
+    )
     if settings:
-        yield Table("settings", "Settings, versions and machine that differ", ("what", *names), settings, numbers=9)
+        yield Table(
+            "settings",
+            "Settings, versions and machine that differ",
+            ("what", *names),
+            settings,
+            numbers=9,
+        )
 
 
-def side_by_side(names: Sequence[str], one: Mapping[str, Figure], other: Mapping[str, Figure]) -> Table:
+def side_by_side(
+    names: Sequence[str], one: Mapping[str, Figure], other: Mapping[str, Figure]
+) -> Table:
     """Figures of two recordings and their differences, without those that are 0 in both."""
     rows = []
     for name, figure in {**other, **one}.items():
@@ -285,18 +379,45 @@ def _totals(recordings: Sequence[Overview]) -> Table:
             held_s.update(recording.holds_s)
         holds = ", ".join(f"{reason} {seconds:.1f} s" for reason, seconds in held_s.most_common())
         share = _share(followed_s, lasts_s)
-        rows.append((cell, week, str(len(group)), f"{lasts_s / 3600:.2f}", share, f"{faults:.0f}", holds or NONE))
-    heads = ("cell", "week", "recordings [1]", "recorded [h]", "followed [%]", "faults [1]", "holds")
+        rows.append(
+            (
+                cell,
+                week,
+                str(len(group)),
+                f"{lasts_s / 3600:.2f}",
+                share,
+                f"{faults:.0f}",
+                holds or NONE,
+            )
+        )
+    heads = (
+        "cell",
+        "week",
+        "recordings [1]",
+        "recorded [h]",
+        "followed [%]",
+        "faults [1]",
+        "holds",
+    )
     return Table("totals", "Totals by cell and week", heads, tuple(rows), numbers=0)
 
 
 def every_figure(recordings: Sequence[Overview]) -> Table:
     """A row for each recording with all its figures."""
-    figures = {name: figure for recording in recordings for name, figure in recording.figures.items()}
+    figures = {
+        name: figure for recording in recordings for name, figure in recording.figures.items()
+    }
     rows = []
     for recording in recordings:
-        values = (_value(figures[name], recording.figures[name].value if name in recording.figures else None) for name in figures)
-        rows.append((str(recording.path), recording.cell, recording.week, recording.begins, *values))
+        values = (
+            _value(
+                figures[name], recording.figures[name].value if name in recording.figures else None
+            )
+            for name in figures
+        )
+        rows.append(
+            (str(recording.path), recording.cell, recording.week, recording.begins, *values)
+        )
     heads = ("recording", "cell", "week", "begins", *map(_with_unit, figures.values()))
     return Table("figures", "All figures", heads, tuple(rows), numbers=4)
 

@@ -11,7 +11,9 @@ from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Records, Vector
 from thirdhand.workbench.report.columns import Columns, runs
 
-NEAR_M = 0.03  # hands visit a via-point if nearer than this, or than its radius, to where it was taught
+NEAR_M = (
+    0.03  # hands visit a via-point if nearer than this, or than its radius, to where it was taught
+)
 PAUSE_S = 0.3  # hands that leave for a shorter time have not left
 LEAST_S = 0.1  # a shorter visit does not count
 SETTLED_S = 0.1  # the tool's final distance is averaged over this time at the end of a visit
@@ -48,14 +50,23 @@ class Place(NamedTuple):
 
 def places(columns: Columns) -> list[Place]:
     """Every via-point that was in force at some time, in the order of teaching."""
-    ticks, times = columns.frames["tick"], columns.times
+    ticks = columns.frames["tick"]
+    times = columns.times
     results: list[Place] = []
     for point, conductor, begin, end in _taught(columns):
         within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
         frames = columns.frames[within]
         if len(frames):
             nearest, visits = _visits(point, conductor, frames, times[within], columns.period_s)
-            results.append(Place(point.name, float(times[within][0]), float(times[within][-1]), nearest, tuple(visits)))
+            results.append(
+                Place(
+                    point.name,
+                    float(times[within][0]),
+                    float(times[within][-1]),
+                    nearest,
+                    tuple(visits),
+                )
+            )
     return results
 
 
@@ -70,7 +81,9 @@ def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:
         over += [(*key, begun.pop(key), tick) for key in list(begun) if key not in in_force]
         for point in skill.via_points:
             begun.setdefault((point, skill.conductor), tick)
-    return sorted([*over, *((*key, tick, np.inf) for key, tick in begun.items())], key=lambda one: one[2])
+    return sorted(
+        [*over, *((*key, tick, np.inf) for key, tick in begun.items())], key=lambda one: one[2]
+    )
 
 
 def _visits(
@@ -78,7 +91,8 @@ def _visits(
 ) -> tuple[float, list[Visit]]:
     """The least distance of the hands, and their visits."""
     sides = [0, 1] if conductor is None else [conductor] * 2
-    taught, hands = np.array([point.left, point.right])[sides], frames["hands"][:, sides]
+    taught = np.array([point.left, point.right])[sides]
+    hands = frames["hands"][:, sides]
     is_seen = (frames["hand_ages"][:, sides] >= 0).all(axis=1)
     away = np.where(is_seen, np.linalg.norm(hands - taught, axis=2).max(axis=1), np.inf)
     target_m = np.array(point.tool)
@@ -87,7 +101,9 @@ def _visits(
         target_m = target_m + hands[:, side] - taught[side]
     error_m = np.linalg.norm(frames["tool"] - target_m, axis=1)
     is_near = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
-    visits, least, settled = [], round(LEAST_S / period_s), max(1, round(SETTLED_S / period_s))
+    visits = []
+    least = round(LEAST_S / period_s)
+    settled = max(1, round(SETTLED_S / period_s))
     for begin, end in runs(is_near):
         if is_near[begin] and end - begin >= least:
             visits.append(

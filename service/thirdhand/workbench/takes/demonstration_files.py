@@ -25,7 +25,9 @@ from thirdhand.workbench.takes.track import Track
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # after this time without a sample the daemon holds for a stale hand
 GAP_RATIO = 5.0  # nothing was seen in a gap longer than GAP_S and 5 usual gaps
-EDGE_S = 0.3  # a take begins or ends in motion if this first or last time is faster than EDGE_SPEED_MPS
+EDGE_S = (
+    0.3  # a take begins or ends in motion if this first or last time is faster than EDGE_SPEED_MPS
+)
 EDGE_SPEED_MPS = 0.1
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLOT_COLUMNS = 60  # characters in a line of the speed plot
@@ -67,7 +69,9 @@ def path_of(folder: Path, name: str) -> Path:
     """The path of a take of this name. Raises DemonstrationNameError."""
     name = name.removesuffix(".mcap")
     if not re.fullmatch(NAME, name):
-        raise DemonstrationNameError(f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name")
+        raise DemonstrationNameError(
+            f"{name!r}: 1 to 64 letters, digits, spaces and . _ - accepted as a take's name"
+        )
     return folder / f"{name}.mcap"
 
 
@@ -85,8 +89,13 @@ def demonstration_paths(folder: Path) -> list[Path]:
     """The files of the takes in a folder, sorted by number: `take-2` before `take-10`. Raises
     OSError.
     """
-    paths = [path for path in folder.iterdir() if path.suffix == ".mcap"]  # glob finds nothing where it may not read
-    return sorted(paths, key=lambda path: [int(x) if x.isdigit() else 0 for x in re.split(r"(\d+)", path.stem)])
+    paths = [
+        path for path in folder.iterdir() if path.suffix == ".mcap"
+    ]  # glob finds nothing where it may not read
+    return sorted(
+        paths,
+        key=lambda path: [int(x) if x.isdigit() else 0 for x in re.split(r"(\d+)", path.stem)],
+    )
 
 
 def summary(path: Path, *, settings: Settings | None = None) -> Summary:
@@ -96,9 +105,19 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     remarks = [line.removeprefix(f"{path}: ") for line in remarks]
     recorded = PoseRecording(path)
     tracks = chosen(recorded, {}, settings or recorded.settings or Settings()).tracks
-    sides = [side for side in TRACK_NAMES if side == "tool" or demonstration.conducts in ("both", side)]
-    streams = tuple(_stream(side, track) for side, track in zip(TRACK_NAMES, tracks, strict=True) if side in sides)
-    remarks += [*_still(demonstration), *_in_motion(demonstration, sides), *remarks_on_places(demonstration)]
+    sides = [
+        side for side in TRACK_NAMES if side == "tool" or demonstration.conducts in ("both", side)
+    ]
+    streams = tuple(
+        _stream(side, track)
+        for side, track in zip(TRACK_NAMES, tracks, strict=True)
+        if side in sides
+    )
+    remarks += [
+        *_still(demonstration),
+        *_in_motion(demonstration, sides),
+        *remarks_on_places(demonstration),
+    ]
     return Summary(path, demonstration, streams, tuple(remarks))
 
 
@@ -107,8 +126,8 @@ def _still(demonstration: Demonstration) -> list[str]:
     motions = (("hands", demonstration.hands), ("tool", demonstration.tool[:, :3]))
     moved = [(name, float(np.ptp(positions_m, axis=0).max())) for name, positions_m in motions]
     return [
-        f"{name}: only {1000 * m:.1f} mm of motion; nothing can be learned if all takes have less than "
-        f"{1000 * LEAST_M:g} mm"
+        f"{name}: only {1000 * m:.1f} mm of motion; nothing can be learned if all takes have less "
+        f"than {1000 * LEAST_M:g} mm"
         for name, m in moved
         if m < LEAST_M
     ]
@@ -116,11 +135,20 @@ def _still(demonstration: Demonstration) -> list[str]:
 
 def _in_motion(demonstration: Demonstration, shown: Sequence[str]) -> list[str]:
     """Remarks on hands or a tool that are in motion when a take begins or ends."""
-    out, seconds = [], demonstration.seconds
+    out = []
+    seconds = demonstration.seconds
     for when, span in (("begins", seconds <= EDGE_S), ("ends", seconds >= seconds[-1] - EDGE_S)):
-        speeds = {side: _mean_speed(seconds[span], getattr(demonstration, side)[span, :3]) for side in shown}
-        if moving := [f"{side} {speed:.2f} m/s" for side, speed in speeds.items() if speed > EDGE_SPEED_MPS]:
-            out.append(f"it {when} in motion: {', '.join(moving)}; let hands and tool rest before and after the task")
+        speeds = {
+            side: _mean_speed(seconds[span], getattr(demonstration, side)[span, :3])
+            for side in shown
+        }
+        if moving := [
+            f"{side} {speed:.2f} m/s" for side, speed in speeds.items() if speed > EDGE_SPEED_MPS
+        ]:
+            out.append(
+                f"it {when} in motion: {', '.join(moving)}; let hands and tool rest before and "
+                "after the task"
+            )
     return out
 
 
@@ -135,7 +163,11 @@ def _stream(side: str, track: Track) -> StreamSummary:
     logged = np.sort(track.logged_ns) / 1e9
     gaps = np.diff(logged, prepend=logged[:1])
     worst = int(np.argmax(gaps))
-    usual_gaps = gaps[1:][gaps[1:] <= max(GAP_S, GAP_RATIO * float(np.median(gaps[1:])))] if len(gaps) > 1 else gaps[1:]
+    usual_gaps = (
+        gaps[1:][gaps[1:] <= max(GAP_S, GAP_RATIO * float(np.median(gaps[1:])))]
+        if len(gaps) > 1
+        else gaps[1:]
+    )
     rate = len(usual_gaps) / float(usual_gaps.sum()) if usual_gaps.any() else 0.0
     began = float(logged[max(0, worst - 1)] - logged[0])
     return StreamSummary(side, len(logged), rate, float(gaps[worst]), began, track.frame)
@@ -145,8 +177,9 @@ def table(found: Summary) -> str:
     """The content of a take as lines of text, with a plot of speeds."""
     lines = [f"{found.path}: {found.lasts_s:.1f} s"]
     lines += [
-        f"  {stream.name:<6}{stream.poses:>7} poses  {stream.rate_hz:6.1f} Hz  longest gap {1e3 * stream.gap_s:.0f} ms at "
-        f"{stream.gap_at_s:.1f} s  frame {stream.frame or 'not named'}"
+        f"  {stream.name:<6}{stream.poses:>7} poses  {stream.rate_hz:6.1f} Hz  longest gap "
+        f"{1e3 * stream.gap_s:.0f} ms at {stream.gap_at_s:.1f} s  frame "
+        f"{stream.frame or 'not named'}"
         for stream in found.streams
     ]
     if found.demonstration.person:
@@ -156,7 +189,8 @@ def table(found: Summary) -> str:
     lines += [f"  {remark}" for remark in found.remarks]
     speeds = {stream.name: _speed(found.demonstration, stream.name) for stream in found.streams}
     lines += [
-        f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s" for side, speed in speeds.items()
+        f"  {side:<6}{_blocks(speed)}  up to {np.max(speed, initial=0.0):.2f} m/s"
+        for side, speed in speeds.items()
     ]
     end = f"{found.lasts_s:.1f} s"
     lines.append(f"  speed {'0 s':<{PLOT_COLUMNS - len(end)}}{end}")
@@ -171,7 +205,8 @@ def _speed(demonstration: Demonstration, side: str) -> Vector:
     window = min(0.1, float(seconds[-1]))
     grid = np.arange(0.0, max(seconds[-1] - window, window), window / 2)
     begin, end = (
-        np.stack([np.interp(grid + late, seconds, column) for column in positions_m.T], axis=1) for late in (0.0, window)
+        np.stack([np.interp(grid + late, seconds, column) for column in positions_m.T], axis=1)
+        for late in (0.0, window)
     )
     speeds = np.linalg.norm(end - begin, axis=1) / window
     return np.asarray(np.interp((edges[:-1] + edges[1:]) / 2, grid + window / 2, speeds))
@@ -179,7 +214,9 @@ def _speed(demonstration: Demonstration, side: str) -> Vector:
 
 def _blocks(speed: Vector) -> str:
     greatest = max(float(np.max(speed)), 0.05)  # noise at rest is drawn flat
-    return "".join(BLOCKS[min(int(len(BLOCKS) * value / greatest), len(BLOCKS) - 1)] for value in speed)
+    return "".join(
+        BLOCKS[min(int(len(BLOCKS) * value / greatest), len(BLOCKS) - 1)] for value in speed
+    )
 
 
 def draw(found: Summary, path: Path) -> None:
@@ -195,17 +232,33 @@ def draw(found: Summary, path: Path) -> None:
     above = figure.add_subplot(grid[:, 1])
     begins = list(demonstration.begins)
     for side in (stream.name for stream in found.streams):
-        positions_m = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)  # breaks the line where a part is left out
+        positions_m = np.insert(
+            getattr(demonstration, side), begins, np.nan, axis=0
+        )  # breaks the line where a part is left out
         for i, axis in enumerate(axes):
-            axis.plot(np.insert(seconds, begins, np.nan), positions_m[:, i], color=TRACK_COLOURS[side], lw=1.2, label=side)
-        above.plot(positions_m[:, 0], positions_m[:, 1], color=TRACK_COLOURS[side], lw=1.2, label=side)
+            axis.plot(
+                np.insert(seconds, begins, np.nan),
+                positions_m[:, i],
+                color=TRACK_COLOURS[side],
+                lw=1.2,
+                label=side,
+            )
+        above.plot(
+            positions_m[:, 0], positions_m[:, 1], color=TRACK_COLOURS[side], lw=1.2, label=side
+        )
         above.plot(positions_m[0, 0], positions_m[0, 1], "o", color=TRACK_COLOURS[side], ms=5)
     for i, axis in enumerate(axes):
         axis.set_ylabel(f"{'xyz'[i]} [m]")
         axis.label_outer()
         for stream in found.streams:
             if stream.gap_s > GAP_S:
-                axis.axvspan(stream.gap_at_s, stream.gap_at_s + stream.gap_s, color=TRACK_COLOURS[stream.name], alpha=0.15, lw=0)
+                axis.axvspan(
+                    stream.gap_at_s,
+                    stream.gap_at_s + stream.gap_s,
+                    color=TRACK_COLOURS[stream.name],
+                    alpha=0.15,
+                    lw=0,
+                )
     axes[0].set_title(f"{found.path.stem}: {found.lasts_s:.1f} s, frame base", parse_math=False)
     axes[-1].set_xlabel("time [s]")
     above.set(title="from above; dots mark the start", xlabel="x [m]", ylabel="y [m]")
@@ -233,11 +286,19 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
         raise RecordingError(f"{path}: {'; '.join(map(str, messages.faults))}; it was not trimmed")
     streams = {POSE.type, JOINTS.type}
     times_ns = [row[2].log_time for row in rows if row[0] and row[0].name in streams] or [0]
-    begin_ns, lasts_s = min(times_ns), (max(times_ns) - min(times_ns)) / 1e9
+    begin_ns = min(times_ns)
+    lasts_s = (max(times_ns) - min(times_ns)) / 1e9
     kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
     if len(kept_s) == len(times_ns):
         return f"nothing was cut: {path} lasts {lasts_s:.1f} s"
-    joints = next((len(JOINTS.decode(row[2].data).names) for row in rows if row[0] and row[0].name == JOINTS.type), 0)
+    joints = next(
+        (
+            len(JOINTS.decode(row[2].data).names)
+            for row in rows
+            if row[0] and row[0].name == JOINTS.type
+        ),
+        0,
+    )
     original = uncut(path)
     existed = original.exists()
     try:
@@ -248,19 +309,28 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
                 file.attach(name, data, begin_ns)
             for schema, channel, message in rows:
                 if schema is None or channel.message_encoding != "cdr":
-                    raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it was not trimmed")
+                    raise RecordingError(
+                        f"{path}: {channel.topic} is no stream of a take; it was not trimmed"
+                    )
                 at_s = (message.log_time - begin_ns) / 1e9
                 if schema.name not in streams or start_s <= at_s <= end_s:
-                    file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+                    file.put(
+                        channel.topic, schema.name, message.data, message.log_time, message.sequence
+                    )
             file.close()
             try:
                 summary(file.path)
             except RecordingError:
-                left = f"from {start_s:g} to {end_s:g} s too little is left to learn from, so it was not trimmed"
+                left = (
+                    f"from {start_s:g} to {end_s:g} s too little is left to learn from, so it was "
+                    "not trimmed"
+                )
                 raise RecordingError(f"{path} lasts {lasts_s:.1f} s: {left}") from None
             if not existed:
                 path.replace(original)
     except KeyError as error:
-        raise RecordingError(f"{path}: a take has no messages of type {error}; it was not trimmed") from None
+        raise RecordingError(
+            f"{path}: a take has no messages of type {error}; it was not trimmed"
+        ) from None
     cut = f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s"
     return f"{cut}; the uncut take is {'still' if existed else 'kept as'} {original}"

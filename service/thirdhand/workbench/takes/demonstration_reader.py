@@ -40,10 +40,14 @@ _STREAMS = tuple(TAKE_KEYS.values())
 MIN_USABLE_SHARE = 0.5  # takes with a smaller usable share are refused
 MIN_SEEN_SHARE = 0.1  # a hand that is seen for a smaller share of the time does not lead the tool
 MAX_NAMED_STRETCHES = 10  # a message names at most this many bad stretches
-UNSEEN_INTERVALS = 5.0  # a tool with a low rate is out of sight after this many of its usual intervals
+UNSEEN_INTERVALS = (
+    5.0  # a tool with a low rate is out of sight after this many of its usual intervals
+)
 
 
-def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand") -> None:
+def write_demonstration(
+    path: str | Path, demonstration: Demonstration, *, cell: str = "thirdhand"
+) -> None:
     """Write a demonstration in frame `base`.
 
     Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
@@ -57,15 +61,22 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
             "np.round(1e9 * seconds).astype(np.int64)"
         )
     poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
-    gripper, count = demonstration.gripper, len(stamps_ns)
+    gripper = demonstration.gripper
+    count = len(stamps_ns)
     arrays: list[tuple[str, Vector, tuple[int, ...]]]
     arrays = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
     if demonstration.conducts != "both":
-        arrays = [entry for entry in arrays if entry[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])]
+        arrays = [
+            entry
+            for entry in arrays
+            if entry[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])
+        ]
     arrays += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
     for name, stream, shape in arrays:
         if stream.shape != shape or not np.isfinite(stream).all():
-            raise ValueError(f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed")
+            raise ValueError(
+                f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed"
+            )
     with McapFile(Path(path), joints=0, attached=False) as file:
         about = {"hands": demonstration.conducts, "person": demonstration.person}
         if about := {name: word for name, word in about.items() if word not in ("both", "")}:
@@ -82,7 +93,13 @@ def write_demonstration(path: str | Path, demonstration: Demonstration, *, cell:
                 file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
         if demonstration.places:
             text = encode_json(demonstration.places).decode()
-            file.put(topic(cell, PLACES_TOPIC), STRING.type, cdr.encode_string(text), int(stamps_ns[0]), 0)
+            file.put(
+                topic(cell, PLACES_TOPIC),
+                STRING.type,
+                cdr.encode_string(text),
+                int(stamps_ns[0]),
+                0,
+            )
 
 
 def read_demonstration(
@@ -110,16 +127,23 @@ def read_demonstration(
         raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
     settings = settings or recorded.settings or Settings()
     if any(not fault.cut for fault in recorded.faults):
-        readable = ", ".join(f"{count} poses on {source}" for source, count in recorded.streams()) or "no poses"
+        readable = (
+            ", ".join(f"{count} poses on {source}" for source, count in recorded.streams())
+            or "no poses"
+        )
         faults = "; ".join(map(str, recorded.faults))
-        raise RecordingError(f"{path}: {faults}; {readable} can be read; nothing is learned from it")
+        raise RecordingError(
+            f"{path}: {faults}; {readable} can be read; nothing is learned from it"
+        )
     selection = chosen(recorded, topics or {}, settings)
     for fault in recorded.faults:
         read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in selection.tracks)
         say(f"{path}: {fault}; {read} were read")
     one_clock = by_one_clock(selection.tracks)
     tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
-    tracks = [_near(recorded, *pair, settings) for pair in zip(tracks, one_clock.tracks, strict=True)]
+    tracks = [
+        _near(recorded, *pair, settings) for pair in zip(tracks, one_clock.tracks, strict=True)
+    ]
     remarks = [*selection.guessed, *_invalid_in(tracks), *mapped]
     if remarks:
         say(f"{path}: {'; '.join(remarks)}")
@@ -129,13 +153,24 @@ def read_demonstration(
     common = CommonPart.of(path, tracks, selection.conducts, settings)
     for line in common.remarks:
         say(f"{path}: {line}")
-    left, right, tool = (_resampled(common.stamps_ns, track.stamps_ns, track.poses) for track in common.tracks)
+    left, right, tool = (
+        _resampled(common.stamps_ns, track.stamps_ns, track.poses) for track in common.tracks
+    )
     closure = recorded.closures(common.stamps_ns, logged=one_clock.logged, part=one_clock.part)
     for line in recorded.unused:
         say(f"{path}: {line}")
     common.stamps_ns.setflags(write=False)
     return Demonstration(
-        common.stamps_ns, left, right, tool, BASE, recorded.places, closure, common.conducts, recorded.person, common.begins
+        common.stamps_ns,
+        left,
+        right,
+        tool,
+        BASE,
+        recorded.places,
+        closure,
+        common.conducts,
+        recorded.person,
+        common.begins,
     )
 
 
@@ -154,41 +189,63 @@ class CommonPart(NamedTuple):
     remarks: list[str]
 
     @staticmethod
-    def of(path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings) -> CommonPart:
+    def of(
+        path: str | Path, tracks: Sequence[Track], conducts: Hands, settings: Settings
+    ) -> CommonPart:
         """The common part of the tracks of left hand, right hand and tool.
 
         Raises RecordingError if too little is left.
         """
         unseen_s = settings.hands.unseen_ms / 1000
-        tool_s = max(unseen_s, UNSEEN_INTERVALS * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9)
-        hands = checked(tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s)
+        tool_s = max(
+            unseen_s, UNSEEN_INTERVALS * float(np.median(np.diff(tracks[2].stamps_ns))) / 1e9
+        )
+        hands = checked(
+            tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s
+        )
         (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
         remarks: list[str] = []
         if conducts == "both":
             shares = [hand.seen_share for hand in hands]
             if min(shares) < MIN_SEEN_SHARE <= max(shares):
                 side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
-                hands, conducts = [max(hands, key=lambda one: one.seen_share)], side
-                remarks.append(f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the time")
+                hands = [max(hands, key=lambda one: one.seen_share)]
+                conducts = side
+                remarks.append(
+                    f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the "
+                    "time"
+                )
         rows = [*hands, tool]
-        start_ns, end_ns = max(row.start_ns for row in rows), min(row.end_ns for row in rows)
+        start_ns = max(row.start_ns for row in rows)
+        end_ns = min(row.end_ns for row in rows)
         if start_ns >= end_ns:
             raise RecordingError(
                 f"{path}: hands and tool have fewer than two stamps of the tool in common: "
                 "were they stamped by different clocks?"
             )
-        named = [stretch for row in rows for stretch in row.stretches if stretch.begin_ns < end_ns and stretch.end_ns > start_ns]
+        named = [
+            stretch
+            for row in rows
+            for stretch in row.stretches
+            if stretch.begin_ns < end_ns and stretch.end_ns > start_ns
+        ]
         remarks += [row.remark for row in rows if row.remark]
         stamps, begins = _left_in(tool.track.stamps_ns, rows)
-        kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9 if len(stamps) else 0.0
-        origin_ns, span_s = min(int(track.stamps_ns[0]) for track in tracks), (end_ns - start_ns) / 1e9
+        kept_s = (
+            sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9
+            if len(stamps)
+            else 0.0
+        )
+        origin_ns = min(int(track.stamps_ns[0]) for track in tracks)
+        span_s = (end_ns - start_ns) / 1e9
         named.sort(key=lambda one: one.begin_ns)
         bad = "; ".join(stretch.text(origin_ns) for stretch in named[:MAX_NAMED_STRETCHES])
         bad += f"; and {len(named) - MAX_NAMED_STRETCHES} more" * (len(named) > MAX_NAMED_STRETCHES)
         if kept_s < MIN_USABLE_SHARE * span_s:
             raise RecordingError(
                 f"{path}: {kept_s:.1f} of {span_s:.1f} s are usable, {MIN_USABLE_SHARE:.0%} needed"
-                f"{f': {bad}' if bad else ''}. Record it again, or cut it with thirdhand record --trim"
+                f"{f': {bad}' if bad else ''}. Record it again, or cut it with thirdhand record "
+                "--trim"
             )
         if bad:
             remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
@@ -196,12 +253,18 @@ class CommonPart(NamedTuple):
         return CommonPart(common_tracks, conducts, stamps, tuple(begins), remarks)
 
 
-def _left_in(stamps: NDArray[np.int64], rows: Sequence[Checked]) -> tuple[NDArray[np.int64], list[int]]:
+def _left_in(
+    stamps: NDArray[np.int64], rows: Sequence[Checked]
+) -> tuple[NDArray[np.int64], list[int]]:
     """The tool's stamps [ns] at which all tracks are seen, without pieces that are too short, and
     the indices of the first stamps after the stretches that are left out.
     """
-    start_ns = max((int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows)
-    end_ns = min((int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows)
+    start_ns = max(
+        (int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows
+    )
+    end_ns = min(
+        (int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows
+    )
     stamps = stamps[(stamps >= start_ns) & (stamps <= end_ns)]
     holes = [hole for row in rows for hole in row.stretches]
     for hole in holes:
@@ -227,9 +290,13 @@ def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settin
         why = far_away(before.name, before.frame, before.poses[0, :3].tolist(), settings)
         if recorded.is_captured:
             rule = "the unit in the file is used, and [hands] unit is ignored"
-            why = f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit that the file names"
+            why = (
+                f"{too_far(track.poses[0, :3].tolist(), 'm', rule)}: export it again in the unit "
+                "that the file names"
+            )
         raise RecordingError(
-            f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far away; the first is {why}"
+            f"{recorded.path}: all {len(is_far)} poses on {before.name} are too far away; the "
+            f"first is {why}"
         )
     poses = track.poses.copy()
     poses[is_far] = np.nan
@@ -241,7 +308,11 @@ def _invalid_in(tracks: Sequence[Track]) -> list[str]:
     most_m = TUNING.intake.max_hand_distance_m
     none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
     count = sum(len(track.poses) for track in tracks)
-    return [f"{none} of {count} poses are invalid or farther than {most_m:g} m, and are left out"] if none else []
+    return (
+        [f"{none} of {count} poses are invalid or farther than {most_m:g} m, and are left out"]
+        if none
+        else []
+    )
 
 
 def _in_order(path: str | Path, track: Track) -> Track:
@@ -249,14 +320,20 @@ def _in_order(path: str | Path, track: Track) -> Track:
     stamps, first = np.unique(track.stamps_ns, return_index=True)
     if len(stamps) < 2:
         raise RecordingError(
-            f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different stamps, 2 needed"
+            f"{path}: {len(track.poses)} poses on {track.name} with {len(stamps)} different "
+            "stamps, 2 needed"
         )
-    return Track(track.name, track.source, stamps, track.logged_ns[first], track.poses[first], track.frame)
+    return Track(
+        track.name, track.source, stamps, track.logged_ns[first], track.poses[first], track.frame
+    )
 
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
     """True if the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
-    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))  # the daemon has the same rule
+    tracker_frames = (
+        "",
+        *([BASE] if hands.frame in ("", BASE) else []),
+    )  # the daemon has the same rule
     return frame not in ("", BASE) or (name != TAKE_KEYS["tool"] and frame in tracker_frames)
 
 
@@ -271,16 +348,21 @@ def in_metres(positions: Vector, hands: HandSettings) -> Vector:
 
 def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
     """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
-    axes, origin = rotation(hands.base_from_tracker[3:]), np.array(hands.base_from_tracker[:3])
+    axes = rotation(hands.base_from_tracker[3:])
+    origin = np.array(hands.base_from_tracker[:3])
     return np.asarray(in_metres(positions, hands) @ axes.T + origin)
 
 
 def far_away(name: str, frame: str, position: Sequence[float], settings: Settings) -> str:
     """Message and remedy for a stream's position, as published, that is too far away."""
-    hands, section = settings.hands_in(frame), settings.tracker_section(frame)
+    hands = settings.hands_in(frame)
+    section = settings.tracker_section(frame)
     if is_by_tracker(name, frame, hands):
         rule = f"{section} unit is {hands.unit!r}"
-        return f"{too_far(position, hands.unit, rule)}: set {section} unit in the cell's settings (--config)"
+        return (
+            f"{too_far(position, hands.unit, rule)}: set {section} unit in the cell's settings "
+            "(--config)"
+        )
     rule = f"{name} in frame {BASE!r} is always in metres, and [hands] unit is ignored"
     also = ", or with the tracker's frame of [hands] frame, in which positions are in [hands] unit"
     return f"{too_far(position, 'm', rule)}: publish it in metres{also}"
@@ -292,12 +374,15 @@ def unknown_frame(name: str, frame: str, hands: HandSettings) -> str:
         return ""
     frame_text = "" if hands.frame == BASE else f", or {hands.frame!r} of [hands] frame,"
     return (
-        f"{name} is in frame {frame!r}: {BASE!r}{frame_text} needed, or a configuration (--config) with this [hands] frame "
-        f"and its pose, [hands] base_from_tracker, or with a table [trackers.{frame}]"
+        f"{name} is in frame {frame!r}: {BASE!r}{frame_text} needed, or a configuration (--config) "
+        "with this [hands] frame and its pose, [hands] base_from_tracker, or with a table "
+        f"[trackers.{frame}]"
     )
 
 
-def in_base(path: str | Path, tracks: Sequence[Track], settings: Settings) -> tuple[list[Track], list[str]]:
+def in_base(
+    path: str | Path, tracks: Sequence[Track], settings: Settings
+) -> tuple[list[Track], list[str]]:
     """Tracks of left hand, right hand and tool in frame `base`, and a remark on which of them were
     transformed.
 
@@ -308,35 +393,50 @@ def in_base(path: str | Path, tracks: Sequence[Track], settings: Settings) -> tu
     for track in tracks:
         if problem := unknown_frame(track.name, track.frame, settings.hands_in(track.frame)):
             raise RecordingError(f"{path}: {problem}")
-    out, mapped, sections = list(tracks), [], dict[str, None]()
+    out = list(tracks)
+    mapped = []
+    sections = dict[str, None]()
     for i, track in enumerate(tracks):
         hands = settings.hands_in(track.frame)
         is_left_handed = hands.axes == "left-handed"
         is_changed = is_left_handed or not np.array_equal(base_from(hands), np.eye(3, 4))
         if is_by_tracker(track.name, track.frame, hands) and is_changed:
             turn = Rotation.from_matrix(rotation(hands.base_from_tracker[3:]))
-            poses, is_finite = np.full_like(track.poses, np.nan), np.isfinite(track.poses[:, 0])
+            poses = np.full_like(track.poses, np.nan)
+            is_finite = np.isfinite(track.poses[:, 0])
             if is_finite.any():
                 poses[is_finite, :3] = from_tracker(track.poses[is_finite, :3], hands)
-                quaternions = track.poses[is_finite, 3:] * ((-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0)
+                quaternions = track.poses[is_finite, 3:] * (
+                    (-1.0, -1.0, 1.0, 1.0) if is_left_handed else 1.0
+                )
                 poses[is_finite, 3:] = (turn * Rotation.from_quat(quaternions)).as_quat()
             out[i] = track._replace(poses=poses, frame=BASE)
             mapped.append(track.name)
             sections[settings.tracker_section(track.frame)] = None
-    remark = f"{', '.join(mapped)} transformed to frame {BASE} by {' and '.join(sections)} unit and base_from_tracker"
+    remark = (
+        f"{', '.join(mapped)} transformed to frame {BASE} by {' and '.join(sections)} unit and "
+        "base_from_tracker"
+    )
     return out, [remark] if mapped else []
 
 
-def _resampled(stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _resampled(
+    stamps: NDArray[np.int64], at: NDArray[np.int64], poses: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Poses (T, 7) at `stamps` by linear interpolation of those at `at` (N,); quaternions are
     interpolated the short way and normalised.
     """
     if np.isin(stamps, at).all():
         out = poses[np.searchsorted(at, stamps)]
     else:
-        signs = np.cumprod(np.where(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0, -1.0, 1.0), axis=0)
-        smooth = np.concatenate([poses[:, :3], poses[:, 3:] * np.concatenate([[1.0], signs])[:, None]], axis=1)
-        times, knots = (stamps - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        signs = np.cumprod(
+            np.where(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0, -1.0, 1.0), axis=0
+        )
+        smooth = np.concatenate(
+            [poses[:, :3], poses[:, 3:] * np.concatenate([[1.0], signs])[:, None]], axis=1
+        )
+        times = (stamps - at[0]).astype(np.float64)
+        knots = (at - at[0]).astype(np.float64)
         out = np.stack([np.interp(times, knots, column) for column in smooth.T], axis=1)
         out[:, 3:] /= np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
     out.setflags(write=False)
@@ -368,7 +468,9 @@ def hand_samples(
         if topics.setdefault(name, topic) != topic:
             raise RecordingError(f"{path} has two streams of {name}: {topics[name]} and {topic}")
         try:
-            samples.append((message.log_time, name.removeprefix("hands/"), cdr.decode_pose(message.data)))
+            samples.append(
+                (message.log_time, name.removeprefix("hands/"), cdr.decode_pose(message.data))
+            )
         except WireError as error:
             causes.append(f"{topic}: {error}")
     if messages.faults and not ends_early(path):
@@ -377,7 +479,10 @@ def hand_samples(
         lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
         raise RecordingError(f"{path} has {lacks}; its topics: {with_types(types)}")
     if causes:
-        remark = f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: {causes[0]}"
+        remark = (
+            f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: "
+            f"{causes[0]}"
+        )
         if not samples:
             raise RecordingError(remark)
         say(remark)

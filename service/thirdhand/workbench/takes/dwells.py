@@ -19,10 +19,12 @@ def remarks_on_places(demonstration: Demonstration) -> list[str]:
     points = demonstration.places
     if not points:
         return []
-    distances_m = np.array([off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points])
+    distances_m = np.array(
+        [off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points]
+    )
     remarks = [
-        f"via-point {point.name!r} was never reached: the tool's smallest distance was {1000 * least:.0f} mm, "
-        f"{1000 * FAR_M:.0f} mm needed"
+        f"via-point {point.name!r} was never reached: the tool's smallest distance was "
+        f"{1000 * least:.0f} mm, {1000 * FAR_M:.0f} mm needed"
         for point, least in zip(points, distances_m.min(axis=1).tolist(), strict=True)
         if least > FAR_M
     ]
@@ -32,8 +34,9 @@ def remarks_on_places(demonstration: Demonstration) -> list[str]:
         near = distances_m[:, during].min(axis=1, initial=np.inf)
         if near.min() > FAR_M:
             remarks.append(
-                f"hands and tool rest from {begin_s:.1f} to {end_s:.1f} s, {1000 * near.min():.0f} mm from the nearest "
-                f"via-point, {points[int(near.argmin())].name!r}: is a via-point missing here?"
+                f"hands and tool rest from {begin_s:.1f} to {end_s:.1f} s, {1000 * near.min():.0f} "
+                f"mm from the nearest via-point, {points[int(near.argmin())].name!r}: is a "
+                "via-point missing here?"
             )
     return remarks
 

@@ -22,7 +22,11 @@ from thirdhand.workbench.takes.pose_streams import (
 from thirdhand.workbench.takes.track import Track
 
 HAND_WORDS = {"hand", "hands", "wrist", "palm", "glove"}
-TRACK_WORDS = {"left": {"left"}, "right": {"right"}, "tool": {"tool", "tcp", "gripper", "effector", "flange"}}
+TRACK_WORDS = {
+    "left": {"left"},
+    "right": {"right"},
+    "tool": {"tool", "tcp", "gripper", "effector", "flange"},
+}
 
 
 class HandsAndTool(NamedTuple):
@@ -35,7 +39,9 @@ class HandsAndTool(NamedTuple):
     guessed: list[str]
 
 
-def chosen(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings) -> HandsAndTool:
+def chosen(
+    recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings
+) -> HandsAndTool:
     """The tracks of hands and tool in a recording.
 
     A topic is `given`, or found by the end of its name, or by a word in its name; the tool may also
@@ -59,10 +65,16 @@ def chosen(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Se
     if len(sources) == 1:
         (conducts,) = (name for name in get_args(Hands) if name in sources)
         other = TRACK_NAMES[1 - TRACK_NAMES.index(conducts)]
-        hint = "" if conducts == recorded.conducts else f": there is no other (--{other} TOPIC names one)"
+        hint = (
+            ""
+            if conducts == recorded.conducts
+            else f": there is no other (--{other} TOPIC names one)"
+        )
         guessed.append(f"the {conducts} hand leads alone{hint}")
     hands = [recorded.track(TAKE_KEYS[name], source, settings) for name, source in sources.items()]
-    return HandsAndTool([hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed)
+    return HandsAndTool(
+        [hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed
+    )
 
 
 def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, PoseTopic]:
@@ -72,20 +84,26 @@ def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, Po
     sides = [side for side in TRACK_NAMES[:2] if _words(str(source)) & TRACK_WORDS[side]]
     if len(sides) != 1:
         raise RecordingError(
-            f"{recorded.path}: {source} is given as left and as right; another topic needed for one of them, or for a "
-            "task of one hand, the option of this hand only"
+            f"{recorded.path}: {source} is given as left and as right; another topic needed for "
+            "one of them, or for a task of one hand, the option of this hand only"
         )
     return {sides[0]: source}
 
 
-def _tool(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]) -> Track:
+def _tool(
+    recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]
+) -> Track:
     """The tool's track; a remark on a guess is appended to `guessed`. Raises RecordingError."""
-    source = _given(recorded, "tool", given["tool"]) if "tool" in given else by_ending(recorded, "tool")
+    source = (
+        _given(recorded, "tool", given["tool"]) if "tool" in given else by_ending(recorded, "tool")
+    )
     joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
     joints = recorded.joint_topic(settings) if source is None else joints
     if joints:
         guessed.append(f"tool is computed from {joints} by the arm's URDF")
-        return recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
+        return recorded.tool_by_joints(
+            joints, settings, recorded.urdf or robot_description(settings)
+        )
     if source is None:
         source = _by_words(recorded, "tool")
         if source is None:
@@ -96,12 +114,16 @@ def _tool(recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Set
 
 def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
     """The stream that an option names. Raises RecordingError."""
-    topic = next((topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), "")
+    topic = next(
+        (topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), ""
+    )
     if topic and recorded.topics[topic] == JOINTS.type and name == "tool":
         return PoseTopic(topic)
     if not topic or recorded.topics[topic] not in POSE_TYPES:
         problem = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
-        raise RecordingError(f"{recorded.path}: --{name} {wanted}: {problem}; {_poses_in(recorded)}")
+        raise RecordingError(
+            f"{recorded.path}: --{name} {wanted}: {problem}; {_poses_in(recorded)}"
+        )
     parts = list(recorded.tracks(topic))
     if wanted.part in parts:
         return PoseTopic(topic, wanted.part)
@@ -119,12 +141,14 @@ def by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
     topics = [
         topic
         for topic, kind in recorded.topics.items()
-        if kind == POSE.type and f"/{topic}".endswith(f"/{TAKE_KEYS[name]}") and "" in recorded.tracks(topic)
+        if kind == POSE.type
+        and f"/{topic}".endswith(f"/{TAKE_KEYS[name]}")
+        and "" in recorded.tracks(topic)
     ]
     if len(topics) > 1:
         raise RecordingError(
-            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {topics[0]} and {topics[1]}; one needed, as --{name} "
-            "of `thirdhand learn` names it"
+            f"{recorded.path} has two streams of {TAKE_KEYS[name]}: {topics[0]} and {topics[1]}; "
+            f"one needed, as --{name} of `thirdhand learn` names it"
         )
     return PoseTopic(topics[0]) if topics else None
 
@@ -136,7 +160,11 @@ def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:
     others = {word for other in TRACK_NAMES[:2] if other != name for word in TRACK_WORDS[other]}
     streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
     words = {source: _words(str(source)) for source in streams}
-    fitting = [source for source in streams if words[source] & TRACK_WORDS[name] and not words[source] & others]
+    fitting = [
+        source
+        for source in streams
+        if words[source] & TRACK_WORDS[name] and not words[source] & others
+    ]
     if len(fitting) > 1 and name != "tool":
         fitting = [source for source in fitting if words[source] & HAND_WORDS] or fitting
     if len(fitting) > 1:
@@ -148,8 +176,8 @@ def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic])
     also = f" or {JOINT_STATES} of the arm's joints" if name == "tool" else ""
     several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
     return RecordingError(
-        f"{recorded.path} has no topic ending in {TAKE_KEYS[name]} with {POSE.type}{also}{several}; "
-        f"{_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
+        f"{recorded.path} has no topic ending in {TAKE_KEYS[name]} with "
+        f"{POSE.type}{also}{several}; {_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
     )
 
 
@@ -161,6 +189,6 @@ def _words(text: str) -> set[str]:
 def _poses_in(recorded: PoseRecording) -> str:
     poses = ", ".join(f"{source} ({count})" for source, count in recorded.streams())
     return (
-        f"its topics: {with_types(recorded.topics)}; topics with poses: {poses or 'none'}; types with poses that are "
-        f"read: {', '.join(POSE_TYPES)}"
+        f"its topics: {with_types(recorded.topics)}; topics with poses: {poses or 'none'}; types "
+        f"with poses that are read: {', '.join(POSE_TYPES)}"
     )

@@ -19,7 +19,14 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from thirdhand.contract import cdr
-from thirdhand.contract.channels import JOINTS, POSE, POSE_WITH_COVARIANCE, STRING, TAKE_KEYS, TRANSFORMS
+from thirdhand.contract.channels import (
+    JOINTS,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    STRING,
+    TAKE_KEYS,
+    TRANSFORMS,
+)
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.joint_states import JointStates, measured
 from thirdhand.contract.messages import BASE, JointState, PoseStamped, WireError
@@ -36,21 +43,44 @@ from thirdhand.workbench.takes.track import Track, clock_parts
 
 Value = TypeVar("Value")
 TRACK_NAMES = ("left", "right", "tool")
-JOINT_STATES, GRIPPER_STATE, PLACES_TOPIC = "joints/state", "gripper/state", "places"
+JOINT_STATES = "joints/state"
+GRIPPER_STATE = "gripper/state"
+PLACES_TOPIC = "places"
 STATE_PARTS_TIMEOUT_S = 0.1  # an arm's state may arrive in several messages within this time
 FROM_ARRAYS = "A few lines of Python make a take from arrays: docs/arrays.md"
 NOT_READ = {
-    **dict.fromkeys((".zst", ".zstd", ".lz4", ".gz", ".zip"), "decompress it first, or give the folder of the bag"),
     **dict.fromkeys(
-        (".parquet", ".npz", ".npy", ".h5", ".hdf5", ".json", ".txt", ".tsv", ".trc", ".bvh", ".fbx", ".tak"),
+        (".zst", ".zstd", ".lz4", ".gz", ".zip"),
+        "decompress it first, or give the folder of the bag",
+    ),
+    **dict.fromkeys(
+        (
+            ".parquet",
+            ".npz",
+            ".npy",
+            ".h5",
+            ".hdf5",
+            ".json",
+            ".txt",
+            ".tsv",
+            ".trc",
+            ".bvh",
+            ".fbx",
+            ".tak",
+        ),
         FROM_ARRAYS,
     ),
 }
 MAX_MESSAGE_BYTES = 1 << 24  # limit of a message after decompression
-POSE_ARRAY, TF_MESSAGE = "geometry_msgs/msg/PoseArray", TRANSFORMS.type
-TRANSFORM, ODOMETRY = "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"
+POSE_ARRAY = "geometry_msgs/msg/PoseArray"
+TF_MESSAGE = TRANSFORMS.type
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_TYPES = (POSE.type, POSE_WITH_COVARIANCE.type, TRANSFORM, POSE_ARRAY, TF_MESSAGE, ODOMETRY)
-NUMBERS_AFTER = {POSE_WITH_COVARIANCE.type: 36, ODOMETRY: 36 + 6 + 36}  # covariances, and a velocity
+NUMBERS_AFTER = {
+    POSE_WITH_COVARIANCE.type: 36,
+    ODOMETRY: 36 + 6 + 36,
+}  # covariances, and a velocity
 _NUMBERS = {count: struct.Struct(f"<{count}d") for count in (7, *NUMBERS_AFTER.values())}
 
 
@@ -101,10 +131,14 @@ class PoseRecording:
         self.places: tuple[ViaPoint, ...] = ()  # recorded via-points of the task
         self.conducts: Hands = "both"  # the hands that lead the tool in a take
         self.person = ""  # the person who demonstrates in a take
-        self._raw: dict[str, list[tuple[int, bytes]]] = {}  # time of recording [ns] and bytes of messages by topic
+        self._raw: dict[
+            str, list[tuple[int, bytes]]
+        ] = {}  # time of recording [ns] and bytes of messages by topic
         self._read: dict[str, dict[str, Parts]] = {}
         self._ros_1_topics: set[str] = set()
-        self.is_captured = False  # True for motion capture: poses are in metres, in the axes of the capture system
+        self.is_captured = (
+            False  # True for motion capture: poses are in metres, in the axes of the capture system
+        )
         if reader := {".csv": read_motive, ".c3d": read_c3d}.get(self.path.suffix.lower()):
             self._read_captured(reader(self._existing()))
         elif self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
@@ -141,33 +175,48 @@ class PoseRecording:
                 self._read_places(message.data)
         self.faults = messages.faults
         about = messages.metadata.get("thirdhand", {})
-        self.conducts = next((hands for hands in get_args(Hands) if hands == about.get("hands")), "both")
+        self.conducts = next(
+            (hands for hands in get_args(Hands) if hands == about.get("hands")), "both"
+        )
         self.person = about.get("person", "")
         if "settings.json" in messages.attachments:
             self.is_ours = True
             try:
-                self.settings = validated(msgspec.json.decode(messages.attachments["settings.json"]), Settings)
+                self.settings = validated(
+                    msgspec.json.decode(messages.attachments["settings.json"]), Settings
+                )
             except (msgspec.DecodeError, InvalidError) as error:
-                self.unused.append(f"the settings in {self.path} are not valid: {in_words(error, named=False)}")
+                self.unused.append(
+                    f"the settings in {self.path} are not valid: {in_words(error, named=False)}"
+                )
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
 
     def _read_places(self, data: bytes) -> None:
         try:
-            self.places = Add(decode_request(cdr.decode_string(_whole(data)).encode(), tuple[ViaPoint, ...])).points
+            self.places = Add(
+                decode_request(cdr.decode_string(_whole(data)).encode(), tuple[ViaPoint, ...])
+            ).points
         except (WireError, ValueError) as error:
-            self.unused.append(f"the recorded {PLACES_TOPIC} are not readable and not used: {error}")
+            self.unused.append(
+                f"the recorded {PLACES_TOPIC} are not readable and not used: {error}"
+            )
 
     def _read_bag(self) -> None:
-        from rosbags.rosbag1 import Reader as Ros1Reader  # its import is slow, and most recordings are MCAP files
+        from rosbags.rosbag1 import (
+            Reader as Ros1Reader,
+        )  # its import is slow, and most recordings are MCAP files
         from rosbags.rosbag2 import Reader as Ros2Reader
 
         if (self.path / "meta" / "info.json").exists():
             raise RecordingError(
-                f"{self.path} is a data set of LeRobot, whose columns do not name hands and tool. {FROM_ARRAYS}"
+                f"{self.path} is a data set of LeRobot, whose columns do not name hands and tool. "
+                f"{FROM_ARRAYS}"
             )
         has_metadata = (self.path / "metadata.yaml").exists()
         if self.path.is_dir() and not has_metadata and any(self.path.glob("*.mcap")):
-            raise RecordingError(f"{self.path} is a folder without metadata.yaml: give its files, {self.path}/*.mcap")
+            raise RecordingError(
+                f"{self.path} is a folder without metadata.yaml: give its files, {self.path}/*.mcap"
+            )
         files = [self._existing()] if not self.path.is_dir() else sorted(self.path.glob("*.db3"))
         for file in (*files, *self.path.glob("*.mcap")):
             begin_of(file)
@@ -179,21 +228,34 @@ class PoseRecording:
                     self._read_sqlite(file)
                 return
             with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
-                self.topics = {connection.topic: connection.msgtype for connection in bag.connections}
+                self.topics = {
+                    connection.topic: connection.msgtype for connection in bag.connections
+                }
                 self._ros_1_topics = set(self.topics) if is_ros_1 else set()
-                connections = [connection for connection in bag.connections if connection.msgtype in (*POSE_TYPES, JOINTS.type)]
-                for connection, logged_ns, data in bag.messages(connections=connections) if connections else ():
+                connections = [
+                    connection
+                    for connection in bag.connections
+                    if connection.msgtype in (*POSE_TYPES, JOINTS.type)
+                ]
+                for connection, logged_ns, data in (
+                    bag.messages(connections=connections) if connections else ()
+                ):
                     self._raw.setdefault(connection.topic, []).append((logged_ns, bytes(data)))
         except Exception as error:  # the exceptions of the bags' storages have no common base
             raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
 
     def _read_sqlite(self, file: Path) -> None:
         """Read a `.db3`, and what a recorder that was killed has left in its `-wal`."""
-        with contextlib.closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as database:
-            kinds = dict(database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr'"))
+        with contextlib.closing(
+            sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)
+        ) as database:
+            kinds = dict(
+                database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr'")
+            )
             self.topics |= kinds
             for topic, logged_ns, data in database.execute(
-                "SELECT name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id ORDER BY timestamp"
+                "SELECT name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id "
+                "ORDER BY timestamp"
             ):
                 if kinds.get(topic) in (*POSE_TYPES, JOINTS.type):
                     self._raw.setdefault(topic, []).append((logged_ns, bytes(data)))
@@ -209,7 +271,9 @@ class PoseRecording:
         for logged_ns, data in raw:
             try:
                 whole = _whole(data)
-                value = decode(_of_ros_1(whole, self.topics[topic]) if topic in self._ros_1_topics else whole)
+                value = decode(
+                    _of_ros_1(whole, self.topics[topic]) if topic in self._ros_1_topics else whole
+                )
             except WireError as error:
                 causes.append(str(error))
             else:
@@ -228,7 +292,9 @@ class PoseRecording:
             return self._read[topic]
         out = dict[str, Parts]()
         rejected: list[str] = []
-        for logged_ns, pairs in self._decoded(topic, functools.partial(_poses, self.topics[topic], rejected)):
+        for logged_ns, pairs in self._decoded(
+            topic, functools.partial(_poses, self.topics[topic], rejected)
+        ):
             for part, pose in pairs:
                 stamps, logged, poses, frames = out.setdefault(part, Parts([], [], [], []))
                 if pose.frame_id not in frames:
@@ -237,7 +303,9 @@ class PoseRecording:
                 logged.append(logged_ns)
                 poses.append(pose.position + pose.orientation)
         if rejected:
-            self.unused.append(f"{topic}: {len(rejected)} transforms are not readable: {rejected[0]}")
+            self.unused.append(
+                f"{topic}: {len(rejected)} transforms are not readable: {rejected[0]}"
+            )
         self._read[topic] = out
         return out
 
@@ -245,26 +313,40 @@ class PoseRecording:
         """One stream as arrays. Raises RecordingError."""
         stamps, logged, rows, (frame, *others) = self.tracks(source.topic)[source.part]
         if others:
-            raise RecordingError(f"{self.path}: {source}: poses in frames {frame!r} and {others[0]!r}; one needed")
+            raise RecordingError(
+                f"{self.path}: {source}: poses in frames {frame!r} and {others[0]!r}; one needed"
+            )
         poses = np.array(rows, np.float64)
-        if self.is_captured:  # `from_tracker` will multiply by the unit and apply the pose of the capture system
+        if (
+            self.is_captured
+        ):  # `from_tracker` will multiply by the unit and apply the pose of the capture system
             poses[:, :3] /= UNIT_M[settings.hands.unit]
             frame = frame if settings.hands.frame in ("", BASE) else settings.hands.frame
-        return Track(name, str(source), np.array(stamps, np.int64), np.array(logged, np.int64), poses, frame)
+        return Track(
+            name, str(source), np.array(stamps, np.int64), np.array(logged, np.int64), poses, frame
+        )
 
     def tool_by_joints(self, topic: str, settings: Settings, urdf: str) -> Track:
         """The tool in frame `base`, computed from joint states by the URDF. Raises
         RecordingError.
         """
-        states = [state for state in self._joint_states(topic, settings.joints.names) if np.isfinite(state[2]).all()]
+        states = [
+            state
+            for state in self._joint_states(topic, settings.joints.names)
+            if np.isfinite(state[2]).all()
+        ]
         if not states:
             raise RecordingError(f"{self.path}: {topic}: no joint state is finite")
         logged, stamps, joints = zip(*states, strict=True)
         poses, rows = tool_poses(settings, urdf, np.array(stamps, np.int64), np.array(joints))
         source = f"{topic}, by the URDF"
-        return Track(TAKE_KEYS["tool"], source, np.array(stamps)[rows], np.array(logged)[rows], poses, BASE)
+        return Track(
+            TAKE_KEYS["tool"], source, np.array(stamps)[rows], np.array(logged)[rows], poses, BASE
+        )
 
-    def closures(self, stamps: NDArray[np.int64], *, logged: bool = False, part: int | None = None) -> Vector | None:
+    def closures(
+        self, stamps: NDArray[np.int64], *, logged: bool = False, part: int | None = None
+    ) -> Vector | None:
         """Closure of the gripper (T,), 0 open to 1 closed, at stamps (T,) [ns]; None if no topic
         ends in `gripper/state`. The closure is the position of the first joint there.
 
@@ -273,7 +355,9 @@ class PoseRecording:
         """
         topics = [topic for topic in self._raw if f"/{topic}".endswith(f"/{GRIPPER_STATE}")]
         if len(topics) > 1:
-            self.unused.append(f"topics {', '.join(sorted(topics))} are not used: one topic of a gripper needed")
+            self.unused.append(
+                f"topics {', '.join(sorted(topics))} are not used: one topic of a gripper needed"
+            )
             return None
         states = list(self._joint_states(topics[0])) if topics else []
         if part is not None:
@@ -286,17 +370,23 @@ class PoseRecording:
         }
         if len(closure_at) < len(states):
             self.unused.append(
-                f"{len(states) - len(closure_at)} of {len(states)} states of the gripper have no position"
+                f"{len(states) - len(closure_at)} of {len(states)} states of the gripper have no "
+                "position"
             )
         if not closure_at:
             return None
         state_ns = np.array(sorted(closure_at), np.int64)
-        times = (stamps - state_ns[0]).astype(np.float64), (state_ns - state_ns[0]).astype(np.float64)
+        times = (
+            (stamps - state_ns[0]).astype(np.float64),
+            (state_ns - state_ns[0]).astype(np.float64),
+        )
         out: Vector = np.interp(*times, [closure_at[i] for i in state_ns.tolist()])
         out.setflags(write=False)
         return out
 
-    def _joint_states(self, topic: str, names: tuple[str, ...] = ()) -> Iterator[tuple[int, int, tuple[float, ...]]]:
+    def _joint_states(
+        self, topic: str, names: tuple[str, ...] = ()
+    ) -> Iterator[tuple[int, int, tuple[float, ...]]]:
         """Time of recording [ns], stamp [ns] and positions of each joint state.
 
         With `names`, these joints only, which may be spread over several messages. Raises
@@ -348,7 +438,9 @@ def type_of(schema: Schema | None, channel: Channel, read: Sequence[str] = ("cdr
 
 def with_types(topics: Mapping[str, str]) -> str:
     """The topics of a recording in words, each with its type."""
-    return ", ".join(f"{topic} ({topics[topic] or 'no type'})" for topic in sorted(topics)) or "none"
+    return (
+        ", ".join(f"{topic} ({topics[topic] or 'no type'})" for topic in sorted(topics)) or "none"
+    )
 
 
 def _whole(data: bytes) -> bytes:
@@ -367,7 +459,10 @@ def _whole(data: bytes) -> bytes:
 
 @functools.cache
 def _typestore() -> Any:
-    from rosbags.typesys import Stores, get_typestore  # its import is slow, and few recordings need it
+    from rosbags.typesys import (
+        Stores,
+        get_typestore,
+    )  # its import is slow, and few recordings need it
 
     return get_typestore(Stores.ROS2_HUMBLE)
 
@@ -389,12 +484,17 @@ def _poses(kind: str, rejected: list[str], data: bytes) -> list[tuple[str, PoseS
     reader = cdr.Reader(data)
     stamp_ns, frame = reader.header()
     child = reader.string() if kind in (TRANSFORM, ODOMETRY) else ""
-    parts = list(map(str, range(reader.items()))) if kind == POSE_ARRAY else [child if kind == TRANSFORM else ""]
+    parts = (
+        list(map(str, range(reader.items())))
+        if kind == POSE_ARRAY
+        else [child if kind == TRANSFORM else ""]
+    )
     rows = [reader.unpack(_NUMBERS[7], 8) for _ in parts]
     if kind in NUMBERS_AFTER:
         reader.unpack(_NUMBERS[NUMBERS_AFTER[kind]], 8)
     reader.end()
     frame = frame if kind == POSE.type else frame.strip("/")
     return [
-        (part.strip("/"), PoseStamped(stamp_ns, frame, row[:3], row[3:])) for part, row in zip(parts, rows, strict=True)
+        (part.strip("/"), PoseStamped(stamp_ns, frame, row[:3], row[3:]))
+        for part, row in zip(parts, rows, strict=True)
     ]

@@ -30,7 +30,9 @@ class Track(NamedTuple):
 
     def at(self, rows: Rows | NDArray[np.bool_]) -> Track:
         """The track with only these of its poses, by index or mask."""
-        return self._replace(stamps_ns=self.stamps_ns[rows], logged_ns=self.logged_ns[rows], poses=self.poses[rows])
+        return self._replace(
+            stamps_ns=self.stamps_ns[rows], logged_ns=self.logged_ns[rows], poses=self.poses[rows]
+        )
 
 
 def clock_parts(stamps: Stamps) -> list[Rows]:
@@ -42,7 +44,8 @@ def clock_parts(stamps: Stamps) -> list[Rows]:
     if len(stamps) < 2 * WINDOW:
         return [np.arange(len(stamps))]
     windows = np.lib.stride_tricks.sliding_window_view(stamps, WINDOW)
-    before, behind = np.median(windows[:-WINDOW], axis=1), windows[WINDOW:].max(axis=1)
+    before = np.median(windows[:-WINDOW], axis=1)
+    behind = windows[WINDOW:].max(axis=1)
     is_anew = behind < before - 1e9 * TUNING.intake.max_late_s
     is_anew[1:] &= ~is_anew[:-1]
     return np.split(np.arange(len(stamps)), np.flatnonzero(is_anew) + WINDOW)

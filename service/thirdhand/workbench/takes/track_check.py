@@ -78,7 +78,8 @@ class Stretch(NamedTuple):
     def text(self, start_ns: int) -> str:
         """A message on the stretch, in seconds after the start of the take."""
         return (
-            f"{self.name} {(self.begin_ns - start_ns) / 1e9:.2f} to {(self.end_ns - start_ns) / 1e9:.2f} s: {self.why}"
+            f"{self.name} {(self.begin_ns - start_ns) / 1e9:.2f} to "
+            f"{(self.end_ns - start_ns) / 1e9:.2f} s: {self.why}"
         )
 
 
@@ -105,7 +106,8 @@ class Checked(NamedTuple):
     @property
     def remark(self) -> str:
         """A remark on the numbers of samples that are left out; empty if there are none."""
-        left_out, rejected = self.poses - len(self.track.poses), self.rejected
+        left_out = self.poses - len(self.track.poses)
+        rejected = self.rejected
         if not left_out:
             return ""
         by_rules = f"; the rules of the daemon reject {rejected}" if rejected else ""
@@ -122,7 +124,8 @@ def checked(tracks: Sequence[Track], settings: Settings, *, longest_s: float) ->
     for track, verdict in zip(tracks, _intake_verdicts(tracks, settings), strict=True):
         why = _lost(track, verdict, settings.hands)
         is_kept = _kept(track, why, verdict.restarts, settings.hands)
-        first, last = int(track.stamps_ns[0]), int(track.stamps_ns[-1])
+        first = int(track.stamps_ns[0])
+        last = int(track.stamps_ns[-1])
         stretches = _stretches(track, is_kept, why, longest_s)
         pose_count = int(np.isfinite(track.poses[:, 0]).sum())
         rejected = sum(bool(reason) for reason in verdict.why)
@@ -134,7 +137,9 @@ def in_base_frame(settings: Settings) -> Settings:
     """The settings for hands that are in frame `base` already."""
     hands = HandSettings()
     mapped = {name: getattr(hands, name) for name in ("frame", "unit", "axes", "base_from_tracker")}
-    return msgspec.structs.replace(settings, hands=msgspec.structs.replace(settings.hands, **mapped))
+    return msgspec.structs.replace(
+        settings, hands=msgspec.structs.replace(settings.hands, **mapped)
+    )
 
 
 def sound(track: Track) -> Track:
@@ -163,20 +168,31 @@ class _Verdict(NamedTuple):
 def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdict]:
     """The decisions on each track, as `left` or `right` hand of one intake, in order of stamps."""
     settings = in_base_frame(settings)
-    intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
+    intake = Intake(settings)
+    state = blank(state_layout(len(settings.joints.names)))
     intake.begin(state)
     state["tick"] = 0
-    out = [_Verdict([Distrust.NONE] * len(track.poses), np.zeros(len(track.poses), bool)) for track in tracks]
-    start_ns = min(int(track.stamps_ns[0]) for track in tracks) - 1  # the intake takes a stamp of 0 for no stamp
+    out = [
+        _Verdict([Distrust.NONE] * len(track.poses), np.zeros(len(track.poses), bool))
+        for track in tracks
+    ]
+    start_ns = (
+        min(int(track.stamps_ns[0]) for track in tracks) - 1
+    )  # the intake takes a stamp of 0 for no stamp
     merged = sorted(
-        (int(ns) - start_ns, side, i) for side, track in enumerate(tracks) for i, ns in enumerate(track.stamps_ns)
+        (int(ns) - start_ns, side, i)
+        for side, track in enumerate(tracks)
+        for i, ns in enumerate(track.stamps_ns)
     )
     rows = [track.poses.tolist() for track in tracks]
-    ticked, period_ns = 0, 1e9 * settings.period_s
+    ticked = 0
+    period_ns = 1e9 * settings.period_s
     for stamp_ns, side, i in merged:
         tick = round(stamp_ns / period_ns)
         intake.advance(state, tick - ticked)
-        ticked, rejected, row = tick, intake.rejected[side].copy(), rows[side][i]
+        ticked = tick
+        rejected = intake.rejected[side].copy()
+        row = rows[side][i]
         intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
         causes = np.flatnonzero(intake.rejected[side] - rejected)
         if len(causes):
@@ -193,7 +209,9 @@ def _lost(track: Track, verdict: _Verdict, hands: HandSettings) -> list[Distrust
     Most repeated poses of a synthetic track, which has no noise, are rests from which it continues.
     In such a track, repeated poses are not rejected.
     """
-    why, poses, seconds = list(verdict.why), track.poses, (track.stamps_ns - track.stamps_ns[:1]) / 1e9
+    why = list(verdict.why)
+    poses = track.poses
+    seconds = (track.stamps_ns - track.stamps_ns[:1]) / 1e9
     changes = np.flatnonzero((np.diff(poses, axis=0) != 0).any(axis=1)) + 1
     bounds = np.concatenate([[0], changes, [len(poses)]])
     is_long = seconds[bounds[1:] - 1] - seconds[bounds[:-1]] >= hands.stale_ms / 1000
@@ -212,7 +230,9 @@ def _is_lost(poses: Vector, seconds: Vector, begin: int, end: int) -> bool:
     if end + 1 >= len(poses):
         return False
     speed = _distance(poses, end, end + 1) / float(seconds[end + 1] - seconds[end])
-    return _distance(poses, end, end - 1) > STEP_M + 2.0 * speed * float(seconds[end] - seconds[end - 1])
+    return _distance(poses, end, end - 1) > STEP_M + 2.0 * speed * float(
+        seconds[end] - seconds[end - 1]
+    )
 
 
 def _distance(poses: Vector, a: int, b: int) -> float:
@@ -227,35 +247,44 @@ def _kept(track: Track, why: Sequence[Distrust], restarts: Mask, hands: HandSett
     if not len(usable):
         return mask
     seconds = (track.stamps_ns[usable] - track.stamps_ns[usable[0]]) / 1e9
-    positions_m, pauses = track.poses[usable, :3], np.diff(seconds)
+    positions_m = track.poses[usable, :3]
+    pauses = np.diff(seconds)
     accepted = np.array([not why[i] for i in usable.tolist()])
     doubted = (accepted[1:] != accepted[:-1]) | restarts[usable[1:]]
     is_leap = doubted & _leaps(positions_m, pauses)
     is_pause = (pauses > hands.stale_ms / 1000) | (np.diff(usable) > 1)
     bounds = np.concatenate([[0], np.flatnonzero(is_leap | is_pause) + 1, [len(usable)]])
-    begins, ends = bounds[:-1], bounds[1:] - 1
+    begins = bounds[:-1]
+    ends = bounds[1:] - 1
     counts = (ends - begins + 1).astype(np.float64)
-    total, before = counts.copy(), [(-1, 0, 0)] * len(begins)
+    total = counts.copy()
+    before = [(-1, 0, 0)] * len(begins)
     for run in range(1, len(begins)):
         distances_m = np.linalg.norm(positions_m[begins[run]] - positions_m[ends[:run]], axis=1)
-        possible = distances_m <= TUNING.intake.jump_m + UNSAMPLED_MPS * (seconds[begins[run]] - seconds[ends[:run]])
+        possible = distances_m <= TUNING.intake.jump_m + UNSAMPLED_MPS * (
+            seconds[begins[run]] - seconds[ends[:run]]
+        )
         possible[-1] &= not is_leap[ends[run - 1]]
         links = {(int(i), 0, 0): total[i] for i in np.flatnonzero(possible)}
         if not possible[-1]:
             links |= {
                 (run - 1, last, first): total[run - 1] - last - first
                 for last, first in TRIMMED
-                if _continues(positions_m, seconds, int(ends[run - 1]) - last, int(begins[run]) + first)
+                if _continues(
+                    positions_m, seconds, int(ends[run - 1]) - last, int(begins[run]) + first
+                )
                 and min(counts[run - 1] - last, counts[run] - first) >= LEAST_CONTINUED
             }
         if links:
             before[run] = max(links, key=links.__getitem__)
             total[run] += links[before[run]]
-    run, dropped = int(np.argmax(total)), 0
+    run = int(np.argmax(total))
+    dropped = 0
     while run >= 0:
         previous, last, first = before[run]
         mask[usable[begins[run] + first : ends[run] + 1 - dropped]] = True
-        run, dropped = previous, last
+        run = previous
+        dropped = last
     rows = np.flatnonzero(mask)
     times_s = (track.stamps_ns[rows] - track.stamps_ns[0]) / 1e9
     mask[rows[displaced(times_s, track.poses[rows, :3])]] = False
@@ -276,7 +305,9 @@ def _leaps(at: Vector, pauses: Vector) -> Mask:
     """
     steps = np.diff(at, axis=0)
     distances_m = np.linalg.norm(steps, axis=1)
-    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
+    turns = (
+        np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.maximum(pauses[1:], pauses[:-1]) ** 2
+    )
     acceleration = np.minimum(np.concatenate([[np.inf], turns]), np.concatenate([turns, [np.inf]]))
     is_leap: Mask = (distances_m > TUNING.intake.jump_m + TUNING.intake.jump_speed_mps * pauses) & (
         acceleration > MAX_HAND_MPS2
@@ -284,19 +315,25 @@ def _leaps(at: Vector, pauses: Vector) -> Mask:
     return is_leap
 
 
-def _stretches(track: Track, kept: Mask, why: Sequence[Distrust], longest_s: float) -> tuple[Stretch, ...]:
+def _stretches(
+    track: Track, kept: Mask, why: Sequence[Distrust], longest_s: float
+) -> tuple[Stretch, ...]:
     """The stretches between retained samples that last longer than `longest_s` [s], and those
     before the first and after the last retained sample.
     """
-    rows, out = np.flatnonzero(kept), list[Stretch]()
+    rows = np.flatnonzero(kept)
+    out = list[Stretch]()
     if not len(rows):
         reason = Counter(why).most_common(1)[0][0]
         return (Stretch(track.name, int(track.stamps_ns[0]), int(track.stamps_ns[-1]), reason),)
-    ends, usual_ns = np.concatenate([[0], rows, [len(kept) - 1]]), float(np.median(np.diff(track.stamps_ns)))
+    ends = np.concatenate([[0], rows, [len(kept) - 1]])
+    usual_ns = float(np.median(np.diff(track.stamps_ns)))
     long = np.flatnonzero(np.diff(track.stamps_ns[ends]) > round(1e9 * longest_s))
     for a, b in zip(ends[long].tolist(), ends[long + 1].tolist(), strict=True):
         between = Counter(why[i] or Distrust.JUMPED for i in range(a, b + 1) if not kept[i])
-        is_sampled = sum(between.values()) * usual_ns > 0.5 * (track.stamps_ns[b] - track.stamps_ns[a])
+        is_sampled = sum(between.values()) * usual_ns > 0.5 * (
+            track.stamps_ns[b] - track.stamps_ns[a]
+        )
         reason = between.most_common(1)[0][0] if is_sampled else Distrust.UNSEEN
         out.append(Stretch(track.name, int(track.stamps_ns[a]), int(track.stamps_ns[b]), reason))
     return tuple(out)

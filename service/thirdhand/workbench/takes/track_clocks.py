@@ -10,7 +10,9 @@ import numpy as np
 from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.takes.track import Track, clock_parts
 
-LARGEST_DELAY_S = 0.2  # the delays from stamp to recording of streams with one clock may differ by this
+LARGEST_DELAY_S = (
+    0.2  # the delays from stamp to recording of streams with one clock may differ by this
+)
 
 
 class OneClock(NamedTuple):
@@ -36,26 +38,38 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
     anew = list(dict.fromkeys(track.name for track in tracks if not _is_steady(track)))
     is_apart = max(ahead_s) - min(ahead_s) > LARGEST_DELAY_S
     if (anew or is_apart) and _are_usable(tracks):
-        clocks = ", ".join(f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True))
+        clocks = ", ".join(
+            f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True)
+        )
         why = f"stamps come from different clocks (relative to the recorder: {clocks})"
         if anew:
             why = f"the clock of {', '.join(anew)} restarts or was set"
         logged = [track._replace(stamps_ns=track.logged_ns) for track in tracks]
-        return OneClock(logged, logged=True, remark=f"{why}; the times of recording are used instead")
+        return OneClock(
+            logged, logged=True, remark=f"{why}; the times of recording are used instead"
+        )
     parts = [clock_parts(track.stamps_ns) for track in tracks]
     counts = [len(track_parts) for track_parts in parts]
     if max(counts) == 1:
         return OneClock(list(tracks))
     part = 0  # in the first part, no clock has restarted
     if len(set(counts)) == 1:
-        part = int(np.argmax([sum(len(track_parts[i]) for track_parts in parts) for i in range(counts[0])]))
-    part_tracks = [track.at(track_parts[part]) for track, track_parts in zip(tracks, parts, strict=True)]
-    left = sum(len(track.stamps_ns) for track in tracks) - sum(len(track.stamps_ns) for track in part_tracks)
-    whose = ", ".join(dict.fromkeys(track.name for track, count in zip(tracks, counts, strict=True) if count > 1))
+        part = int(
+            np.argmax([sum(len(track_parts[i]) for track_parts in parts) for i in range(counts[0])])
+        )
+    part_tracks = [
+        track.at(track_parts[part]) for track, track_parts in zip(tracks, parts, strict=True)
+    ]
+    left = sum(len(track.stamps_ns) for track in tracks) - sum(
+        len(track.stamps_ns) for track in part_tracks
+    )
+    whose = ", ".join(
+        dict.fromkeys(track.name for track, count in zip(tracks, counts, strict=True) if count > 1)
+    )
     lasts_s = max(float(np.ptp(track.stamps_ns)) for track in part_tracks) / 1e9
     remark = (
-        f"the clock of {whose} restarts, and the times of recording do too: part {part + 1} of {max(counts)} is "
-        f"used, which lasts {lasts_s:.1f} s; {left} poses are left out"
+        f"the clock of {whose} restarts, and the times of recording do too: part {part + 1} of "
+        f"{max(counts)} is used, which lasts {lasts_s:.1f} s; {left} poses are left out"
     )
     return OneClock(part_tracks, part=part, remark=remark)
 
@@ -67,7 +81,9 @@ def _is_steady(track: Track) -> bool:
     if not np.ptp(track.logged_ns):
         return True
     ahead_s = (track.stamps_ns - track.logged_ns) / 1e9
-    second = ((track.logged_ns - track.logged_ns.min()) / (1e9 * TUNING.intake.tracker_memory_s)).astype(np.int64)
+    second = (
+        (track.logged_ns - track.logged_ns.min()) / (1e9 * TUNING.intake.tracker_memory_s)
+    ).astype(np.int64)
     fastest = np.full(int(second.max()) + 1, -np.inf)
     np.maximum.at(fastest, second, ahead_s)
     return bool(np.ptp(fastest[np.isfinite(fastest)]) <= LARGEST_DELAY_S)
@@ -75,4 +91,6 @@ def _is_steady(track: Track) -> bool:
 
 def _are_usable(tracks: Sequence[Track]) -> bool:
     """True if the times of recording grow, so that they can replace the stamps."""
-    return all(np.ptp(track.logged_ns) > 0 and len(clock_parts(track.logged_ns)) == 1 for track in tracks)
+    return all(
+        np.ptp(track.logged_ns) > 0 and len(clock_parts(track.logged_ns)) == 1 for track in tracks
+    )

@@ -70,7 +70,8 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
         for end in rows[i + 1 :].tolist():
             if seconds[end] - seconds[begin] > MAX_JUMP_S:
                 break
-            left, moved = steps[begin] + steps[end], steps[begin] - steps[end]
+            left = steps[begin] + steps[end]
+            moved = steps[begin] - steps[end]
             if np.linalg.norm(left) < MAX_REMAINDER * np.linalg.norm(moved):
                 mask[begin + 1 : end + 1] = True
                 after = end + 1
@@ -84,12 +85,16 @@ def _without_glitches(positions: Vector, around: int) -> Vector:
     """
     medians = median_filter(positions, (GLITCH_WINDOW, 1), mode="nearest")
     distances_m = np.linalg.norm(positions - medians, axis=1)
-    return np.where((distances_m > GLITCH_RATIO * _usual(distances_m, around))[:, None], medians, positions)
+    return np.where(
+        (distances_m > GLITCH_RATIO * _usual(distances_m, around))[:, None], medians, positions
+    )
 
 
 def _usual(sizes: Vector, around: int) -> Vector:
     """The usual one of sizes (N,) among so many neighbours on both sides."""
-    return np.asarray(percentile_filter(sizes, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror"))
+    return np.asarray(
+        percentile_filter(sizes, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror")
+    )
 
 
 def _steps(seconds: Vector, positions: Vector) -> Vector:
@@ -130,5 +135,7 @@ def _unusual(steps: Vector, around: int) -> NDArray[np.intp]:
     padded = np.pad(steps, ((1, 1), (0, 0)))
     deviations_m = np.linalg.norm(0.5 * (padded[:-2] + padded[2:]) - share * steps, axis=1)
     return np.flatnonzero(
-        (size > np.maximum(STEP_M, UNUSUAL_RATIO * usual)) & (size >= largest) & (deviations_m < MAX_BESIDE * size)
+        (size > np.maximum(STEP_M, UNUSUAL_RATIO * usual))
+        & (size >= largest)
+        & (deviations_m < MAX_BESIDE * size)
     )

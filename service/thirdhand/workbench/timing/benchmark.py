@@ -25,15 +25,27 @@ from thirdhand.workbench.timing.probe import EDGES_US, figures, percentiles
 from thirdhand.workbench.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "thirdhand")
-DURATION_PARTS = 6  # the duration is divided into two parts each for the empty loop, the core and the whole
+DURATION_PARTS = (
+    6  # the duration is divided into two parts each for the empty loop, the core and the whole
+)
 MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (
-    ("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance", "`performance` holds the clock rate"),
-    ("/proc/sys/kernel/sched_rt_runtime_us", "-1", "-1 does not limit the time of a real-time loop"),
+    (
+        "/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
+        "performance",
+        "`performance` holds the clock rate",
+    ),
+    (
+        "/proc/sys/kernel/sched_rt_runtime_us",
+        "-1",
+        "-1 does not limit the time of a real-time loop",
+    ),
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
 LOOP_KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
-NOTHING_US = 10.0  # added to both medians of lateness, because the ratio of two small numbers means nothing
+NOTHING_US = (
+    10.0  # added to both medians of lateness, because the ratio of two small numbers means nothing
+)
 SLOWER = 1.15  # accepted latency / (half a period + round trip + work)
 
 
@@ -74,7 +86,11 @@ def run(
         else:
             say(f"{kind}: {part_s:g} s")
             results[kind].append(probe(kind, *kinds[kind]))
-    report = {"rate_hz": rate_hz, "cores": len(os.sched_getaffinity(0)), "granted": whole.pop("granted")}
+    report = {
+        "rate_hz": rate_hz,
+        "cores": len(os.sched_getaffinity(0)),
+        "granted": whole.pop("granted"),
+    }
     report |= {kind: _joined(parts) for kind, parts in results.items()} | {"whole": whole}
     return report | {"ratios": _ratios(report)}
 
@@ -89,7 +105,8 @@ def _whole(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, echo() as echo_at:
         folder = keep or Path(name)
-        arguments, before = ("--joints", "assumed", "--rate", str(rate_hz)), set(folder.glob("*.mcap"))
+        arguments = ("--joints", "assumed", "--rate", str(rate_hz))
+        before = set(folder.glob("*.mcap"))
         # the timing of each tick is recorded with its frame
         settings = msgspec.structs.replace(cell_of(arm), recording=RecordingSettings(frames_hz=0))
         cell: dict[str, Any] = {"settings": settings, "record": folder, "program": program}
@@ -108,7 +125,13 @@ def _whole(
                 raise ProbeError(f"the service failed: {service.log.read_text()[-500:]}")
         recorded = sorted(set(folder.glob("*.mcap")) - before)
         timing = np.array(
-            [step.timing for path in recorded for step in Recording.open(path).steps() if step.timing], TIMING
+            [
+                step.timing
+                for path in recorded
+                for step in Recording.open(path).steps()
+                if step.timing
+            ],
+            TIMING,
         )
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
         began = service.log.read_text().partition("started in ")[2].partition("\n")[0]
@@ -118,7 +141,9 @@ def _whole(
         "ticks": int(timing["tick"][-1] - timing["tick"][0]),
         "missed": int(timing["missed"][-1] - timing["missed"][0]),
         **figures(timing["lateness_us"], timing["work_us"]),
-        "stages_us": {name: percentiles(timing["stages_us"][:, i]) for i, name in enumerate(STAGES)},
+        "stages_us": {
+            name: percentiles(timing["stages_us"][:, i]) for i, name in enumerate(STAGES)
+        },
         "processes": processes,
     }
 
@@ -127,7 +152,10 @@ def _joined(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """The merged parts of one kind: sums of counts, means of percentiles, the maximum of maxima."""
     out: dict[str, Any] = {name: sum(part[name] for part in parts) for name in ("ticks", "missed")}
     for name in ("lateness_us", "work_us"):
-        means = {share: round(float(np.mean([part[name][share] for part in parts])), 2) for share in parts[0][name]}
+        means = {
+            share: round(float(np.mean([part[name][share] for part in parts])), 2)
+            for share in parts[0][name]
+        }
         out[name] = means | {"max": max(part[name]["max"] for part in parts)}
     for name in ("lateness_counts", "work_counts"):
         out[name] = np.sum([part[name] for part in parts], axis=0).tolist()
@@ -135,12 +163,15 @@ def _joined(parts: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _ratios(report: dict[str, Any]) -> dict[str, float]:
-    empty, whole = report["empty"], report["whole"]
+    empty = report["empty"]
+    whole = report["whole"]
     work_ms = whole["work_us"]["p50"] / 1e3
     least_ms = 500.0 / report["rate_hz"] + whole["round_trip_ms"]["p50"] + work_ms
     ratios = {
-        "missed_more": whole["missed"] / max(1, whole["ticks"]) - empty["missed"] / max(1, empty["ticks"]),
-        "lateness_p50": (whole["lateness_us"]["p50"] + NOTHING_US) / (empty["lateness_us"]["p50"] + NOTHING_US),
+        "missed_more": whole["missed"] / max(1, whole["ticks"])
+        - empty["missed"] / max(1, empty["ticks"]),
+        "lateness_p50": (whole["lateness_us"]["p50"] + NOTHING_US)
+        / (empty["lateness_us"]["p50"] + NOTHING_US),
         "lateness_p99": whole["lateness_us"]["p99"] / max(1.0, empty["lateness_us"]["p99"]),
         "lateness_p99.9": whole["lateness_us"]["p99.9"] / max(1.0, empty["lateness_us"]["p99.9"]),
         "latency": whole["latency_ms"]["p50"] / least_ms,
@@ -153,15 +184,24 @@ def _ratios(report: dict[str, Any]) -> dict[str, float]:
 def text(report: dict[str, Any]) -> str:
     """The report for people to read."""
     names = ("p50", "p99", "p99.9", "max")
-    rows = [f"{report['rate_hz']} Hz on {report['cores']} cores {'':>18}{''.join(f'{name:>9}' for name in names)}"]
+    rows = [
+        f"{report['rate_hz']} Hz on {report['cores']} cores "
+        f"{'':>18}{''.join(f'{name:>9}' for name in names)}"
+    ]
     for kind, label in LOOP_KINDS:
         loop = report[kind]
         share = 100 * loop["missed"] / max(1, loop["ticks"])
-        rows.append(f"  {label:<11} {loop['missed']} of {loop['ticks']} deadlines missed ({share:.2f} %)")
+        rows.append(
+            f"  {label:<11} {loop['missed']} of {loop['ticks']} deadlines missed ({share:.2f} %)"
+        )
         for name, unit in (("lateness_us", "late µs"), ("work_us", "work µs")):
             rows.append(f"    {unit:<34}" + "".join(f"{loop[name][share]:9.1f}" for share in names))
-    whole, ratios = report["whole"], report["ratios"]
-    for name, label in (("latency_ms", "hand to command ms"), ("round_trip_ms", "there and back by Zenoh ms")):
+    whole = report["whole"]
+    ratios = report["ratios"]
+    for name, label in (
+        ("latency_ms", "hand to command ms"),
+        ("round_trip_ms", "there and back by Zenoh ms"),
+    ):
         rows.append(f"    {label:<34}" + "".join(f"{whole[name][share]:9.2f}" for share in names))
     rows += [
         f"    {f'of it, {name} µs':<34}" + "".join(f"{stage[share]:9.1f}" for share in names)
@@ -177,10 +217,11 @@ def text(report: dict[str, Any]) -> str:
         f"{'locked' if granted['memory_locked'] else 'not locked'}",
         *([f"    started in {whole['start']}"] if whole.get("start") else []),
         "",
-        f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and {ratios['lateness_p99.9']:.2f} times "
-        "the empty loop's;",
+        f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and "
+        f"{ratios['lateness_p99.9']:.2f} times the empty loop's;",
         f"  missed deadlines: {100 * ratios['missed_more']:+.2f} % compared with the empty loop",
-        f"  hand to command: {ratios['latency']:.2f} times the sum of half a period, the round trip and the work",
+        f"  hand to command: {ratios['latency']:.2f} times the sum of half a period, the round "
+        "trip and the work",
         "",
         _verdict(report),
     ]
@@ -193,11 +234,17 @@ def draw(report: dict[str, Any], path: Path) -> None:
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2, sharey=True), ("lateness", "work"), strict=True):
-        for (kind, label), colour in zip(LOOP_KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True):
+        for (kind, label), colour in zip(
+            LOOP_KINDS, ("#999999", "#0072b2", "#d55e00"), strict=True
+        ):
             counts = np.array(report[kind][f"{name}_counts"])
-            axes.stairs(counts / max(1, counts.sum()), EDGES_US, label=label, color=colour, linewidth=1.4)
+            axes.stairs(
+                counts / max(1, counts.sum()), EDGES_US, label=label, color=colour, linewidth=1.4
+            )
         axes.axvline(1e6 / report["rate_hz"], color="black", linestyle=":", linewidth=1)
-        axes.set(xscale="log", yscale="log", xlabel=f"{name} [µs], dotted: the period", xlim=(1, 2e4))
+        axes.set(
+            xscale="log", yscale="log", xlabel=f"{name} [µs], dotted: the period", xlim=(1, 2e4)
+        )
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("share of ticks")
     figure.axes[0].legend()
@@ -209,15 +256,19 @@ def _verdict(report: dict[str, Any]) -> str:
     advice = "; ".join(_kernel())
     if not report["granted"]["realtime"]:
         return (
-            "Real-time scheduling was not granted. To grant it: `ulimit -r 90` as root before the service starts, a "
-            "line `<user> - rtprio 90` in /etc/security/limits.conf, or AmbientCapabilities=CAP_SYS_NICE in its unit."
+            "Real-time scheduling was not granted. To grant it: `ulimit -r 90` as root before the "
+            "service starts, a line `<user> - rtprio 90` in /etc/security/limits.conf, or "
+            "AmbientCapabilities=CAP_SYS_NICE in its unit."
         )
     if report["cores"] < 2:
         return "One core is too few: loop, recorder and viewer need two."
     if report["empty"]["missed"] > 0.001 * report["empty"]["ticks"]:
         return f"Even an empty loop misses deadlines on this machine: stop other programs. {advice}"
     if report["ratios"]["missed_more"] > MISSED_MORE or report["ratios"]["latency"] > SLOWER:
-        return f"The loop misses more deadlines, or answers later, than this machine would allow. {advice}"
+        return (
+            "The loop misses more deadlines, or answers later, than this machine would allow. "
+            f"{advice}"
+        )
     return "The loop meets its deadlines on this machine."
 
 

@@ -47,7 +47,9 @@ UNCOUNTED_S = 1.0  # the first second is not counted
 
 def percentiles(values: Any) -> dict[str, float]:
     """The percentiles PERCENTS of values, by name; zeros without values."""
-    quantiles = np.percentile(values, PERCENTS).round(2).tolist() if len(values) else [0.0] * len(PERCENTS)
+    quantiles = (
+        np.percentile(values, PERCENTS).round(2).tolist() if len(values) else [0.0] * len(PERCENTS)
+    )
     return dict(zip(("p50", "p99", "p99.9", "max"), quantiles, strict=True))
 
 
@@ -56,7 +58,9 @@ def figures(lateness_us: Any, work_us: Any) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for name, values in (("lateness", lateness_us), ("work", work_us)):
         results[f"{name}_us"] = percentiles(values)
-        results[f"{name}_counts"] = np.histogram(np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US)[0].tolist()
+        results[f"{name}_counts"] = np.histogram(
+            np.clip(values, EDGES_US[0], EDGES_US[-1]), EDGES_US
+        )[0].tolist()
     return results
 
 
@@ -74,7 +78,8 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
     """Run a loop that does `work` each tick; its missed deadlines, lateness and work [µs]."""
     realtime = ask_for_real_time().realtime
     clock = Deadlines(rate_hz, spin_ns=SPIN_NS if realtime else 0)
-    late_us, work_us = [], []
+    late_us = []
+    work_us = []
     first = missed = 0
     for _ in range(round((UNCOUNTED_S + seconds) * rate_hz)):
         index, late_ns = clock.wait()
@@ -82,13 +87,19 @@ def loop(rate_hz: int, seconds: float, work: Callable[[int], object]) -> dict[st
         work(index)
         took = time.perf_counter_ns() - began
         if index < UNCOUNTED_S * rate_hz:
-            first, missed = index, clock.missed
+            first = index
+            missed = clock.missed
         elif index > (UNCOUNTED_S + seconds) * rate_hz:
             break
         else:
             late_us.append(late_ns / 1e3)
             work_us.append(took / 1e3)
-    return {"realtime": realtime, "ticks": index - first, "missed": clock.missed - missed, **figures(late_us, work_us)}
+    return {
+        "realtime": realtime,
+        "ticks": index - first,
+        "missed": clock.missed - missed,
+        **figures(late_us, work_us),
+    }
 
 
 @functools.cache
@@ -113,7 +124,9 @@ def hands_of(session: zenoh.Session, skill: Skill) -> Callable[[float, int], Non
 
     def publish(t: float, stamp_ns: int) -> None:
         for publisher, place in zip(publishers, swaying(skill, t), strict=True):
-            publisher.put(cdr.encode_pose(PoseStamped(stamp_ns, "base", place, (0.0, 0.0, 0.0, 1.0))))
+            publisher.put(
+                cdr.encode_pose(PoseStamped(stamp_ns, "base", place, (0.0, 0.0, 0.0, 1.0)))
+            )
 
     return publish
 
@@ -123,15 +136,23 @@ def core(skill: Skill, rate_hz: int, seconds: float, arm: str) -> dict[str, Any]
     cell = cell_of(arm)
     assumed = msgspec.structs.replace(cell.arm, source="assumed")
     settings = msgspec.structs.replace(cell, rate_hz=rate_hz, arm=assumed)
-    skill, urdf = replace(skill, threshold=math.inf), robot_description(settings)
+    skill = replace(skill, threshold=math.inf)
+    urdf = robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
-    controller, every = Controller(settings, skill, urdf=urdf), max(1, round(HANDS_EVERY_S * rate_hz))
+    controller = Controller(settings, skill, urdf=urdf)
+    every = max(1, round(HANDS_EVERY_S * rate_hz))
 
     def step(index: int) -> object:
         hands = swaying(skill, index / rate_hz) if index % every == 0 else []
         poses = (PoseStamped(1 + index, "", place, (0.0, 0.0, 0.0, 1.0)) for place in hands)
         return controller.step(
-            Tick(index, tuple(Event(f"hands/{side}", b"", pose) for side, pose in zip(SIDES, poses, strict=False)))
+            Tick(
+                index,
+                tuple(
+                    Event(f"hands/{side}", b"", pose)
+                    for side, pose in zip(SIDES, poses, strict=False)
+                ),
+            )
         )
 
     return loop(rate_hz, seconds, step)
@@ -158,7 +179,8 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
         ]
         publish = hands_of(session, skill)
         ping = session.declare_publisher("probe/ping", express=True)
-        start_ns, sent = time.time_ns(), []
+        start_ns = time.time_ns()
+        sent = []
         for k in range(round((UNCOUNTED_S + seconds) * TRACKER_HZ)):
             due_ns = start_ns + round(1e9 * k / TRACKER_HZ)
             time.sleep(max(0.0, (due_ns - time.time_ns()) / 1e9))
@@ -172,7 +194,11 @@ def tracker(skill: Skill, endpoint: str, echo_at: str, seconds: float) -> dict[s
         for subscriber in listening:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
     latencies_ms = [(answered[stamp] - stamp) / 1e6 for stamp in sent if stamp in answered]
-    return {"latency_ms": percentiles(latencies_ms), "round_trip_ms": percentiles(trips_ms), "sent": len(sent)}
+    return {
+        "latency_ms": percentiles(latencies_ms),
+        "round_trip_ms": percentiles(trips_ms),
+        "sent": len(sent),
+    }
 
 
 def echo() -> None:

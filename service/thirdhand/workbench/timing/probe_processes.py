@@ -24,7 +24,9 @@ class ProbeError(ExplainedError):
 def probe(kind: str, *arguments: object) -> dict[str, Any]:
     """Run a probe and return its result. Raises ProbeError."""
     command = [*PROBE, kind, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
+    )
     if done.returncode != 0:
         raise ProbeError(f"{kind} could not be measured: {done.stderr.strip()[-500:]}")
     result: dict[str, Any] = json.loads(done.stdout)
@@ -34,7 +36,9 @@ def probe(kind: str, *arguments: object) -> dict[str, Any]:
 @contextlib.contextmanager
 def echo() -> Iterator[str]:
     """A context with a running echo; its endpoint."""
-    with subprocess.Popen([*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [*PROBE, "echo"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         assert process.stdin is not None
         try:

@@ -32,7 +32,9 @@ from thirdhand.workbench.trackers.hand_message import PageHands, decode_hands, i
 from thirdhand.workbench.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
-PAGE_SILENCE_S = 10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
+PAGE_SILENCE_S = (
+    10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
+)
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
 MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
 MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
@@ -63,13 +65,19 @@ class BrowserHands:
         has_token: Callable[[str], bool],
         pinches: Pinches | None = None,
     ) -> None:
-        self._tracker, self._client, self._latest, self._frame = tracker, client, latest, frame
-        self._has_token, self._pinches = has_token, pinches
+        self._tracker = tracker
+        self._client = client
+        self._latest = latest
+        self._frame = frame
+        self._has_token = has_token
+        self._pinches = pinches
         self._name = f"hands {secrets.token_hex(4)}"  # of the person who holds by a sign
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
         self._owned_s = 0.0
-        self.published = self.lost = self.delayed = 0  # messages of hands: published, missing between others, dropped
+        self.published = self.lost = self.delayed = (
+            0  # messages of hands: published, missing between others, dropped
+        )
         self._number: int | None = None
         # each page may wait for two orders; the hold of one must not wait for those of others
         self._ordering = ThreadPoolExecutor(2 * MAX_PAGES, thread_name_prefix="order")
@@ -136,20 +144,26 @@ class BrowserHands:
         if self._owner is not page:
             if self._owner is not None and now_s - self._owned_s < OWNER_S:
                 return False
-            self._owner, self._number = page, None
+            self._owner = page
+            self._number = None
             self._release()
         if self._number is not None:
             self.lost += (hands.number - self._number - 1) & 0xFFFF
         if now_s - self._owned_s > MAX_PINCH_GAP_S:
             self._release()
-        self._number, self._owned_s = hands.number, now_s
+        self._number = hands.number
+        self._owned_s = now_s
         if time.time_ns() - hands.stamp_ns > 1e9 * MAX_HELD_UP_S:
             self.delayed += 1
             return True
         frame_id = f"{self._frame}{hands.epoch or ''}"
         for hand in hands.hands:
             self._tracker.publish(
-                hand.side, hand.position, hand.orientation, stamp_ns=hands.stamp_ns, frame_id=frame_id
+                hand.side,
+                hand.position,
+                hand.orientation,
+                stamp_ns=hands.stamp_ns,
+                frame_id=frame_id,
             )
         if self._pinches is not None:
             self._pinches.publish({hand.side: hand.pinch_m for hand in hands.hands}, hands.stamp_ns)
@@ -165,18 +179,27 @@ class BrowserHands:
         """Send the status until the page leaves. A page that does not read it is disconnected."""
         with contextlib.suppress(ConnectionError):
             while True:
-                await page.send_str(json.dumps({"status": self._latest.summary(), "objects": self._latest.objects()}))
+                await page.send_str(
+                    json.dumps(
+                        {"status": self._latest.summary(), "objects": self._latest.objects()}
+                    )
+                )
                 await asyncio.sleep(PAGE_STATUS_S)
 
     async def _order(self, page: web.WebSocketResponse, order: str) -> None:
         """Carry out an order or a correction, even if the page disconnects meanwhile."""
         if order == "resume by hands" and self._owner is not page:
-            is_done, text = False, NOT_FOLLOWED
+            is_done = False
+            text = NOT_FOLLOWED
         else:
             name = self._name if order in BY_HANDS else ""
-            carry_out = functools.partial(carried_out, self._client, BY_HANDS.get(order, order), by=name)
+            carry_out = functools.partial(
+                carried_out, self._client, BY_HANDS.get(order, order), by=name
+            )
             if match := CORRECTION.fullmatch(order):
                 carry_out = functools.partial(corrected, self._client, match[1])
-            is_done, text = await asyncio.get_running_loop().run_in_executor(self._ordering, carry_out)
+            is_done, text = await asyncio.get_running_loop().run_in_executor(
+                self._ordering, carry_out
+            )
         with contextlib.suppress(ConnectionError):
             await page.send_str(json.dumps({"order": order, "answer": text, "done": is_done}))

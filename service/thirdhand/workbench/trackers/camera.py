@@ -45,7 +45,9 @@ class HandCamera(AbstractContextManager["HandCamera"]):
         """`view_deg`: horizontal angle of view; `hand_length` [m]: from the crease of the wrist to
         the tip of the middle finger. Raises CameraError.
         """
-        self._view_deg, self._length, self._last_ms = view_deg, hand_length, 0
+        self._view_deg = view_deg
+        self._length = hand_length
+        self._last_ms = 0
         self._mediapipe = mediapipe()
         vision = self._mediapipe.tasks.vision
         options = vision.HandLandmarkerOptions(
@@ -57,7 +59,9 @@ class HandCamera(AbstractContextManager["HandCamera"]):
             with _silenced():
                 self._landmarker = vision.HandLandmarker.create_from_options(options)
         except (RuntimeError, ValueError) as error:
-            raise CameraError(f"{model} is no model of hands that MediaPipe loads: {error}") from None
+            raise CameraError(
+                f"{model} is no model of hands that MediaPipe loads: {error}"
+            ) from None
 
     def hands(self, picture: Any, at_ms: int) -> dict[str, HandPoints]:
         """The hands by side, in a picture (H, W, 3) in RGB, not mirrored; its time must grow.
@@ -69,10 +73,17 @@ class HandCamera(AbstractContextManager["HandCamera"]):
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
         with quiet:
             detection = self._landmarker.detect_for_video(image, self._last_ms)
-        hands = zip(detection.handedness, detection.hand_landmarks, detection.hand_world_landmarks, strict=True)
+        hands = zip(
+            detection.handedness,
+            detection.hand_landmarks,
+            detection.hand_world_landmarks,
+            strict=True,
+        )
         hand_points = dict[str, HandPoints]()
         for kinds, *parts in sorted(hands, key=lambda hand: hand[0][0].score, reverse=True):
-            points, shape = (np.array([[point.x, point.y, point.z] for point in part]) for part in parts)
+            points, shape = (
+                np.array([[point.x, point.y, point.z] for point in part]) for part in parts
+            )
             side = kinds[0].category_name.lower()
             if side in hand_points:
                 (side,) = set(SIDES) - {side}
@@ -102,11 +113,14 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
     device = cv2.VideoCapture()
     try:
         is_open = False
-        with contextlib.suppress(cv2.error, ValueError):  # of a number or a name that it cannot pass on
+        with contextlib.suppress(
+            cv2.error, ValueError
+        ):  # of a number or a name that it cannot pass on
             is_open = device.open(int(source) if source.isdecimal() else source)
         if not is_open:
             raise CameraError(
-                f"no camera {source} can be opened; the number of a camera that no program uses needed, or a video file"
+                f"no camera {source} can be opened; the number of a camera that no program uses "
+                "needed, or a video file"
             )
         device.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not one that waited
         any_read = False
@@ -119,30 +133,43 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
         device.release()
 
 
-def publish(tracker: Tracker, camera: HandCamera, source: str, say: Callable[[str], object]) -> None:
+def publish(
+    tracker: Tracker, camera: HandCamera, source: str, say: Callable[[str], object]
+) -> None:
     """Publish the hands of each picture of a source, until it ends; every 2 s, say what is seen.
     Raises CameraError.
     """
-    count, since, last = 0, time.monotonic(), dict[str, PalmPose]()
+    count = 0
+    since = time.monotonic()
+    last = dict[str, PalmPose]()
     for stamp_ns, picture in pictures(source):
         palms = camera.palms(picture, stamp_ns // 1_000_000)
         for side, pose in palms.items():
             x, y, z = pose.position.tolist()
             qx, qy, qz, qw = pose.orientation.as_quat().tolist()
-            tracker.publish(side, (x, y, z), (qx, qy, qz, qw), stamp_ns=stamp_ns, frame_id=CAMERA_FRAME)
-        count, last = count + 1, last | palms
+            tracker.publish(
+                side, (x, y, z), (qx, qy, qz, qw), stamp_ns=stamp_ns, frame_id=CAMERA_FRAME
+            )
+        count = count + 1
+        last = last | palms
         if (passed_s := time.monotonic() - since) > REPORT_S:
             summary = ", ".join(
-                f"{side} {last[side].position[2]:.2f} m away" if side in last else f"{side} not seen" for side in SIDES
+                f"{side} {last[side].position[2]:.2f} m away"
+                if side in last
+                else f"{side} not seen"
+                for side in SIDES
             )
             say(f"{summary}; {count / passed_s:.0f} pictures a second")
-            count, since, last = 0, time.monotonic(), {}
+            count = 0
+            since = time.monotonic()
+            last = {}
 
 
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
     """A context in which MediaPipe's libraries cannot write their notes on standard error."""
-    stderr_copy, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr_copy = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
         yield

@@ -28,7 +28,12 @@ from thirdhand.core.tuning import TUNING
 from thirdhand.daemon.cell_streams import SolePublisher, identity
 from thirdhand.recordings.mcap_file import machine, whole_file
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.workbench.takes.demonstration_reader import far_away, from_tracker, is_by_tracker, unknown_frame
+from thirdhand.workbench.takes.demonstration_reader import (
+    far_away,
+    from_tracker,
+    is_by_tracker,
+    unknown_frame,
+)
 from thirdhand.workbench.takes.dwells import REST_M
 from thirdhand.workbench.takes.pose_streams import GRIPPER_STATE, JOINT_STATES, PLACES_TOPIC
 from thirdhand.workbench.takes.tool_poses import tool_poses
@@ -37,7 +42,10 @@ from thirdhand.workbench.takes.track import Track
 HAND_KEYS = ("hands/left", "hands/right")
 TOOL_KEY = TAKE_KEYS["tool"]
 CAPTURED_KEYS = (*HAND_KEYS, TOOL_KEY, JOINT_STATES, GRIPPER_STATE)
-OTHER_CELLS = ("**/hands/*", "**/tool/pose")  # these expressions find streams of other cells, and misspelt keys
+OTHER_CELLS = (
+    "**/hands/*",
+    "**/tool/pose",
+)  # these expressions find streams of other cells, and misspelt keys
 MAX_OTHER_KEYS = 8  # an error message lists at most this many of them
 REST_RAD = 0.02  # a joint at rest moves less than this
 MIN_COVERED_SHARE = 0.7  # samples must cover this share of a rest
@@ -69,41 +77,59 @@ class Capture:
     """
 
     def __init__(
-        self, session: zenoh.Session, cell: str, settings: Settings, conducts: Hands = "both", person: str = ""
+        self,
+        session: zenoh.Session,
+        cell: str,
+        settings: Settings,
+        conducts: Hands = "both",
+        person: str = "",
     ) -> None:
-        self.cell, self.settings, self.conducts, self.person = cell, settings, conducts, person
+        self.cell = cell
+        self.settings = settings
+        self.conducts = conducts
+        self.person = person
         self._urdf = robot_description(settings)
         self.hands = HAND_KEYS if conducts == "both" else (TAKE_KEYS[conducts],)
         self.samples: dict[str, list[Sample]] = {
             key: [] for key in CAPTURED_KEYS if key not in HAND_KEYS or key in self.hands
         }
         self.malformed: dict[str, int] = {}
-        self.of_others: dict[str, int] = {}  # messages of a hand's second publisher, which are left out
+        self.of_others: dict[
+            str, int
+        ] = {}  # messages of a hand's second publisher, which are left out
         self._sole = {key: SolePublisher() for key in self.hands}
         self._waiting: dict[str, list[tuple[int, bytes, str]]] = {key: [] for key in self.samples}
-        self._heard_s, self._moved = time.monotonic(), False
+        self._heard_s = time.monotonic()
+        self._moved = False
         self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
         heard = [(channels.key(cell, key), self._listener(key)) for key in self.samples]
         if (domain := settings.network.ros2_domain) is not None:
             topics = ros2.heard(cell, settings.ros2, self.samples)
-            heard += [(ros2.key(domain, topic), self._listener(topic.channel, topic.frame)) for topic in topics]
+            heard += [
+                (ros2.key(domain, topic), self._listener(topic.channel, topic.frame))
+                for topic in topics
+            ]
         self._subscribers = [session.declare_subscriber(key, listener) for key, listener in heard]
 
     def _listener(self, key: str, frame: str = "") -> Callable[[zenoh.Sample], None]:
         """A function that queues the messages of a channel; with a `frame`, the poses of that
         child frame.
         """
-        waiting, name = self._waiting[key], cdr.bytes_of_frame(frame)
+        waiting = self._waiting[key]
+        name = cdr.bytes_of_frame(frame)
 
         def take(sample: zenoh.Sample) -> None:
-            arrived_ns, payload = time.time_ns(), sample.payload.to_bytes()
+            arrived_ns = time.time_ns()
+            payload = sample.payload.to_bytes()
             publisher = identity(sample)
             if not frame:
                 waiting.append((arrived_ns, payload, publisher))
             elif name in payload:
                 try:
                     poses = cdr.decode_transforms(payload, (frame,))
-                    waiting.extend((arrived_ns, cdr.encode_pose(pose), publisher) for _, pose in poses)
+                    waiting.extend(
+                        (arrived_ns, cdr.encode_pose(pose), publisher) for _, pose in poses
+                    )
                 except WireError:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
 
@@ -122,7 +148,9 @@ class Capture:
                 arrived_ns, payload, publisher = waiting.pop(0)
                 self._heard_s = time.monotonic()
                 try:
-                    sample = (self._state if key == JOINT_STATES else self._sample)(key, arrived_ns, payload)
+                    sample = (self._state if key == JOINT_STATES else self._sample)(
+                        key, arrived_ns, payload
+                    )
                 except WireError:
                     self.malformed[key] = self.malformed.get(key, 0) + 1
                     continue
@@ -135,7 +163,9 @@ class Capture:
     def _state(self, key: str, arrived_ns: int, payload: bytes) -> Sample | None:
         """The state of all joints that a message completes; None if it completes none."""
         message = cdr.decode_joints(payload)
-        state = self._states.take(message, arrived_ns / 1e9) or self._states.incomplete(message, arrived_ns / 1e9)
+        state = self._states.take(message, arrived_ns / 1e9) or self._states.incomplete(
+            message, arrived_ns / 1e9
+        )
         if state is None:
             return None
         received = payload if state is message else cdr.encode_joints(state)
@@ -159,7 +189,11 @@ class Capture:
     @property
     def missing(self) -> list[str]:
         """The required streams that have not been received yet."""
-        tool = [] if self.samples[TOOL_KEY] or self.samples[JOINT_STATES] else [f"{TOOL_KEY} or {JOINT_STATES}"]
+        tool = (
+            []
+            if self.samples[TOOL_KEY] or self.samples[JOINT_STATES]
+            else [f"{TOOL_KEY} or {JOINT_STATES}"]
+        )
         return [key for key in self.hands if not self.samples[key]] + tool
 
     def check(self) -> None:
@@ -180,7 +214,10 @@ class Capture:
     @property
     def streams(self) -> dict[str, list[Sample]]:
         """The streams of both hands, and of the tool if it is tracked, else of the arm's joints."""
-        return {key: self.samples[key] for key in (*self.hands, TOOL_KEY if self.samples[TOOL_KEY] else JOINT_STATES)}
+        return {
+            key: self.samples[key]
+            for key in (*self.hands, TOOL_KEY if self.samples[TOOL_KEY] else JOINT_STATES)
+        }
 
     @property
     def silent_s(self) -> float:
@@ -199,9 +236,11 @@ class Capture:
         if now_ns - began_ns < 1e9 * rest_s:
             return False
         for key, samples in self.streams.items():
-            lately = [*itertools.takewhile(lambda one: now_ns - one.arrived_ns <= 1e9 * rest_s, reversed(samples))][
-                ::-1
-            ]
+            lately = [
+                *itertools.takewhile(
+                    lambda one: now_ns - one.arrived_ns <= 1e9 * rest_s, reversed(samples)
+                )
+            ][::-1]
             still = [sample.at for sample in lately]
             self._moved = self._moved or (
                 bool(still) and _motion(key, np.array([samples[0].at, still[-1]])) > MOVED_RATIO
@@ -218,12 +257,15 @@ class Capture:
         times_ns = [sample.arrived_ns for samples in self.streams.values() for sample in samples]
         start_ns, end_ns = self.span_of_motion()
         for key, samples in self.samples.items():
-            self.samples[key] = [sample for sample in samples if start_ns <= sample.arrived_ns <= end_ns]
+            self.samples[key] = [
+                sample for sample in samples if start_ns <= sample.arrived_ns <= end_ns
+            ]
         return max(0.0, (start_ns - min(times_ns)) / 1e9), max(0.0, (max(times_ns) - end_ns) / 1e9)
 
     def span_of_motion(self) -> tuple[int, int]:
         """Begin and end of the motion [ns], with RETAINED_REST_S of rest before and after."""
-        begins, ends = [], []
+        begins = []
+        ends = []
         for key, samples in self.streams.items():
             positions = np.array([sample.at for sample in samples])
             margin = REST_RAD if key == JOINT_STATES else REST_M
@@ -242,13 +284,19 @@ class Capture:
         Without a tracked tool its poses are computed from the joints. Raises CaptureError, OSError.
         """
         if lacking := self.missing:
-            raise CaptureError(f"no messages on {', '.join(lacking)} arrived in time: no demonstration was written")
+            raise CaptureError(
+                f"no messages on {', '.join(lacking)} arrived in time: no demonstration was written"
+            )
         messages = [
-            (sample.arrived_ns, key, sample.payload) for key, samples in self.samples.items() for sample in samples
+            (sample.arrived_ns, key, sample.payload)
+            for key, samples in self.samples.items()
+            for sample in samples
         ]
         if not self.samples[TOOL_KEY]:
             tool = self.tool_by(self.samples[JOINT_STATES])
-            rows = zip(tool.logged_ns.tolist(), tool.stamps_ns.tolist(), tool.poses.tolist(), strict=True)
+            rows = zip(
+                tool.logged_ns.tolist(), tool.stamps_ns.tolist(), tool.poses.tolist(), strict=True
+            )
             for arrived_ns, stamp_ns, pose_row in rows:
                 pose = PoseStamped(stamp_ns, BASE, tuple(pose_row[:3]), tuple(pose_row[3:]))
                 messages.append((arrived_ns, TOOL_KEY, channels.POSE.encode(pose)))
@@ -268,17 +316,22 @@ class Capture:
     def tool_by(self, states: Sequence[Sample]) -> Track:
         """The tool's track in frame `base`, from states of the arm's joints by its URDF."""
         logged = np.array([state.arrived_ns for state in states], np.int64)
-        stamps = np.array([channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64)
-        stamps, joints = np.where(stamps == 0, logged, stamps), np.array([state.at for state in states])
+        stamps = np.array(
+            [channels.JOINTS.decode(state.payload).stamp_ns for state in states], np.int64
+        )
+        stamps = np.where(stamps == 0, logged, stamps)
+        joints = np.array([state.at for state in states])
         poses, rows = tool_poses(self.settings, self._urdf, stamps, joints)
         return Track("tool", "", stamps[rows], logged[rows], poses, BASE)
 
     def not_received(self, missing: Sequence[str], more: str = "") -> str:
         """A message on streams that do not arrive, and what to check."""
-        unreadable = "".join(f"; {n} messages on {key} are not readable" for key, n in self.malformed.items())
+        unreadable = "".join(
+            f"; {n} messages on {key} are not readable" for key, n in self.malformed.items()
+        )
         return (
-            f"not received: {', '.join(missing)}{unreadable}{more}. Are tracker and arm running, connected to the same "
-            f"endpoint, and in cell {self.cell}?"
+            f"not received: {', '.join(missing)}{unreadable}{more}. Are tracker and arm running, "
+            f"connected to the same endpoint, and in cell {self.cell}?"
         )
 
 
@@ -307,8 +360,12 @@ def capture(
 
     Raises CaptureError if hands and tool are not received within `wait_s` [s].
     """
-    captured, others = Capture(session, cell, settings, conducts, person), Overheard(session, *OTHER_CELLS)
-    at_rest = f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} s"
+    captured = Capture(session, cell, settings, conducts, person)
+    others = Overheard(session, *OTHER_CELLS)
+    at_rest = (
+        f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} "
+        "s"
+    )
     try:
         begun_s = time.monotonic()
         say(f"waiting for {', '.join(captured.missing)} of cell {cell}")
@@ -323,7 +380,8 @@ def capture(
         others.close()
         captured.check()
         captured.begin()
-        begun_s, shown_s = time.monotonic(), 0.0
+        begun_s = time.monotonic()
+        shown_s = 0.0
         say(f"recording{f'; it ends once {at_rest} after a motion' if until == 'rest' else ''}")
         while not is_ended():
             time.sleep(CAPTURE_POLL_S)
@@ -331,7 +389,9 @@ def capture(
             lasts_s = time.monotonic() - begun_s
             if lasts_s - shown_s > PROGRESS_S:
                 shown_s = lasts_s
-                counts = ", ".join(f"{key} {len(samples)}" for key, samples in captured.streams.items())
+                counts = ", ".join(
+                    f"{key} {len(samples)}" for key, samples in captured.streams.items()
+                )
                 progress(f"{lasts_s:5.1f} s   {counts}")
             if until == "rest" and captured.is_over(rest_s):
                 say(f"ended by rest: {at_rest}")

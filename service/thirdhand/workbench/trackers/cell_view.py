@@ -19,7 +19,17 @@ from thirdhand.contract.requests import Reply, Status
 MAX_STATUS_BYTES = 262_144  # a daemon's has 3 to 10 kB, and more with many via-points
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 SHOWN_FIELDS = (
-    *("mode", "reason", "because", "hands_m", "tool_m", "target_m", "std_m", "segment", "segment_belief"),
+    *(
+        "mode",
+        "reason",
+        "because",
+        "hands_m",
+        "tool_m",
+        "target_m",
+        "std_m",
+        "segment",
+        "segment_belief",
+    ),
     *("demonstrated_m", "hands_at_m", "trackers"),
 )
 
@@ -28,7 +38,8 @@ class Latest:
     """The newest status of the daemon, its age, and the objects on the bench."""
 
     def __init__(self, session: zenoh.Session, cell: str, first: Status | None = None) -> None:
-        self._status, self._at = first, time.monotonic()
+        self._status = first
+        self._at = time.monotonic()
         self._objects: tuple[SceneObject, ...] = ()
         self._subscribers = [
             session.declare_subscriber(channels.key(cell, suffix), take)
@@ -39,7 +50,8 @@ class Latest:
         if len(sample.payload) > MAX_STATUS_BYTES:
             return
         with contextlib.suppress(RefusedError):
-            self._status, self._at = decoded(sample.payload.to_bytes(), Status), time.monotonic()
+            self._status = decoded(sample.payload.to_bytes(), Status)
+            self._at = time.monotonic()
 
     def _take_objects(self, sample: zenoh.Sample) -> None:
         with contextlib.suppress(WireError):  # the daemon reports them
@@ -50,22 +62,33 @@ class Latest:
         the position is in a frame of the arm, which holds it.
         """
         fields = ("name", "shape", "position", "size", "colour")
-        return [{name: getattr(item, name) for name in fields} | {"held": item.frame_id != BASE} for item in self._objects]
+        return [
+            {name: getattr(item, name) for name in fields} | {"held": item.frame_id != BASE}
+            for item in self._objects
+        ]
 
     def summary(self) -> dict[str, Any]:
         """Mode, reason, its title and explanation, remedy by the page's buttons, positions [m], age
         [s], URL and process of the live view, and further facts in one line; empty before the first
         status.
         """
-        now, age_s = self._status, time.monotonic() - self._at
+        now = self._status
+        age_s = time.monotonic() - self._at
         if now is None:
             return {}
         hands = ", ".join(f"{side} hand {age:.0f} ms old" for side, age in now.hand_age_ms.items())
         near = f"{100 * now.hand_distance_m:.0f} cm to the nearest, " if hands else ""
-        facts = f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill {now.skill}"
+        facts = (
+            f"{hands or 'no hands seen'}; {near}{now.rate_hz:.0f} Hz, {now.missed} missed; skill "
+            f"{now.skill}"
+        )
         values = {name: getattr(now, name) for name in SHOWN_FIELDS} | {"title": title(now.reason)}
         remedy = _COMMAND.sub(
-            lambda found: f"{found[1]}pressing {found[2].title()}" if found[1] else f"press {found[2].title()}",
+            lambda found: (
+                f"{found[1]}pressing {found[2].title()}"
+                if found[1]
+                else f"press {found[2].title()}"
+            ),
             now.remedy,
         )
         live = [now.scribe.get("live"), now.scribe.get("pid")]
@@ -85,7 +108,11 @@ def corrected(client: Client, given: str) -> tuple[bool, str]:
     except (ExplainedError, ValueError) as error:
         return False, _failed("correct", error)
     correction = reply.correction
-    text = "" if correction is None else f"{correction.name} {'undone' if correction.undone else 'in force'}: {correction.text}"
+    text = (
+        ""
+        if correction is None
+        else f"{correction.name} {'undone' if correction.undone else 'in force'}: {correction.text}"
+    )
     return True, f"{text}. Resume lets the tool go there" + f"; {reply.note}" * bool(reply.note)
 
 
@@ -104,4 +131,8 @@ def carried_out(client: Client, order: str, by: str = "") -> tuple[bool, str]:
 
 def _failed(order: str, error: Exception) -> str:
     """The failure of an order, in words."""
-    return f"{order}: {error}" if isinstance(error, UncertainError) else f"{order} was NOT carried out: {error}"
+    return (
+        f"{order}: {error}"
+        if isinstance(error, UncertainError)
+        else f"{order} was NOT carried out: {error}"
+    )

@@ -25,9 +25,11 @@ from typing import NamedTuple
 from thirdhand.contract.messages import Quaternion, Vector3, WireError, finite
 from thirdhand.contract.records import SIDES
 
-HANDS_MAGIC, PING_MAGIC = 0x53444E48, 0x474E4950
+HANDS_MAGIC = 0x53444E48
+PING_MAGIC = 0x474E4950
 HANDS_LAYOUT = struct.Struct("<IBBHdd12f12f")
-PING, SERVER_TIME = struct.Struct("<I4xd"), struct.Struct("<d")
+PING = struct.Struct("<I4xd")
+SERVER_TIME = struct.Struct("<d")
 HAND_FLOATS = 12
 MAX_AHEAD_MS = 200.0  # a headset predicts less than this
 MAX_CLOCK_ERROR_MS = 1000.0  # a page that compares clocks is never ahead by this
@@ -83,7 +85,9 @@ def decode_hands(data: bytes, now_ns: int) -> PageHands:
     if not -MAX_CLOCK_ERROR_MS <= age_ms <= MAX_AGE_MS:
         raise WireError(f"hands of {_ago(age_ms)}: the page's clock is wrong")
     hands = tuple(
-        _hand(side, values[HAND_FLOATS * i : HAND_FLOATS * (i + 1)]) for i, side in enumerate(SIDES) if seen_bits >> i & 1
+        _hand(side, values[HAND_FLOATS * i : HAND_FLOATS * (i + 1)])
+        for i, side in enumerate(SIDES)
+        if seen_bits >> i & 1
     )
     return PageHands(epoch, number, min(int((at_ms + ahead_ms) * 1e6), now_ns), hands)
 
@@ -98,7 +102,9 @@ def _hand(side: str, values: list[float]) -> PageHand:
     if abs(norm - 1.0) > UNIT_TOLERANCE:
         raise WireError(f"{side} hand: a quaternion of norm {norm:.3g}, 1 needed")
     turn = (x / norm, y / norm, z / norm, w / norm)  # float32 leaves 1e-7
-    return PageHand(side, (values[0], values[1], values[2]), turn, (values[7], values[8], values[9]), values[10])
+    return PageHand(
+        side, (values[0], values[1], values[2]), turn, (values[7], values[8], values[9]), values[10]
+    )
 
 
 def _ago(age_ms: float) -> str:

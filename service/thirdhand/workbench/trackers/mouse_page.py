@@ -44,7 +44,9 @@ class MousePage(HandsPage):
     those of `HandsPage`.
     """
 
-    page, scripts, frame = "mouse.html", ("link", "controls"), BASE
+    page = "mouse.html"
+    scripts = ("link", "controls")
+    frame = BASE
 
     def __init__(
         self,

@@ -16,16 +16,32 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-WRIST, INDEX, MIDDLE, RING, LITTLE = 0, 5, 9, 13, 17  # MediaPipe's numbers of the wrist and of the knuckles
+# MediaPipe's numbers of the wrist and of the knuckles
+WRIST = 0
+INDEX = 5
+MIDDLE = 9
+RING = 13
+LITTLE = 17
 PALM = (WRIST, INDEX, MIDDLE, RING, LITTLE)
 # An average palm in shares of the hand's length, from the crease of the wrist to the tip of the
 # middle finger: x to the middle knuckle, y towards the thumb.
 AVERAGE_PALM = np.array(
-    [[0.0, 0.0, 0.0], [0.505, 0.125, 0.0], [0.515, 0.0, 0.0], [0.475, -0.115, 0.0], [0.41, -0.215, 0.0]]
+    [
+        [0.0, 0.0, 0.0],
+        [0.505, 0.125, 0.0],
+        [0.515, 0.0, 0.0],
+        [0.475, -0.115, 0.0],
+        [0.41, -0.215, 0.0],
+    ]
 )
-PALM_CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]  # the palm's position is their mean
-_AHEAD = AVERAGE_PALM[PALM_CORNERS].sum(axis=0) / np.linalg.norm(AVERAGE_PALM[PALM_CORNERS].sum(axis=0))
-MAX_ERROR = 0.02  # root mean square error of x / z and y / z; with a larger one, the points are not those of a palm
+PALM_CORNERS = [
+    PALM.index(point) for point in (WRIST, INDEX, LITTLE)
+]  # the palm's position is their mean
+_AHEAD = AVERAGE_PALM[PALM_CORNERS].sum(axis=0) / np.linalg.norm(
+    AVERAGE_PALM[PALM_CORNERS].sum(axis=0)
+)
+# root mean square error of x / z and y / z; with a larger one, the points are not those of a palm
+MAX_ERROR = 0.02
 NEWTON_STEPS = 10  # Gauss-Newton steps; the last one changes the pose by less than 0.1 mm
 MAX_TURN_RAD = 0.3  # largest turn in one step
 RANK_SHARE = 1e-3  # directions that the picture hardly determines keep their initial value
@@ -62,7 +78,9 @@ class PalmPose(NamedTuple):
     orientation: Rotation
 
 
-def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: float) -> PalmPose | None:
+def palm_pose(
+    side: str, picture: Array, shape: Array, lens: Lens, hand_length: float
+) -> PalmPose | None:
     """The palm of the `left` or `right` hand whose points are seen at `picture` (21, 2), 0 to 1 of
     width and height; None if no palm of this size [m] explains them.
 
@@ -90,12 +108,16 @@ def palm_pose(side: str, picture: Array, shape: Array, lens: Lens, hand_length: 
         jacobian = np.concatenate([of_point @ _crossed(turned), of_point], axis=2)
         step = np.linalg.lstsq(jacobian.reshape(-1, 6), -errors.ravel(), rcond=RANK_SHARE)[0]
         step *= min(1.0, MAX_TURN_RAD / max(float(np.linalg.norm(step[:3])), 1e-9))
-        turn, position_m = Rotation.from_rotvec(step[:3]) * turn, position_m + step[3:]
+        turn = Rotation.from_rotvec(step[:3]) * turn
+        position_m = position_m + step[3:]
     if np.sqrt(np.mean(errors**2)) > MAX_ERROR:
         return None
     back = np.array([0.0, 0.0, 1.0 if side == "right" else -1.0])
     axes = np.stack([np.cross(back, -_AHEAD), back, -_AHEAD], axis=1)
-    return PalmPose((turn.apply(palm) + position_m)[PALM_CORNERS].mean(axis=0), turn * Rotation.from_matrix(axes))
+    return PalmPose(
+        (turn.apply(palm) + position_m)[PALM_CORNERS].mean(axis=0),
+        turn * Rotation.from_matrix(axes),
+    )
 
 
 def _crossed(vectors: Array) -> Array:
@@ -108,8 +130,11 @@ def where_seen(points: Array, u: Array) -> Array:
     """The translation t (3,) for which points (N, 3) are seen at u (N, 2), by linear least squares:
     (x + t_x) - u_x (z + t_z) = 0, and the same in y.
     """
-    ones, none = np.ones(len(u)), np.zeros(len(u))
-    left = np.concatenate([np.stack([ones, none, -u[:, 0]], 1), np.stack([none, ones, -u[:, 1]], 1)])
+    ones = np.ones(len(u))
+    none = np.zeros(len(u))
+    left = np.concatenate(
+        [np.stack([ones, none, -u[:, 0]], 1), np.stack([none, ones, -u[:, 1]], 1)]
+    )
     right = (u * points[:, 2:] - points[:, :2]).T.ravel()
     moved: Array = np.linalg.lstsq(left, right, rcond=None)[0]
     return moved

@@ -10,7 +10,9 @@ from thirdhand.client import Publisher
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import GRIPPER, JointState
 
-PINCHED_M, PARTED_M = 0.02, 0.04  # thumb and index tip: a pinch begins below the first, and ends above the second
+# thumb and index tip: a pinch begins below the first, and ends above the second
+PINCHED_M = 0.02
+PARTED_M = 0.04
 OPEN_M = 0.08  # fingers this far apart wish an open gripper
 
 
@@ -21,9 +23,16 @@ class Pinches:
     """
 
     def __init__(
-        self, session: zenoh.Session, cell: str, *, clutch: str | None = None, gripper: str | None = None
+        self,
+        session: zenoh.Session,
+        cell: str,
+        *,
+        clutch: str | None = None,
+        gripper: str | None = None,
     ) -> None:
-        self._clutch, self._gripper, self._is_pressed = clutch, gripper, False
+        self._clutch = clutch
+        self._gripper = gripper
+        self._is_pressed = False
         self._publishers = {
             key: Publisher(session, cell, key)
             for key, side in (("clutch", clutch), ("gripper/wish", gripper))
@@ -48,4 +57,6 @@ class Pinches:
         if self._gripper is not None and self._gripper in distances_m:
             open_share = (distances_m[self._gripper] - PINCHED_M) / (OPEN_M - PINCHED_M)
             closure = 1.0 - min(max(open_share, 0.0), 1.0)
-            self._publishers["gripper/wish"].put(cdr.encode_joints(JointState(stamp_ns, (GRIPPER,), (closure,), ())))
+            self._publishers["gripper/wish"].put(
+                cdr.encode_joints(JointState(stamp_ns, (GRIPPER,), (closure,), ()))
+            )

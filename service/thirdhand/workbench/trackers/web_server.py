@@ -32,7 +32,10 @@ from thirdhand.settings.whole_file import whole
 HTML = "text/html; charset=utf-8"
 JSON = "application/json"
 JAVASCRIPT = "text/javascript; charset=utf-8"
-INLINE = "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+INLINE = (
+    "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src "
+    "'unsafe-inline'"
+)
 MAX_BODY_BYTES = 4096  # of a request
 MAX_CONNECTIONS = 256  # at once: some for each page; a process may often open 1024 files
 REQUEST_WITHIN_S = 5.0  # a handshake, and then the first request, must be complete after this time
@@ -87,15 +90,23 @@ def server_certificate(name: str, folder: Path) -> ServerCertificate:
         context.load_cert_chain(file)
         names = _names_in(file)
     except FileNotFoundError:
-        raise ExplainedError("no program `openssl`, which makes the page's certificate: install it") from None
+        raise ExplainedError(
+            "no program `openssl`, which makes the page's certificate: install it"
+        ) from None
     except (OSError, subprocess.CalledProcessError) as error:  # an SSLError too
-        words = error.stderr.decode().strip() if isinstance(error, subprocess.CalledProcessError) else in_words(error)
-        raise ExplainedError(f"no certificate for {name} in {file}: {words}; delete the file for a new one") from None
+        words = (
+            error.stderr.decode().strip()
+            if isinstance(error, subprocess.CalledProcessError)
+            else in_words(error)
+        )
+        raise ExplainedError(
+            f"no certificate for {name} in {file}: {words}; delete the file for a new one"
+        ) from None
     certificate = ServerCertificate(context, name, names)
     if not certificate.is_for(_same_address(name)):
         raise ExplainedError(
-            f"--https {name}: the certificate in {file} is for {', '.join(names) or 'no host'}; one of these needed, "
-            "with any word for *; or delete the file for a new one"
+            f"--https {name}: the certificate in {file} is for {', '.join(names) or 'no host'}; "
+            "one of these needed, with any word for *; or delete the file for a new one"
         )
     return certificate
 
@@ -171,22 +182,29 @@ class WebServer:
     ) -> None:
         self.token = token or secrets.token_urlsafe(24)
         self.scheme = "https" if certificate else "http"
-        self._unknown, self._certificate, self._host = unknown, certificate, ""
+        self._unknown = unknown
+        self._certificate = certificate
+        self._host = ""
         self.end: Callable[[], object] = lambda: None  # ends the serving, from any thread
         self._silent: set[web.RequestHandler] = set()  # new connections without a request yet
-        self._application = web.Application(client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded])
+        self._application = web.Application(
+            client_max_size=MAX_BODY_BYTES, middlewares=[self._guarded]
+        )
         self._application.add_routes(routes)
 
     async def serve(self, listen: Address, listening: Callable[[Address], object]) -> None:
         """Serve until SIGTERM, SIGHUP or `end`; call `listening` with the address taken. Raises
         OSError if the address is not available.
         """
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        loop = asyncio.get_running_loop()
+        ended = asyncio.Event()
         self.end = lambda: loop.call_soon_threadsafe(ended.set)
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, lambda *_: self.end())
-        runner = web.AppRunner(self._application, access_log=None, handler_cancellation=True, shutdown_timeout=0.1)
+        runner = web.AppRunner(
+            self._application, access_log=None, handler_cancellation=True, shutdown_timeout=0.1
+        )
         await runner.setup()
         assert runner.server is not None
         answering = runner.server
@@ -203,7 +221,9 @@ class WebServer:
         try:
             listener = _Listener(listen)
             limit_s = REQUEST_WITHIN_S if tls else None
-            server = await loop.create_server(connection, sock=listener, ssl=tls, ssl_handshake_timeout=limit_s)
+            server = await loop.create_server(
+                connection, sock=listener, ssl=tls, ssl_handshake_timeout=limit_s
+            )
             listening(Address(listen.host, listener.getsockname()[1]))
             await ended.wait()
         finally:
@@ -221,14 +241,18 @@ class WebServer:
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
     @web.middleware
-    async def _guarded(self, request: web.Request, handler: Callable[[web.Request], Any]) -> web.StreamResponse:
+    async def _guarded(
+        self, request: web.Request, handler: Callable[[web.Request], Any]
+    ) -> web.StreamResponse:
         self._silent.discard(request.protocol)
         if self._is_foreign(request.headers.get("Host", ""), request.headers.get("Origin")):
             return await refused(request, 403, FOREIGN)
         try:
             await request.read()
         except web.HTTPRequestEntityTooLarge:
-            return await refused(request, 413, f"A body of at most {MAX_BODY_BYTES} bytes is accepted.")
+            return await refused(
+                request, 413, f"A body of at most {MAX_BODY_BYTES} bytes is accepted."
+            )
         try:
             response: web.StreamResponse = await handler(request)
         except web.HTTPException as error:
@@ -243,7 +267,9 @@ class WebServer:
             name = (urlsplit(f"//{host}").hostname or "").lower()
             if not re.fullmatch(r"[\w.:\[\]-]+", host):
                 return True
-            if name in ("localhost", self._host) or (self._certificate and self._certificate.is_for(name)):
+            if name in ("localhost", self._host) or (
+                self._certificate and self._certificate.is_for(name)
+            ):
                 return False
             return not ipaddress.ip_address(name)
         except ValueError:
@@ -251,7 +277,11 @@ class WebServer:
 
 
 def answer(
-    status: int, text: str, *, kind: str = "text/plain; charset=utf-8", policy: str = "frame-ancestors 'none'"
+    status: int,
+    text: str,
+    *,
+    kind: str = "text/plain; charset=utf-8",
+    policy: str = "frame-ancestors 'none'",
 ) -> web.Response:
     """An answer with the headers of all answers; `policy` is added to `default-src 'none'`."""
     headers = {

@@ -38,7 +38,9 @@ from thirdhand_sim.script import Array
 
 STANDS_M = 0.001  # a tool that stays within this distance of its end is at rest
 DISK_MB = 64
-BEFORE_S, AFTER_S = 0.3, 1.0  # the figure shows this time around a fault
+# the figure shows this time around a fault
+BEFORE_S = 0.3
+AFTER_S = 1.0
 SCRIBE_SILENT_S = 8.0  # time in which a stopped scribe is replaced, and the new one writes
 Act = Callable[[FaultyCell], None]
 
@@ -78,7 +80,12 @@ def _kill_the_workshop_at_work(cell: FaultyCell) -> None:
     skill_worker = cell.child("skill worker")
     os.kill(skill_worker, signal.SIGSTOP)  # so it is at work when it is killed
     threading.Timer(0.2, os.kill, [skill_worker, signal.SIGKILL]).start()
-    place = {"name": "p", "left": [0.62, -0.28, 0.3], "right": [0.98, 0.32, 0.06], "tool": [0.54, -0.28, 0.38]}
+    place = {
+        "name": "p",
+        "left": [0.62, -0.28, 0.3],
+        "right": [0.98, 0.32, 0.06],
+        "tool": [0.54, -0.28, 0.38],
+    }
     with contextlib.suppress(RefusedError):
         cell.client.ask("via_points", {"op": "add", "points": [place]})
 
@@ -99,32 +106,52 @@ def _empty_the_disk(cell: FaultyCell) -> None:
 
 
 def _until_recorded(cell: FaultyCell) -> None:
-    cell.until(lambda: cell.client.status().scribe["state"] == "recording", "nothing was recorded again")
+    cell.until(
+        lambda: cell.client.status().scribe["state"] == "recording", "nothing was recorded again"
+    )
 
 
-KILL, STOP, CONT = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
+KILL = signal.SIGKILL
+STOP = signal.SIGSTOP
+CONT = signal.SIGCONT
 FAULTS = {
     "tracker killed": Fault(_signal("tracker", KILL), _begin_anew("tracker")),
     "tracker frozen": Fault(_signal("tracker", STOP), _signal("tracker", CONT)),
-    "tracker repeats its last sample": Fault(_signal("tracker", signal.SIGUSR1), _begin_anew("tracker")),
+    "tracker repeats its last sample": Fault(
+        _signal("tracker", signal.SIGUSR1), _begin_anew("tracker")
+    ),
     "clock of the tracker set back": Fault(_signal("tracker", signal.SIGUSR2), stops=False),
     "clock of the tracker set ahead": Fault(_signal("tracker", signal.SIGUSR2), stops=False),
-    "network to the tracker silent": Fault(_signal("to_tracker", STOP), _signal("to_tracker", CONT)),
+    "network to the tracker silent": Fault(
+        _signal("to_tracker", STOP), _signal("to_tracker", CONT)
+    ),
     "network to the tracker torn": Fault(_signal("to_tracker", KILL), _begin_anew("to_tracker")),
-    "network to the arm silent": Fault(_signal("to_arm", STOP), _and_reset(_signal("to_arm", CONT))),
+    "network to the arm silent": Fault(
+        _signal("to_arm", STOP), _and_reset(_signal("to_arm", CONT))
+    ),
     "network to the arm torn": Fault(_signal("to_arm", KILL), _and_reset(_begin_anew("to_arm"))),
     "skill worker killed": Fault(_kill_the_workshop_at_work, stops=False),
-    "scribe killed": Fault(_stop_or_kill("scribe", KILL), _until_recorded, stops=False, lasts_s=3.0),
-    "scribe stopped": Fault(_stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S),
+    "scribe killed": Fault(
+        _stop_or_kill("scribe", KILL), _until_recorded, stops=False, lasts_s=3.0
+    ),
+    "scribe stopped": Fault(
+        _stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S
+    ),
     "disk full": Fault(_fill_the_disk, _empty_the_disk, stops=False, lasts_s=3.0),
     # The last of its cell, as it ends the service.
     "service killed": Fault(_kill_the_service, FaultyCell.begin_service),
     # The first of its cell, as it removes the recordings.
-    "recording folder removed": Fault(_remove_the_folder, _until_recorded, stops=False, network="router", lasts_s=3.0),
-    "cable pulled": Fault(
-        lambda cell: cell.link.set("down"), _and_reset(lambda cell: cell.link.set("up")), network="link"
+    "recording folder removed": Fault(
+        _remove_the_folder, _until_recorded, stops=False, network="router", lasts_s=3.0
     ),
-    "router killed": Fault(_signal("router", KILL), _and_reset(_begin_anew("router")), network="router"),
+    "cable pulled": Fault(
+        lambda cell: cell.link.set("down"),
+        _and_reset(lambda cell: cell.link.set("up")),
+        network="link",
+    ),
+    "router killed": Fault(
+        _signal("router", KILL), _and_reset(_begin_anew("router")), network="router"
+    ),
     "service asked to end": Fault(_end_the_service, FaultyCell.begin_service, network="router"),
 }
 SHORT = (
@@ -143,7 +170,9 @@ class Recorded:
     def __init__(self, folder: Path) -> None:
         recorded = [read(Recording.open(path)).frames for path in sorted(folder.glob("*.mcap"))]
         self.ticks, self.modes, self.reasons = (
-            np.concatenate([np.empty(0, np.int64), *(frames[name] for frames in recorded)]).astype(np.int64)
+            np.concatenate([np.empty(0, np.int64), *(frames[name] for frames in recorded)]).astype(
+                np.int64
+            )
             for name in ("tick", "mode", "reason")
         )
 
@@ -156,7 +185,9 @@ class Recorded:
 
     def stopped(self, after: int, until: int) -> int:
         """The number of ticks that did not follow."""
-        return int(((self.ticks > after) & (self.ticks <= until) & (self.modes != Mode.FOLLOW)).sum())
+        return int(
+            ((self.ticks > after) & (self.ticks <= until) & (self.modes != Mode.FOLLOW)).sum()
+        )
 
 
 def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
@@ -165,10 +196,14 @@ def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
     """
     far = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) > STANDS_M)
     rest_index = min(int(far[-1]) + 1, len(times) - 1) if len(far) else 0
-    return float(times[rest_index]), float(np.linalg.norm(np.diff(places[: rest_index + 1], axis=0), axis=1).sum())
+    return float(times[rest_index]), float(
+        np.linalg.norm(np.diff(places[: rest_index + 1], axis=0), axis=1).sum()
+    )
 
 
-def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorded, steps: Array) -> dict[str, Any]:
+def figures(
+    cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorded, steps: Array
+) -> dict[str, Any]:
     """The figures of one fault; `steps` (T, 5) are the arm's: time [s], tool [m], speed [m/s]."""
     period_ms = 1e3 * cell.settings.period_s
     until = event.mended_s if fault.stops else event.ended_s
@@ -185,7 +220,9 @@ def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorde
         if event.lost >= 0
         else sum(entry[1] > recorded.ticks.max() for entry in cell.commands),
         "speed_m_per_s": float(mine[0, 4]),
-        "fastest_m_per_s": float(steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= event.ended_s), 4].max()),
+        "fastest_m_per_s": float(
+            steps[(steps[:, 0] >= event.struck_s) & (steps[:, 0] <= event.ended_s), 4].max()
+        ),
         "arm_largest_gap_ms": 1e3 * float(np.diff(mine[:, 0]).max()),
     }
     if fault.stops:
@@ -199,7 +236,9 @@ def figures(cell: FaultyCell, event: FaultTimes, fault: Fault, recorded: Recorde
         }
     else:
         gaps = np.diff([event.struck_s, *(command[0] for command in commands)])
-        before = np.diff([command[0] for command in cell.commands if 0 < event.struck_s - command[0] < BEFORE_S])
+        before = np.diff(
+            [command[0] for command in cell.commands if 0 < event.struck_s - command[0] < BEFORE_S]
+        )
         numbers |= {
             "command_largest_gap_ms": 1e3 * float(gaps.max()),
             "command_mean_gap_ms": 1e3 * float(gaps.mean()),
@@ -214,7 +253,9 @@ def _commanded(told: list[Command], settings: Settings) -> float:
     if len(told) < 2:
         return 0.0
     arm = Arm(settings, robot_description(settings))
-    places = np.array([arm.at(np.array(cdr.decode_joints(payload).position)).position for _, _, payload in told])
+    places = np.array(
+        [arm.at(np.array(cdr.decode_joints(payload).position)).position for _, _, payload in told]
+    )
     return way_to_rest(np.arange(len(places), dtype=np.float64), places)[1]
 
 
@@ -245,7 +286,9 @@ class Suffered:
 
 
 def suffered(
-    names: Sequence[str], say: Callable[[str], None] = lambda line: None, settings: Settings | None = None
+    names: Sequence[str],
+    say: Callable[[str], None] = lambda line: None,
+    settings: Settings | None = None,
 ) -> Suffered:
     """The results of some faults, each caused once, in a cell with some settings.
 
@@ -260,7 +303,9 @@ def suffered(
                 say("disk full: mounting a small disk is not allowed here, left out")
             try:
                 if mine:
-                    _suffer(result, mine, FaultyCell(folder, network=network, settings=settings), say)
+                    _suffer(
+                        result, mine, FaultyCell(folder, network=network, settings=settings), say
+                    )
             except PartError as error:
                 if network != "link":
                     raise
@@ -268,7 +313,9 @@ def suffered(
     return result
 
 
-def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Callable[[str], None]) -> None:
+def _suffer(
+    result: Suffered, names: Sequence[str], cell: FaultyCell, say: Callable[[str], None]
+) -> None:
     """Cause some faults in one running cell, and add their results."""
     events: list[FaultTimes] = []
     with cell:
@@ -276,36 +323,54 @@ def _suffer(result: Suffered, names: Sequence[str], cell: FaultyCell, say: Calla
             say(name)
             events.append(cell.suffer(name, FAULTS[name]))
         cell.close()
-        recorded, steps = Recorded(cell.records), np.array(cell.arm.steps)
+        recorded = Recorded(cell.records)
+        steps = np.array(cell.arm.steps)
     result.unasked += cell.unasked
     for event in events:
         result.figures[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
-        near = steps[(steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)]
+        near = steps[
+            (steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)
+        ]
         result.speeds[event.fault] = np.column_stack([near[:, 0] - event.struck_s, near[:, 4]])
     recorded_ticks = set(recorded.ticks.tolist())
     missing = sum(tick not in recorded_ticks for _, tick, _ in cell.commands)
-    result.unaccounted += max(0, missing - sum(result.figures[name]["lost_ticks"] for name in names))
+    result.unaccounted += max(
+        0, missing - sum(result.figures[name]["lost_ticks"] for name in names)
+    )
 
 
 def table(found: dict[str, dict[str, Any]]) -> str:
     """The figures for people to read."""
-    rows = [f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'commanded':>11}{'lost':>7}{'moves again':>13}"]
+    rows = [
+        f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'commanded':>11}"
+        f"{'lost':>7}{'moves again':>13}"
+    ]
     rows += [f"{'':<32}{'ms':>8}{'ms':>9}{'mm':>11}{'mm':>11}{'ticks':>7}{'ms':>13}"]
     for name, numbers in found.items():
         values = (
             numbers.get(key)
-            for key in ("hold_ms", "rest_ms", "travelled_mm", "commanded_mm", "lost_ticks", "moves_again_ms")
+            for key in (
+                "hold_ms",
+                "rest_ms",
+                "travelled_mm",
+                "commanded_mm",
+                "lost_ticks",
+                "moves_again_ms",
+            )
         )
         cells = ("-" if value is None else f"{value:.0f}" for value in values)
         rows.append(
-            f"{name:<32}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, (8, 9, 11, 11, 7, 13), strict=True))
+            f"{name:<32}"
+            + "".join(f"{cell:>{w}}" for cell, w in zip(cells, (8, 9, 11, 11, 7, 13), strict=True))
         )
     return "\n".join(rows)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The figures of every fault, or of a few for a quick look."""
-    came = suffered(list(FAULTS) if options.share == 1 else SHORT, results.say, cell_of(options.arm))
+    came = suffered(
+        list(FAULTS) if options.share == 1 else SHORT, results.say, cell_of(options.arm)
+    )
     print(table(came.figures), flush=True)
     _draw(results, came)
     return {
@@ -319,10 +384,16 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 def _draw(results: Results, came: Suffered) -> None:
     stopping = [name for name in came.speeds if FAULTS[name].stops]
     figure, grid = pyplot().subplots(
-        -(-len(stopping) // 3), 3, figsize=(9, 1.9 * -(-len(stopping) // 3)), sharex=True, sharey=True, squeeze=False
+        -(-len(stopping) // 3),
+        3,
+        figsize=(9, 1.9 * -(-len(stopping) // 3)),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
     )
     for axes, name in zip(grid.flat, stopping, strict=False):
-        speed, numbers = came.speeds[name], came.figures[name]
+        speed = came.speeds[name]
+        numbers = came.figures[name]
         axes.plot(1e3 * speed[:, 0], speed[:, 1], color=TOOL)
         axes.axvline(0, color=REFERENCE, linewidth=0.8)
         if numbers["hold_ms"] is not None:

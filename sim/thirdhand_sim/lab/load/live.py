@@ -17,7 +17,9 @@ from thirdhand_sim.lab.scenes import OFFSET_M, Drawn
 from thirdhand_sim.network import RunReport
 
 ATTEMPTS = 3
-SKIPPED = 25  # a run with more skipped periods of the bench is no evidence: the machine was too busy
+SKIPPED = (
+    25  # a run with more skipped periods of the bench is no evidence: the machine was too busy
+)
 
 
 def is_evidence(skipped: int) -> bool:
@@ -25,7 +27,9 @@ def is_evidence(skipped: int) -> bool:
     return skipped <= SKIPPED
 
 
-def steady_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = False) -> tuple[RunReport, int]:
+def steady_run(
+    drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = False
+) -> tuple[RunReport, int]:
     """A `live_run` in which the machine kept real time, or the last attempt, and the attempt's
     number. With `record` the folder is emptied before each.
     """
@@ -62,8 +66,15 @@ def _arguments(drawn: Drawn, folder: Path) -> list[str]:
     for name, value in (("offset", OFFSET_M), ("tremor", TREMOR_M), ("noise", NOISE_M)):
         arguments += [f"--{name}-mm", str(1000 * value)]
     for pause in drawn.pauses:
-        arguments += ["--turn" if pause.depth > 1 else "--pause", str(pause.at_s), str(pause.lasts_s)]
-    places = "".join(f"{name} = {list(getattr(drawn.scene, name))}\n" for name in ("handover", "glass", "soldering"))
+        arguments += [
+            "--turn" if pause.depth > 1 else "--pause",
+            str(pause.at_s),
+            str(pause.lasts_s),
+        ]
+    places = "".join(
+        f"{name} = {list(getattr(drawn.scene, name))}\n"
+        for name in ("handover", "glass", "soldering")
+    )
     scene = folder / "scene.toml"
     scene.write_text(places)
     return [*arguments, "--scene", str(scene)]

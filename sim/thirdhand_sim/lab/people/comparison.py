@@ -47,7 +47,9 @@ DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
 PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
 SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # scenes of a person, half with each sigma
 SIGMAS_M = (0.005, 0.010)
-BREAKING_SCENES: dict[Group, int] = {group: len(part["breaking"].numbers) for group, part in PARTS.items()}
+BREAKING_SCENES: dict[Group, int] = {
+    group: len(part["breaking"].numbers) for group, part in PARTS.items()
+}
 RESAMPLED = 2000
 SAME = 0.05  # candidates within this difference of success are equally good
 TEACHER = "teacher"
@@ -63,8 +65,14 @@ class Entry(NamedTuple):
 METHODS = {
     "ours": Entry("ours, between places", (Service(),)),
     "as_paper": Entry("ours, the paper's way:\nplaces are via-points", (ServiceAsPaper(),)),
-    "none": Entry("no demonstrations", tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0))),
-    "look_up": Entry("distance-weighted\nlook-up", tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0))),
+    "none": Entry(
+        "no demonstrations",
+        tuple(NoDemonstrations(ell) for ell in (5.0, 1.0, 2.5, 10.0, 20.0, 40.0)),
+    ),
+    "look_up": Entry(
+        "distance-weighted\nlook-up",
+        tuple(LookUp(power) for power in (4.0, 2.0, 3.0, 6.0, 8.0, 12.0)),
+    ),
     "gaussian_process": Entry(
         "Gaussian process",
         tuple(
@@ -75,7 +83,9 @@ METHODS = {
     "gmr": Entry("GMR", tuple(MixtureRegression(count) for count in (6, 5, 8, 12, 16, 20))),
     "paper": Entry(
         "KMP, the paper's numbers,\nour neighbourhoods",
-        tuple(ServiceAsPaper(0.5, 2.0, spread) for spread in (0.005, 0.0001, 0.001, 0.003, 0.01, 0.02)),
+        tuple(
+            ServiceAsPaper(0.5, 2.0, spread) for spread in (0.005, 0.0001, 0.001, 0.003, 0.01, 0.02)
+        ),
     ),
     "promp": Entry(
         "Interaction ProMP",
@@ -139,12 +149,17 @@ def outcomes(task: Task) -> list[Outcome]:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
     group = options.group
-    people, scenes = max(2, round(PEOPLE[group] * options.share)), SCENES[group]
+    people = max(2, round(PEOPLE[group] * options.share))
+    scenes = SCENES[group]
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
     tasks = [Task(TEACHER, 0, group, "", people, scenes, options.hands)]
     for method, entry in METHODS.items():
-        tried = range(len(entry.candidates)) if group == "tuning" and options.share == 1 else range(1)
-        tasks += [Task(method, number, group, "", people, scenes, options.hands) for number in tried]
+        tried = (
+            range(len(entry.candidates)) if group == "tuning" and options.share == 1 else range(1)
+        )
+        tasks += [
+            Task(method, number, group, "", people, scenes, options.hands) for number in tried
+        ]
         tasks += [Task(method, 0, group, kind, 0, breaking_scenes, None) for kind in BREAKING]
     by_task: dict[Task, list[Outcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
@@ -153,15 +168,26 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
         else:
             results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
-    main = {task.method: rows for task, rows in by_task.items() if not task.kind and task.candidate == 0}
+    main = {
+        task.method: rows for task, rows in by_task.items() if not task.kind and task.candidate == 0
+    }
     broken = {
-        method: {kind: _broken(by_task[task]) for task in tasks for kind in [task.kind] if task.method == method and kind}
+        method: {
+            kind: _broken(by_task[task])
+            for task in tasks
+            for kind in [task.kind]
+            if task.method == method and kind
+        }
         for method in METHODS
     }
     for method, entry in METHODS.items():
-        compared = [rows for task, rows in by_task.items() if task.method == method and not task.kind]
+        compared = [
+            rows for task, rows in by_task.items() if task.method == method and not task.kind
+        ]
         if (best := chosen(compared)) > 0:
-            results.say(f"{method}: {entry.candidates[best]} is better than what is chosen; put it first")
+            results.say(
+                f"{method}: {entry.candidates[best]} is better than what is chosen; put it first"
+            )
     numbers = {
         "set": group,
         "people": len({row.person for row in main["ours"]}),
@@ -180,7 +206,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "levels": LEVELS,
         "methods": {
             method: {
-                **({} if method == TEACHER else {"parameters": repr(METHODS[method].candidates[0])}),
+                **(
+                    {} if method == TEACHER else {"parameters": repr(METHODS[method].candidates[0])}
+                ),
                 **summary(rows),
             }
             for method, rows in main.items()
@@ -220,12 +248,16 @@ def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
         out[name] = {"mean": mean, "low": low, "high": high}
     out["coverage"] = np.mean([row.inside for row in rows], axis=0).tolist()
     for name in ("predicted_mm", "error_mm"):
-        out[f"{name[:-3]}_rms_mm"] = float(np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows])))
+        out[f"{name[:-3]}_rms_mm"] = float(
+            np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows]))
+        )
     swapped = sum(row.swapped for row in rows)
     out["swapped_held"] = sum(row.swapped_held for row in rows) / swapped if swapped else None
     out["events"] = [float(np.mean([row.events[i].reached for row in rows])) for i in range(3)]
     for name in ("error_mm", "true_error_mm"):
-        out[f"event_{name}_median"] = [float(np.median([getattr(o.events[i], name) for o in rows])) for i in range(3)]
+        out[f"event_{name}_median"] = [
+            float(np.median([getattr(o.events[i], name) for o in rows])) for i in range(3)
+        ]
     return out
 
 
@@ -242,7 +274,8 @@ def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, fl
     """The mean of values (M,), and its 95 % interval by drawing people with replacement."""
     names = sorted({row.person for row in rows})
     index = np.array([names.index(row.person) for row in rows])
-    total, count = np.bincount(index, values), np.bincount(index)
+    total = np.bincount(index, values)
+    count = np.bincount(index)
     drawn = np.random.default_rng(DRAWING).integers(len(names), size=(RESAMPLED, len(names)))
     means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
     return float(values.mean()), float(np.percentile(means, 2.5)), float(np.percentile(means, 97.5))
@@ -250,7 +283,10 @@ def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, fl
 
 def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
     """Successes, and failures in which the tool held through each event that it missed."""
-    held = [not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near for o in rows]
+    held = [
+        not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near
+        for o in rows
+    ]
     return {"successes": sum(row.success for row in rows), "held": sum(held), "of": len(rows)}
 
 
@@ -259,7 +295,10 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     methods = numbers["methods"]
     plt = pyplot()
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
-    labels = {TEACHER: "teacher who knows\nthe scene", **{name: entry.label for name, entry in METHODS.items()}}
+    labels = {
+        TEACHER: "teacher who knows\nthe scene",
+        **{name: entry.label for name, entry in METHODS.items()},
+    }
     colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
     bars = (
         ("success", 100.0, "success [%]\n(dark: on the teacher's path throughout)"),
@@ -277,15 +316,29 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             ax.plot((low, high), (i, i), color="black", lw=1.2)
             ax.text(max(mean, high), i, f" {mean:.0f}", va="center", fontsize=8)
         ax.set(xlabel=label)
-        ax.set_yticks(range(len(methods)), [labels[m] for m in methods] if ax is axes[0] else [""] * len(methods), fontsize=8)
+        ax.set_yticks(
+            range(len(methods)),
+            [labels[m] for m in methods] if ax is axes[0] else [""] * len(methods),
+            fontsize=8,
+        )
         ax.invert_yaxis()
     levels = 100 * np.array(LEVELS)
     axes[3].plot((0, 100), (0, 100), "--", color="black", lw=0.8)
     label_y = 104.0
-    for method, scores in sorted(methods.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]):
+    for method, scores in sorted(
+        methods.items(), key=lambda item: -item[1].get("coverage", [0.0])[-1]
+    ):
         if method != TEACHER:
             inside = 100 * np.array(scores["coverage"])
-            axes[3].plot(levels, inside, "o-", ms=3, lw=1.2, color=colours[method], zorder=3 if method == "ours" else 2)
+            axes[3].plot(
+                levels,
+                inside,
+                "o-",
+                ms=3,
+                lw=1.2,
+                color=colours[method],
+                zorder=3 if method == "ours" else 2,
+            )
             label_y = min(label_y - 4.5, inside[-1])  # below the one before it
             axes[3].annotate(
                 labels[method].partition(",\n")[0].partition(":")[0].replace("\n", " "),
@@ -295,9 +348,23 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
                 fontsize=7.5,
                 color=colours[method],
                 annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colours[method], "relpos": (0, 0.5), "shrinkB": 2},
+                arrowprops={
+                    "arrowstyle": "-",
+                    "lw": 0.6,
+                    "color": colours[method],
+                    "relpos": (0, 0.5),
+                    "shrinkB": 2,
+                },
             )
-    axes[3].set(xlabel="nominal region [%]", ylabel="teacher's tool inside [%]", xlim=(0, 101), ylim=(0, 101))
-    people, scenes = numbers["people"], numbers["scenes_of_each"]
-    figure.suptitle(f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % intervals")
+    axes[3].set(
+        xlabel="nominal region [%]",
+        ylabel="teacher's tool inside [%]",
+        xlim=(0, 101),
+        ylim=(0, 101),
+    )
+    people = numbers["people"]
+    scenes = numbers["scenes_of_each"]
+    figure.suptitle(
+        f"{people} people who did not demonstrate, {people * scenes} scenes; lines: 95 % intervals"
+    )
     results.figure(figure)

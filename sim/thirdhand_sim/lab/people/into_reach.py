@@ -53,14 +53,17 @@ class RigidMap(NamedTuple):
     @property
     def rotation(self) -> Array:
         """The rotation matrix (3, 3)."""
-        return np.rint(Rotation.from_euler("z", 90.0 * self.quarter_turns, degrees=True).as_matrix())
+        return np.rint(
+            Rotation.from_euler("z", 90.0 * self.quarter_turns, degrees=True).as_matrix()
+        )
 
     @staticmethod
     def of(shown: Sequence[LeftOut], reach: Reach) -> RigidMap:
         """The map that brings the tool of these takes best into the reach."""
         tool = np.concatenate([take.tool[:: max(1, len(take.tool) // SAMPLES)] for take in shown])
         mean = tool.mean(axis=0)
-        low, high = np.array(reach.centre) - reach.outer, np.array(reach.centre) + reach.outer
+        low = np.array(reach.centre) - reach.outer
+        high = np.array(reach.centre) + reach.outer
         low = np.maximum(low, (reach.min_x, low[1], reach.min_z))
         axes = [np.arange(a, b, GRID_M) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -69,7 +72,10 @@ class RigidMap(NamedTuple):
         for turns in range(4):
             turn_map = RigidMap(turns, tuple(mean.tolist()), (0.0,) * 3)
             offsets_m = turn_map.positions(tool)
-            depths = [float(np.quantile(depth_m(offsets_m + centre, reach), SHALLOW_SHARE)) for centre in grid]
+            depths = [
+                float(np.quantile(depth_m(offsets_m + centre, reach), SHALLOW_SHARE))
+                for centre in grid
+            ]
             deepest = int(np.argmax(depths))
             candidate = turn_map._replace(centre=tuple(np.round(grid[deepest], 3).tolist()))
             best = max(best, (depths[deepest], candidate), key=lambda one: one[0])
@@ -84,7 +90,9 @@ class RigidMap(NamedTuple):
         turn = Rotation.from_matrix(self.rotation)
 
         def pose(x: Array) -> Array:
-            return np.hstack([self.positions(x[:, :3]), (turn * Rotation.from_quat(x[:, 3:])).as_quat()])
+            return np.hstack(
+                [self.positions(x[:, :3]), (turn * Rotation.from_quat(x[:, 3:])).as_quat()]
+            )
 
         d: Demonstration = take.demonstration
         places = tuple(
@@ -98,7 +106,9 @@ class RigidMap(NamedTuple):
             for point in d.places
         )
         return take._replace(
-            demonstration=d._replace(left=pose(d.left), right=pose(d.right), tool=pose(d.tool), places=places),
+            demonstration=d._replace(
+                left=pose(d.left), right=pose(d.right), tool=pose(d.tool), places=places
+            ),
             hands=self.positions(take.hands.reshape(-1, 2, 3)).reshape(-1, 6),
             velocities=(take.velocities.reshape(-1, 2, 3) @ self.rotation.T).reshape(-1, 6),
             tool=self.positions(take.tool),

@@ -36,7 +36,8 @@ from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.results import Array, ExperimentError
 from thirdhand_sim.lab.rivals.method import Observed, Predicted
 
-RATE_HZ, JUDGED_HZ = 125, 25
+RATE_HZ = 125
+JUDGED_HZ = 25
 LONGEST_SHIFT_S = 1.0
 SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
 BACK_S = 2.0  # the hands' way back to where the take begins
@@ -89,7 +90,9 @@ def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
     """A take, once through intake."""
     times, moving, _ = _through_core(demonstration)
     stamps = (demonstration.stamps_ns - demonstration.stamps_ns[0]) * 1e-9
-    tool = np.stack([np.interp(times, stamps, column) for column in demonstration.tool[:, :3].T], axis=1)
+    tool = np.stack(
+        [np.interp(times, stamps, column) for column in demonstration.tool[:, :3].T], axis=1
+    )
     return LeftOut(name, group, demonstration, times, moving[:, 0], moving[:, 1], tool)
 
 
@@ -107,13 +110,20 @@ def predicted_rounds(
     `session_of`.
     """
     hands, begins = session_of(take.demonstration, broken_share)
-    prediction, count = _through_core(hands, skill, reach)[2], len(take.times)
+    prediction = _through_core(hands, skill, reach)[2]
+    count = len(take.times)
     assert prediction.covariance is not None
     assert prediction.held is not None
     assert prediction.uncertain is not None
     parts = [slice(begin, begin + count) for begin in begins]
     return [
-        Predicted(prediction.mean[part], prediction.covariance[part], prediction.held[part], prediction.uncertain[part], prediction.radii)
+        Predicted(
+            prediction.mean[part],
+            prediction.covariance[part],
+            prediction.held[part],
+            prediction.uncertain[part],
+            prediction.radii,
+        )
         for part in parts
     ]
 
@@ -125,15 +135,21 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
     On the way back, position is a polynomial of minimum jerk over BACK_S, and orientation is the
     normalized mean of the ends. The tool is where the take has it, and is not used.
     """
-    seconds, poses, begins = [take.seconds], [np.hstack([take.left, take.right])], [0]
-    whole_s, whole = seconds[0], poses[0]
+    seconds = [take.seconds]
+    poses = [np.hstack([take.left, take.right])]
+    begins = [0]
+    whole_s = seconds[0]
+    whole = poses[0]
     for rest_s in SESSION_RESTS_S:
         for share in (broken_share, 1.0):
             if share == 0.0:
                 continue
-            over_s, begin = seconds[-1][-1], math.ceil((seconds[-1][-1] + BACK_S + rest_s) * JUDGED_HZ)
+            over_s = seconds[-1][-1]
+            begin = math.ceil((seconds[-1][-1] + BACK_S + rest_s) * JUDGED_HZ)
             way_s = np.arange(take.period_s, BACK_S, take.period_s)
-            rest_at_s = np.arange(over_s + BACK_S, begin / JUDGED_HZ - 0.5 * take.period_s, take.period_s)
+            rest_at_s = np.arange(
+                over_s + BACK_S, begin / JUDGED_HZ - 0.5 * take.period_s, take.period_s
+            )
             done = max(2, round(share * len(whole)))
             seconds += [over_s + way_s, rest_at_s, begin / JUDGED_HZ + whole_s[:done]]
             poses += [
@@ -143,10 +159,15 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
             ]
             if share == 1.0:
                 begins.append(begin)
-    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)  # one sample more, as rounding may cut off the last one
+    seconds.append(
+        seconds[-1][-1:] + 1.0 / JUDGED_HZ
+    )  # one sample more, as rounding may cut off the last one
     poses.append(poses[-1][-1:])
-    hands, stamps = np.concatenate(poses), np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)
-    return take._replace(stamps_ns=stamps, left=hands[:, :7], right=hands[:, 7:], tool=hands[:, :7]), begins
+    hands = np.concatenate(poses)
+    stamps = np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)
+    return take._replace(
+        stamps_ns=stamps, left=hands[:, :7], right=hands[:, 7:], tool=hands[:, :7]
+    ), begins
 
 
 def _way(first: Array, last: Array, shares: Array) -> Array:
@@ -167,20 +188,29 @@ def _through_core(
 
     While no hands are known, it holds what it predicted last.
     """
-    settings, used = _settings(reach or ANYWHERE), skill or shipped_skill()
+    settings = _settings(reach or ANYWHERE)
+    used = skill or shipped_skill()
     if reach is None:
         used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
-    intake, stage, state = Intake(settings), SkillStage(settings, used), start_state(settings, used)
+    intake = Intake(settings)
+    stage = SkillStage(settings, used)
+    state = start_state(settings, used)
     frame = blank(frame_layout(len(settings.joints.names)))
     alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
     received = hand_events(demonstration, range(2) if alone is None else [alone])
     every = RATE_HZ // JUDGED_HZ
-    moving, means, covariances, held, unsure = [], [], [], [], []
+    moving = []
+    means = []
+    covariances = []
+    held = []
+    unsure = []
     for tick, inbox in enumerate(received):
         intake_flags = intake.step(state, frame, 1, inbox)
         hands = state["hands"]
         if alone is not None:
-            intake_flags = HANDS_KNOWN * bool(frame["hand_ages"][alone] < frame["stale_ticks"][alone])
+            intake_flags = HANDS_KNOWN * bool(
+                frame["hand_ages"][alone] < frame["stale_ticks"][alone]
+            )
             hands = hands[[alone, alone]]
         goes = bool(intake_flags & HANDS_KNOWN)
         if skill is not None and goes:
@@ -192,8 +222,13 @@ def _through_core(
             covariances.append(frame["covariance"].copy())
             held.append(not goes)
             unsure.append(bool(state["unsure"]))
-    times, flags = np.arange(len(moving)) / JUDGED_HZ, (np.array(held), np.array(unsure))
-    return times, np.array(moving), Predicted(np.array(means), np.array(covariances), *flags, used.regions.radii)
+    times = np.arange(len(moving)) / JUDGED_HZ
+    flags = (np.array(held), np.array(unsure))
+    return (
+        times,
+        np.array(moving),
+        Predicted(np.array(means), np.array(covariances), *flags, used.regions.radii),
+    )
 
 
 def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
@@ -210,7 +245,8 @@ def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list
 
 def judged(take: LeftOut, said: Predicted) -> Judged:
     """The judgement of a prediction of a take."""
-    count, errors = len(take.tool), take.tool - said.mean
+    count = len(take.tool)
+    errors = take.tool - said.mean
     shifted = []
     for shift in range(-round(LONGEST_SHIFT_S * JUDGED_HZ), round(LONGEST_SHIFT_S * JUDGED_HZ) + 1):
         if abs(shift) <= count // 2:
@@ -220,10 +256,14 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
     least, _, shift = min(shifted)
     inside = None
     if said.covariance is not None:
-        squares = np.einsum("ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0])
+        squares = np.einsum(
+            "ti,ti->t", errors, np.linalg.solve(said.covariance, errors[:, :, None])[:, :, 0]
+        )
         inside = tuple(int((squares <= radius).sum()) for radius in said.radii)
     lengths = np.linalg.norm(errors, axis=1)
-    held, unsure, wrong = said.held, said.uncertain, lengths > UNSURE_M
+    held = said.held
+    unsure = said.uncertain
+    wrong = lengths > UNSURE_M
     warned = None if held is None or unsure is None else held | unsure
     return Judged(
         count,
@@ -249,17 +289,34 @@ def read(path: Path, *, named: bool = False) -> Demonstration:
     """
     try:
         with np.load(path, allow_pickle=False) as data:
-            times, left, right, tool = (np.asarray(data[name], np.float64) for name in ("t", "left", "right", "tool"))
+            times, left, right, tool = (
+                np.asarray(data[name], np.float64) for name in ("t", "left", "right", "tool")
+            )
     except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands and tool: {in_words(error, named=False)}") from None
-    conducts: Hands = "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
-    left, right = (right, right) if conducts == "right" else (left, left) if conducts == "left" else (left, right)
+        raise ExperimentError(
+            f"{path}: not a recording of hands and tool: {in_words(error, named=False)}"
+        ) from None
+    conducts: Hands = (
+        "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
+    )
+    left, right = (
+        (right, right)
+        if conducts == "right"
+        else (left, left)
+        if conducts == "left"
+        else (left, right)
+    )
     if not all(np.isfinite(part).all() for part in (times, left, right, tool)):
-        raise ExperimentError(f"{path}: holds numbers that are not finite, beside a hand that was not seen at all")
+        raise ExperimentError(
+            f"{path}: holds numbers that are not finite, beside a hand that was not seen at all"
+        )
     rows = [
         {
             "name": name,
-            **{part: x[i].tolist() for part, x in (("left", left), ("right", right), ("tool", tool))},
+            **{
+                part: x[i].tolist()
+                for part, x in (("left", left), ("right", right), ("tool", tool))
+            },
             "std": PLACE_STD_M,
             "radius": 0.03,
         }

@@ -24,18 +24,30 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
 PERIOD_S = 0.002
-NOISY_HZ, CUT_HZ, NOISY_CUT_HZ = 60.0, 6.0, 2.5  # a tracker below 60 Hz is a camera, and is noisier
+# a tracker below 60 Hz is a camera, and is noisier
+NOISY_HZ = 60.0
+CUT_HZ = 6.0
+NOISY_CUT_HZ = 2.5
 PRECISE_M = 0.0004  # [m] noise (standard deviation) of motion capture is below this
-CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # base from a camera's x right, y down
+CAMERA_AXES = np.array(
+    [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+)  # base from a camera's x right, y down
 MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is scaled down
-STOP_SPEED, STOP_S = 0.31, 0.08  # [m/s], [s] of sudden stops
+# [m/s], [s] of sudden stops
+STOP_SPEED = 0.31
+STOP_S = 0.08
 MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
-UNSEEN_AT, UNSEEN_S = (0.3, 0.7), (0.1, 0.5)  # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
+# one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
+UNSEEN_AT = (0.3, 0.7)
+UNSEEN_S = (0.1, 0.5)
 SMALL_KINDS = {  # amplitude [m], speed of the hand besides [m/s]
     "3 mm in a drift of 0.1 m/s": (0.003, 0.1),
     "2 mm at rest": (0.002, 0.0),
 }
-SMALL_S, SMALL_JUDGED_S, SMALL_RISE_S = 3.5, 2.0, 0.5  # duration, its judged end, the rise at the begin
+# duration, its judged end, the rise at the begin
+SMALL_S = 3.5
+SMALL_JUDGED_S = 2.0
+SMALL_RISE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,8 +78,12 @@ def recorded(folder: Path, middle: Array) -> list[Moving]:
     """
     files = sorted(folder.glob("*.npz"))
     if not files:
-        raise ExperimentError(f"no recorded hands in {folder}: .npz files with time_s, left and right needed")
-    return [sequence for number, path in enumerate(files) for sequence in _of_file(path, middle, number)]
+        raise ExperimentError(
+            f"no recorded hands in {folder}: .npz files with time_s, left and right needed"
+        )
+    return [
+        sequence for number, path in enumerate(files) for sequence in _of_file(path, middle, number)
+    ]
 
 
 def hands_in(path: Path) -> tuple[Array, Array, float]:
@@ -77,9 +93,13 @@ def hands_in(path: Path) -> tuple[Array, Array, float]:
     try:
         with np.load(path, allow_pickle=False) as data:
             t = np.asarray(data["t" if "t" in data else "time_s"], np.float64)
-            left, right = (_seen(t, np.asarray(data[name], np.float64)) for name in ("left", "right"))
+            left, right = (
+                _seen(t, np.asarray(data[name], np.float64)) for name in ("left", "right")
+            )
     except (KeyError, ValueError, OSError) as error:
-        raise ExperimentError(f"{path}: not a recording of hands: {in_words(error, named=False)}") from None
+        raise ExperimentError(
+            f"{path}: not a recording of hands: {in_words(error, named=False)}"
+        ) from None
     is_camera = 1 / float(np.mean(np.diff(t))) < NOISY_HZ
     axes = CAMERA_AXES if is_camera else np.eye(3)
     return t, np.hstack([left @ axes.T, right @ axes.T]), NOISY_CUT_HZ if is_camera else CUT_HZ
@@ -91,15 +111,19 @@ def _of_file(path: Path, middle: Array, number: int) -> list[Moving]:
     rate = 1 / float(np.mean(np.diff(t)))
     repaired = repair(t, hands).hands
     middle_of_hands = np.median(repaired, axis=0)
-    hands, repaired = hands - middle_of_hands, repaired - middle_of_hands
+    hands = hands - middle_of_hands
+    repaired = repaired - middle_of_hands
     truth = _smooth(repaired, rate, cut_hz)
-    speed = np.linalg.norm(np.gradient(truth.reshape(-1, 2, 3), 1 / rate, axis=0), axis=2).max(axis=1)
+    speed = np.linalg.norm(np.gradient(truth.reshape(-1, 2, 3), 1 / rate, axis=0), axis=2).max(
+        axis=1
+    )
     scale = min(1.0, MOST_SPEED / float(np.percentile(speed, 99)), 0.3 / float(np.abs(truth).max()))
     ticks = np.arange(0.0, t[-1], PERIOD_S)
     spline = CubicSpline(t, middle + scale * truth)
     fine = spline(ticks)
     jumping = CubicSpline(t, middle + scale * _smooth(hands, rate, cut_hz))(ticks)
-    name, tracker = path.stem, tracker_kind(rate, hands)
+    name = path.stem
+    tracker = tracker_kind(rate, hands)
     random = np.random.default_rng(number)
 
     def seen(group: str, rate_hz: float, noise: float) -> Moving:
@@ -147,7 +171,9 @@ def _seen(t: Array, hand: Array) -> Array:
 
 def _smooth(x: Array, rate_hz: float, cut_hz: float) -> Array:
     sos = butter(4, cut_hz, fs=rate_hz, output="sos")
-    return np.asarray(sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * rate_hz / cut_hz))))
+    return np.asarray(
+        sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * rate_hz / cut_hz)))
+    )
 
 
 def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[Moving]:
@@ -161,7 +187,12 @@ def modelled(middle: Array, *, numbers: Sequence[int], seconds: float) -> list[M
             ("clean", 100, 0.0005, False),
             ("recorded", 30, 0.002, True),
             ("30 Hz, 2 mm", 30, 0.002, False),
-            ("60 - 240 Hz, 0.3 - 5 mm", (60, 120, 240)[number % 3], (0.001, 0.0003, 0.005)[number % 3], True),
+            (
+                "60 - 240 Hz, 0.3 - 5 mm",
+                (60, 120, 240)[number % 3],
+                (0.001, 0.0003, 0.005)[number % 3],
+                True,
+            ),
         ):
             random = np.random.default_rng([number, rate_hz])
             stamps = np.arange(0.0, times[-1], 1 / rate_hz)
@@ -178,21 +209,36 @@ def person(seed: int, middle: Array, seconds: float) -> Array:
     t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
     x = np.zeros((len(t), 6))
     for hand in (0, 3):
-        start_s, position_m, before = 0.5, np.zeros(3), np.zeros(3)
+        start_s = 0.5
+        position_m = np.zeros(3)
+        before = np.zeros(3)
         while start_s < seconds - 1.5:
-            goal = before if random.random() < 0.2 else random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.6)
-            before, reach_m, position_m = position_m, goal - position_m, goal
+            goal = (
+                before
+                if random.random() < 0.2
+                else random.uniform(-0.08, 0.08, 3) * (1.0, 1.0, 0.6)
+            )
+            before = position_m
+            reach_m = goal - position_m
+            position_m = goal
             lasts = random.uniform(0.4, 0.8) + 3.5 * float(np.linalg.norm(reach_m))
             u = np.clip((t - start_s) / lasts, 0.0, 1.0)
             x[:, hand : hand + 3] += reach_m * (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
-            start_s += lasts * random.uniform(0.7, 1.0) + (random.exponential(0.6) if random.random() < 0.5 else 0.0)
-    sway = sosfiltfilt(butter(2, 1.2, fs=1 / PERIOD_S, output="sos"), random.standard_normal((len(t), 6)), axis=0)
+            start_s += lasts * random.uniform(0.7, 1.0) + (
+                random.exponential(0.6) if random.random() < 0.5 else 0.0
+            )
+    sway = sosfiltfilt(
+        butter(2, 1.2, fs=1 / PERIOD_S, output="sos"), random.standard_normal((len(t), 6)), axis=0
+    )
     return np.asarray(middle + x + 0.004 * sway / sway.std(axis=0))
 
 
-def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Generator) -> tuple[Array, Array]:
+def _spoilt(
+    stamps: Array, samples: Array, rate_hz: float, random: np.random.Generator
+) -> tuple[Array, Array]:
     """Stamps and samples with outliers of some centimetres, and dropouts of 30 to 90 ms."""
-    samples, keep = samples.copy(), np.ones(len(stamps), bool)
+    samples = samples.copy()
+    keep = np.ones(len(stamps), bool)
     for hand in (0, 3):
         hit = random.random(len(stamps)) < 0.002
         samples[hit, hand : hand + 3] += 0.05 * random.standard_normal((int(hit.sum()), 3))
@@ -202,19 +248,31 @@ def _spoilt(stamps: Array, samples: Array, rate_hz: float, random: np.random.Gen
 
 
 def stops(
-    middle: Array, *, numbers: Sequence[int], rate_hz: float = 100, noise: float = 0.0005, group: str = "sudden stops"
+    middle: Array,
+    *,
+    numbers: Sequence[int],
+    rate_hz: float = 100,
+    noise: float = 0.0005,
+    group: str = "sudden stops",
 ) -> list[Moving]:
     """One hand moves evenly at 0.31 m/s, stops within 80 ms, and rests."""
     out = []
     for number in numbers:
         random = np.random.default_rng([number, 7])
         direction = np.zeros(6)
-        direction[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (1.0, 1.0, 0.5)
+        direction[3 * (number % 2) : 3 * (number % 2) + 3] = random.standard_normal(3) * (
+            1.0,
+            1.0,
+            0.5,
+        )
         direction /= np.linalg.norm(direction)
         t = np.arange(round(2.1 / PERIOD_S)) * PERIOD_S
         stop_s = 1.15 + 0.15 * random.random()
-        up, down = np.clip((t - 0.5) / 0.3, 0.0, 1.0), np.clip((t - stop_s) / STOP_S, 0.0, 1.0)
-        travel_m = np.cumsum(STOP_SPEED * up**2 * (3 - 2 * up) * (1 - down**2 * (3 - 2 * down))) * PERIOD_S
+        up = np.clip((t - 0.5) / 0.3, 0.0, 1.0)
+        down = np.clip((t - stop_s) / STOP_S, 0.0, 1.0)
+        travel_m = (
+            np.cumsum(STOP_SPEED * up**2 * (3 - 2 * up) * (1 - down**2 * (3 - 2 * down))) * PERIOD_S
+        )
         end = middle + random.uniform(-0.05, 0.05, 6) * (1.0, 1.0, 0.5, 1.0, 1.0, 0.3)
         truth = end + direction * (travel_m - travel_m[-1])[:, None]
         stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
@@ -230,9 +288,13 @@ def reaches(*, seeds: Sequence[int]) -> list[Moving]:
     for seed in seeds:
         script = HandScript(Scene(), seed=seed)
         times = np.arange(round(script.duration_s / PERIOD_S)) * PERIOD_S
-        truth = np.array([np.concatenate([hand.position for hand in script.truth(t)]) for t in times])
+        truth = np.array(
+            [np.concatenate([hand.position for hand in script.truth(t)]) for t in times]
+        )
         stamps = np.arange(0.0, script.duration_s - 0.01, 0.01)
-        samples = np.array([np.concatenate([pose[:3] for pose in script.sample(t)]) for t in stamps])
+        samples = np.array(
+            [np.concatenate([pose[:3] for pose in script.sample(t)]) for t in stamps]
+        )
         out.append(Moving(f"scene {seed}", "minimum jerk", truth, stamps, samples))
     return out
 
@@ -247,9 +309,9 @@ def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Movin
     rise = np.clip(t / SMALL_RISE_S, 0.0, 1.0)
     rise = rise**2 * (3 - 2 * rise)
     travel_m = np.cumsum(drift_mps * rise) * PERIOD_S
-    motion_m = (travel_m - travel_m[-1] / 2)[:, None] * drift + (amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t))[
-        :, None
-    ] * shake
+    motion_m = (travel_m - travel_m[-1] / 2)[:, None] * drift + (
+        amplitude_m * rise * np.sin(2 * np.pi * rate_hz * t)
+    )[:, None] * shake
     truth = np.tile(middle, (len(t), 1))
     truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += motion_m
     stamps = np.arange(0.0, t[-1], 0.01)

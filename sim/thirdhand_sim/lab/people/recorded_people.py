@@ -16,7 +16,9 @@ from thirdhand_sim.lab.results import Array, ExperimentError
 from thirdhand_sim.people import Person, TrackerModel, person
 from thirdhand_sim.sessions import SHAPE_STEPS
 
-SLOW_MPS, LEAST_REACH_M = 0.05, 0.06  # a reach lies between slow moments, and is at least this long
+# a reach lies between slow moments, and is at least this long
+SLOW_MPS = 0.05
+LEAST_REACH_M = 0.06
 MOST_UNEVEN = 5.0  # largest ratio of a reach's highest speed to its mean speed
 FIRST_NUMBER = 100  # seeds of their other habits, which no modelled person has
 
@@ -24,9 +26,15 @@ FIRST_NUMBER = 100  # seeds of their other habits, which no modelled person has
 def recorded_people(folder: Path) -> list[Person]:
     """One person for each recording of a folder that has reaches. Raises ExperimentError."""
     files = sorted(folder.glob("*.npz"))
-    people = [one for number, path in enumerate(files) if (one := _of_file(path, FIRST_NUMBER + number)) is not None]
+    people = [
+        one
+        for number, path in enumerate(files)
+        if (one := _of_file(path, FIRST_NUMBER + number)) is not None
+    ]
     if not people:
-        raise ExperimentError(f"no recorded hands in {folder}: .npz files with time_s, left and right needed")
+        raise ExperimentError(
+            f"no recorded hands in {folder}: .npz files with time_s, left and right needed"
+        )
     return people
 
 
@@ -39,7 +47,9 @@ def _of_file(path: Path, number: int) -> Person | None:
     if not reaches:
         return None
     tracker = TrackerModel(rate_hz=rate, residual=hands - smooth, dropouts_hz=0.05)
-    return person("tuning", number)._replace(name=f"recorded {number}", tracker=tracker, shapes=reaches)
+    return person("tuning", number)._replace(
+        name=f"recorded {number}", tracker=tracker, shapes=reaches
+    )
 
 
 def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
@@ -62,8 +72,15 @@ def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
         local = (part - part[0]) @ np.stack([along, side, np.cross(along, side)], axis=1) / length
         local = np.stack([np.interp(u, np.arange(len(part)), column) for column in local.T], axis=1)
         eased = np.linspace(0, 1, SHAPE_STEPS)
-        eased = eased**3 * (10 - 15 * eased + 6 * eased * eased)  # recorded parts begin and end at SLOW_MPS, not at 0
-        local = np.stack([np.interp(eased, np.linspace(0, 1, SHAPE_STEPS), column) for column in local.T], axis=1)
-        if np.abs(np.gradient(local[:, 0])).max() * SHAPE_STEPS <= MOST_UNEVEN and np.abs(local).max() < 1.2:
+        eased = eased**3 * (
+            10 - 15 * eased + 6 * eased * eased
+        )  # recorded parts begin and end at SLOW_MPS, not at 0
+        local = np.stack(
+            [np.interp(eased, np.linspace(0, 1, SHAPE_STEPS), column) for column in local.T], axis=1
+        )
+        if (
+            np.abs(np.gradient(local[:, 0])).max() * SHAPE_STEPS <= MOST_UNEVEN
+            and np.abs(local).max() < 1.2
+        ):
             out.append((local[:, 0], local * (0.0, 1.0, 1.0)))
     return out

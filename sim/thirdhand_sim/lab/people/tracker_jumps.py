@@ -19,19 +19,30 @@ from thirdhand_sim.lab.results import Array
 
 # A quick hand: standard deviation and time scale of a squared exponential. Its acceleration has a
 # standard deviation of 27 m/s^2 an axis: a reach of 0.2 m at 2 m/s has 33 m/s^2 at most.
-SPREAD_M, SCALE_S = 0.1, 0.08
-USUAL_MPS, SPEED_SPAN_S = 2.0, 0.1  # the spread is in proportion to a recording's speed above this
+SPREAD_M = 0.1
+SCALE_S = 0.08
+# the spread is in proportion to a recording's speed above this
+USUAL_MPS = 2.0
+SPEED_SPAN_S = 0.1
 SCALES_S = (SCALE_S, 0.12, 0.18, 0.27, 0.4)  # from quick to calm hands
-PLACE_M, DRIFT_MPS = 1.0, 1.0  # standard deviations of the place and of the speed over a window
+# standard deviations of the place and of the speed over a window
+PLACE_M = 1.0
+DRIFT_MPS = 1.0
 TRACKED_NOISE_FLOOR_M = 0.002  # includes a hand's tremor
 SAMPLES_BESIDE = 8  # samples on each side that predict
 LONGEST_S = 0.5  # longest run
 RUN_GROWTH = 1.25  # ratio of the lengths of runs, above the first few
-THRESHOLD, THRESHOLD_EACH = 30.0, 6.0  # squared distance of a wrong run, and more for each of its samples
+# squared distance of a wrong run, and more for each of its samples
+THRESHOLD = 30.0
+THRESHOLD_EACH = 6.0
 LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
-ALIKE = 0.5  # the candidates are runs with at least this share of the largest excess over the threshold
+ALIKE = (
+    0.5  # the candidates are runs with at least this share of the largest excess over the threshold
+)
 CANDIDATES = 40  # the shortest of these are compared
-BRIDGE_MARGIN = 0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
+BRIDGE_MARGIN = (
+    0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
+)
 STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
 EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
 NOISE_ORDER = 5  # differences of this order contain a tracker's noise and hardly a hand's motion
@@ -64,9 +75,12 @@ class Process(NamedTuple):
 
     def log_likelihood(self, t: Array, x: Array) -> float:
         """Logarithm of the probability density of samples (M, 3) [m] at times (M,) [s]."""
-        covariance, centred = self.covariance(t[None])[0], x - x.mean(axis=0)
+        covariance = self.covariance(t[None])[0]
+        centred = x - x.mean(axis=0)
         squared = float(np.sum(centred * np.linalg.solve(covariance, centred)))
-        return -0.5 * (squared + 3 * (float(np.linalg.slogdet(covariance)[1]) + len(t) * math.log(2 * math.pi)))
+        return -0.5 * (
+            squared + 3 * (float(np.linalg.slogdet(covariance)[1]) + len(t) * math.log(2 * math.pi))
+        )
 
     def best(self, t: Array, x: Array) -> tuple[float, Process]:
         """The largest log-likelihood of samples, over time scales, and its process."""
@@ -106,14 +120,17 @@ def quick_process(t: Array, x: Array) -> Process:
     span = max(1, round(SPEED_SPAN_S / float(np.median(np.diff(t)))))
     speed = np.linalg.norm(x[span:] - x[:-span], axis=1) / (t[span:] - t[:-span])
     usual = float(np.percentile(speed, 95)) if len(speed) else 0.0
-    return Process(max(noise_std_m(x), TRACKED_NOISE_FLOOR_M), SPREAD_M * max(1.0, usual / USUAL_MPS))
+    return Process(
+        max(noise_std_m(x), TRACKED_NOISE_FLOOR_M), SPREAD_M * max(1.0, usual / USUAL_MPS)
+    )
 
 
 def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
     """Samples (T,) in which a tracker has exchanged left and right: it does so where both hands
     jump to where the other one was, faster than hands move. Most samples are named rightly.
     """
-    left, right = hands[:, :3], hands[:, 3:]
+    left = hands[:, :3]
+    right = hands[:, 3:]
 
     def moved(a: Array, b: Array) -> Array:
         return np.asarray(np.linalg.norm(b[1:] - a[:-1], axis=1))
@@ -144,21 +161,31 @@ def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]
     if len(t) <= 2 * SAMPLES_BESIDE:
         return []
     longest = max(1, round(LONGEST_S / float(np.median(np.diff(t)))))
-    rows, length = [], 1
+    rows = []
+    length = 1
     while length <= min(longest, len(t) - 2 * SAMPLES_BESIDE):
         squared, off_m = _off_prediction(t, x, length, quick)
         excess = squared - THRESHOLD - THRESHOLD_EACH * length
         begins = np.flatnonzero((excess > 0) & (off_m > LEAST_JUMP_M))
         rows.append(np.stack([excess[begins], begins, begins + length], axis=1))
         length = max(length + 1, round(RUN_GROWTH * length))
-    candidates, runs, reach = np.concatenate(rows), [], longest + SAMPLES_BESIDE
+    candidates = np.concatenate(rows)
+    runs = []
+    reach = longest + SAMPLES_BESIDE
     while len(candidates):
         excess, first, last = candidates[np.argmax(candidates[:, 0])]
-        alike = candidates[(candidates[:, 0] >= ALIKE * excess) & (candidates[:, 1] < last) & (candidates[:, 2] > first)]
+        alike = candidates[
+            (candidates[:, 0] >= ALIKE * excess)
+            & (candidates[:, 1] < last)
+            & (candidates[:, 2] > first)
+        ]
         alike = alike[np.argsort(alike[:, 2] - alike[:, 1], kind="stable")[:CANDIDATES]]
         begin, end = _most_probable(t, x, alike[:, 1:].astype(int), quick)
         runs.append((begin, end))
-        candidates = candidates[(candidates[:, 1] >= max(last, end) + reach) | (candidates[:, 2] <= min(first, begin) - reach)]
+        candidates = candidates[
+            (candidates[:, 1] >= max(last, end) + reach)
+            | (candidates[:, 2] <= min(first, begin) - reach)
+        ]
     return runs
 
 
@@ -166,7 +193,9 @@ def _most_probable(t: Array, x: Array, runs: NDArray[np.int_], quick: Process) -
     """The run [begin, end) of several (K, 2) without which the samples around them are most
     probable. A wrong sample is anywhere within 1 m^3: the logarithm of its density is 0.
     """
-    around = np.arange(max(0, runs[:, 0].min() - SAMPLES_BESIDE), min(len(t), runs[:, 1].max() + SAMPLES_BESIDE))
+    around = np.arange(
+        max(0, runs[:, 0].min() - SAMPLES_BESIDE), min(len(t), runs[:, 1].max() + SAMPLES_BESIDE)
+    )
     right = [around[(around < begin) | (around >= end)] for begin, end in runs]
     begin, end = runs[np.argmax([quick.best(t[indices], x[indices])[0] for indices in right])]
     return int(begin), int(end)
@@ -183,7 +212,9 @@ def _off_prediction(t: Array, x: Array, length: int, quick: Process) -> tuple[Ar
     for offset in np.unique(begins - firsts):
         of = np.flatnonzero(begins - firsts == offset)
         windows = firsts[of, None] + np.arange(size)
-        spans, span_index = np.unique(np.round((t[windows] - t[windows[:, :1]]) / STAMP_S), axis=0, return_inverse=True)
+        spans, span_index = np.unique(
+            np.round((t[windows] - t[windows[:, :1]]) / STAMP_S), axis=0, return_inverse=True
+        )
         precision = np.linalg.inv(quick.covariance(STAMP_S * spans))
         run = slice(offset, offset + length)
         # For y ~ N(0, P^-1) the run is off by r = P_rr^-1 (P y)_r, whose covariance is P_rr^-1.
@@ -198,15 +229,22 @@ def _bridged(t: Array, x: Array, wrong: NDArray[np.bool_], quick: Process) -> Ar
     """A path (T, 3) [m] with its wrong samples predicted from the right ones around them, by the
     process that makes these most probable; hardly beyond where these are.
     """
-    out, valid = x.copy(), np.flatnonzero(~wrong)
+    out = x.copy()
+    valid = np.flatnonzero(~wrong)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):
-        around = np.concatenate([valid[valid < begin][-SAMPLES_BESIDE:], valid[valid >= end][:SAMPLES_BESIDE]])
+        around = np.concatenate(
+            [valid[valid < begin][-SAMPLES_BESIDE:], valid[valid >= end][:SAMPLES_BESIDE]]
+        )
         process = quick.best(t[around], x[around])[1]
         covariance = process.covariance(t[None, np.concatenate([around, np.arange(begin, end)])])[0]
-        middle, size = x[around].mean(axis=0), len(around)
+        middle = x[around].mean(axis=0)
+        size = len(around)
         weighted = np.linalg.solve(covariance[:size, :size], x[around] - middle)
-        low, high = x[around].min(axis=0), x[around].max(axis=0)
+        low = x[around].min(axis=0)
+        high = x[around].max(axis=0)
         beyond = BRIDGE_MARGIN * (high - low)
-        out[begin:end] = np.clip(middle + covariance[size:, :size] @ weighted, low - beyond, high + beyond)
+        out[begin:end] = np.clip(
+            middle + covariance[size:, :size] @ weighted, low - beyond, high + beyond
+        )
     return out

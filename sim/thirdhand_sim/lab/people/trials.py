@@ -31,13 +31,20 @@ from thirdhand_sim.sessions import Session
 from thirdhand_sim.teach import places_of
 
 RATE_HZ = 125
-WITHIN_M, FOR_S, SLOW_MPS = 0.010, 0.3, 0.05  # an event succeeds within 10 mm for 0.3 s below 5 cm/s
-NEAR_M, FAST_MPS = 0.05, 0.25  # nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
+# an event succeeds within 10 mm for 0.3 s below 5 cm/s
+WITHIN_M = 0.010
+FOR_S = 0.3
+SLOW_MPS = 0.05
+# nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
+NEAR_M = 0.05
+FAST_MPS = 0.25
 WRONG_M = 0.10  # a target farther from the teacher's tool is followed falsely
 SMOOTHED = 5  # ticks; velocity of a target of a rival with a memory is taken over them
 LONGEST_DELAY_S = 0.6
 KEPT = 0.05  # largest share of the time falsely followed on the teacher's path
-SWAP_NOTICED_S, SWAP_OVER_S = 0.3, 0.2  # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
+# a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
+SWAP_NOTICED_S = 0.3
+SWAP_OVER_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +87,27 @@ def seen(session: Session) -> Seen:
     all_ticks = tuple(ticks(session))
     core = controller(replace(shipped_skill(), threshold=np.inf), settings())
     times = np.arange(len(all_ticks)) / RATE_HZ
-    estimates, stillness, fresh = np.zeros((len(all_ticks), 3, 6)), np.zeros((len(all_ticks), 2)), np.zeros(len(all_ticks), bool)
+    estimates = np.zeros((len(all_ticks), 3, 6))
+    stillness = np.zeros((len(all_ticks), 2))
+    fresh = np.zeros(len(all_ticks), bool)
     for k, tick in enumerate(all_ticks):
         fresh[k] = core.step(tick)["mode"] == Mode.FOLLOW
         state = core.state
-        estimates[k], stillness[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6), state["hand_stillness"]
+        estimates[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6)
+        stillness[k] = state["hand_stillness"]
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(session, all_ticks, times, estimates, stillness, fresh, swapped, session.hands(times), session.tool(times))
+    return Seen(
+        session,
+        all_ticks,
+        times,
+        estimates,
+        stillness,
+        fresh,
+        swapped,
+        session.hands(times),
+        session.tool(times),
+    )
 
 
 class EventOutcome(NamedTuple):
@@ -131,22 +151,35 @@ class Outcome(NamedTuple):
 def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
     """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
     served_frames = served(placed, one)
-    target, tool, held = served_frames["target"], served_frames["tool"], served_frames["mode"] != Mode.FOLLOW
+    target = served_frames["target"]
+    tool = served_frames["tool"]
+    held = served_frames["mode"] != Mode.FOLLOW
     speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
     events = tuple(_event(one, tool, speed, held, i) for i in range(3))
-    hand_distance_m = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(axis=1)
+    hand_distance_m = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(
+        axis=1
+    )
     too_near = bool(((hand_distance_m < NEAR_M) & (speed > FAST_MPS)).any())
     judged = one.times > 0.5
     good = judged & ~one.due
     delay, _ = _delayed(target, one.tool, good)
     tool_delay, _ = _delayed(tool, one.tool, good & ~held)
-    teacher_tool = np.concatenate([np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]])
-    errors, covariance = (teacher_tool - target)[good], served_frames["covariance"][good]
-    squares = np.einsum("ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    teacher_tool = np.concatenate(
+        [np.repeat(one.tool[:1], delay, axis=0), one.tool[: len(target) - delay]]
+    )
+    errors = (teacher_tool - target)[good]
+    covariance = served_frames["covariance"][good]
+    squares = np.einsum(
+        "ti,ti->t", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
+    )
     radii = placed.regions.radii if isinstance(placed, Skill) else CHI_SQUARE
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
     wrong = np.linalg.norm(target - teacher_tool, axis=1) > WRONG_M
-    planted = (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S) & (one.times < one.session.swapped_s[1]) & judged
+    planted = (
+        (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S)
+        & (one.times < one.session.swapped_s[1])
+        & judged
+    )
     return Outcome(
         one.session.person.name,
         one.session.number,
@@ -174,7 +207,9 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
         return frames(placed, one.ticks, settings())
     predicted, motion = _moving(placed, one)
     assert predicted.covariance is not None
-    covariance, held, now = predicted.covariance, predicted.held, 0
+    covariance = predicted.covariance
+    held = predicted.held
+    now = 0
 
     def counted() -> Iterator[Tick]:
         nonlocal now
@@ -198,14 +233,19 @@ def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
     """
     s, v, a = one.estimates.transpose(1, 0, 2)
     if placed is None:
-        count, as_told = len(one.times), replace(one.session, places=one.session.told)
+        count = len(one.times)
+        as_told = replace(one.session, places=one.session.told)
         predicted = Predicted(as_told.tool(one.times), np.tile(1e-4 * np.eye(3), (count, 1, 1)))
     else:
         observed = Observed(one.times, s, v, one.rest)
         predicted = placed.predict(observed)
         if placed.depends_on is DependsOn.HANDS:
-            return predicted, along_hands(lambda hands: placed.mean(observed._replace(hands=hands)), s, v, a)
-    before = np.concatenate([np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]])
+            return predicted, along_hands(
+                lambda hands: placed.mean(observed._replace(hands=hands)), s, v, a
+            )
+    before = np.concatenate(
+        [np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]]
+    )
     velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
     return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)
 
@@ -218,15 +258,24 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOut
         true = one.hands[window, :3] + TOOL_FROM_HAND
     else:
         places = one.session.told, one.session.places
-        perceived, true = (np.broadcast_to(p.glass if i == 1 else p.carry, (int(window.sum()), 3)) for p in places)
+        perceived, true = (
+            np.broadcast_to(p.glass if i == 1 else p.carry, (int(window.sum()), 3)) for p in places
+        )
     distance_m = np.linalg.norm(tool[window] - perceived, axis=1)
     is_within = (distance_m <= WITHIN_M) & (speed[window] < SLOW_MPS)
     steps = int(FOR_S * RATE_HZ)
-    runs = np.convolve(is_within, np.ones(steps), mode="valid") if len(is_within) >= steps else np.zeros(1)
+    runs = (
+        np.convolve(is_within, np.ones(steps), mode="valid")
+        if len(is_within) >= steps
+        else np.zeros(1)
+    )
     best = int(np.argmin(uniform_filter1d(distance_m, steps, mode="nearest")))
     true_off = np.linalg.norm(tool[window] - true, axis=1)
-    reached, was_held = bool((runs >= steps - 0.5).any()), bool(held[window].mean() > 0.8)
-    return EventOutcome(reached, 1000 * float(distance_m[best]), 1000 * float(true_off[best]), was_held)
+    reached = bool((runs >= steps - 0.5).any())
+    was_held = bool(held[window].mean() > 0.8)
+    return EventOutcome(
+        reached, 1000 * float(distance_m[best]), 1000 * float(true_off[best]), was_held
+    )
 
 
 def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:

@@ -75,12 +75,16 @@ def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
 
 def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
     """Errors and steepness of a variant in random scenes."""
-    errors, steepness, refused = [], [], 0
+    errors = []
+    steepness = []
+    refused = 0
     for number in numbers:
         drawn = draw(number, seed=SCENES.seed)
         via_points = drawn.scene.via_points()
         if variant.bare:
-            via_points = tuple(msgspec.structs.replace(point, radius=0.0, follow="none") for point in via_points)
+            via_points = tuple(
+                msgspec.structs.replace(point, radius=0.0, follow="none") for point in via_points
+            )
         try:
             skill = taught(variant.skill, via_points)
         except SkillError:
@@ -94,5 +98,8 @@ def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
 
 def _slope(skill: Skill, hands: Array) -> Array:
     """The tool's velocities (6, 3) for 1 m/s of each axis of the hands, at hands (6,) [m]."""
-    positions, still = hands.reshape(2, 3), np.zeros((2, 3))
-    return np.array([skill.predict(positions, axis.reshape(2, 3), still).velocity for axis in np.eye(6)])
+    positions = hands.reshape(2, 3)
+    still = np.zeros((2, 3))
+    return np.array(
+        [skill.predict(positions, axis.reshape(2, 3), still).velocity for axis in np.eye(6)]
+    )

@@ -11,18 +11,35 @@ import rerun as rr
 from kmp import KMP, GaussianKernel, GaussianMixture, Gaussians
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.reproduction.writing import DURATION_S, TARGETS, TIMES, recorded, write
-from thirdhand_sim.lab.results import ADAPTED, DESIRED, REFERENCE, Array, Options, Results, ellipse, pyplot, rgb
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    DESIRED,
+    REFERENCE,
+    Array,
+    Options,
+    Results,
+    ellipse,
+    pyplot,
+    rgb,
+)
 
-ELL, LAMBDA = 8.0, 0.1  # the paper's; time in seconds
+# the paper's; time in seconds
+ELL = 8.0
+LAMBDA = 0.1
 SEEDS = EXPERIMENTS["letters"].seeds
-COMPONENTS, SEED = 8, SEEDS.method
+COMPONENTS = 8
+SEED = SEEDS.method
 WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
-TOLERANCE_S = 0.004  # below half of the reference's step: each desired point replaces one reference point
+TOLERANCE_S = (
+    0.004  # below half of the reference's step: each desired point replaces one reference point
+)
 HALF_CM = 12.5  # half of the width and height of a drawn letter
 SETS = {"model": "modelled", "recorded": "recorded"}
-NEAR_S = 0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
+NEAR_S = (
+    0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
+)
 
 
 class Case(NamedTuple):
@@ -51,9 +68,18 @@ def learned(name: str, demonstrations: Array) -> Letter:
     """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the
     paper's numbers.
     """
-    samples = np.concatenate([np.column_stack([TIMES, demonstration]) for demonstration in demonstrations])
-    mixture = GaussianMixture.fit(samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION)
-    primitive = KMP.fit(TIMES[:, None], mixture.regress(TIMES[:, None]), kernel=GaussianKernel(ELL), lambda_mean=LAMBDA)
+    samples = np.concatenate(
+        [np.column_stack([TIMES, demonstration]) for demonstration in demonstrations]
+    )
+    mixture = GaussianMixture.fit(
+        samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION
+    )
+    primitive = KMP.fit(
+        TIMES[:, None],
+        mixture.regress(TIMES[:, None]),
+        kernel=GaussianKernel(ELL),
+        lambda_mean=LAMBDA,
+    )
     return Letter(name, demonstrations, mixture, primitive)
 
 
@@ -71,7 +97,11 @@ def cases(letter: Letter) -> list[Case]:
     out = []
     for name, rows in chosen:
         angles = random.uniform(0, 2 * np.pi, len(rows))
-        steps = size * random.uniform(0.12, 0.25, (len(rows), 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+        steps = (
+            size
+            * random.uniform(0.12, 0.25, (len(rows), 1))
+            * np.column_stack([np.cos(angles), np.sin(angles)])
+        )
         out.append(Case(name, TIMES[list(rows)], letter.reference[list(rows)] + steps))
     return out
 
@@ -122,9 +152,15 @@ def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
     sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in names}}
     if options.letters is not None:
         real = recorded(options.letters)
-        sets["recorded"] = {name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]}
-    learned_sets = {name: [learned(*item) for item in letters.items()] for name, letters in sets.items()}
-    results.say(", ".join(f"{len(rows)} letters learned ({name})" for name, rows in learned_sets.items()))
+        sets["recorded"] = {
+            name: real[name] for name in list(real)[: max(2, round(len(real) * options.share))]
+        }
+    learned_sets = {
+        name: [learned(*item) for item in letters.items()] for name, letters in sets.items()
+    }
+    results.say(
+        ", ".join(f"{len(rows)} letters learned ({name})" for name, rows in learned_sets.items())
+    )
     return learned_sets
 
 
@@ -144,12 +180,17 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         flat = [entry for per in numbers[name].values() for entry in per]
         numbers[f"{name}_summary"] = {
             "largest_miss_at_desired_points_cm": max(entry["miss_cm"] for entry in flat),
-            "rms_deviation_elsewhere_cm": float(np.sqrt(np.mean([entry["rms_elsewhere_cm"] ** 2 for entry in flat]))),
+            "rms_deviation_elsewhere_cm": float(
+                np.sqrt(np.mean([entry["rms_elsewhere_cm"] ** 2 for entry in flat]))
+            ),
             "largest_deviation_elsewhere_cm": max(entry["largest_elsewhere_cm"] for entry in flat),
-            "demonstrations_scatter_cm": float(np.mean([row.demonstrations.std(axis=0).mean() for row in rows])),
+            "demonstrations_scatter_cm": float(
+                np.mean([row.demonstrations.std(axis=0).mean() for row in rows])
+            ),
         }
         for row in rows:
-            path, strips = f"/{name}/{row.name}", list(row.demonstrations * (1, -1))
+            path = f"/{name}/{row.name}"
+            strips = list(row.demonstrations * (1, -1))
             lines = rr.LineStrips2D(strips, colors=[rgb(REFERENCE)], radii=[0.03])
             stream.log(f"{path}/demonstrations", lines, static=True)
             for number, case in enumerate(cases(row)):
@@ -161,26 +202,40 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 def _measured(letter: Letter, case: Case) -> dict[str, Any]:
     primitive = adapted(letter, case)
-    away = np.linalg.norm(primitive.mean(TIMES[:, None]) - letter.reference, axis=1)[elsewhere(case)]
+    away = np.linalg.norm(primitive.mean(TIMES[:, None]) - letter.reference, axis=1)[
+        elsewhere(case)
+    ]
     return {
         "case": case.name,
-        "miss_cm": float(np.linalg.norm(primitive.mean(case.times[:, None]) - case.points, axis=1).max()),
+        "miss_cm": float(
+            np.linalg.norm(primitive.mean(case.times[:, None]) - case.points, axis=1).max()
+        ),
         "rms_elsewhere_cm": _rms(away),
         "largest_elsewhere_cm": float(away.max()),
     }
 
 
 def record(
-    stream: rr.RecordingStream, path: str, number: int, lines: Mapping[str, tuple[Array, str]], case: Case
+    stream: rr.RecordingStream,
+    path: str,
+    number: int,
+    lines: Mapping[str, tuple[Array, str]],
+    case: Case,
 ) -> None:
     """Logs the trajectories of a case, by name with their colours, and its desired points."""
     stream.set_time("case", sequence=number)
     for name, (line, colour) in lines.items():  # Rerun's y axis points down
-        stream.log(f"{path}/{name}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08]))
-    stream.log(f"{path}/desired", rr.Points2D(case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3]))
+        stream.log(
+            f"{path}/{name}", rr.LineStrips2D([line * (1, -1)], colors=[rgb(colour)], radii=[0.08])
+        )
+    stream.log(
+        f"{path}/desired", rr.Points2D(case.points * (1, -1), colors=[rgb(DESIRED)], radii=[0.3])
+    )
 
 
-def draw_lines(axes: Any, letter: Letter, case: Case, lines: Mapping[str, tuple[Array, str]], mark: str) -> None:
+def draw_lines(
+    axes: Any, letter: Letter, case: Case, lines: Mapping[str, tuple[Array, str]], mark: str
+) -> None:
     """Draws the mean of the demonstrations, trajectories by label with their colours, and desired
     points in the colour `mark`.
     """
@@ -207,7 +262,9 @@ def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
     for block, (name, rows) in enumerate(sets.items()):
         columns = grid[:, 4 * block : 4 * block + 4]
         columns[0, 0].set_title(f"{name}\ndemonstrations", fontsize=8.5, loc="left")
-        for axes, title in zip(columns[0, 1:], ("start,\nvia-point", "via-point,\nend", "all three"), strict=True):
+        for axes, title in zip(
+            columns[0, 1:], ("start,\nvia-point", "via-point,\nend", "all three"), strict=True
+        ):
             axes.set_title(title, fontsize=8.5, loc="left")
         for letter in rows:
             _draw_letter(columns[names.index(letter.name)], letter)
@@ -218,13 +275,36 @@ def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
     axes.text(x, y - HALF_CM - 0.5, "10 cm", ha="center", va="top", fontsize=7)
     handles = [
         plt.Line2D([], [], color=REFERENCE, lw=0.8, label="demonstrations"),
-        plt.Line2D([], [], color=ADAPTED, marker="o", ms=7, lw=0, alpha=0.5, label="Gaussians, 1 standard deviation"),
+        plt.Line2D(
+            [],
+            [],
+            color=ADAPTED,
+            marker="o",
+            ms=7,
+            lw=0,
+            alpha=0.5,
+            label="Gaussians, 1 standard deviation",
+        ),
         plt.Line2D([], [], color=REFERENCE, ls="--", label="reference (GMR)"),
         plt.Line2D([], [], color=ADAPTED, label="adapted (KMP)"),
-        plt.Line2D([], [], color=DESIRED, marker="o", mfc="none", mew=1.6, ms=6, lw=0, label="desired points"),
+        plt.Line2D(
+            [],
+            [],
+            color=DESIRED,
+            marker="o",
+            mfc="none",
+            mew=1.6,
+            ms=6,
+            lw=0,
+            label="desired points",
+        ),
     ]
     figure.legend(
-        handles=handles, loc="outside lower center", ncols=5 if len(sets) > 1 else 3, frameon=False, fontsize=8
+        handles=handles,
+        loc="outside lower center",
+        ncols=5 if len(sets) > 1 else 3,
+        frameon=False,
+        fontsize=8,
     )
     results.figure(figure)
 
@@ -237,7 +317,9 @@ def _middle(letter: Letter) -> tuple[float, float]:
 def _draw_letter(row: Any, letter: Letter) -> None:
     for demonstration in letter.demonstrations:
         row[0].plot(*demonstration.T, color=REFERENCE, lw=0.7)
-    for mean, covariance in zip(letter.mixture.means[:, 1:], letter.mixture.covariances[:, 1:, 1:], strict=True):
+    for mean, covariance in zip(
+        letter.mixture.means[:, 1:], letter.mixture.covariances[:, 1:, 1:], strict=True
+    ):
         ellipse(row[0], mean, covariance, facecolor=ADAPTED, edgecolor=ADAPTED, alpha=0.35)
     for axes, case in zip(row[1:], cases(letter), strict=True):
         axes.plot(*letter.reference.T, "--", color=REFERENCE, lw=0.9)

@@ -11,14 +11,37 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from thirdhand_sim.lab.reproduction.letters import SETS, Case, Letter, Line, by_kmp, cases, draw_lines, gathered
+from thirdhand_sim.lab.reproduction.letters import (
+    SETS,
+    Case,
+    Letter,
+    Line,
+    by_kmp,
+    cases,
+    draw_lines,
+    gathered,
+)
 from thirdhand_sim.lab.reproduction.writing import DURATION_S, TIMES
-from thirdhand_sim.lab.results import ADAPTED, DESIRED, OTHER, Array, ExperimentError, Options, Results, pyplot
+from thirdhand_sim.lab.results import (
+    ADAPTED,
+    DESIRED,
+    OTHER,
+    Array,
+    ExperimentError,
+    Options,
+    Results,
+    pyplot,
+)
 from thirdhand_sim.lab.rivals.promp import BASES, learned_promp
 
 VIA_VARIANCE = 1e-6  # [cm²] as for KMP
 WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
-METHODS = {"kmp": ("KMP", ADAPTED), "promp": ("ProMP", OTHER), "dmp": ("DMP", "#009E73"), "gmm": ("GMM", DESIRED)}
+METHODS = {
+    "kmp": ("KMP", ADAPTED),
+    "promp": ("ProMP", OTHER),
+    "dmp": ("DMP", "#009E73"),
+    "gmm": ("GMM", DESIRED),
+}
 SHOWN = ("B", "G")
 
 Trajectory: TypeAlias = Callable[[Letter, Case], Array]
@@ -41,18 +64,26 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             for row in rows
             for case in cases(row)
         ]
-        numbers[SETS[name]] = {key: _summary([lines[key] for lines in line_sets]) for key in methods}
+        numbers[SETS[name]] = {
+            key: _summary([lines[key] for lines in line_sets]) for key in methods
+        }
         last = [lines for lines in line_sets if len(lines["kmp"].case.times) == 3]
-        examples += [lines for lines in last if lines["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)]
+        examples += [
+            lines for lines in last if lines["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)
+        ]
     _draw(results, examples)
     return numbers
 
 
 def conditioned(letter: Letter, case: Case) -> Array:
     """The trajectory (200, 2) [cm] of the letter's ProMP through the desired points."""
-    primitive = learned_promp([TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES)
+    primitive = learned_promp(
+        [TIMES] * len(letter.demonstrations), list(letter.demonstrations), bases=BASES
+    )
     for t, point in zip(case.times, case.points, strict=True):
-        primitive = primitive.condition_position(point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S)
+        primitive = primitive.condition_position(
+            point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S
+        )
     return np.asarray(primitive.mean_trajectory(TIMES.copy()))
 
 
@@ -68,7 +99,9 @@ def configured(letter: Letter, case: Case) -> Array:
     primitive = DMP(2, execution_time=DURATION_S, dt=TIMES[1], n_weights_per_dim=WEIGHTS)
     primitive.imitate(TIMES, mean)
     points = {float(t): point for t, point in zip(case.times, case.points, strict=True)}
-    primitive.configure(start_y=points.get(TIMES[0], mean[0]), goal_y=points.get(TIMES[-1], mean[-1]))
+    primitive.configure(
+        start_y=points.get(TIMES[0], mean[0]), goal_y=points.get(TIMES[-1], mean[-1])
+    )
     times, line = primitive.open_loop()
     return np.column_stack([np.interp(TIMES, times, column) for column in line.T])
 
@@ -81,7 +114,9 @@ def _summary(lines: list[Line]) -> dict[str, float]:
             misses[{TIMES[0]: "start", TIMES[-1]: "end"}.get(t, "via")].append(float(miss))
     return {
         **{f"largest_miss_of_{kind}_cm": max(values) for kind, values in misses.items()},
-        "mean_rms_deviation_elsewhere_cm": float(np.mean([line.rms_deviation_elsewhere_cm for line in lines])),
+        "mean_rms_deviation_elsewhere_cm": float(
+            np.mean([line.rms_deviation_elsewhere_cm for line in lines])
+        ),
     }
 
 
@@ -91,5 +126,7 @@ def _draw(results: Results, shown: list[dict[str, Line]]) -> None:
         lines = {label: (example[key].points, colour) for key, (label, colour) in METHODS.items()}
         draw_lines(axes, example["kmp"].letter, example["kmp"].case, lines, "black")
     grid[0][0].set_ylabel("cm")
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(
+        *grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
     results.figure(figure)

@@ -32,14 +32,19 @@ def along_hands(law: HandsToTool, hands: Array, velocities: Array, accelerations
     """
     speed = np.repeat(np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2), 3, axis=1)
     goes = 1.0 - np.exp(-((speed / CALM_MPS) ** 4))
-    step, bend = MOTION_STEP_S * goes * velocities, 0.5 * MOTION_STEP_S**2 * goes * accelerations
+    step = MOTION_STEP_S * goes * velocities
+    bend = 0.5 * MOTION_STEP_S**2 * goes * accelerations
     return differences(*(law(hands + sign * step + abs(sign) * bend) for sign in STEPS))
 
 
 def differences(behind: Array, now: Array, ahead: Array) -> Array:
     """Motion (..., 3, 3) at the middle one of three positions (..., 3) [m], MOTION_STEP_S apart."""
     acceleration = (ahead - 2.0 * now + behind) / MOTION_STEP_S**2
-    motion = [now, (ahead - behind) / (2.0 * MOTION_STEP_S), np.clip(acceleration, -MAX_TARGET_MPS2, MAX_TARGET_MPS2)]
+    motion = [
+        now,
+        (ahead - behind) / (2.0 * MOTION_STEP_S),
+        np.clip(acceleration, -MAX_TARGET_MPS2, MAX_TARGET_MPS2),
+    ]
     return np.stack(motion, axis=-2)
 
 
@@ -65,15 +70,21 @@ class Rival(Skill):
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
         prediction = self.says(*seen.now.copy())
         position, velocity, acceleration = np.round(prediction.motion, 6)
-        turn, gate_m = self.constant_turn, float(prediction.far)
-        return Prediction(position, velocity, acceleration, prediction.covariance, gate_m, 0.0, turn, NO_GRIPPER)
+        turn = self.constant_turn
+        gate_m = float(prediction.far)
+        return Prediction(
+            position, velocity, acceleration, prediction.covariance, gate_m, 0.0, turn, NO_GRIPPER
+        )
 
 
 def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:
     """The skill with another law, and with other changed fields."""
     values = {attribute.name: getattr(skill, attribute.name) for attribute in fields(Skill)}
     # The digest is of the name alone: nothing is recorded that would need the rest.
-    return Rival(**{**values, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed}, says=says)
+    return Rival(
+        **{**values, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed},
+        says=says,
+    )
 
 
 def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
@@ -82,6 +93,8 @@ def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
         return lambda bench: placed
 
     def of_hands(*moving: Array) -> Said:
-        return Said(along_hands(lambda at: placed.mean(Observed.resting(at)), *(x[None] for x in moving))[0])
+        return Said(
+            along_hands(lambda at: placed.mean(Observed.resting(at)), *(x[None] for x in moving))[0]
+        )
 
     return lambda bench: rival(skill, of_hands)

@@ -64,14 +64,17 @@ def ours(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Follower:
         speed = np.linalg.norm(np.diff(records["tool"], axis=0), axis=1) / PERIOD_S
         limited = float(np.mean(records["flags"] & Flag.SPEED_LIMITED > 0))
         paths = (records[name] for name in ("hands", "target", "setpoint"))
-        return Followed(records["tool"], records["joint_velocities"], float(speed.max()), limited, *paths)
+        return Followed(
+            records["tool"], records["joint_velocities"], float(speed.max()), limited, *paths
+        )
 
     return follow
 
 
 def _ticks(hands: Moving) -> Iterator[Tick]:
     """Hands at rest at their start, then the tracker's samples, at the tick of their arrival."""
-    count, resting = len(hands.stamps), np.arange(-SETTLE_TICKS, 0, RESTING_EVERY) * PERIOD_S
+    count = len(hands.stamps)
+    resting = np.arange(-SETTLE_TICKS, 0, RESTING_EVERY) * PERIOD_S
     stamps = np.concatenate([resting, hands.stamps])
     samples = np.vstack([np.tile(hands.truth[0], (len(resting), 1)), hands.samples])
     late = np.zeros((len(stamps), 2))
@@ -82,7 +85,11 @@ def _ticks(hands: Moving) -> Iterator[Tick]:
     for stamp, position, waits in zip(stamps, samples, late, strict=True):
         for side, part, wait in zip(SIDES, (position[:3], position[3:]), waits, strict=True):
             came = stamp + wait
-            tick = SETTLE_TICKS + math.ceil(came / PERIOD_S - 1e-9) if came < math.inf else len(inboxes)
+            tick = (
+                SETTLE_TICKS + math.ceil(came / PERIOD_S - 1e-9)
+                if came < math.inf
+                else len(inboxes)
+            )
             if tick < len(inboxes):
                 x, y, z = part.tolist()
                 since_ns = round(1e9 * (stamp + SETTLE_TICKS * PERIOD_S))
@@ -95,7 +102,8 @@ class _Chain:
     """Inverse kinematics and joint limiter behind a rival's setpoints."""
 
     def __init__(self, skill: Skill, settings: Settings) -> None:
-        self.skill, self.settings = skill, settings
+        self.skill = skill
+        self.settings = settings
         # Rivals plan no stop: the speed of a tool far from its target is not reduced.
         eager = Closing(settings.tool.acceleration / 2, settings.tool.max_speed, far_damping=0.0)
         self.arm = Arm(settings, robot_description(settings), eager)
@@ -118,12 +126,15 @@ class _Chain:
     def follow(self, setpoints: Array) -> Followed:
         """The tool led by setpoints (N, 2, 3): position and velocity."""
         q, dq, ddq = self.start(setpoints[0, 0])
-        tool, joints, limited = np.empty((len(setpoints), 3)), np.empty((len(setpoints), len(q))), 0
+        tool = np.empty((len(setpoints), 3))
+        joints = np.empty((len(setpoints), len(q)))
+        limited = 0
         for k, (position, velocity) in enumerate(setpoints):
             # Without the acceleration that ours passes on: a time-optimal one jumps.
             solution = self.arm.step(q, position, velocity, self.orientation, moving=dq)
             q, dq, ddq = self.limiter.step(q, dq, ddq, solution.velocity)[:3]
-            tool[k], joints[k] = self.arm.at(q).position, dq
+            tool[k] = self.arm.at(q).position
+            joints[k] = dq
             limited += solution.speed_limited
         return _followed(tool, joints, limited)._replace(setpoint=setpoints[:, 0])
 
@@ -136,18 +147,24 @@ def _followed(tool: Array, joints: Array, limited: int) -> Followed:
 def _newest(hands: Moving) -> Array:
     """Index of the newest sample at each tick (N,)."""
     arrival_ticks = np.ceil(hands.stamps / PERIOD_S - 1e-9)
-    return np.maximum(np.searchsorted(arrival_ticks, np.arange(len(hands.truth)), side="right") - 1, 0)
+    return np.maximum(
+        np.searchsorted(arrival_ticks, np.arange(len(hands.truth)), side="right") - 1, 0
+    )
 
 
 def one_euro(hands: Moving, least_hz: float, beta: float) -> Array:
     """Samples behind a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
     speed.
     """
-    out, x, speed = np.empty_like(hands.samples), hands.samples[0].copy(), np.zeros(6)
+    out = np.empty_like(hands.samples)
+    x = hands.samples[0].copy()
+    speed = np.zeros(6)
     out[0] = x
     for k in range(1, len(out)):
         interval = hands.stamps[k] - hands.stamps[k - 1]
-        speed += _share(1.0, interval) * ((hands.samples[k] - hands.samples[k - 1]) / interval - speed)
+        speed += _share(1.0, interval) * (
+            (hands.samples[k] - hands.samples[k - 1]) / interval - speed
+        )
         for hand in (slice(0, 3), slice(3, 6)):
             cut_hz = least_hz + beta * float(np.linalg.norm(speed[hand]))
             x[hand] += _share(cut_hz, interval) * (hands.samples[k, hand] - x[hand])
@@ -186,15 +203,21 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
         chain = _Chain(skill, settings)
         targets = chain.targets(hands.samples)[_newest(hands)]
         q = chain.start(targets[0])[0]
-        before, low, setpoints, limited = q, q.copy(), np.empty((len(targets), len(q))), 0
+        before = q
+        low = q.copy()
+        setpoints = np.empty((len(targets), len(q)))
+        limited = 0
         for k, target in enumerate(targets):
             solution = chain.arm.step(q, target, np.zeros(3), chain.orientation)
             limited += solution.speed_limited
             q = q + PERIOD_S * solution.velocity
             low = (q + before - (1.0 - coefficient) * low) / (1.0 + coefficient)
-            before, setpoints[k] = q, low
+            before = q
+            setpoints[k] = low
         moved = _by_ruckig(setpoints, limits)
-        return _followed(np.array([chain.arm.at(q).position for q in moved[:, 0]]), moved[:, 1], limited)
+        return _followed(
+            np.array([chain.arm.at(q).position for q in moved[:, 0]]), moved[:, 1], limited
+        )
 
     return follow
 
@@ -224,14 +247,20 @@ def truth(skill: Skill, settings: Settings) -> Follower:
 def _by_ruckig(wanted: Array, limits: tuple[list[float], list[float], list[float]]) -> Array:
     """States (N, 3, D) of a time-optimal chase of positions (N, D), each assumed at rest."""
     size = wanted.shape[1]
-    solver, question, profile = Ruckig(size, PERIOD_S), InputParameter(size), Trajectory(size)
+    solver = Ruckig(size, PERIOD_S)
+    question = InputParameter(size)
+    profile = Trajectory(size)
     question.synchronization = Synchronization.No
     question.max_velocity, question.max_acceleration, question.max_jerk = limits
     question.target_velocity = question.target_acceleration = [0.0] * size
-    state, out, since = np.stack([wanted[0], np.zeros(size), np.zeros(size)]), np.empty((len(wanted), 3, size)), 0
+    state = np.stack([wanted[0], np.zeros(size), np.zeros(size)])
+    out = np.empty((len(wanted), 3, size))
+    since = 0
     for k, position in enumerate(wanted):
         if k == 0 or (position != wanted[k - 1]).any():
-            question.current_position, question.current_velocity, question.current_acceleration = state.tolist()
+            question.current_position, question.current_velocity, question.current_acceleration = (
+                state.tolist()
+            )
             question.target_position = position.tolist()
             solver.calculate(question, profile)
             since = k

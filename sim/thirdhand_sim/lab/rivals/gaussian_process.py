@@ -29,9 +29,12 @@ from thirdhand_sim.teach import places_of
 
 COVARIANCE_EVERY = 4  # ticks from one covariance to the next: as often as a slow tracker sends
 VIA_STD_M = 0.001
-PROCESS_SAMPLES, FOLDS = 400, 4
+PROCESS_SAMPLES = 400
+FOLDS = 4
 # Tried lengths of the hands, and of other inputs relative to them, in the inputs' median distance.
-LENGTHS, OTHERS, NOISES = (0.15, 0.3, 0.6, 1.2), (1.0, 0.3, 3.0), (0.01, 0.1, 1.0)
+LENGTHS = (0.15, 0.3, 0.6, 1.2)
+OTHERS = (1.0, 0.3, 3.0)
+NOISES = (0.01, 0.1, 1.0)
 
 
 class Posterior(NamedTuple):
@@ -66,7 +69,9 @@ class Kernel:
     lengths: Array
 
     def __call__(self, a: Array, b: Array) -> Array:
-        return np.asarray(self.variance * np.exp(-0.5 * cdist(a / self.lengths, b / self.lengths, "sqeuclidean")))
+        return np.asarray(
+            self.variance * np.exp(-0.5 * cdist(a / self.lengths, b / self.lengths, "sqeuclidean"))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +98,14 @@ class PlacedProcess:
         threshold: float = np.inf,
     ) -> PlacedProcess:
         """The process of groups of data: inputs (N, 6), outputs (N, 3) [m], noise (N,) [m²]."""
-        s, owner = np.concatenate(inputs), np.repeat(np.arange(len(inputs)), [len(group) for group in inputs])
+        s = np.concatenate(inputs)
+        owner = np.repeat(np.arange(len(inputs)), [len(group) for group in inputs])
         k = kernels[0](s, s)
         for kernel in kernels[1:]:
             k += (owner[:, None] == owner) * kernel(s, s)
-        posterior = Posterior.of(k + np.diag(np.concatenate(noise) + 1e-9), np.concatenate(outputs), centre)
+        posterior = Posterior.of(
+            k + np.diag(np.concatenate(noise) + 1e-9), np.concatenate(outputs), centre
+        )
         return PlacedProcess(kernels, s, owner == len(inputs) - 1, posterior, threshold)
 
     def _rows(self, hands: Array) -> Array:
@@ -114,7 +122,9 @@ class PlacedProcess:
         """As `Placed.predict`."""
         rows = self._rows(seen.hands)
         prior = sum(kernel.variance for kernel in self.kernels)
-        sparse_variance = np.maximum(prior - self.posterior.explained(rows[::COVARIANCE_EVERY]), 1e-6)
+        sparse_variance = np.maximum(
+            prior - self.posterior.explained(rows[::COVARIANCE_EVERY]), 1e-6
+        )
         variance = np.repeat(sparse_variance, COVARIANCE_EVERY)[: len(rows)]
         covariance = variance[:, None, None] * np.eye(3)
         return Predicted(self.posterior.mean(rows), covariance, np.sqrt(variance) > self.threshold)
@@ -136,9 +146,15 @@ class GaussianProcess:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedProcess:
         """The process with its kernels."""
-        rows = [np.linspace(0, len(demo.times) - 1, self.each).astype(int) for demo in demonstrations]
-        inputs = np.concatenate([demo.hands[index] for demo, index in zip(demonstrations, rows, strict=True)])
-        outputs = np.concatenate([demo.tool[index] for demo, index in zip(demonstrations, rows, strict=True)])
+        rows = [
+            np.linspace(0, len(demo.times) - 1, self.each).astype(int) for demo in demonstrations
+        ]
+        inputs = np.concatenate(
+            [demo.hands[index] for demo, index in zip(demonstrations, rows, strict=True)]
+        )
+        outputs = np.concatenate(
+            [demo.tool[index] for demo, index in zip(demonstrations, rows, strict=True)]
+        )
         owner = np.repeat(np.arange(len(demonstrations)), self.each)
         same_owner = owner[:, None] == owner
         centre = outputs.mean(axis=0)
@@ -148,23 +164,36 @@ class GaussianProcess:
             shared, individual, l_s, r_s, l_o, r_o, noise = np.exp(log)
             first = shared**2 * np.exp(-0.5 * (left / l_s**2 + right / r_s**2))
             second = same_owner * individual**2 * np.exp(-0.5 * (left / l_o**2 + right / r_o**2))
-            root = cho_factor(first + second + (noise**2 + 1e-8) * np.eye(len(same_owner)), lower=True)
+            root = cho_factor(
+                first + second + (noise**2 + 1e-8) * np.eye(len(same_owner)), lower=True
+            )
             weights = cho_solve(root, outputs - centre)
             outer = 0.5 * (3.0 * cho_solve(root, np.eye(len(same_owner))) - weights @ weights.T)
-            by_first, by_second = outer * first, outer * second
+            by_first = outer * first
+            by_second = outer * second
             slopes = [2.0 * by_first.sum(), 2.0 * by_second.sum()]
             slopes += [(by_first * left).sum() / l_s**2, (by_first * right).sum() / r_s**2]
             slopes += [(by_second * left).sum() / l_o**2, (by_second * right).sum() / r_o**2]
             slopes += [2.0 * noise**2 * np.trace(outer)]
-            value = 3.0 * np.log(np.diag(root[0])).sum() + 0.5 * np.sum(weights * (outputs - centre))
+            value = 3.0 * np.log(np.diag(root[0])).sum() + 0.5 * np.sum(
+                weights * (outputs - centre)
+            )
             return float(value), np.array(slopes)
 
         begin = np.log([0.2, max(0.05, self.own_m), 0.3, 0.3, 0.3, 0.3, 0.005])
         bounds = [(0.02, 2.0), (max(self.own_m, 0.02), 2.0)] + [(0.05, 3.0)] * 4 + [(0.001, 0.05)]
         limits: list[tuple[float, float]] = np.log(bounds).tolist()
-        optimum = np.exp(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 100}).x)
-        kernels = [Kernel(optimum[i] ** 2, np.repeat(optimum[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)]
-        base = LearnedProcess(kernels[0], kernels[1], float(optimum[6]), inputs, outputs, owner, centre, np.inf)
+        optimum = np.exp(
+            minimize(
+                cost, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 100}
+            ).x
+        )
+        kernels = [
+            Kernel(optimum[i] ** 2, np.repeat(optimum[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)
+        ]
+        base = LearnedProcess(
+            kernels[0], kernels[1], float(optimum[6]), inputs, outputs, owner, centre, np.inf
+        )
         variances = [base.without(i).variances(demo.hands) for i, demo in enumerate(demonstrations)]
         return replace(base, threshold=self.gate * float(np.sqrt(np.concatenate(variances).max())))
 
@@ -185,7 +214,9 @@ class LearnedProcess:
     def without(self, number: int) -> LearnedProcess:
         """With one demonstration left out."""
         mask = self.owner != number
-        return replace(self, inputs=self.inputs[mask], outputs=self.outputs[mask], owner=self.owner[mask])
+        return replace(
+            self, inputs=self.inputs[mask], outputs=self.outputs[mask], owner=self.owner[mask]
+        )
 
     def variances(self, hands: Array) -> Array:
         """Predicted variances (T,) [m²] at hands (T, 6) [m] in an unknown scene."""
@@ -201,7 +232,12 @@ class LearnedProcess:
         outputs = [self.outputs[group] for group in groups] + [via_tools]
         noise = [np.full(int(group.sum()), self.noise**2) for group in groups] + [std**2]
         return PlacedProcess.of(
-            [self.shared, self.own], inputs, outputs, noise, centre=self.centre, threshold=self.threshold
+            [self.shared, self.own],
+            inputs,
+            outputs,
+            noise,
+            centre=self.centre,
+            threshold=self.threshold,
         )
 
 
@@ -223,14 +259,21 @@ class SampleProcess:
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
         samples = joined(demonstrations)[:: self.every]
-        inputs, outputs, centre = samples[:, :6], samples[:, 6:], samples[:, 6:].mean(axis=0)
+        inputs = samples[:, :6]
+        outputs = samples[:, 6:]
+        centre = samples[:, 6:].mean(axis=0)
         if self.ell is None:
-            size, lengths = ConstantKernel(0.05, (1e-4, 1e2)), RBF(np.full(6, 0.3), (0.03, 10.0))
+            size = ConstantKernel(0.05, (1e-4, 1e2))
+            lengths = RBF(np.full(6, 0.3), (0.03, 10.0))
             kernel = size * lengths + WhiteKernel(1e-4, (1e-6, 1e-2))
         else:
             lengths = RBF(np.full(6, (2 * self.ell) ** -0.5), "fixed")
             kernel = ConstantKernel(0.05) * lengths + WhiteKernel(1e-4, "fixed")
-        fitted = GaussianProcessRegressor(kernel, random_state=SEED).fit(inputs, outputs - centre).kernel_
+        fitted = (
+            GaussianProcessRegressor(kernel, random_state=SEED)
+            .fit(inputs, outputs - centre)
+            .kernel_
+        )
         shared = Kernel(float(fitted.k1.k1.constant_value), np.asarray(fitted.k1.k2.length_scale))
         return LearnedSamples(shared, float(fitted.k2.noise_level), inputs, outputs, centre)
 
@@ -249,8 +292,11 @@ class LearnedSamples:
         """The process in a scene with these places."""
         via_hands, via_tools, _ = neighbourhoods(places_of(places)[1:])
         is_far = cdist(self.inputs, via_hands).min(axis=1) >= TOLERANCE_M
-        inputs, outputs = np.concatenate([self.inputs[is_far], via_hands]), np.concatenate([self.outputs[is_far], via_tools])
-        noise = np.concatenate([np.full(int(is_far.sum()), self.noise), np.full(len(via_hands), VIA_STD_M**2)])
+        inputs = np.concatenate([self.inputs[is_far], via_hands])
+        outputs = np.concatenate([self.outputs[is_far], via_tools])
+        noise = np.concatenate(
+            [np.full(int(is_far.sum()), self.noise), np.full(len(via_hands), VIA_STD_M**2)]
+        )
         # Closed loops amplify rounding: another triangle moves the events of a scene by 0.8 mm.
         covariance = self.kernel(inputs, inputs) + np.diag(noise)
         posterior = Posterior.of(covariance, outputs, self.centre, lower=False)
@@ -264,7 +310,10 @@ def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
 
     def learn(shown: Sequence[LeftOut]) -> Law:
         count = max(2, PROCESS_SAMPLES // len(shown))
-        rows = [np.unique(np.linspace(0, len(take.tool) - 1, count).round().astype(int)) for take in shown]
+        rows = [
+            np.unique(np.linspace(0, len(take.tool) - 1, count).round().astype(int))
+            for take in shown
+        ]
         tool = np.concatenate([take.tool[index] for take, index in zip(shown, rows, strict=True)])
         thin = [[x[index] for x in inputs(take)] for take, index in zip(shown, rows, strict=True)]
         groups = [np.concatenate(parts) for parts in zip(*thin, strict=True)]
@@ -273,24 +322,45 @@ def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
         fold_of = np.repeat(np.arange(len(shown)) % FOLDS, [len(index) for index in rows])
 
         def solved(known: Array, noise: float, kept: Any = slice(None)) -> Posterior:
-            return Posterior.of(known + noise * np.eye(len(known)), tool[kept], tool[kept].mean(axis=0))
+            return Posterior.of(
+                known + noise * np.eye(len(known)), tool[kept], tool[kept].mean(axis=0)
+            )
 
         tried = []
-        for length, other, noise in itertools.product(LENGTHS, OTHERS if len(groups) > 1 else OTHERS[:1], NOISES):
+        for length, other, noise in itertools.product(
+            LENGTHS, OTHERS if len(groups) > 1 else OTHERS[:1], NOISES
+        ):
             lengths = length**2 * np.array(usual) * [1.0, *[other**2] * (len(groups) - 1)]
-            gram = np.exp(-0.5 * np.sum([d / square for d, square in zip(squares, lengths, strict=True)], axis=0))
-            errors, variances = [], []
+            gram = np.exp(
+                -0.5
+                * np.sum([d / square for d, square in zip(squares, lengths, strict=True)], axis=0)
+            )
+            errors = []
+            variances = []
             for fold in np.unique(fold_of):
-                training, held = fold_of != fold, fold_of == fold
-                posterior, across = solved(gram[np.ix_(training, training)], noise, training), gram[np.ix_(held, training)]
+                training = fold_of != fold
+                held = fold_of == fold
+                posterior = solved(gram[np.ix_(training, training)], noise, training)
+                across = gram[np.ix_(held, training)]
                 errors.append(np.sum((tool[held] - posterior.mean(across)) ** 2, axis=1))
                 variances.append(1.0 + noise - posterior.explained(across))
-            squared_errors, left = np.concatenate(errors), np.concatenate(variances)
-            tried.append((float(squared_errors.mean()), lengths, noise, float(np.mean(squared_errors / left)) / 3.0))
+            squared_errors = np.concatenate(errors)
+            left = np.concatenate(variances)
+            tried.append(
+                (
+                    float(squared_errors.mean()),
+                    lengths,
+                    noise,
+                    float(np.mean(squared_errors / left)) / 3.0,
+                )
+            )
         _, lengths, noise, scale = min(tried, key=lambda one: one[0])
 
         def kernel(a: list[Array], b: list[Array]) -> Array:
-            distances = [cdist(x, y, "sqeuclidean") / square for x, y, square in zip(a, b, lengths, strict=True)]
+            distances = [
+                cdist(x, y, "sqeuclidean") / square
+                for x, y, square in zip(a, b, lengths, strict=True)
+            ]
             return np.asarray(np.exp(-0.5 * np.sum(distances, axis=0)))
 
         posterior = solved(kernel(groups, groups), noise)

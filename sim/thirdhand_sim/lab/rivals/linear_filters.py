@@ -35,9 +35,13 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     Sequences with gaps in their samples are taken as they are: the samples in order.
     """
     up = max(1, -(-LEAST_OUTPUT_HZ // rate_hz))
-    taps, step = round(REACH_S * rate_hz), 1 / (rate_hz * up)
+    taps = round(REACH_S * rate_hz)
+    step = 1 / (rate_hz * up)
     size = taps * up
-    square, cross, jerk, push = np.zeros((size, size)), np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
+    square = np.zeros((size, size))
+    cross = np.zeros(size)
+    jerk = np.zeros((size, size))
+    push = np.zeros((size, size))
     energy = wanted_jerk = wanted_push = 0.0
     count = 0
     for sequence in sequences:
@@ -45,17 +49,22 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
         samples = skill.mean(sequence.samples)
         outputs = np.arange(size, up * len(samples))
         times = sequence.stamps[0] + outputs * step
-        outputs, times = outputs[times < len(truth) * PERIOD_S - step], times[times < len(truth) * PERIOD_S - step]
+        outputs = outputs[times < len(truth) * PERIOD_S - step]
+        times = times[times < len(truth) * PERIOD_S - step]
         for axis in range(3):
             mean = samples[:, axis].mean()
             x = np.interp(times, np.arange(len(truth)) * PERIOD_S, truth[:, axis]) - mean
             rows = _rows(samples[:, axis] - mean, outputs, up, taps)
-            third, second = np.diff(rows, 3, axis=0) / step**3, np.diff(rows, 2, axis=0) / step**2
-            square, cross = square + rows.T @ rows, cross + rows.T @ x
-            jerk, push = jerk + third.T @ third, push + second.T @ second
+            third = np.diff(rows, 3, axis=0) / step**3
+            second = np.diff(rows, 2, axis=0) / step**2
+            square = square + rows.T @ rows
+            cross = cross + rows.T @ x
+            jerk = jerk + third.T @ third
+            push = push + second.T @ second
             wanted_jerk += float((np.diff(x, 3) ** 2).sum()) / step**6
             wanted_push += float((np.diff(x, 2) ** 2).sum()) / step**4
-            energy, count = energy + float(x @ x), count + len(x)
+            energy = energy + float(x @ x)
+            count = count + len(x)
     scale = float(np.trace(square)) / size
     whole = np.kron(np.eye(up), np.ones(taps))  # what rests is met
     floors = []
@@ -63,7 +72,10 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
         left = square + weight * jerk + 1e3 * scale * whole.T @ whole + 1e-9 * scale * np.eye(size)
         w = np.linalg.solve(left, cross + 1e3 * scale * whole.T @ np.ones(up))
         error = max(float(w @ square @ w - 2 * w @ cross + energy), 0.0) / count * 3
-        ratios = (float(np.sqrt(w @ matrix @ w / of)) for matrix, of in ((push, wanted_push), (jerk, wanted_jerk)))
+        ratios = (
+            float(np.sqrt(w @ matrix @ w / of))
+            for matrix, of in ((push, wanted_push), (jerk, wanted_jerk))
+        )
         floors.append(Floor(1000 * float(np.sqrt(error)), *ratios))
     return floors
 

@@ -41,7 +41,9 @@ class Observed(NamedTuple):
     def resting(hands: Array, times: Array | float = 0.0) -> Observed:
         """Hands (T, 6) [m] at rest."""
         shape = len(hands)
-        return Observed(np.broadcast_to(times, shape), hands, np.zeros((shape, 6)), np.ones((shape, 2)))
+        return Observed(
+            np.broadcast_to(times, shape), hands, np.zeros((shape, 6)), np.ones((shape, 2))
+        )
 
 
 class Predicted(NamedTuple):

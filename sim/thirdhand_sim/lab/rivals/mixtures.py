@@ -17,7 +17,8 @@ from thirdhand_sim.sessions import SessionDemonstration
 
 SEED = EXPERIMENTS["people"].seeds.method
 # Hands are far below this quantile of the demonstrations' log densities, less a slack [nat].
-UNUSUAL, SLACK = 0.001, 10.0
+UNUSUAL = 0.001
+SLACK = 10.0
 
 
 def frames(places: Places) -> Array:
@@ -41,7 +42,10 @@ def joined(shown: SessionDemonstration) -> Array:
 def path_share(shown: SessionDemonstration) -> Array:
     """Share (T,) of the path of hands and tool; at rest it does not grow."""
     window = np.ones(13) / 13  # half a second
-    x = np.stack([np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T], axis=1)
+    x = np.stack(
+        [np.convolve(np.pad(c, 6, mode="edge"), window, mode="valid") for c in joined(shown).T],
+        axis=1,
+    )
     speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
     travel_m = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] below 2 cm/s they rest
     return np.asarray((travel_m - travel_m[0]) / (travel_m[-1] - travel_m[0]))
@@ -57,7 +61,12 @@ class MixtureRegression:
         """The mixture, by EM."""
         samples = np.concatenate([joined(demonstration) for demonstration in demonstrations])
         mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
-        return LearnedMixture(mixture, threshold([log_density(mixture, demonstration.hands) for demonstration in demonstrations]))
+        return LearnedMixture(
+            mixture,
+            threshold(
+                [log_density(mixture, demonstration.hands) for demonstration in demonstrations]
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +88,11 @@ class LearnedMixture:
     def predict(self, seen: Observed) -> Predicted:
         """As `Placed.predict`; it holds where such hands were not demonstrated."""
         regression = self.mixture.regress(seen.hands)
-        return Predicted(regression.mean, regression.covariance, log_density(self.mixture, seen.hands) < self.threshold)
+        return Predicted(
+            regression.mean,
+            regression.covariance,
+            log_density(self.mixture, seen.hands) < self.threshold,
+        )
 
 
 def log_density(mixture: GaussianMixture, hands: Array) -> Array:
@@ -99,7 +112,11 @@ def log_normal(x: Array, mean: Array, covariance: Array) -> Array:
     """Log density (T,) of x (T, D) under a normal distribution."""
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, (x - mean).T)
-    return np.asarray(-np.log(np.diag(root)).sum() - 0.5 * (white**2).sum(axis=0) - 0.5 * len(mean) * np.log(2 * np.pi))
+    return np.asarray(
+        -np.log(np.diag(root)).sum()
+        - 0.5 * (white**2).sum(axis=0)
+        - 0.5 * len(mean) * np.log(2 * np.pi)
+    )
 
 
 def threshold(densities: Sequence[Array]) -> float:

@@ -55,23 +55,31 @@ def in_mean_scene(take: LeftOut, mean: Array | None) -> LeftOut:
 
     hands = of_both(take.hands)
     velocities = (of_both(take.hands + STEP_S * take.velocities) - hands) / STEP_S
-    return take._replace(hands=hands, velocities=velocities, tool=carried(take.tool, scene[2], mean[2]))
+    return take._replace(
+        hands=hands, velocities=velocities, tool=carried(take.tool, scene[2], mean[2])
+    )
 
 
 def past(seen: Observed | LeftOut) -> Array:
     """Hands at the times of MEMORY_S before now, relative to now: (T, 6 M) [m]."""
     now = np.arange(len(seen.hands))
-    return np.hstack([seen.hands[np.maximum(0, now - round(s * JUDGED_HZ))] - seen.hands for s in MEMORY_S])
+    return np.hstack(
+        [seen.hands[np.maximum(0, now - round(s * JUDGED_HZ))] - seen.hands for s in MEMORY_S]
+    )
 
 
 def clock(seen: Observed | LeftOut) -> Array:
     """The time [s] since a hand first moved faster than MOVES_MPS, (T, 1); 0 before."""
     speeds = np.linalg.norm(seen.velocities.reshape(len(seen.times), 2, 3), axis=2).max(axis=1)
-    begins = seen.times[int(np.argmax(speeds > MOVES_MPS))] if (speeds > MOVES_MPS).any() else np.inf
+    begins = (
+        seen.times[int(np.argmax(speeds > MOVES_MPS))] if (speeds > MOVES_MPS).any() else np.inf
+    )
     return np.asarray(np.maximum(seen.times - begins, 0.0)[:, None])
 
 
-def left_out_by(learn: Learn, shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool) -> list[Predicted]:
+def left_out_by(
+    learn: Learn, shown: Sequence[LeftOut], asked: Sequence[LeftOut], *, told: bool
+) -> list[Predicted]:
     """Predictions of takes by a rival that learns from others, with the via-points or without."""
     mean = np.mean([scene_of(take) for take in shown], axis=0) if told else None
     model = learn([in_mean_scene(take, mean) for take in shown])
@@ -80,7 +88,11 @@ def left_out_by(learn: Learn, shown: Sequence[LeftOut], asked: Sequence[LeftOut]
         placed = model.place(None)
         assert not isinstance(placed, Skill)
         prediction = placed.predict(in_mean_scene(take, mean).seen)
-        back = prediction.mean if mean is None else carried(prediction.mean, mean[2], scene_of(take)[2])
+        back = (
+            prediction.mean
+            if mean is None
+            else carried(prediction.mean, mean[2], scene_of(take)[2])
+        )
         out.append(prediction._replace(mean=back))
     return out
 
@@ -95,7 +107,9 @@ def same_time(shown: Sequence[LeftOut]) -> Law:
     """The mean tool after the same elapsed time; after the end of a take, its last one."""
 
     def predict(seen: Observed) -> Predicted:
-        tools = [take.tool[np.minimum(np.arange(len(seen.times)), len(take.tool) - 1)] for take in shown]
+        tools = [
+            take.tool[np.minimum(np.arange(len(seen.times)), len(take.tool) - 1)] for take in shown
+        ]
         return Predicted(np.mean(tools, axis=0))
 
     return Law(predict)
@@ -103,7 +117,10 @@ def same_time(shown: Sequence[LeftOut]) -> Law:
 
 def linear_in_hands(shown: Sequence[LeftOut]) -> Law:
     """The linear function of the hands that fits best."""
-    hands, tool = (np.concatenate(parts) for parts in zip(*((take.hands, take.tool) for take in shown), strict=True))
+    hands, tool = (
+        np.concatenate(parts)
+        for parts in zip(*((take.hands, take.tool) for take in shown), strict=True)
+    )
     return Law(lambda seen: Predicted(linear(hands, tool, seen.hands)))
 
 
@@ -114,7 +131,9 @@ def neighbours(shown: Sequence[LeftOut]) -> Law:
     def predict(seen: Observed) -> Predicted:
         nearest = [tree.query(seen.hands) for tree in trees]
         weights = np.array([1.0 / (distance_m + OFF_PLACE_M) ** 4 for distance_m, _ in nearest])
-        tools = np.array([take.tool[index] for take, (_, index) in zip(shown, nearest, strict=True)])
+        tools = np.array(
+            [take.tool[index] for take, (_, index) in zip(shown, nearest, strict=True)]
+        )
         return Predicted(np.einsum("kt,kti->ti", weights / weights.sum(axis=0), tools))
 
     return Law(predict)
@@ -129,11 +148,13 @@ def hmm(shown: Sequence[LeftOut]) -> Law:
     thin = [(take.hands[::step], take.velocities[::step], take.tool[::step]) for take in shown]
     hands, velocities, tool = (np.concatenate(parts) for parts in zip(*thin, strict=True))
     counts = [len(part) for part, *_ in thin]
-    last, owner = np.cumsum(counts) - 1, np.repeat(np.arange(len(thin)), counts)
+    last = np.cumsum(counts) - 1
+    owner = np.repeat(np.arange(len(thin)), counts)
     place, pace = (_scatter(x, owner) for x in (hands, velocities))
     features = np.hstack([hands / place, velocities / pace])
     starts = np.concatenate([[0], last[:-1] + 1])
-    onward, further = 0.6 / step, 0.2 / step
+    onward = 0.6 / step
+    further = 0.2 / step
     ends_next = np.isin(np.arange(len(owner)), starts)
     ends_second = ends_next | np.isin(np.arange(len(owner)), starts + 1)
 
@@ -142,18 +163,25 @@ def hmm(shown: Sequence[LeftOut]) -> Law:
         log = -0.5 * CORRELATED * cdist(rows, features, "sqeuclidean")
         belief = np.full(len(owner), 0.1 / len(owner))
         belief[starts] += 0.9 / len(starts)
-        means, covariances = [], []
+        means = []
+        covariances = []
         for row in log:
             belief = belief * np.exp(row - row.max())
             belief /= belief.sum()
             mean = belief @ tool
             means.append(mean)
-            covariances.append((tool - mean).T @ (belief[:, None] * (tool - mean)) + 1e-4 * np.eye(3))
-            first, second = np.roll(belief, 1), np.roll(belief, 2)
-            first[ends_next], second[ends_second] = 0.0, 0.0
+            covariances.append(
+                (tool - mean).T @ (belief[:, None] * (tool - mean)) + 1e-4 * np.eye(3)
+            )
+            first = np.roll(belief, 1)
+            second = np.roll(belief, 2)
+            first[ends_next] = 0.0
+            second[ends_second] = 0.0
             stays = (1.0 - onward - further) * belief
             stays[last] = belief[last]
-            belief = (1.0 - RESTARTS) * (stays + onward * first + further * second) + RESTARTS / len(owner)
+            belief = (1.0 - RESTARTS) * (
+                stays + onward * first + further * second
+            ) + RESTARTS / len(owner)
         return Predicted(np.array(means), np.array(covariances))
 
     return Law(predict)

@@ -16,7 +16,9 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import places_of
 
-FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])  # d tool / d hands where the tool follows the left hand
+FOLLOW = np.hstack(
+    [np.eye(3), np.zeros((3, 3))]
+)  # d tool / d hands where the tool follows the left hand
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,9 @@ class NoDemonstrations:
         """The regression through these places."""
         via_hands, via_tools, std = neighbourhoods(places_of(places))
         kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
-        return PlacedProcess.of([kernel], [via_hands], [via_tools], [std**2], centre=via_tools.mean(axis=0))
+        return PlacedProcess.of(
+            [kernel], [via_hands], [via_tools], [std**2], centre=via_tools.mean(axis=0)
+        )
 
 
 @dataclass(frozen=True)
@@ -69,14 +73,19 @@ class PlacedLookUp:
         """As `Placed.predict`; the covariance is that of the weighted tools, and a constant."""
         mean, weights, tools = self._weighed(seen.hands)
         offsets = tools - mean[:, None]
-        covariance = np.einsum("tp,tpi,tpj->tij", weights, offsets, offsets) + self.method.deviation_m**2 * np.eye(3)
+        covariance = np.einsum(
+            "tp,tpi,tpj->tij", weights, offsets, offsets
+        ) + self.method.deviation_m**2 * np.eye(3)
         return Predicted(mean, covariance, np.zeros(len(mean), bool))
 
     def _weighed(self, hands: Array) -> tuple[Array, Array, Array]:
         via_hands = np.array([[*p.left, *p.right] for p in self.points])
         away = hands[:, None] - via_hands
         tools = np.array([p.tool for p in self.points]) + np.stack(
-            [away[:, i] @ (FOLLOW.T if p.follow == "left" else np.zeros((6, 3))) for i, p in enumerate(self.points)],
+            [
+                away[:, i] @ (FOLLOW.T if p.follow == "left" else np.zeros((6, 3)))
+                for i, p in enumerate(self.points)
+            ],
             axis=1,
         )
         weights = 1.0 / (np.sum(away**2, axis=2) + 1e-8) ** (self.method.power / 2.0)

@@ -21,7 +21,9 @@ RIDGE = 10.0
 LEAST_STD_M = 0.001
 
 
-def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, bases: int, ridge: float = RIDGE) -> Any:
+def learned_promp(
+    times: Sequence[Array], trajectories: Sequence[Array], *, bases: int, ridge: float = RIDGE
+) -> Any:
     """The ProMP (of movement_primitives) of trajectories (T, O) at times (T,) [s], from 0.
 
     H demonstrations leave the weights' covariance with a rank of H - 1, which can meet that many
@@ -34,10 +36,13 @@ def learned_promp(times: Sequence[Array], trajectories: Sequence[Array], *, base
         from movement_primitives.promp import ProMP
     except ImportError:
         raise ExperimentError(
-            "ProMPs need movement_primitives, which is not installed: pip install 'thirdhand[experiments]'"
+            "ProMPs need movement_primitives, which is not installed: pip install "
+            "'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    primitive.imitate([t.copy() for t in times], list(trajectories))  # divides the given times in place
+    primitive.imitate(
+        [t.copy() for t in times], list(trajectories)
+    )  # divides the given times in place
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
         primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))
@@ -63,21 +68,31 @@ class InteractionProMP:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedInteraction:
         """The distribution of the weights."""
-        weights, residuals, phases = [], [], []
+        weights = []
+        residuals = []
+        phases = []
         for demonstration in demonstrations:
-            x, phase = joined(demonstration), self.phase(demonstration)
+            x = joined(demonstration)
+            phase = self.phase(demonstration)
             basis = self.basis(phase)
             w = np.linalg.solve(basis.T @ basis + 1e-3 * np.eye(self.bases), basis.T @ x)
             residuals.append(np.mean((x - basis @ w) ** 2, axis=0))
             weights.append(w.T.ravel())
-            order = np.argmin(np.linalg.norm(x[:, None] - frames(demonstration.places), axis=2), axis=0)
+            order = np.argmin(
+                np.linalg.norm(x[:, None] - frames(demonstration.places), axis=2), axis=0
+            )
             phases.append(phase[order])
         w = np.array(weights)
         covariance = np.cov(w.T)
         covariance += self.ridge * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
         noise = np.mean(residuals, axis=0)
-        base = LearnedInteraction(self, w.mean(axis=0), covariance, noise, np.median(phases, axis=0), -np.inf)
-        usual = [base.place(demonstration.places).evidence(demonstration.hands)[::5] for demonstration in demonstrations]
+        base = LearnedInteraction(
+            self, w.mean(axis=0), covariance, noise, np.median(phases, axis=0), -np.inf
+        )
+        usual = [
+            base.place(demonstration.places).evidence(demonstration.hands)[::5]
+            for demonstration in demonstrations
+        ]
         return replace(base, threshold=threshold(usual))
 
     def basis(self, phase: Array) -> Array:
@@ -107,7 +122,9 @@ class LearnedInteraction:
 
     def place(self, places: Places) -> PlacedInteraction:
         """Conditioned on hands and tool at each place."""
-        method, mean, covariance = self.method, self.mean, self.covariance
+        method = self.method
+        mean = self.mean
+        covariance = self.covariance
         std = max(places.std_m / np.sqrt(3.0), LEAST_STD_M)
         noise = np.concatenate([np.full(6, std**2 + method.hands_m**2), np.full(3, std**2)])
         for phase, frame in zip(self.at, frames(places), strict=True):
@@ -150,7 +167,9 @@ class PlacedInteraction:
         beliefs = self._phases(logs)  # (T, Z)
         over = self.covariances[:, :6, :6]
         gains = np.linalg.solve(over, self.covariances[:, :6, 6:])  # (Z, 6, 3)
-        left = self.covariances[:, 6:, 6:] - np.einsum("zio,zip->zop", gains, self.covariances[:, :6, 6:])
+        left = self.covariances[:, 6:, 6:] - np.einsum(
+            "zio,zip->zop", gains, self.covariances[:, :6, 6:]
+        )
         constant = self.means[:, 6:] - np.einsum("zi,zio->zo", self.means[:, :6], gains)
         tools = constant + np.einsum("ti,zio->tzo", seen.hands, gains, optimize=True)
         mean = np.einsum("tz,tzo->to", beliefs, tools)
@@ -162,13 +181,17 @@ class PlacedInteraction:
 
     def _likelihoods(self, hands: Array) -> Array:
         rows = zip(self.means, self.covariances, strict=True)
-        return np.stack([log_normal(hands, mean[:6], covariance[:6, :6]) for mean, covariance in rows], axis=1)
+        return np.stack(
+            [log_normal(hands, mean[:6], covariance[:6, :6]) for mean, covariance in rows], axis=1
+        )
 
     def _phases(self, logs: Array) -> Array:
         """The belief in each phase (T, Z), from the hands until then."""
         cells = self.method.cells
         steps = {-1: 0.05, 0: 0.60, 1: 0.25, 2: 0.08, 3: 0.02}
-        move = np.sum([share * np.eye(cells, k=step) for step, share in steps.items()], axis=0) + 1e-6
+        move = (
+            np.sum([share * np.eye(cells, k=step) for step, share in steps.items()], axis=0) + 1e-6
+        )
         move /= move.sum(axis=1, keepdims=True)
         belief = np.exp(-np.arange(cells) / 3.0)
         belief /= belief.sum()

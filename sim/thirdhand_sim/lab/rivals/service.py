@@ -18,7 +18,8 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import places_of, recorded
 
-COMPONENTS, SEED = 10, EXPERIMENTS["statistics"].seeds.method
+COMPONENTS = 10
+SEED = EXPERIMENTS["statistics"].seeds.method
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,9 @@ class Service:
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
         """By `thirdhand.workbench.learning`."""
-        return LearnedByService(learn([recorded(demonstration) for demonstration in demonstrations]), start=True)
+        return LearnedByService(
+            learn([recorded(demonstration) for demonstration in demonstrations]), start=True
+        )
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,13 @@ class ServiceAsPaper:
         """The skill with these parameters."""
         taken = [recorded(demonstration) for demonstration in demonstrations]
         return LearnedByService(
-            learn(taken, ell=self.ell, penalty=self.penalty, spread_m=self.spread_m, components=self.components)
+            learn(
+                taken,
+                ell=self.ell,
+                penalty=self.penalty,
+                spread_m=self.spread_m,
+                components=self.components,
+            )
         )
 
 
@@ -56,9 +65,13 @@ class LearnedByService:
 
     def place(self, places: Places) -> Skill:
         """The skill adapted to the places."""
-        return adapted(self.skill, places_of(places)[0 if self.start else 1 :], tolerance=TOLERANCE_M)
+        return adapted(
+            self.skill, places_of(places)[0 if self.start else 1 :], tolerance=TOLERANCE_M
+        )
 
 
 def joined(demonstrations: Sequence[SessionDemonstration]) -> Array:
     """Hands and tool (T, 9) [m] of all demonstrations."""
-    return np.concatenate([np.hstack([demonstration.hands, demonstration.tool]) for demonstration in demonstrations])
+    return np.concatenate(
+        [np.hstack([demonstration.hands, demonstration.tool]) for demonstration in demonstrations]
+    )

@@ -29,9 +29,15 @@ class Method(Protocol):
         """
 
 
-METHODS: tuple[type[Method], ...] = (Mixture, Segmented, HandInputs)  # the last one applies to all demonstrations
+METHODS: tuple[type[Method], ...] = (
+    Mixture,
+    Segmented,
+    HandInputs,
+)  # the last one applies to all demonstrations
 
 
 def method_of(demonstrations: Sequence[Demonstration], options: Options) -> Method:
     """The first of METHODS that applies to these demonstrations and options."""
-    return next(found for method in METHODS if (found := method.of(demonstrations, options)) is not None)
+    return next(
+        found for method in METHODS if (found := method.of(demonstrations, options)) is not None
+    )

@@ -21,9 +21,14 @@ from thirdhand.workbench.learning.regions import blocks_of
 LONGER = 1.5  # the hands may rest this many times as long as in any demonstration
 LEAST_REST_S = 1.0  # a shorter rest is no pause
 LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
-HALF_WAY = 0.5  # on this share of the way to the end, or to another segment's begin, hands are not at the begin
-LEAST_NEAR_M = 2.0 * OWN_NEAR_M  # hands within this distance of where demonstrations begin have returned there
-NEAR_TIMES = 2.0  # so have those within this multiple of the largest distance of their begins from the mean
+# on this share of the way to the end, or to another segment's begin, hands are not at the begin
+HALF_WAY = 0.5
+LEAST_NEAR_M = (
+    2.0 * OWN_NEAR_M
+)  # hands within this distance of where demonstrations begin have returned there
+NEAR_TIMES = (
+    2.0  # so have those within this multiple of the largest distance of their begins from the mean
+)
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
 LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
 FIRST_STAMP_NS = 1_000_000_000
@@ -44,25 +49,42 @@ class Tempo(NamedTuple):
         """The tempo of a demonstration, sample by sample."""
         step = max(1, math.floor(1.0 / (MOST_TEMPO_HZ * demonstration.period_s)))
         settings = Settings()
-        intake, state = Intake(settings), blank(state_layout(len(settings.joints.names)))
+        intake = Intake(settings)
+        state = blank(state_layout(len(settings.joints.names)))
         intake.begin(state)
-        state["tick"], ticked, samples = 0, 0, []
+        state["tick"] = 0
+        ticked = 0
+        samples = []
         since_ns = demonstration.stamps_ns - demonstration.stamps_ns[0] + FIRST_STAMP_NS
-        left, right = demonstration.left[::step].tolist(), demonstration.right[::step].tolist()
+        left = demonstration.left[::step].tolist()
+        right = demonstration.right[::step].tolist()
         for stamp_ns, *poses in zip(since_ns[::step].tolist(), left, right, strict=True):
             tick = round((stamp_ns - FIRST_STAMP_NS) * 1e-9 / settings.period_s)
             intake.advance(state, tick - ticked)
             ticked = tick
             for side, row in enumerate(poses):
-                intake.take_hand(state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:])))
-            samples.append(np.hstack([np.linalg.norm(state["hand_velocity_lowpass"], axis=1), state["hand_stillness"]]))
-        times_s, sampled_s = demonstration.seconds, (since_ns[::step] - FIRST_STAMP_NS) * 1e-9
-        columns = np.stack([np.interp(times_s, sampled_s, column) for column in np.array(samples).T], axis=1)
+                intake.take_hand(
+                    state, side, PoseStamped(stamp_ns, BASE, tuple(row[:3]), tuple(row[3:]))
+                )
+            samples.append(
+                np.hstack(
+                    [
+                        np.linalg.norm(state["hand_velocity_lowpass"], axis=1),
+                        state["hand_stillness"],
+                    ]
+                )
+            )
+        times_s = demonstration.seconds
+        sampled_s = (since_ns[::step] - FIRST_STAMP_NS) * 1e-9
+        columns = np.stack(
+            [np.interp(times_s, sampled_s, column) for column in np.array(samples).T], axis=1
+        )
         return cls(demonstration.hands, columns[:, :2], columns[:, 2:], demonstration.period_s)
 
     def seconds(self, clock: TaskClock, alone: int | None) -> Vector:
         """The clock (T,) [s]; `alone` is the side of the only hand that matters."""
-        hands, sides = self.hands, slice(None) if alone is None else [alone]
+        hands = self.hands
+        sides = slice(None) if alone is None else [alone]
         if alone is not None:
             hands = np.tile(hands[:, 3 * alone :][:, :3], 2)
         return counted(
@@ -75,7 +97,14 @@ class Tempo(NamedTuple):
 
     def in_segments(self, rows: Vector, segments: NDArray[np.int64]) -> Vector:
         """The clock (T,) [s] in these segments (T,), with the parameters `rows` of the clock."""
-        return counted(self.hands, self.speeds.max(axis=1), self.stillness.min(axis=1), self.period_s, rows, segments)
+        return counted(
+            self.hands,
+            self.speeds.max(axis=1),
+            self.stillness.min(axis=1),
+            self.period_s,
+            rows,
+            segments,
+        )
 
     def rested_s(self, alone: int | None) -> Vector:
         """Times (T,) [s] since the hands moved; 0 before their first motion."""
@@ -97,17 +126,23 @@ class Tempo(NamedTuple):
 
     def _are_near(self, place: Vector, radius_m: float, alone: int | None) -> NDArray[np.bool_]:
         distances_m = np.linalg.norm((self.hands - place).reshape(-1, 2, 3), axis=2)
-        return np.asarray((distances_m[:, slice(None) if alone is None else [alone]] <= radius_m).all(axis=1))
+        return np.asarray(
+            (distances_m[:, slice(None) if alone is None else [alone]] <= radius_m).all(axis=1)
+        )
 
 
 def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
     """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
-    begins, ends = (np.array([_conducting(tempo.hands[row], alone) for tempo in tempos]) for row in (0, -1))
+    begins, ends = (
+        np.array([_conducting(tempo.hands[row], alone) for tempo in tempos]) for row in (0, -1)
+    )
     begin = begins.mean(axis=0)
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
     ends_m = np.linalg.norm((ends - begin).reshape(-1, 2, 3), axis=2).max(axis=1)
     near_m = max(LEAST_NEAR_M, min(NEAR_TIMES * off_m, HALF_WAY * float(np.median(ends_m))))
-    free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(begin=tuple(begin.tolist()))
+    free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(
+        begin=tuple(begin.tolist())
+    )
     ends_s = [float(tempo.seconds(free, alone)[-1]) for tempo in tempos]
     return free._replace(longest_s=max(ends_s), over_s=min(ends_s))
 
@@ -118,21 +153,39 @@ def _conducting(hands: Vector, alone: int | None) -> Vector:
 
 
 def _endless(
-    tempos: Sequence[Tempo], begins: Sequence[Vector], near_m: float, alone: int | None, *, waits: bool
+    tempos: Sequence[Tempo],
+    begins: Sequence[Vector],
+    near_m: float,
+    alone: int | None,
+    *,
+    waits: bool,
 ) -> TaskClock:
     """A clock that does not stop by itself, whose rests are longer than those of demonstrations
     that begin with these hands (6,) [m].
     """
     rested_s = [tempo.rested_s(alone) for tempo in tempos]
-    is_home = [tempo.has_returned(begin, near_m, alone) for tempo, begin in zip(tempos, begins, strict=True)]
+    is_home = [
+        tempo.has_returned(begin, near_m, alone)
+        for tempo, begin in zip(tempos, begins, strict=True)
+    ]
     rest_s = LONGER * max(float(times_s.max()) for times_s in rested_s)
-    home_s = LONGER * max(float(times_s[inside].max(initial=0.0)) for times_s, inside in zip(rested_s, is_home, strict=True))
-    rest_s, home_s = max(rest_s, LEAST_REST_S), max(home_s, LEAST_HOME_S)
-    return TaskClock(waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6)
+    home_s = LONGER * max(
+        float(times_s[inside].max(initial=0.0))
+        for times_s, inside in zip(rested_s, is_home, strict=True)
+    )
+    rest_s = max(rest_s, LEAST_REST_S)
+    home_s = max(home_s, LEAST_HOME_S)
+    return TaskClock(
+        waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6
+    )
 
 
 def segment_clock_of(
-    tempos: Sequence[Tempo], placed: Sequence[Records], labels: Sequence[NDArray[np.int64]], *, waits: bool
+    tempos: Sequence[Tempo],
+    placed: Sequence[Records],
+    labels: Sequence[NDArray[np.int64]],
+    *,
+    waits: bool,
 ) -> TaskClock:
     """The clock of the segments (K,) of demonstrations with these tempos and labels (T,), with a
     weight of 1. Only where a segment begins does a rest start it anew.
@@ -167,7 +220,8 @@ def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:
     """
     in_time = {person: number for number, person in enumerate(dict.fromkeys(persons.tolist()))}
     numbers = np.array([in_time[person] for person in persons.tolist()], np.intp)
-    out, blocks = np.zeros_like(persons), blocks_of(numbers, len(persons) // 2)
+    out = np.zeros_like(persons)
+    blocks = blocks_of(numbers, len(persons) // 2)
     for number, block in enumerate(blocks if len(blocks) >= LEAST_PAIRS else ()):
         out[block] = number
     return out
@@ -177,6 +231,7 @@ def remark_on(clock: TaskClock) -> str:
     """The remark on a skill that has a clock."""
     rests = "waits while the hands rest" if clock.waits else "runs on while the hands rest"
     return (
-        f"the tool partly follows a timetable: a clock, which starts when a hand moves faster than {CLOCK_START_MPS} "
-        f"m/s, predicts it better. It {rests}, and stops after {clock.longest_s:.1f} s"
+        "the tool partly follows a timetable: a clock, which starts when a hand moves faster than "
+        f"{CLOCK_START_MPS} m/s, predicts it better. It {rests}, and stops after "
+        f"{clock.longest_s:.1f} s"
     )

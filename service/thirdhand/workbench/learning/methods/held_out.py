@@ -18,7 +18,9 @@ Fit = Callable[[int | None], KMP]  # the primitive without a person's takes, or 
 ROWS = 500  # inputs that are predicted at once, which bounds the memory
 
 
-def held_out_takes(takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, progress: Progress) -> list[HeldOut]:
+def held_out_takes(
+    takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, progress: Progress
+) -> list[HeldOut]:
     """The takes, with inputs (T, I), as predicted by the primitive without their person; by that of
     all takes if there is one person only.
     """
@@ -29,7 +31,8 @@ def held_out_takes(takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, pr
         primitive = fit(person if len(numbers) > 1 else None)
         for h in np.flatnonzero(persons == person).tolist():
             progress(f"holding out demonstration {h + 1} of {len(takes)}")
-            take, predicted = takes[h], primitive.predict(inputs[h])
+            take = takes[h]
+            predicted = primitive.predict(inputs[h])
             deviations = standard_deviations(predicted.covariance)
             errors = take.position - predicted.mean
             out[h] = HeldOut(take, errors, predicted.covariance, deviations, inputs[h], inputs[h])
@@ -39,19 +42,28 @@ def held_out_takes(takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, pr
 def gate_of(primitive: KMP, held_out: Sequence[HeldOut], order: int, ceiling_m: float) -> Gate:
     """The gate on the primitive's standard deviation; its inputs hold `order` rows of memory."""
     inputs = np.concatenate([every_few(result.inputs) for result in held_out])
-    beyond = (swapped(inputs, order)[:, 6:], inputs[:, 6:], inputs[:, 6:])  # the inputs beyond the positions
+    beyond = (
+        swapped(inputs, order)[:, 6:],
+        inputs[:, 6:],
+        inputs[:, 6:],
+    )  # the inputs beyond the positions
     wrong = [
         _deviations(primitive, np.hstack([hands, tail.repeat(len(hands) // len(inputs), axis=0)]))
         for hands, tail in zip(nonsense(inputs[:, :6]), beyond, strict=True)
     ]
-    return gate_between(np.concatenate([result.gate_m for result in held_out]), wrong, ceiling=min(ceiling_m, HIGHEST_GATE_M))
+    return gate_between(
+        np.concatenate([result.gate_m for result in held_out]),
+        wrong,
+        ceiling=min(ceiling_m, HIGHEST_GATE_M),
+    )
 
 
 def swapped(inputs: Vector, order: int) -> Vector:
     """Inputs (T, I) with the memory, of `order` rows, and the turns of left and right hand swapped;
     the hands' positions stay.
     """
-    out, turns = inputs.copy(), 6 * (1 + order)
+    out = inputs.copy()
+    turns = 6 * (1 + order)
     end = turns + (inputs.shape[1] - turns) // TURN_INPUTS * TURN_INPUTS  # a clock has no side
     for columns, width in ((slice(6, turns), 3), (slice(turns, end), 9)):
         pairs = inputs[:, columns].reshape(len(inputs), -1, 2, width)
@@ -62,4 +74,6 @@ def swapped(inputs: Vector, order: int) -> Vector:
 def _deviations(primitive: KMP, inputs: Vector) -> Vector:
     """The standard deviations (M,) [m] of predictions at inputs (M, I), in blocks."""
     blocks = np.split(inputs, range(ROWS, len(inputs), ROWS))
-    return np.concatenate([standard_deviations(primitive.predict(block).covariance) for block in blocks])
+    return np.concatenate(
+        [standard_deviations(primitive.predict(block).covariance) for block in blocks]
+    )

@@ -33,10 +33,14 @@ from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
 from thirdhand.workbench.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
 from thirdhand.workbench.learning.regions import local_errors, refitted_errors
 
-AS_GOOD, AS_GOOD_M = 1.02, 0.002  # an error up to this multiple of the least one, or this much larger, is as good
+# an error up to this multiple of the least one, or this much larger, is as good
+AS_GOOD = 1.02
+AS_GOOD_M = 0.002
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
 LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
-LEAST_PERSONS = 3  # hyper-parameters are chosen anew without each block of takes from this number of persons on
+LEAST_PERSONS = (
+    3  # hyper-parameters are chosen anew without each block of takes from this number of persons on
+)
 
 
 class Inputs(NamedTuple):
@@ -62,7 +66,8 @@ class Inputs(NamedTuple):
 
     def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
         """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
-        hands, turns = demonstration.hands, demonstration.turns if self.turned else None
+        hands = demonstration.hands
+        turns = demonstration.turns if self.turned else None
         if self.alone is not None:
             hands = np.tile(hands[:, 3 * self.alone :][:, :3], 2)
             turns = None if turns is None else np.tile(turns[:, 9 * self.alone :][:, :9], 2)
@@ -80,9 +85,14 @@ KINDS = (  # from simple to rich
     Inputs("orientations", turned=True),
     Inputs("memory", order=ORDER),
 )
-CLOCKS = {True: ", and a clock that waits for resting hands", False: ", and a clock"}  # names; the first is simpler
+CLOCKS = {
+    True: ", and a clock that waits for resting hands",
+    False: ", and a clock",
+}  # names; the first is simpler
 WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
-CLOCK_ERROR_SHARE = 0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
+CLOCK_ERROR_SHARE = (
+    0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
+)
 
 
 @dataclass(frozen=True)
@@ -102,34 +112,53 @@ class HandInputs:
 
         If a skill is refined, the weight of the new takes is chosen with the kind.
         """
-        takes, earlier = taught.new, taught.earlier
+        takes = taught.new
+        earlier = taught.earlier
         remarks = [self.why_not_segmented] if self.why_not_segmented else []
-        points, ell = self.options.points, self.options.ell
+        points = self.options.points
+        ell = self.options.ell
         tempos = [Tempo.of(take.demonstration) for take in taught.all]
-        outcome = Chosen(POSITIONS, {}, {1.0: 0.0}) if ell is not None else _chosen(taught, tempos, points, progress)
+        outcome = (
+            Chosen(POSITIONS, {}, {1.0: 0.0})
+            if ell is not None
+            else _chosen(taught, tempos, points, progress)
+        )
         kind = outcome.kind
         if kind.order and kind.clock is None:
-            kind = kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
+            kind = kind._replace(
+                clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0)
+            )
         elif kind.clock is not None:
             remarks.append(
-                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where demonstrations begin "
-                f"starts it anew, and one of more than {kind.clock.rest_s:.1f} s after the task"
+                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where "
+                "demonstrations begin starts it anew, and one of more than "
+                f"{kind.clock.rest_s:.1f} s after the task"
             )
         if kind.alone is not None:
             remarks.append(
-                f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, and the other one "
-                "makes no difference, and may be absent"
+                f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, "
+                "and the other one makes no difference, and may be absent"
             )
         inputs = [
             take.hands if ell is not None else kind.of(take.demonstration, tempo)
             for take, tempo in zip(taught.all, tempos, strict=True)
         ]
-        inputs, before = inputs[: len(takes)], inputs[len(takes) :]
+        before = inputs[len(takes) :]
+        inputs = inputs[: len(takes)]
         weight, weights = chosen(outcome.by_weight_m)
         if math.isinf(weight):
-            earlier, before = [], []
+            earlier = []
+            before = []
         progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
-        fit = refit(kind, [*takes, *earlier], [*inputs, *before], points, ell, earlier=len(earlier), weight=weight)
+        fit = refit(
+            kind,
+            [*takes, *earlier],
+            [*inputs, *before],
+            points,
+            ell,
+            earlier=len(earlier),
+            weight=weight,
+        )
         progress(f"learning from all {len(takes) + len(earlier)}")
         primitive = fit(None)
         held_out = held_out_takes(takes, inputs, fit, progress)
@@ -139,12 +168,20 @@ class HandInputs:
             progress("calibrating the covariance")
 
             def refitted(kept: list[int]) -> HandsKMP:
-                used_takes, used_inputs = [*(takes[i] for i in kept), *earlier], [*(inputs[i] for i in kept), *before]
-                others = refit(kind, used_takes, used_inputs, points, ell, earlier=len(earlier), weight=weight)
+                used_takes = [*(takes[i] for i in kept), *earlier]
+                used_inputs = [*(inputs[i] for i in kept), *before]
+                others = refit(
+                    kind, used_takes, used_inputs, points, ell, earlier=len(earlier), weight=weight
+                )
                 return HandsKMP(others(None), kind.turned, kind.clock)
 
-            timed, errors = local_errors(refitted_errors(takes, inputs, refitted), inputs, takes, primitive)
-            held_out = [result._replace(timed=take_errors) for result, take_errors in zip(held_out, timed, strict=True)]
+            timed, errors = local_errors(
+                refitted_errors(takes, inputs, refitted), inputs, takes, primitive
+            )
+            held_out = [
+                result._replace(timed=take_errors)
+                for result, take_errors in zip(held_out, timed, strict=True)
+            ]
         return Fitted(
             HandsKMP(primitive, kind.turned, kind.clock, errors),
             held_out,
@@ -158,15 +195,25 @@ class HandInputs:
 
 
 def _weighted(
-    kind: Inputs, taught: Taught, tempos: Sequence[Tempo], weight: float, points: int, blocks: NDArray[np.intp]
+    kind: Inputs,
+    taught: Taught,
+    tempos: Sequence[Tempo],
+    weight: float,
+    points: int,
+    blocks: NDArray[np.intp],
 ) -> DirectSelection:
     """The selection of a mean of this kind of inputs with this weight of new takes, where the takes
     of a block (H,) are held out at once.
     """
     earlier = taught.earlier if math.isfinite(weight) else []
     takes = [*taught.new, *earlier]
-    pairs = [(kind.of(take.demonstration, tempo), take.position) for take, tempo in zip(takes, tempos, strict=False)]
-    return selection_of(pairs, points, persons=blocks[: len(takes)], rich=True, earlier=len(earlier), factor=weight)
+    pairs = [
+        (kind.of(take.demonstration, tempo), take.position)
+        for take, tempo in zip(takes, tempos, strict=False)
+    ]
+    return selection_of(
+        pairs, points, persons=blocks[: len(takes)], rich=True, earlier=len(earlier), factor=weight
+    )
 
 
 def candidates(demonstrations: Sequence[Demonstration]) -> list[Inputs]:
@@ -200,9 +247,16 @@ def refit(
     """
     is_rich = kind.is_rich
     pairs = [(take_inputs, take.position) for take_inputs, take in zip(inputs, takes, strict=True)]
-    count, persons = RICH_TIMES * points if is_rich else points, persons_of(takes)
+    count = RICH_TIMES * points if is_rich else points
+    persons = persons_of(takes)
     choice = selection_of(
-        pairs, count, persons=persons, isotropic=is_rich, rich=is_rich, earlier=earlier, factor=weight
+        pairs,
+        count,
+        persons=persons,
+        isotropic=is_rich,
+        rich=is_rich,
+        earlier=earlier,
+        factor=weight,
     )
     parameters = choice.parameters(ell, may_be_linear=True)
     residuals = choice.residuals(parameters.ell, parameters.noise, parameters.ridge)
@@ -228,13 +282,16 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     blocks = persons if taught.earlier else paired(persons)
 
     def error_m(kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
-        return _weighted(kind, taught, tempos, weight, points, held_out).best_mean(may_be_linear=True)[0]
+        return _weighted(kind, taught, tempos, weight, points, held_out).best_mean(
+            may_be_linear=True
+        )[0]
 
     def by_weight_m(kind: Inputs) -> dict[float, float]:
         weights = WEIGHTS if taught.earlier else WEIGHTS[:1]
         return {weight: error_m(kind, weight, persons) for weight in weights}
 
-    kinds, errors_m = candidates([take.demonstration for take in taught.all]), dict[str, dict[float, float]]()
+    kinds = candidates([take.demonstration for take in taught.all])
+    errors_m = dict[str, dict[float, float]]()
     for kind in kinds:
         progress(f"trying {kind.name}")
         errors_m[kind.name] = by_weight_m(kind)
@@ -244,14 +301,18 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
         return Chosen(simplest, tried_m, errors_m[simplest.name])
     best = min(kinds, key=lambda kind: tried_m[kind.name])
     first = next(kind for kind in kinds if kind.alone == simplest.alone)
-    bases, timed = sorted({first, simplest, best}, key=kinds.index), list[Inputs]()
+    bases = sorted({first, simplest, best}, key=kinds.index)
+    timed = list[Inputs]()
     weights = {kind: min(found := errors_m[kind.name], key=found.__getitem__) for kind in bases}
     limit_m = clock_limit_m(min(error_m(kind, weights[kind], blocks) for kind in bases))
     for kind in bases:
         for waits, name in CLOCKS.items():
             progress(f"trying {kind.name}{name}")
             clock = clock_of(tempos, kind.alone, waits=waits)
-            weighted = [kind._replace(name=kind.name + name, clock=clock._replace(weight=w)) for w in WEIGHTS_MPS]
+            weighted = [
+                kind._replace(name=kind.name + name, clock=clock._replace(weight=w))
+                for w in WEIGHTS_MPS
+            ]
             with_clock_m = [error_m(candidate, weights[kind], blocks) for candidate in weighted]
             weighed = preferred(weighted, with_clock_m, AS_GOOD * min(with_clock_m))
             tried_m[weighed.name] = error_m(weighed, weights[kind], persons)

@@ -19,7 +19,9 @@ from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.held_out import gate_of, held_out_takes
 from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Progress, Take, Taught
 
-ELL_PER_M2, PENALTY = 5.0, 2.0  # the kernel's ell and lambda, unless they are given
+# the kernel's ell and lambda, unless they are given
+ELL_PER_M2 = 5.0
+PENALTY = 2.0
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,17 @@ class Mixture:
         progress(f"learning from all {len(takes)}")
         primitive = self._primitive(takes)
         held_out = held_out_takes(
-            takes, inputs, lambda person: self._primitive([take for take in takes if take.person != person]), progress
+            takes,
+            inputs,
+            lambda person: self._primitive([take for take in takes if take.person != person]),
+            progress,
         )
         ceiling_m = CEILING_M * _calibration(held_out)
         return Fitted(HandsKMP(primitive), held_out, gate_of(primitive, held_out, 0, ceiling_m))
 
     def _primitive(self, takes: Sequence[Take]) -> KMP:
-        points, seed = self.options.points, self.options.seed
+        points = self.options.points
+        seed = self.options.seed
         samples = np.concatenate([np.hstack([take.hands, take.position]) for take in takes])
         mixture = GaussianMixture.fit(samples, components=self.components, seed=seed)
         inputs = mixture.sample_inputs(points, dimensions=6, seed=seed)

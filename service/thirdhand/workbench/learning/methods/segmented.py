@@ -45,7 +45,13 @@ from thirdhand.workbench.learning.division import (
     via_points_never_reached,
 )
 from thirdhand.workbench.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
-from thirdhand.workbench.learning.methods.clock import Tempo, begins_of, paired, remark_on, segment_clock_of
+from thirdhand.workbench.learning.methods.clock import (
+    Tempo,
+    begins_of,
+    paired,
+    remark_on,
+    segment_clock_of,
+)
 from thirdhand.workbench.learning.methods.held_out import held_out_takes
 from thirdhand.workbench.learning.methods.inputs import (
     AS_GOOD,
@@ -73,17 +79,35 @@ from thirdhand.workbench.learning.regions import LEAST_BLOCKS, blocks_of, unknow
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
-SAMPLES_TRIED = 200  # delays and inputs are compared with about this number of samples of a demonstration
-LEAST_OFF_M = 0.03  # lower limit of the hands' distance from a path, root mean square; few takes may show less
+SAMPLES_TRIED = (
+    200  # delays and inputs are compared with about this number of samples of a demonstration
+)
+# lower limit of the hands' distance from a path, root mean square; few takes may show less
+LEAST_OFF_M = 0.03
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
-CORNERS = ((1.0, 0.0), (0.0, 1.0))  # one hand is at the end of its path, the other still at the start
-SEEN_SHARES = (0.5, 1.0)  # the tool waits at these shares of the path to a corner that was demonstrated
+CORNERS = (
+    (1.0, 0.0),
+    (0.0, 1.0),
+)  # one hand is at the end of its path, the other still at the start
+SEEN_SHARES = (
+    0.5,
+    1.0,
+)  # the tool waits at these shares of the path to a corner that was demonstrated
 UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
-KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the longest clock at which the tool's share is known
+KNOWN_TIMES = (
+    0.0,
+    0.25,
+    0.5,
+    0.75,
+    1.0,
+)  # shares of the longest clock at which the tool's share is known
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
-HOLD_SHARE = 0.005  # share of the time that the gate may hold: the tool follows hands that come from elsewhere
-OWN_DELAY_SHARE = 0.75  # the new takes get a delay of their own if it reduces their error to this share
+# share of the time that the gate may hold: the tool follows hands that come from elsewhere
+HOLD_SHARE = 0.005
+OWN_DELAY_SHARE = (
+    0.75  # the new takes get a delay of their own if it reduces their error to this share
+)
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
 WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the path, no offset
@@ -97,7 +121,9 @@ class Hyperparameters(NamedTuple):
     weight: float = 1.0  # of a new take, see `weights`
 
 
-ELLS, NOISES = (4.0, 2.0, 8.0, 16.0), (0.1, 0.03, 0.3)  # candidates
+# candidates
+ELLS = (4.0, 2.0, 8.0, 16.0)
+NOISES = (0.1, 0.03, 0.3)
 
 
 class Samples(NamedTuple):
@@ -119,10 +145,16 @@ class Samples(NamedTuple):
         """The samples of demonstrations, of which the first `new` are new, without a clock."""
         count = len(encoded[0].segments)
         counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
-        sampled_rows = [demo.rows(row_count) for demo, row_count in zip(encoded, counts, strict=True)]
+        sampled_rows = [
+            demo.rows(row_count) for demo, row_count in zip(encoded, counts, strict=True)
+        ]
         shares, labels, outputs = (
-            np.concatenate([values[rows] for values, rows in zip(column, sampled_rows, strict=True)])
-            for column in zip(*((demo.along, demo.labels, demo.wanted) for demo in encoded), strict=True)
+            np.concatenate(
+                [values[rows] for values, rows in zip(column, sampled_rows, strict=True)]
+            )
+            for column in zip(
+                *((demo.along, demo.labels, demo.wanted) for demo in encoded), strict=True
+            )
         )
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in sampled_rows])
         return cls(encoded, sampled_rows, inputs_of(shares, labels, count), outputs, owner, new)
@@ -145,22 +177,30 @@ class Samples(NamedTuple):
         }
         return min(errors_m, key=errors_m.__getitem__)
 
-    def held_out(self, ell: float, noises: Sequence[float], weight: float, block_of: Indices | None = None) -> Vector:
+    def held_out(
+        self, ell: float, noises: Sequence[float], weight: float, block_of: Indices | None = None
+    ) -> Vector:
         """The tool's errors (J, N, 3) [m] at the N samples of new demonstrations, with these noises
         (J,) and this weight. Each of the H demonstrations is held out, or its whole block in
         `block_of` (H,).
         """
         squares = ((self.inputs[:, None] - self.inputs) ** 2).sum(axis=2)
-        is_new, held_out = self.owner < self.new, self.owner if block_of is None else block_of[self.owner]
+        is_new = self.owner < self.new
+        held_out = self.owner if block_of is None else block_of[self.owner]
         roots = np.where(is_new, 1.0, math.sqrt(weight))[:, None]
         # K + r W = W^1/2 (W^-1/2 K W^-1/2 + r I) W^1/2
-        kernel, targets = np.exp(-ell * squares) / (roots * roots.T), (self.outputs - PRIOR) / roots
+        kernel = np.exp(-ell * squares) / (roots * roots.T)
+        targets = (self.outputs - PRIOR) / roots
         missed = roots * held_out_residuals(kernel, np.array(noises), held_out, lambda _: targets)
         predictions = (self.outputs - missed)[:, is_new]
         errors = np.empty((*predictions.shape[:2], 3))
-        for h, (demo, rows) in enumerate(zip(self.encoded[: self.new], self.rows[: self.new], strict=True)):
+        for h, (demo, rows) in enumerate(
+            zip(self.encoded[: self.new], self.rows[: self.new], strict=True)
+        ):
             mine = self.owner[is_new] == h
-            errors[:, mine] = [demo.tool[rows] - demo.tools(rows, outputs) for outputs in predictions[:, mine]]
+            errors[:, mine] = [
+                demo.tool[rows] - demo.tools(rows, outputs) for outputs in predictions[:, mine]
+            ]
         return errors
 
     def fitted(self, parameters: Hyperparameters, without: Sequence[int] = ()) -> KMP:
@@ -178,11 +218,15 @@ class Samples(NamedTuple):
             prior_mean=PRIOR,
             representation="dense",
         )
-        known_inputs, shares = self._known([demo for i, demo in enumerate(self.encoded) if i not in without])
+        known_inputs, shares = self._known(
+            [demo for i, demo in enumerate(self.encoded) if i not in without]
+        )
         if self.clock is not None:
             known_inputs, shares = self._timed(known_inputs, shares, self.clock)
         means = np.column_stack([shares, np.zeros((len(known_inputs), OUTPUTS - 1))])
-        known_outputs = Gaussians(means, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(known_inputs), 1, 1)))
+        known_outputs = Gaussians(
+            means, np.tile(KNOWN_STD**2 * np.eye(OUTPUTS), (len(known_inputs), 1, 1))
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)
             return primitive.adapt(known_inputs, known_outputs, tolerance=0.0)
@@ -196,7 +240,8 @@ class Samples(NamedTuple):
         """
         segments = self.encoded[0].segments[at[:, 2:].argmax(axis=1)]
         moves = (segments["square"] > STAYS) | (segments["leads"] != NONE)[:, None]
-        ends, begins = (at[:, :2] == 1.0).all(axis=1), ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
+        ends = (at[:, :2] == 1.0).all(axis=1)
+        begins = ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
         timed_rows = [
             (row, share, time)
             for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
@@ -213,16 +258,25 @@ class Samples(NamedTuple):
         The share is 1 at the end of a segment and 0 at its start. At a corner it is 0 or 1 if the
         tool usually was at that end, and 0 if no demonstration has the corner.
         """
-        squares, leads = shown[0].segments["square"], shown[0].segments["leads"]
+        squares = shown[0].segments["square"]
+        leads = shown[0].segments["leads"]
         moving_segments = np.flatnonzero((squares > STAYS).all(axis=1) & (leads == NONE)).tolist()
-        rows: list[tuple[float, float, int, float]] = [(1.0, 1.0, k, 1.0) for k in range(len(squares))]
+        rows: list[tuple[float, float, int, float]] = [
+            (1.0, 1.0, k, 1.0) for k in range(len(squares))
+        ]
         begins = np.where((squares > STAYS) | (leads != NONE)[:, None], 0.0, 1.0)
         rows += [(*begins[k], k, 0.0) for k in np.flatnonzero(squares.any(axis=1))]
         for corner in CORNERS:
             is_unseen = _seen(shown, corner, moving_segments)[0] < LEAST_SEEN_S
             for k in moving_segments:
                 lasts_s, shares = _seen(shown, corner, [k])
-                usual = 0.0 if is_unseen else float(np.median(shares)) if lasts_s >= LEAST_SEEN_S else 0.5
+                usual = (
+                    0.0
+                    if is_unseen
+                    else float(np.median(shares))
+                    if lasts_s >= LEAST_SEEN_S
+                    else 0.5
+                )
                 if usual < NEAR:
                     waits = UNSEEN_SHARES if is_unseen else SEEN_SHARES
                     rows += [(share * corner[0], share * corner[1], k, 0.0) for share in waits]
@@ -232,11 +286,15 @@ class Samples(NamedTuple):
         return inputs_of(table[:, :2], table[:, 2].astype(np.int64), len(squares)), table[:, 3]
 
 
-def _seen(shown: Sequence[Encoded], corner: tuple[float, float], segments: Sequence[int]) -> tuple[float, Vector]:
+def _seen(
+    shown: Sequence[Encoded], corner: tuple[float, float], segments: Sequence[int]
+) -> tuple[float, Vector]:
     """The time [s] that hands were near a corner of these segments, and the tool's shares then."""
     rows = [demo.near(corner, segments) for demo in shown]
     lasts_s = sum(float(mask.sum()) * demo.period_s for demo, mask in zip(shown, rows, strict=True))
-    return lasts_s, np.concatenate([demo.wanted[mask, 0] for demo, mask in zip(shown, rows, strict=True)])
+    return lasts_s, np.concatenate(
+        [demo.wanted[mask, 0] for demo, mask in zip(shown, rows, strict=True)]
+    )
 
 
 def inputs_of(shares: Vector, labels: Indices, count: int) -> Vector:
@@ -254,16 +312,23 @@ def leading_tasks(task: Task, shown: Sequence[Encoded]) -> dict[str, Task]:
     moving_segments = np.flatnonzero((shown[0].segments["square"] > STAYS).all(axis=1)).tolist()
     followed = set(task.follow.tolist()) - {NONE}
     sides = [
-        side for side in (LEFT, RIGHT) if followed == {side} or _seen(shown, CORNERS[side], moving_segments)[0] >= LEAST_SEEN_S
+        side
+        for side in (LEFT, RIGHT)
+        if followed == {side} or _seen(shown, CORNERS[side], moving_segments)[0] >= LEAST_SEEN_S
     ]
-    return {f"positions, shares of the {SIDES[side]} hand alone": task._replace(leads=side) for side in sides}
+    return {
+        f"positions, shares of the {SIDES[side]} hand alone": task._replace(leads=side)
+        for side in sides
+    }
 
 
 def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[str, Task]:
     """Tasks in which the tool turns with hands that turn in the demonstrations, by name: with the
     hands that it follows, or with one hand that it then follows everywhere.
     """
-    turns = np.concatenate([demonstration.turns for demonstration in demonstrations]).reshape(-1, 2, 9)
+    turns = np.concatenate([demonstration.turns for demonstration in demonstrations]).reshape(
+        -1, 2, 9
+    )
     sides = np.flatnonzero(np.ptp(turns, axis=0).max(axis=1) > math.sin(LEAST_TURN_RAD)).tolist()
     levers = np.zeros((len(task.names), 3))
     out: dict[str, Task] = {}
@@ -272,7 +337,9 @@ def turning_tasks(task: Task, demonstrations: Sequence[Demonstration]) -> dict[s
     for side in sides:
         if (task.follow != side).any():
             everywhere = np.full_like(task.follow, side)
-            out[f"orientation of the {SIDES[side]} hand"] = task._replace(follow=everywhere, levers=levers)
+            out[f"orientation of the {SIDES[side]} hand"] = task._replace(
+                follow=everywhere, levers=levers
+            )
     return out
 
 
@@ -290,7 +357,13 @@ class _Prediction(NamedTuple):
 
     @classmethod
     def of(
-        cls, one: Encoded, placed: Placed, delay_s: float, tempo: Tempo | None, clock: TaskClock | None, step: int
+        cls,
+        one: Encoded,
+        placed: Placed,
+        delay_s: float,
+        tempo: Tempo | None,
+        clock: TaskClock | None,
+        step: int,
     ) -> Self:
         """The prediction at one of every `step` samples."""
         belief = np.zeros((len(one.tool), MOST_SEGMENTS))
@@ -302,16 +375,23 @@ class _Prediction(NamedTuple):
         if clock is not None and tempo is not None:
             times = tempo.in_segments(clock.rows(begins_of(placed.segments)), belief.argmax(axis=1))
         hands = np.hstack([hands, one.turns(delay_s)])[::step]
-        belief, tempos = belief[::step], np.column_stack([one.stillness, times])[::step]
+        belief = belief[::step]
+        tempos = np.column_stack([one.stillness, times])[::step]
         errors = one.tool[::step] - placed.mean(hands, belief, tempos)
         coverage = covered(hands, tempos[:, :2], belief.argmax(axis=1), placed.segments)
         segment_inputs = SEGMENT_DISTANCE_BESIDE * belief[:, : len(one.segments)]
-        inputs = [coverage[:, :2], segment_inputs, *([] if clock is None else [clock.weight * tempos[:, 2:]])]
+        inputs = [
+            coverage[:, :2],
+            segment_inputs,
+            *([] if clock is None else [clock.weight * tempos[:, 2:]]),
+        ]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
     def retained(self, count: int) -> Vector:
         """Errors (M, 6) at up to `count` samples: shares (2,), segment, and error (3,) [m]."""
-        rows = np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
+        rows = (
+            np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
+        )
         segments = self.belief[rows].argmax(axis=1)
         return np.column_stack([self.inputs[rows, :2], segments, self.errors[rows]])
 
@@ -344,24 +424,33 @@ class Candidate(NamedTuple):
         """The candidate of a task with this delay. Earlier demonstrations have a delay of their
         own, `before_s`, and the new ones this weight against them.
         """
-        task, encoded = encode(task, [*new, *earlier], [delay_s] * len(new) + [before_s] * len(earlier))
+        task, encoded = encode(
+            task, [*new, *earlier], [delay_s] * len(new) + [before_s] * len(earlier)
+        )
         samples = Samples.of(encoded, len(new))
         return cls(task, delay_s, encoded, samples, _off_m(encoded), samples.best(weight))
 
     def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The candidate with a clock as the last input, and the best parameters with it."""
         samples = self.samples.clocked(tempos, clock)
-        return self._replace(samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos)
+        return self._replace(
+            samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos
+        )
 
-    def without(self, block: Sequence[int], primitive: KMP, step: int = 1) -> dict[int, _Prediction]:
+    def without(
+        self, block: Sequence[int], primitive: KMP, step: int = 1
+    ) -> dict[int, _Prediction]:
         """The predictions of a block's demonstrations at one of every `step` samples, by a
         primitive that was learned without them.
         """
-        clock, predictions = self.samples.clock, dict[int, _Prediction]()
+        clock = self.samples.clock
+        predictions = dict[int, _Prediction]()
         for h in block:
             placed = Placed.of(self.task, self.encoded[h].at, self.off, primitive, NO_ERRORS, clock)
             tempo = None if clock is None else self.tempos[h]
-            predictions[h] = _Prediction.of(self.encoded[h], placed, self.delay_s, tempo, clock, step)
+            predictions[h] = _Prediction.of(
+                self.encoded[h], placed, self.delay_s, tempo, clock, step
+            )
         return predictions
 
     def squares(self, blocks: Sequence[Sequence[int]]) -> Vector:
@@ -369,7 +458,9 @@ class Candidate(NamedTuple):
         step = 1 + max(len(demo.labels) for demo in self.encoded) // SAMPLES_TRIED
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
-            predictions |= self.without(block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step)
+            predictions |= self.without(
+                block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step
+            )
         return np.array([rms(predictions[h].errors) ** 2 for h in range(self.samples.new)])
 
 
@@ -382,7 +473,9 @@ def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence
 
 def is_clear(gains: Vector) -> bool:
     """True if the mean of gains (B,) in blocks is above one standard error of it."""
-    return len(gains) < LEAST_BLOCKS or bool(gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains)))
+    return len(gains) < LEAST_BLOCKS or bool(
+        gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains))
+    )
 
 
 def with_delay(
@@ -402,14 +495,19 @@ def with_delay(
     delays_s = DELAYS_S if given_s is None else (given_s,)
     candidates = [Candidate.of(task, shown, late_s) for late_s in delays_s]
     squares = np.array([candidate.squares(blocks) for candidate in candidates])
-    best, each_s = int(squares.sum(axis=1).argmin()), np.array(delays_s)[squares.argmin(axis=0)]
+    best = int(squares.sum(axis=1).argmin())
+    each_s = np.array(delays_s)[squares.argmin(axis=0)]
     if usual_s is not None:
         usual = delays_s.index(usual_s)
         if squares[best].sum() > OWN_DELAY_SHARE**2 * squares[usual].sum():
             best = usual
     elif not is_clear(np.array([(squares[0] - squares[best])[block].mean() for block in blocks])):
         best = 0
-    return candidates[best], Delay(delays_s[best], float(each_s.std())), math.sqrt(float(squares[best].mean()))
+    return (
+        candidates[best],
+        Delay(delays_s[best], float(each_s.std())),
+        math.sqrt(float(squares[best].mean())),
+    )
 
 
 @dataclass(frozen=True)
@@ -433,16 +531,20 @@ class Segmented:
 
         Raises SkillError if the tool never came near a via-point.
         """
-        takes, demonstrations = taught.new, [take.demonstration for take in taught.all]
+        takes = taught.new
+        demonstrations = [take.demonstration for take in taught.all]
         names = [take.name for take in taught.all]
         remarks = via_points_never_reached(self.task, demonstrations, names)
         progress(f"learning between the via-points {', '.join(self.task.names)}")
         blocks = blocks_of(persons_of(takes))
         best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
-        task, encoded, off_m = best.task, best.encoded, best.off
+        task = best.task
+        encoded = best.encoded
+        off_m = best.off
         if best.samples.clock is not None:
             remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each segment")
-        tempos, demos = [Tempo.of(take.demonstration) for take in takes], encoded[: len(takes)]
+        tempos = [Tempo.of(take.demonstration) for take in takes]
+        demos = encoded[: len(takes)]
         untimed = segment_clock_of(
             tempos, [demo.segments for demo in demos], [demo.labels for demo in demos], waits=False
         )._replace(weight=0.0)
@@ -453,7 +555,9 @@ class Segmented:
             predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
-        known_places = unknown._replace(scatters=np.zeros_like(unknown.scatters))  # the places of held-out takes are given
+        known_places = unknown._replace(
+            scatters=np.zeros_like(unknown.scatters)
+        )  # the places of held-out takes are given
         progress(f"learning from all {len(takes)}")
         model = SegmentedKMP(
             best.samples.fitted(best.parameters),
@@ -468,13 +572,28 @@ class Segmented:
         held_out: dict[int, HeldOut] = {}
         wrong: dict[int, list[Vector]] = {}
         for block in blocks:
-            others = np.concatenate([take_errors for h, take_errors in enumerate(errors) if h not in block] or errors)
+            others = np.concatenate(
+                [take_errors for h, take_errors in enumerate(errors) if h not in block] or errors
+            )
             for h in block:
-                placed = Placed.of(task, encoded[h].at, off_m, model.primitive, others, best.samples.clock, known_places)
+                placed = Placed.of(
+                    task,
+                    encoded[h].at,
+                    off_m,
+                    model.primitive,
+                    others,
+                    best.samples.clock,
+                    known_places,
+                )
                 held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
-                wrong[h] = [placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))]
+                wrong[h] = [
+                    placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))
+                ]
         in_order = [held_out[h] for h in range(len(takes))]
-        kinds = [np.concatenate(kind) for kind in zip(*(wrong[h] for h in range(len(takes))), strict=True)]
+        kinds = [
+            np.concatenate(kind)
+            for kind in zip(*(wrong[h] for h in range(len(takes))), strict=True)
+        ]
         reached = np.concatenate([result.gate_m for result in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
         baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
@@ -497,12 +616,20 @@ class Segmented:
         candidates, its name, and the weights.
         """
         new, earlier = (
-            [Divided.of(self.task, take.demonstration) for take in takes] for takes in (taught.new, taught.earlier)
+            [Divided.of(self.task, take.demonstration) for take in takes]
+            for takes in (taught.new, taught.earlier)
         )
-        demonstrations, given_s = [take.demonstration for take in taught.new], self.options.delay_s
+        demonstrations = [take.demonstration for take in taught.new]
+        given_s = self.options.delay_s
         progress(f"choosing the delay over {len(new)} demonstrations")
-        everybody, all_blocks = [*new, *earlier], blocks_of(persons_of(taught.all))  # to judge what all persons share
-        usual_s = with_delay(self.task, everybody, all_blocks, given_s=given_s)[1].mean_s if earlier else None
+        # to judge what all persons share
+        everybody = [*new, *earlier]
+        all_blocks = blocks_of(persons_of(taught.all))
+        usual_s = (
+            with_delay(self.task, everybody, all_blocks, given_s=given_s)[1].mean_s
+            if earlier
+            else None
+        )
         best, delay, error_m = with_delay(self.task, new, blocks, usual_s, given_s)
 
         def tried(task: Task) -> Candidate:
@@ -510,10 +637,15 @@ class Segmented:
 
         if earlier:
             error_m = math.sqrt(tried(self.task).squares(all_blocks).mean())
-        taken, tried_m = POSITIONS.name, {POSITIONS.name: error_m}
+        taken = POSITIONS.name
+        tried_m = {POSITIONS.name: error_m}
         for is_simpler in (True, False):
             demos = tried(best.task).encoded if earlier else best.encoded
-            tasks = leading_tasks(best.task, demos) if is_simpler else turning_tasks(best.task, demonstrations)
+            tasks = (
+                leading_tasks(best.task, demos)
+                if is_simpler
+                else turning_tasks(best.task, demonstrations)
+            )
             errors_m = {taken: tried_m[taken]}
             for name, task in tasks.items():
                 progress(f"trying {name}")
@@ -526,35 +658,65 @@ class Segmented:
                 errors_m[taken] = errors_m[taken] if earlier else least_m
             tried_m |= errors_m
         clocked = _with_clocks(best, taught, progress)
-        errors_m = {taken + name: math.sqrt(candidate.squares(blocks).mean()) for name, candidate in clocked.items()}
-        without_m = math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
+        errors_m = {
+            taken + name: math.sqrt(candidate.squares(blocks).mean())
+            for name, candidate in clocked.items()
+        }
+        without_m = (
+            math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
+        )
         if errors_m and min(errors_m.values()) < clock_limit_m(without_m):
-            best = clocked[preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))]
-            taken = next(name for name, candidate in zip(errors_m, clocked.values(), strict=True) if candidate is best)
+            best = clocked[
+                preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))
+            ]
+            taken = next(
+                name
+                for name, candidate in zip(errors_m, clocked.values(), strict=True)
+                if candidate is best
+            )
         if not earlier or taken in errors_m:  # else these are errors of the new takes alone
             tried_m |= errors_m
         if len(tried_m) == 1:
             tried_m = {}
         if not earlier:
             return best, delay, tried_m, taken, None
-        progress(f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones")
-        before_s = with_delay(best.task, earlier, blocks_of(persons_of(taught.earlier)), given_s=given_s)[1].mean_s
+        progress(
+            f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones"
+        )
+        before_s = with_delay(
+            best.task, earlier, blocks_of(persons_of(taught.earlier)), given_s=given_s
+        )[1].mean_s
         weighted = {
             weight: Candidate.of(
-                best.task, new, delay.mean_s, earlier if math.isfinite(weight) else (), before_s, weight
+                best.task,
+                new,
+                delay.mean_s,
+                earlier if math.isfinite(weight) else (),
+                before_s,
+                weight,
             )
             for weight in WEIGHTS
         }
         if (clock := best.samples.clock) is not None:
             tempos = [Tempo.of(take.demonstration) for take in taught.all]
-            weighted = {weight: candidate.clocked(tempos[: len(candidate.encoded)], clock) for weight, candidate in weighted.items()}
-        weight, weights = chosen({weight: math.sqrt(candidate.squares(blocks).mean()) for weight, candidate in weighted.items()})
+            weighted = {
+                weight: candidate.clocked(tempos[: len(candidate.encoded)], clock)
+                for weight, candidate in weighted.items()
+            }
+        weight, weights = chosen(
+            {
+                weight: math.sqrt(candidate.squares(blocks).mean())
+                for weight, candidate in weighted.items()
+            }
+        )
         return weighted[weight], delay, tried_m, taken, weights
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
         places = (list(ordered(take.demonstration.places, self.task.names)) for take in takes)
-        return NamedViaPoints(self.task.names, np.mean([NamedViaPoints.of(points).at for points in places], axis=0))
+        return NamedViaPoints(
+            self.task.names, np.mean([NamedViaPoints.of(points).at for points in places], axis=0)
+        )
 
     def _without_places(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
         """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
@@ -579,8 +741,10 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
         return min(map(rms, samples.held_out(best.parameters.ell, NOISES, 1.0, block_of)))
 
     tempos = [Tempo.of(take.demonstration) for take in taught.new]
-    limit_m, out = clock_limit_m(error_m(best.samples)), dict[str, Candidate]()
-    segments, labels = [demo.segments for demo in best.encoded], [demo.labels for demo in best.encoded]
+    limit_m = clock_limit_m(error_m(best.samples))
+    out = dict[str, Candidate]()
+    segments = [demo.segments for demo in best.encoded]
+    labels = [demo.labels for demo in best.encoded]
     for waits, name in CLOCKS.items():
         progress(f"trying {POSITIONS.name}{name}")
         clock = segment_clock_of(tempos, segments, labels, waits=waits)
@@ -596,10 +760,16 @@ def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
     it follows a hand, they are those of its offset from that hand; where it also turns with the
     hand, zeros.
     """
-    points_m = np.array([demo.at.at[[demo.at.names.index(name) for name in task.names]] for demo in encoded])
+    points_m = np.array(
+        [demo.at.at[[demo.at.names.index(name) for name in task.names]] for demo in encoded]
+    )
     for n, side in enumerate(task.follow.tolist()):
         if side != NONE:
-            points_m[:, n, 6:] -= points_m[:, n, 6:] if task.levers is not None else points_m[:, n, 3 * side : 3 * side + 3]
+            points_m[:, n, 6:] -= (
+                points_m[:, n, 6:]
+                if task.levers is not None
+                else points_m[:, n, 3 * side : 3 * side + 3]
+            )
     offsets_m = points_m[:, :, 6:] - points_m[:, :, 6:].mean(axis=0)
     return np.asarray(np.einsum("dni,dnj->nij", offsets_m, offsets_m) / max(len(encoded) - 1, 1))
 
@@ -608,14 +778,21 @@ def _off_m(encoded: Sequence[Encoded]) -> Vector:
     """The distances (K, 2) [m] of the hands from their paths in each segment, root mean square. A
     segment that no demonstration has gets those of all segments.
     """
-    labels, distances_m = np.concatenate([demo.labels for demo in encoded]), np.concatenate([demo.off for demo in encoded])
-    by_segment = [distances_m[labels == k] if (labels == k).any() else distances_m for k in range(len(encoded[0].segments))]
-    return np.array([np.maximum(np.sqrt((part_m**2).mean(axis=0)), LEAST_OFF_M) for part_m in by_segment])
+    labels = np.concatenate([demo.labels for demo in encoded])
+    distances_m = np.concatenate([demo.off for demo in encoded])
+    by_segment = [
+        distances_m[labels == k] if (labels == k).any() else distances_m
+        for k in range(len(encoded[0].segments))
+    ]
+    return np.array(
+        [np.maximum(np.sqrt((part_m**2).mean(axis=0)), LEAST_OFF_M) for part_m in by_segment]
+    )
 
 
 def _held_out(take: Take, one: Encoded, placed: Placed, found: _Prediction) -> HeldOut:
     """The record of a take with the covariance from other blocks' errors, in `placed`."""
-    hands, rows = one.moving[:, 0], zip(found.hands, found.belief, found.tempos, strict=True)
+    hands = one.moving[:, 0]
+    rows = zip(found.hands, found.belief, found.tempos, strict=True)
     return HeldOut(
         take,
         found.errors,

@@ -29,4 +29,6 @@ def name_of(weight: float) -> str:
 def chosen(errors_m: Mapping[float, float]) -> tuple[float, Weights]:
     """The weight with the least error [m], and all errors by name."""
     weight = min(errors_m, key=errors_m.__getitem__)
-    return weight, Weights(name_of(weight), {name_of(candidate): error_m for candidate, error_m in errors_m.items()})
+    return weight, Weights(
+        name_of(weight), {name_of(candidate): error_m for candidate, error_m in errors_m.items()}
+    )

@@ -45,15 +45,21 @@ def hand_settings(calibration: Calibration, frame: str) -> dict[str, Any]:
 def lines(values: Mapping[str, Any], tracker: str = "") -> str:
     """The values of [trackers.NAME], or without a tracker of [hands], as lines of a TOML file."""
     table = f"[trackers.{tomlkit.key(tracker).as_string()}]" if tracker else "[hands]"
-    return f"{table}\n" + "".join(f"{name} = {tomlkit.item(value).as_string()}\n" for name, value in values.items())
+    return f"{table}\n" + "".join(
+        f"{name} = {tomlkit.item(value).as_string()}\n" for name, value in values.items()
+    )
 
 
 def record_path(path: Path, tracker: str = "") -> Path:
     """The path of the record beside a cell's settings."""
-    return path.with_suffix(f".{quote(tracker, safe='')}.calibration.json" if tracker else ".calibration.json")
+    return path.with_suffix(
+        f".{quote(tracker, safe='')}.calibration.json" if tracker else ".calibration.json"
+    )
 
 
-def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, tracker: str = "") -> Path:
+def write(
+    path: Path, values: Mapping[str, Any], record: CalibrationRecord, tracker: str = ""
+) -> Path:
     """Write values of [trackers.NAME], or without a tracker of [hands], into a cell's settings, and
     the record beside them. Returns the path of the earlier file, which is kept.
 
@@ -66,10 +72,13 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
         path = real_path(path)
     except CalibrationError as error:
         raise CalibrationError(f"{error}. {by_hand}") from None
-    before, text = load(path), text_in(path)
+    before = load(path)
+    text = text_in(path)
     try:
         document = tomlkit.parse(text)
-        section: Any = document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
+        section: Any = (
+            document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
+        )
         section = section[tracker] if tracker else section
         for name, value in values.items():
             section[name] = value
@@ -79,10 +88,14 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
         raise CalibrationError(f"{path} cannot be changed: {error}. {by_hand}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
-    fields = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    fields = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+    }
     table: Any = before.trackers[tracker] if tracker else before.hands
     replaced = msgspec.structs.replace(table, **fields)
-    changes = {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
+    changes = (
+        {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
+    )
     if after != msgspec.structs.replace(before, **changes):
         raise CalibrationError(f"{path} cannot be changed without other settings. {by_hand}")
     backup = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
@@ -92,7 +105,9 @@ def write(path: Path, values: Mapping[str, Any], record: CalibrationRecord, trac
             backup.unlink()
             raise CalibrationError(f"{path} was changed by another program meanwhile. {by_hand}")
         _replace(path, changed.encode())
-        _replace(record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n")
+        _replace(
+            record_path(path, tracker), msgspec.json.format(msgspec.json.encode(record)) + b"\n"
+        )
     except OSError as error:
         raise CalibrationError(f"{in_words(error)}. {by_hand}") from None
     return backup
@@ -105,10 +120,16 @@ def real_path(path: Path) -> Path:
     try:
         target = path.resolve(strict=True)
     except (OSError, RuntimeError) as error:  # a RuntimeError for links in a circle
-        raise CalibrationError(f"cannot read configuration {path}: {in_words(error, named=False)}") from None
-    is_writable = target.is_file() and target.stat().st_mode & 0o222 and os.access(target.parent, os.W_OK)
+        raise CalibrationError(
+            f"cannot read configuration {path}: {in_words(error, named=False)}"
+        ) from None
+    is_writable = (
+        target.is_file() and target.stat().st_mode & 0o222 and os.access(target.parent, os.W_OK)
+    )
     if not (is_writable and os.access(target, os.W_OK)):
-        raise CalibrationError(f"{path} cannot be written: a file that this user may change, in such a folder, needed")
+        raise CalibrationError(
+            f"{path} cannot be written: a file that this user may change, in such a folder, needed"
+        )
     return target
 
 
@@ -130,11 +151,13 @@ def recorded(path: Path, settings: Settings, tracker: str = "") -> CalibrationRe
         record = validated(raw, CalibrationRecord)
     except FileNotFoundError:
         raise CalibrationError(
-            f"{record_file} does not exist, so that the hand's place in the tool is unknown: `thirdhand calibrate --held` "
-            "writes it"
+            f"{record_file} does not exist, so that the hand's place in the tool is unknown: "
+            "`thirdhand calibrate --held` writes it"
         ) from None
     except (OSError, UnusableError, msgspec.DecodeError, UnicodeDecodeError, InvalidError) as error:
-        raise CalibrationError(f"{record_file} cannot be read: {in_words(error, named=False)}") from None
+        raise CalibrationError(
+            f"{record_file} cannot be read: {in_words(error, named=False)}"
+        ) from None
     pose = settings.hands_in(tracker).base_from_tracker
     return msgspec.structs.replace(
         record, calibration=msgspec.structs.replace(record.calibration, base_from_tracker=pose)

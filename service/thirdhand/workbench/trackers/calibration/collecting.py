@@ -40,12 +40,17 @@ SHOWN_SAMPLES = 120  # the expected accuracy is computed from this number of sam
 SHOW_EVERY_S = 2.0
 LEAST_LED_S = 15.0  # the tool is led at least this long
 LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at half of that
-LEAST_LED_M, LEAST_TURNED_RAD = 0.10, math.radians(40)  # and at least this far, in each direction
+# and at least this far, in each direction
+LEAST_LED_M = 0.10
+LEAST_TURNED_RAD = math.radians(40)
 LED_POLL_S = 0.05
 STREAM_ENDS_S = 1.0  # a stream that is silent for longer has ended
 LARGEST_POSITION = 1e9  # in any unit; squares of larger numbers overflow
-FAR_RATIO = 100.0  # positions are left out if they are this many times as far from the median as half of them
-MIN_MEDIAN_OFF = 0.05  # in the tracker's unit: a hand that rested for most of the time may still move by 5 m
+# positions are left out if they are this many times as far from the median as half of them
+FAR_RATIO = 100.0
+MIN_MEDIAN_OFF = (
+    0.05  # in the tracker's unit: a hand that rested for most of the time may still move by 5 m
+)
 TOUCH_S = 0.5  # a touch is the median over this time
 MAX_TOUCH_M = 0.015  # during a touch, the hand moves at most this far
 LEAST_TOUCH_SAMPLES = 5
@@ -80,8 +85,8 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
     joints = recorded.joint_topic(settings)
     if not joints:
         raise CalibrationError(
-            f"{path} has no {JOINT_STATES} of the joints {', '.join(settings.joints.names)}: give the arm by --config, "
-            f"or record them; its topics: {with_types(recorded.topics)}"
+            f"{path} has no {JOINT_STATES} of the joints {', '.join(settings.joints.names)}: give "
+            f"the arm by --config, or record them; its topics: {with_types(recorded.topics)}"
         )
     hands: dict[str, Track] = {}
     for side in SIDES:
@@ -89,8 +94,8 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
             hands[side] = recorded.track(TAKE_KEYS[side], source, settings)
     if not hands:
         raise CalibrationError(
-            f"{path} has no hands: a topic ending in hands/left or hands/right with {channels.POSE.type} needed; its "
-            f"topics: {with_types(recorded.topics)}"
+            f"{path} has no hands: a topic ending in hands/left or hands/right with "
+            f"{channels.POSE.type} needed; its topics: {with_types(recorded.topics)}"
         )
     tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
     return LedTracks(hands, tool), settings
@@ -114,7 +119,11 @@ class LiveLed(Capture):
     def ended(self) -> list[str]:
         """The streams that arrived, but not in the last STREAM_ENDS_S."""
         since_ns = time.time_ns() - round(1e9 * STREAM_ENDS_S)
-        return [key for key, samples in self.samples.items() if samples and samples[-1].arrived_ns < since_ns]
+        return [
+            key
+            for key, samples in self.samples.items()
+            if samples and samples[-1].arrived_ns < since_ns
+        ]
 
     def led(self, *, most_states: int | None = None, since_s: float | None = None) -> LedTracks:
         """The hands and the tool of the last `since_s` [s], None: all; the tool with at most
@@ -154,12 +163,25 @@ class LiveLed(Capture):
         """
         samples = _lately(self.samples[TAKE_KEYS[side]], TOUCH_S)
         if len(samples) < LEAST_TOUCH_SAMPLES:
-            raise CalibrationError(f"{len(samples)} samples of {TAKE_KEYS[side]} in {TOUCH_S:g} s: is the hand seen?")
+            raise CalibrationError(
+                f"{len(samples)} samples of {TAKE_KEYS[side]} in {TOUCH_S:g} s: is the hand seen?"
+            )
         poses = [channels.POSE.decode(sample.payload) for sample in samples]
-        positions_m = in_metres(np.array([pose.position for pose in poses]), self.settings.hands_in(poses[-1].frame_id))
-        moved_m = float(np.ptp(np.sort(positions_m, axis=0)[len(positions_m) // 10 : len(positions_m) - len(positions_m) // 10], axis=0).max())
+        positions_m = in_metres(
+            np.array([pose.position for pose in poses]), self.settings.hands_in(poses[-1].frame_id)
+        )
+        moved_m = float(
+            np.ptp(
+                np.sort(positions_m, axis=0)[
+                    len(positions_m) // 10 : len(positions_m) - len(positions_m) // 10
+                ],
+                axis=0,
+            ).max()
+        )
         if moved_m > MAX_TOUCH_M:
-            raise CalibrationError(f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again")
+            raise CalibrationError(
+                f"the hand moved by {1e3 * moved_m:.0f} mm: hold it still and press Enter again"
+            )
         return np.asarray(np.median(positions_m, axis=0))
 
 
@@ -177,8 +199,9 @@ def tracker_of(hand: Track, settings: Settings) -> str:
     """
     if settings.trackers and hand.frame not in settings.tracker_frames:
         raise CalibrationError(
-            f"{hand.name} is in frame {hand.frame!r}, which has no table in the settings: add [trackers.{hand.frame}], "
-            f"or, if it is that of [hands] (now {settings.hands.frame!r}), set [hands] frame = {hand.frame!r}"
+            f"{hand.name} is in frame {hand.frame!r}, which has no table in the settings: add "
+            f"[trackers.{hand.frame}], or, if it is that of [hands] (now "
+            f"{settings.hands.frame!r}), set [hands] frame = {hand.frame!r}"
         )
     return hand.frame if hand.frame in settings.trackers else ""
 
@@ -190,30 +213,39 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
     """
     if not is_by_tracker(hand.name, hand.frame, hands):
         raise CalibrationError(
-            f"{hand.name} is in frame {BASE!r}, and [hands] frame is {hands.frame!r}: its publisher maps it already, "
-            "and base_from_tracker has no effect. Let it publish in the tracker's own frame"
+            f"{hand.name} is in frame {BASE!r}, and [hands] frame is {hands.frame!r}: its "
+            "publisher maps it already, and base_from_tracker has no effect. Let it publish in the "
+            "tracker's own frame"
         )
     remarks: list[str] = []
     (hand_ns, hand_is_foreign), (tool_ns, tool_is_foreign) = map(_clock, (hand, tool))
     if hand_is_foreign or tool_is_foreign:
-        hand_ns, tool_ns = hand.logged_ns, tool.logged_ns
+        hand_ns = hand.logged_ns
+        tool_ns = tool.logged_ns
         whose = hand.name if hand_is_foreign else JOINT_STATES
         remarks.append(f"the stamps of {whose} are of another clock: times of arrival are used")
     finite = _plausible(hand.poses[:, :3])
     if not finite.all():
         remarks.append(
-            f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite, or far from all others, "
-            "and not used"
+            f"{(~finite).sum()} of {len(finite)} positions of {hand.name} are not finite, or far "
+            "from all others, and not used"
         )
     tool_ns, tool_rows = np.unique(tool_ns, return_index=True)
     sound = np.isfinite(tool.poses[tool_rows]).all(axis=1)
-    tool_ns, tool_rows = tool_ns[sound], tool_rows[sound]
+    tool_ns = tool_ns[sound]
+    tool_rows = tool_rows[sound]
     hand_ns, hand_rows = np.unique(hand_ns[finite], return_index=True)
     positions = in_metres(hand.poses[finite][hand_rows, :3], hands)
     if len(tool_ns) < 2:
-        raise CalibrationError(f"no {JOINT_STATES} arrived while the tool was led: is the arm's driver running?")
+        raise CalibrationError(
+            f"no {JOINT_STATES} arrived while the tool was led: is the arm's driver running?"
+        )
     after = np.clip(np.searchsorted(tool_ns, hand_ns), 1, len(tool_ns) - 1)
-    near = (hand_ns >= tool_ns[0]) & (hand_ns <= tool_ns[-1]) & (np.diff(tool_ns)[after - 1] < 1e9 * MAX_GAP_S)
+    near = (
+        (hand_ns >= tool_ns[0])
+        & (hand_ns <= tool_ns[-1])
+        & (np.diff(tool_ns)[after - 1] < 1e9 * MAX_GAP_S)
+    )
     origin = tool_ns[0]
     held = HeldTool(
         (hand_ns[near] - origin) / 1e9,
@@ -231,7 +263,9 @@ def _plausible(positions: Vector) -> NDArray[np.bool_]:
     """
     sound = np.asarray((np.abs(positions) < LARGEST_POSITION).all(axis=1))
     if sound.any():
-        distances = np.linalg.norm(np.where(sound[:, None], positions, 0.0) - np.median(positions[sound], axis=0), axis=1)
+        distances = np.linalg.norm(
+            np.where(sound[:, None], positions, 0.0) - np.median(positions[sound], axis=0), axis=1
+        )
         sound &= distances <= FAR_RATIO * max(float(np.median(distances[sound])), MIN_MEDIAN_OFF)
     return sound
 
@@ -240,7 +274,9 @@ def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
     """Stamps [ns], and true if they are of another clock than the times of arrival."""
     if not len(track.stamps_ns):
         return track.stamps_ns, False
-    return track.stamps_ns, bool(abs(np.median(track.logged_ns - track.stamps_ns)) > 1e9 * CLOCK_TOLERANCE_S)
+    return track.stamps_ns, bool(
+        abs(np.median(track.logged_ns - track.stamps_ns)) > 1e9 * CLOCK_TOLERANCE_S
+    )
 
 
 def the_hand(hands: Collection[str], side: str | None) -> str:
@@ -248,15 +284,21 @@ def the_hand(hands: Collection[str], side: str | None) -> str:
     CalibrationError: which hand a tracker calls left is not assumed.
     """
     if side is None and len(hands) > 1:
-        raise CalibrationError("both hands arrive: give the one that is at the tool, by --hand left or --hand right")
+        raise CalibrationError(
+            "both hands arrive: give the one that is at the tool, by --hand left or --hand right"
+        )
     if not hands:
         raise CalibrationError("no hand arrives: is the tracker running?")
     if side is not None and side not in hands:
-        raise CalibrationError(f"{TAKE_KEYS[side]} is needed, and nothing arrives there; {', '.join(hands)} arrives")
+        raise CalibrationError(
+            f"{TAKE_KEYS[side]} is needed, and nothing arrives there; {', '.join(hands)} arrives"
+        )
     return side or next(iter(hands))
 
 
-def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int) -> SolvedHand:
+def solved(
+    led: LedTracks, settings: Settings, corners: Vector, side: str | None, **more: int
+) -> SolvedHand:
     """The calibration by the hand of a side, or by the only one that arrives. It is that of this
     hand's tracker; the other hand may have another one.
 
@@ -273,13 +315,15 @@ def solved(led: LedTracks, settings: Settings, corners: Vector, side: str | None
                 continue
             raise CalibrationError(
                 f"{error}. {TAKE_KEYS[other]} moves with the tool, with a residual of "
-                f"{1e3 * solution.calibration.rms_m:.0f} mm: if the {other} hand holds it, give --hand {other}; else the "
-                "tracker exchanges left and right"
+                f"{1e3 * solution.calibration.rms_m:.0f} mm: if the {other} hand holds it, give "
+                f"--hand {other}; else the tracker exchanges left and right"
             ) from None
         raise
 
 
-def _solved(led: LedTracks, settings: Settings, corners: Vector, side: str, **more: int) -> SolvedHand:
+def _solved(
+    led: LedTracks, settings: Settings, corners: Vector, side: str, **more: int
+) -> SolvedHand:
     track = led.hands[side]
     held, remarks = held_tool(track, led.tool, settings.hands_in(tracker_of(track, settings)))
     calibration = solve_held(held, corners, section=settings.tracker_section(track.frame), **more)
@@ -301,14 +345,19 @@ class LedProgress(NamedTuple):
         return f"led over {moved} cm, turned {turned}; accuracy {accuracy}: {self.advice}"
 
 
-def progress(led: LedTracks, settings: Settings, corners: Vector, side: str | None) -> LedProgress | None:
+def progress(
+    led: LedTracks, settings: Settings, corners: Vector, side: str | None
+) -> LedProgress | None:
     """The progress of a calibration; None before the arm was heard."""
     if len(led.tool.poses) < 4:
         return None
-    cover, std_m, advice = coverage(led.tool.poses[:, :3], led.tool.poses[:, 3:]), None, ""
+    cover = coverage(led.tool.poses[:, :3], led.tool.poses[:, 3:])
+    std_m = None
+    advice = ""
     try:
         calibration = solved(led, settings, corners, side, max_samples=SHOWN_SAMPLES).calibration
-        std_m, advice = calibration.std_m, calibration.remedy
+        std_m = calibration.std_m
+        advice = calibration.remedy
     except CalibrationError as error:
         advice = str(error) if len(led.tool.poses) > SHOWN_SAMPLES else ""
     if cover.extent_m[2] < LEAST_LED_M:
@@ -344,9 +393,12 @@ def lead(
         live.collect()
         if is_ended():
             return "ended by the operator"
-        before, ended = ended, live.ended
+        before = ended
+        ended = live.ended
         if ended != before:
-            warn(f"{' and '.join(ended)} no longer arrives" if ended else "all streams arrive again")
+            warn(
+                f"{' and '.join(ended)} no longer arrives" if ended else "all streams arrive again"
+            )
         if now_s - shown_s < SHOW_EVERY_S:
             continue
         status = progress(live.led(most_states=4 * SHOWN_SAMPLES), settings, corners, side)
@@ -355,7 +407,10 @@ def lead(
             continue
         lasts_s = now_s - begun_s
         show(f"{lasts_s:4.0f} s  {status.text()}")
-        wide = status.coverage.extent_m[2] >= LEAST_LED_M and status.coverage.turned_rad[1] >= LEAST_TURNED_RAD
+        wide = (
+            status.coverage.extent_m[2] >= LEAST_LED_M
+            and status.coverage.turned_rad[1] >= LEAST_TURNED_RAD
+        )
         goal_m = accept_m if lasts_s > LED_S else 0.5 * accept_m
         if status.std_m is not None and wide and lasts_s > LEAST_LED_S and status.std_m < goal_m:
             return f"ended: the expected accuracy is {1e3 * status.std_m:.1f} mm"

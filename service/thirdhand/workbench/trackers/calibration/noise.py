@@ -33,7 +33,9 @@ class WanderingNoise(NamedTuple):
 
     def whitened(self, values: Vector) -> Vector:
         """Values (N, ...) of the samples, with independent errors of the same variance."""
-        flat = solve_triangular(self.factor, values.reshape(len(values), -1), lower=True, check_finite=False)
+        flat = solve_triangular(
+            self.factor, values.reshape(len(values), -1), lower=True, check_finite=False
+        )
         return np.asarray(flat.reshape(values.shape))
 
 
@@ -51,8 +53,10 @@ def estimated(times_s: Vector, off: Vector, jacobian: Vector) -> WanderingNoise:
     """
 
     def cost(noise: WanderingNoise) -> float:
-        count, parameters = off.size, jacobian.shape[2]
-        residual, slopes = noise.whitened(off).ravel(), noise.whitened(jacobian).reshape(count, parameters)
+        count = off.size
+        parameters = jacobian.shape[2]
+        residual = noise.whitened(off).ravel()
+        slopes = noise.whitened(jacobian).reshape(count, parameters)
         base, triangle = np.linalg.qr(slopes)
         square = float(residual @ residual - np.square(base.T @ residual).sum())
         determinants = 3.0 * np.log(np.diag(noise.factor)).sum()
@@ -62,4 +66,6 @@ def estimated(times_s: Vector, off: Vector, jacobian: Vector) -> WanderingNoise:
     middle = WANDERING_SHARES[len(WANDERING_SHARES) // 2]
     wandering = min((candidate(times_s, middle, time_s) for time_s in WANDERING_TIMES_S), key=cost)
     shares = (share for share in (0.0, *WANDERING_SHARES) if share != middle)
-    return min((wandering, *(candidate(times_s, share, wandering.time_s) for share in shares)), key=cost)
+    return min(
+        (wandering, *(candidate(times_s, share, wandering.time_s) for share in shares)), key=cost
+    )

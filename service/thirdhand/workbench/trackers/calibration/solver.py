@@ -31,23 +31,33 @@ from thirdhand.settings.config import Point, Pose, Settings
 from thirdhand.workbench.trackers.calibration.noise import WanderingNoise, estimated
 
 FIRST_SCALE_M = 0.01  # in the first fit, larger residuals have a bounded influence
-SCALES_M = (0.001, 0.05)  # bounds of that scale in the next fits, where it is 2 robust standard deviations
+SCALES_M = (
+    0.001,
+    0.05,
+)  # bounds of that scale in the next fits, where it is 2 robust standard deviations
 OUTLIER_DEVIATIONS = 6.0  # a sample with a residual of more robust standard deviations is not used
 NOISE_ROUNDS = 2  # estimates of the noise, each followed by a fit
 MAX_STAMP_DELAY_S = 0.5  # a longer delay shows that clocks differ
 FIRST_DELAYS_S = tuple(np.linspace(-0.2, 0.4, 13).tolist())  # the fit begins with the best of these
 LEVER_M = 0.5  # for the condition number, a rotation by 1 rad is a displacement of 0.5 m
 MAX_CONDITION = 1000.0
-MIN_SAMPLES, MAX_FIT_SAMPLES = 100, 400  # of a hand that holds the tool
+# of a hand that holds the tool
+MIN_SAMPLES = 100
+MAX_FIT_SAMPLES = 400
 MIN_POINTS = 4
 MIN_EXTENT_M = 0.05  # the positions must extend this far in their narrowest direction
 EXTENT_DEVIATIONS = 4.0  # extent of positions or orientations / their standard deviation
 TRACKER_UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
-MAX_SCALE_ERROR = 1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
+MAX_SCALE_ERROR = (
+    1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
+)
 # The residual with the right sense of the axes is below this share of that with the other sense: of
 # points, of which a few agree by chance, and of a held tool.
-MIRRORED_RATIO, HELD_MIRRORED_RATIO = 0.5, 0.75
-MAX_UNEXPLAINED = 0.5  # the residual of a hand at the tool is at most this share of the tool's motion
+MIRRORED_RATIO = 0.5
+HELD_MIRRORED_RATIO = 0.75
+MAX_UNEXPLAINED = (
+    0.5  # the residual of a hand at the tool is at most this share of the tool's motion
+)
 BENCH_HEIGHT_M = 0.4  # the bench extends from the table top to this height
 CONFIDENCE = 0.99  # of the upper limit of the errors' variance: few samples may agree by chance
 EPSILON = 1e-7  # step of numerical derivatives
@@ -130,11 +140,16 @@ def bench_corners(settings: Settings) -> Vector:
     """The corners (8, 3) [m] of the bench: the table top where the arm reaches it, up to
     BENCH_HEIGHT_M.
     """
-    table, reach, spans = settings.table, settings.reach, []
+    table = settings.table
+    reach = settings.reach
+    spans = []
     for axis in range(2):
-        middle, half = table.centre[axis], table.half_size[axis]
-        low, high = reach.centre[axis] - reach.outer, reach.centre[axis] + reach.outer
-        low, high = max(middle - half, low), min(middle + half, high)
+        middle = table.centre[axis]
+        half = table.half_size[axis]
+        low = reach.centre[axis] - reach.outer
+        high = reach.centre[axis] + reach.outer
+        low = max(middle - half, low)
+        high = min(middle + half, high)
         spans.append((low, high) if low < high else (middle - half, middle + half))
     spans.append((table.centre[2], table.centre[2] + BENCH_HEIGHT_M))
     return np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -167,13 +182,15 @@ def solve_held(
     """
     if min(len(held.hand), len(held.tool)) < MIN_SAMPLES:
         raise CalibrationError(
-            f"{len(held.hand)} samples of the hand and {len(held.tool)} of the arm in the same time; {MIN_SAMPLES} of "
-            "each needed: lead the tool for longer"
+            f"{len(held.hand)} samples of the hand and {len(held.tool)} of the arm in the same "
+            f"time; {MIN_SAMPLES} of each needed: lead the tool for longer"
         )
     cover = coverage(held.tool, held.turn)
     _check_extent(cover)
     flips = np.where(np.sum(held.turn[1:] * held.turn[:-1], axis=1) < 0, -1.0, 1.0)
-    turn = held.turn * np.cumprod(np.r_[1.0, flips])[:, None]  # without changes of sign, to interpolate neighbours
+    turn = (
+        held.turn * np.cumprod(np.r_[1.0, flips])[:, None]
+    )  # without changes of sign, to interpolate neighbours
     poses = [*held.tool.T, *turn.T]
     rows = np.arange(0, len(held.hand), math.ceil(len(held.hand) / max_samples), dtype=np.intp)
     span_s = (held.tool_s[0], held.tool_s[-1])
@@ -191,17 +208,23 @@ def solve_held(
     first = _robust(problem(rows))
     is_near = _inliers(first.off, first.deviation_m)
     inlier_problem = problem(rows[is_near])
-    hint = f" The tool turned by {_degrees(cover)}" if cover.turned_rad[1] < math.radians(20) else ""
+    hint = (
+        f" The tool turned by {_degrees(cover)}" if cover.turned_rad[1] < math.radians(20) else ""
+    )
     return _refined(inlier_problem, first, corners, hint)
 
 
-def solve_points(hand: Vector, base: Vector, corners: Vector, *, section: str = "[hands]") -> Calibration:
+def solve_points(
+    hand: Vector, base: Vector, corners: Vector, *, section: str = "[hands]"
+) -> Calibration:
     """The calibration from positions of a hand (N, 3) [m] at known points (N, 3) [m] of frame
     `base`. `corners` (C, 3) are those of the bench [m]; `section` is the table in the settings that
     an error names. Raises CalibrationError.
     """
     if len(hand) < MIN_POINTS:
-        raise CalibrationError(f"{len(hand)} points given; {MIN_POINTS} or more needed, 8 recommended")
+        raise CalibrationError(
+            f"{len(hand)} points given; {MIN_POINTS} or more needed, 8 recommended"
+        )
     _check_extent(coverage(base, Rotation.identity(len(base)).as_quat()))
     first = _robust(_touched(hand, base, section))
     is_near = _inliers(first.off, first.deviation_m)
@@ -235,12 +258,13 @@ def _check_extent(cover: Coverage, outliers: Sequence[int] | NDArray[np.intp] = 
     if len(outliers):
         points = ", ".join(str(number + 1) for number in outliers)
         raise CalibrationError(
-            f"point {points} does not fit the others, which extend over {sizes} cm alone; {100 * MIN_EXTENT_M:.0f} cm "
-            f"or more needed in every direction. Touch it again, and two more points that are farther along {axis}"
+            f"point {points} does not fit the others, which extend over {sizes} cm alone; "
+            f"{100 * MIN_EXTENT_M:.0f} cm or more needed in every direction. Touch it again, and "
+            f"two more points that are farther along {axis}"
         )
     raise CalibrationError(
-        f"the positions extend over {sizes} cm; {100 * MIN_EXTENT_M:.0f} cm or more needed in every direction. "
-        f"Lead the tool farther apart, above all along {axis}"
+        f"the positions extend over {sizes} cm; {100 * MIN_EXTENT_M:.0f} cm or more needed in "
+        f"every direction. Lead the tool farther apart, above all along {axis}"
     )
 
 
@@ -268,7 +292,9 @@ def _residual(problem: _Problem, turn: Rotation, centre: Vector, x: Vector) -> V
     """Residuals (N, 3) [m] at parameters (10,), or (6,) of touched points."""
     tool, tool_turn = problem.tool_at(float(x[9]) if problem.is_held else 0.0)
     held = tool + tool_turn.apply(x[6:9]) if problem.is_held else tool
-    return np.asarray((Rotation.from_rotvec(x[:3]) * turn).apply(problem.hand - centre) + x[3:6] - held)
+    return np.asarray(
+        (Rotation.from_rotvec(x[:3]) * turn).apply(problem.hand - centre) + x[3:6] - held
+    )
 
 
 def _robust(problem: _Problem) -> _Fit:
@@ -291,25 +317,31 @@ def _check_sense(problem: _Problem, matrix: Vector, fit: _Fit) -> None:
     narrow = np.linalg.svd(moved, full_matrices=False)[2][2]
     flip = np.eye(3) - 2.0 * np.outer(narrow, narrow)
     start = matrix @ flip if np.linalg.det(matrix) < 0 else fit.turn.as_matrix()
-    mirrored = _rigid(problem._replace(hand=fit.centre + moved @ flip), start, fit.centre, fit.delay_s)
+    mirrored = _rigid(
+        problem._replace(hand=fit.centre + moved @ flip), start, fit.centre, fit.delay_s
+    )
     # Each of few points counts that fits in either sense; of many samples, most do.
     fits = _inliers(np.minimum(fit.off, mirrored.off), min(fit.deviation_m, mirrored.deviation_m))
     tool, turn = problem.tool_at(fit.delay_s)
-    _check_extent(coverage(tool[fits], turn.as_quat()[fits]), () if problem.is_held else np.flatnonzero(~fits))
-    middle, ratio = (np.median, HELD_MIRRORED_RATIO) if problem.is_held else (np.mean, MIRRORED_RATIO)
+    _check_extent(
+        coverage(tool[fits], turn.as_quat()[fits]), () if problem.is_held else np.flatnonzero(~fits)
+    )
+    middle, ratio = (
+        (np.median, HELD_MIRRORED_RATIO) if problem.is_held else (np.mean, MIRRORED_RATIO)
+    )
     off_mm = 1e3 * float(middle(fit.off[fits]))
     mirrored_mm = 1e3 * float(middle(mirrored.off[fits]))
     differ = f"the residual is {off_mm:.0f} mm, and {mirrored_mm:.0f} mm with one axis reversed"
     if mirrored_mm < ratio * off_mm:
         raise CalibrationError(
-            f"the tracker's axes are mirrored (left-handed): {differ}. base_from_tracker cannot express "
-            "that: reverse one axis in the tracker's program, like z = -z for Unity's axes, or change "
-            f"{problem.section} axes"
+            f"the tracker's axes are mirrored (left-handed): {differ}. base_from_tracker cannot "
+            "express that: reverse one axis in the tracker's program, like z = -z for Unity's "
+            f"axes, or change {problem.section} axes"
         )
     if off_mm > ratio * mirrored_mm:
         raise CalibrationError(
-            f"the positions do not tell whether the tracker's axes are mirrored (left-handed): {differ}. "
-            "Repeat the positions, two or more of them at least 20 cm above the others"
+            "the positions do not tell whether the tracker's axes are mirrored (left-handed): "
+            f"{differ}. Repeat the positions, two or more of them at least 20 cm above the others"
         )
 
 
@@ -319,7 +351,8 @@ def _similar(problem: _Problem) -> tuple[float, Vector, Vector]:
     """
     base, _ = problem.tool_at(0.0)
     centre = problem.hand.mean(axis=0)
-    hand, base = problem.hand - centre, base - base.mean(axis=0)
+    hand = problem.hand - centre
+    base = base - base.mean(axis=0)
     u, _, vt = np.linalg.svd(base.T @ hand)
     return 0.0, u @ vt * (np.linalg.norm(base) / max(float(np.linalg.norm(hand)), 1e-12)), centre
 
@@ -334,7 +367,8 @@ def _affine(problem: _Problem) -> tuple[float, Vector, Vector]:
     best: tuple[float, float, Vector] | None = None
     centre = np.median(problem.hand, axis=0)
     size = max(float(np.median(np.linalg.norm(problem.hand - centre, axis=1))), 1e-12)
-    hand, count = (problem.hand - centre) / size, len(problem.hand)
+    hand = (problem.hand - centre) / size
+    count = len(problem.hand)
     rows = np.zeros((count, 3, 15))
     for axis in range(3):
         rows[:, axis, 3 * axis : 3 * axis + 3] = hand
@@ -343,7 +377,9 @@ def _affine(problem: _Problem) -> tuple[float, Vector, Vector]:
         tool, turn = problem.tool_at(delay_s)
         rows[:, :, 12:] = -turn.as_matrix()
         weights = np.ones((count, 1))
-        for _ in range(5):  # reweighted, so that it minimises the distances rather than their squares
+        for _ in range(
+            5
+        ):  # reweighted, so that it minimises the distances rather than their squares
             weighted = (weights[:, :, None] * rows).reshape(3 * count, -1)
             solution = np.linalg.lstsq(weighted, (weights * tool).ravel(), rcond=1e-9)[0]
             distances_m = np.linalg.norm(rows @ solution - tool, axis=1)
@@ -363,14 +399,17 @@ def _check_motion(problem: _Problem, delay_s: float, matrix: Vector, centre: Vec
     motion_m = np.median(np.linalg.norm(tool, axis=1))
     if off_m > MAX_UNEXPLAINED * motion_m:
         raise CalibrationError(
-            f"the hand does not move with the tool: they differ by {1e3 * off_m:.0f} mm while the tool moves by "
-            f"{1e3 * motion_m:.0f} mm. Hold the tool in the tracked hand, and let go of it only at the end"
+            f"the hand does not move with the tool: they differ by {1e3 * off_m:.0f} mm while the "
+            f"tool moves by {1e3 * motion_m:.0f} mm. Hold the tool in the tracked hand, and let go "
+            "of it only at the end"
         )
 
 
 def _check_scale(matrix: Vector, section: str) -> None:
     """Raise CalibrationError if the tracker's positions are not in metres."""
-    scale = max(float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9)  # the widest direction has the least error
+    scale = max(
+        float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9
+    )  # the widest direction has the least error
     if 1 / MAX_SCALE_ERROR < scale < MAX_SCALE_ERROR:
         return
     unit = min(TRACKER_UNITS_M, key=lambda name: abs(math.log(TRACKER_UNITS_M[name] / scale)))
@@ -379,7 +418,9 @@ def _check_scale(matrix: Vector, section: str) -> None:
     times = f"{float(f'{1 / scale:.2g}'):g}"
     finding = f"the hand moves {times} times as far as the tool"
     if unit in ("mm", "cm"):
-        raise CalibrationError(f'{finding}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"')
+        raise CalibrationError(
+            f'{finding}: the tracker looks to publish {unit}. Set {section} unit = "{unit}"'
+        )
     looks = f": the tracker looks to publish {unit}" if unit else ""
     raise CalibrationError(f"{finding}{looks}. Let it publish metres, or correct {section} unit")
 
@@ -398,8 +439,11 @@ def _rigid(problem: _Problem, matrix: Vector, centre: Vector, delay_s: float) ->
         def off(x: Vector, turn: Rotation = turn) -> Vector:
             return _residual(problem, turn, centre, x).ravel()
 
-        fit = least_squares(off, x, loss="soft_l1", f_scale=scale_m, bounds=(-bounds, bounds), x_scale=0.1)
-        turn, x = Rotation.from_rotvec(fit.x[:3]) * turn, fit.x
+        fit = least_squares(
+            off, x, loss="soft_l1", f_scale=scale_m, bounds=(-bounds, bounds), x_scale=0.1
+        )
+        turn = Rotation.from_rotvec(fit.x[:3]) * turn
+        x = fit.x
         x[:3] = 0.0
         deviation_m = max(1.4826 * float(np.median(np.abs(fit.fun))), 1e-5)
         scale_m = float(np.clip(2.0 * deviation_m, *SCALES_M))
@@ -414,17 +458,21 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
     """
     if abs(first.delay_s) > 0.98 * MAX_STAMP_DELAY_S:
         raise CalibrationError(
-            f"the stamps of hand and arm differ by {MAX_STAMP_DELAY_S:g} s or more: synchronise the clocks, or let "
+            f"the stamps of hand and arm differ by {MAX_STAMP_DELAY_S:g} s or more: synchronise "
+            "the clocks, or let "
             "each program stamp a sample when it is measured"
         )
-    count, samples = (10 if problem.is_held else 6), len(problem.hand)
+    count = 10 if problem.is_held else 6
+    samples = len(problem.hand)
 
     def off(x: Vector) -> Vector:
         return _residual(problem, first.turn, first.centre, x)
 
     def slopes(x: Vector) -> Vector:
         reference = off(x)
-        return np.stack([(off(x + EPSILON * axis) - reference) / EPSILON for axis in np.eye(count)], axis=2)
+        return np.stack(
+            [(off(x + EPSILON * axis) - reference) / EPSILON for axis in np.eye(count)], axis=2
+        )
 
     def fitted(x: Vector, noise: WanderingNoise | None) -> Vector:
         def white(x: Vector) -> Vector:
@@ -440,25 +488,36 @@ def _refined(problem: _Problem, first: _Fit, corners: Vector, hint: str) -> Cali
             noise = estimated(problem.times_s, off(x), jacobian)
             x = fitted(x, noise)
             jacobian = slopes(x)
-        white, weighted = noise.whitened(off(x)), noise.whitened(jacobian)
+        white = noise.whitened(off(x))
+        weighted = noise.whitened(jacobian)
     else:
         x = fitted(x, None)
-        white, weighted = off(x), slopes(x)
+        white = off(x)
+        weighted = slopes(x)
     information = np.einsum("nik,nil->kl", weighted, weighted)
     outliers = len(first.off) - samples  # each has chosen a sample to be left out
     freedom = max(3 * (samples - outliers) - count, 1)
-    variance = np.square(white).sum() / (3 * samples - count) * freedom / chdtri(freedom, CONFIDENCE)
-    covariance, levers = variance * np.linalg.inv(information), corners - x[3:6]
+    variance = (
+        np.square(white).sum() / (3 * samples - count) * freedom / chdtri(freedom, CONFIDENCE)
+    )
+    covariance = variance * np.linalg.inv(information)
+    levers = corners - x[3:6]
     stds = _stds(covariance, levers)
     remedy = LEAD_APART
     if problem.is_held:
         firm = np.array([*range(6), 9])
         firm_covariance = variance * np.linalg.inv(information[np.ix_(firm, firm)])
-        remedy = TURN_WRIST if _stds(firm_covariance, levers).max() < 0.7 * stds.max() else LEAD_APART
-    turn, residual = Rotation.from_rotvec(x[:3]) * first.turn, np.linalg.norm(off(x), axis=1)
+        remedy = (
+            TURN_WRIST if _stds(firm_covariance, levers).max() < 0.7 * stds.max() else LEAD_APART
+        )
+    turn = Rotation.from_rotvec(x[:3]) * first.turn
+    residual = np.linalg.norm(off(x), axis=1)
     x = np.pad(x, (0, 10 - count))
     return Calibration(
-        base_from_tracker=(*(x[3:6] - turn.apply(first.centre)).round(5).tolist(), *turn.as_quat().round(7).tolist()),
+        base_from_tracker=(
+            *(x[3:6] - turn.apply(first.centre)).round(5).tolist(),
+            *turn.as_quat().round(7).tolist(),
+        ),
         hand_in_tool=tuple(x[6:9].round(5).tolist()),
         delay_s=round(float(x[9]), 5),
         rms_m=float(np.sqrt(np.square(residual).mean())),
@@ -478,15 +537,18 @@ def _condition(jacobian: Vector, hint: str) -> float:
     what to do about the direction that is known least.
     """
     count = jacobian.shape[1]
-    _, strength, directions = np.linalg.svd(jacobian / np.array([LEVER_M] * 3 + [1.0] * (count - 3)))
+    _, strength, directions = np.linalg.svd(
+        jacobian / np.array([LEVER_M] * 3 + [1.0] * (count - 3))
+    )
     condition = float(strength[0] / max(strength[-1], 1e-12))
     if condition > MAX_CONDITION:
         weakest = directions[-1]
         parts = {LEAD_APART: weakest[:3], TURN_WRIST: weakest[3:9], LEAD_FASTER: weakest[9:]}
         remedy = max(parts, key=lambda name: float(np.linalg.norm(parts[name])))
         raise CalibrationError(
-            f"the positions do not determine the tracker's pose: their condition number is {min(condition, 1e9):.0f}, "
-            f"at most {MAX_CONDITION:.0f} accepted.{hint}. To determine it, {remedy}"
+            "the positions do not determine the tracker's pose: their condition number is "
+            f"{min(condition, 1e9):.0f}, at most {MAX_CONDITION:.0f} accepted.{hint}. To determine "
+            f"it, {remedy}"
         )
     return condition
 
