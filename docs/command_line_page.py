@@ -55,9 +55,8 @@ def page() -> str:
 
 def _subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser, by their names."""
-    actions = [
-        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
-    ]  # noqa: SLF001
+    kind = argparse._SubParsersAction  # noqa: SLF001
+    actions = [action for action in parser._actions if isinstance(action, kind)]  # noqa: SLF001
     return {name: found for action in actions for name, found in action.choices.items()}
 
 

@@ -27,10 +27,11 @@ from thirdhand.settings.config import Settings, robot_description
 PICTURE = Path(__file__).with_name("frames.png")
 TRACKER = (1.2, 0.0, 0.9, 0.683, 0.683, -0.183, -0.183)  # `base_from_tracker` of first-tracker.md
 PLATE_FROM_TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0, 1.0)
+# [m] the person faces the arm
 HANDS = {
     "left hand": (0.78, -0.22, 0.10),
     "right hand": (0.78, 0.22, 0.10),
-}  # [m] the person faces the arm
+}
 AXIS_M, ELBOW_M = 0.13, 0.18
 COLOURS = ("tab:red", "tab:green", "tab:blue")  # x, y, z
 DPI = 90

@@ -100,21 +100,23 @@ def _paragraphs(kind: Any) -> str:
 
 
 def _comments(kind: Any) -> dict[str, str]:
-    """The comment beside each field of a class, by the field's name."""
+    """The comment above or beside each field of a class, by the field's name."""
     source = textwrap.dedent(inspect.getsource(kind))
     comments: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             comments[token.start[0]] = token.string.removeprefix("#").strip()
-    fields = [node for node in ast.parse(source).body[0].body if isinstance(node, ast.AnnAssign)]  # type: ignore[attr-defined]
-    return {
-        ast.unparse(node.target): " ".join(
-            comments[line]
-            for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
-            if line in comments
-        )
-        for node in fields
-    }
+    texts: dict[str, str] = {}
+    for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
+        if isinstance(node, ast.AnnAssign):
+            first = node.lineno
+            while source.splitlines()[first - 2].strip().startswith("#"):
+                first -= 1
+            rows = range(first, (node.end_lineno or node.lineno) + 1)
+            texts[ast.unparse(node.target)] = " ".join(
+                comments[row] for row in rows if row in comments
+            )
+    return texts
 
 
 def _default(field: types.Field) -> Any:

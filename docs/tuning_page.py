@@ -16,15 +16,9 @@ from thirdhand_sim.lab.evidence import RESULTS, result_of, staleness, tree
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"
-STAGES = (
-    "intake",
-    "skill",
-    "setpoint",
-    "arm",
-    "separation",
-    "decision",
-)  # the limiter has no tuned number
-RECORD = re.compile(r"\s*# (\S+) to (\S+)\. More: (.+)\. Less: (.+)\.")
+# the limiter has no tuned number
+STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision")
+RECORD = re.compile(r"(\S+) to (\S+)\. More: (.+?)\. Less: (.+?)\.(?= |$)(.*)")
 HEAD = """# Tuned numbers
 
 <!-- Written by `python docs/tuning_page.py` from service/thirdhand/core/*/tuning.py: change it there. -->
@@ -62,7 +56,7 @@ class Number(NamedTuple):
 
 
 def numbers_of(stage: str) -> Iterator[Number]:
-    """The tuned numbers of a stage, which are those with a range in the line above."""
+    """The tuned numbers of a stage, which are those with a range in the comment above."""
     values = vars(skill_tuning) if stage == "skill" else getattr(TUNING, stage)._asdict()
     lines = (
         (ROOT / "service" / "thirdhand" / "core" / stage / "tuning.py")
@@ -70,13 +64,18 @@ def numbers_of(stage: str) -> Iterator[Number]:
         .splitlines()
     )
     for node in ast.walk(ast.parse("\n".join(lines))):
-        if isinstance(node, (ast.Assign, ast.AnnAssign)) and (
-            record := RECORD.fullmatch(lines[node.lineno - 2])
-        ):
+        if not isinstance(node, (ast.Assign, ast.AnnAssign)):
+            continue
+        above: list[str] = []
+        for line in reversed(lines[: node.lineno - 1]):
+            if not line.strip().startswith("#"):
+                break
+            above.insert(0, line.strip("# "))
+        if record := RECORD.search(" ".join(above)):
             name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
-            low, high, more, less = record.groups()
-            meaning = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2]
-            yield Number(name, values[name], meaning, float(low), float(high), more, less)
+            low, high, more, less, meaning = record.groups()
+            meaning += lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2]
+            yield Number(name, values[name], meaning.strip(), float(low), float(high), more, less)
 
 
 def page() -> str:

@@ -23,17 +23,14 @@ class FakeArm:
 
     period_s: float = 0.002  # at which the drive takes what is written
     takes_velocity: bool = False  # it is led by positions, and keeps to them by itself
-    lag_s: float = (
-        0.0  # of its servo, which `thirdhand doctor` measures: what is written leads by it
-    )
-    speed_limits: SpeedLimits | None = (
-        None  # less than in `limits` at some positions, where the drive has such
-    )
+    # of its servo, which `thirdhand doctor` measures: what is written leads by it
+    lag_s: float = 0.0
+    # less than in `limits` at some positions, where the drive has such
+    speed_limits: SpeedLimits | None = None
 
     def __init__(self, settings: Settings) -> None:
-        self.limits = (
-            settings.joints
-        )  # names, and what the drive can do: no less than what is commanded
+        # names, and what the drive can do: no less than what is commanded
+        self.limits = settings.joints
         self.position, self.velocity = (
             np.array(settings.arm.posture),
             np.zeros(len(settings.joints.names)),

@@ -12,10 +12,8 @@ import time
 from thirdhand import Tracker, client_settings
 
 RATE_HZ = 100
-LEFT, RIGHT = (
-    (0.98, -0.32, 0.06),
-    (0.98, 0.32, 0.06),
-)  # frame base [m]: x forward from the arm, y to its left, z up
+# frame base [m]: x forward from the arm, y to its left, z up
+LEFT, RIGHT = ((0.98, -0.32, 0.06), (0.98, 0.32, 0.06))
 
 
 def main(arguments: list[str] | None = None) -> None:

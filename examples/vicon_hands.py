@@ -23,10 +23,8 @@ from thirdhand.contract.messages import PoseStamped, Quaternion
 
 FRAME = "vicon"
 PORT = 51001
-HEAD, ITEM = (
-    struct.Struct("<IB"),
-    struct.Struct("<BH"),
-)  # frame and number of items; kind and size of an item
+# frame and number of items; kind and size of an item
+HEAD, ITEM = (struct.Struct("<IB"), struct.Struct("<BH"))
 OBJECT = struct.Struct("<24s6d")  # name, x y z [mm], rotations about the moving x, y and z [rad]
 
 

@@ -29,9 +29,8 @@ from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, Expansion, check_resolved
 
-_LEAST_SHARED = (
-    0.75  # a border is faster than a fit if at least this share of points precedes the first change
-)
+# a border is faster than a fit if at least this share of points precedes the first change
+_LEAST_SHARED = 0.75
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
 _COLUMNS = 64  # columns of a factor that are copied at once
 
@@ -101,9 +100,8 @@ class _Bordered(NamedTuple):
         p = len(self.base)
         n = sum(self.border.shape)
         factor = np.zeros((n, n), order="F")  # LAPACK's order: each use would copy another
-        for a in range(
-            0, p, _COLUMNS
-        ):  # pages above the diagonal are not written, and take no memory
+        # pages above the diagonal are not written, and take no memory
+        for a in range(0, p, _COLUMNS):
             factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
         factor[p:, :p] = self.border.T
         factor[p:, p:] = self.corner

@@ -180,9 +180,8 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     alone = np.count_nonzero(covariance, axis=2) == 1
-    exact = (
-        alone & (variances > 0) & (variances < _EXACT_BELOW)
-    )  # exact outputs of `Gaussians.of`, beside others that are not
+    # exact outputs of `Gaussians.of`, beside others that are not
+    exact = alone & (variances > 0) & (variances < _EXACT_BELOW)
     filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
     try:
         smallest = np.linalg.eigvalsh(filled)[:, 0]

@@ -172,9 +172,8 @@ class GaussianKernel(Immutable):
             return k
         i, u = directed(along_a, stretch)
         j, v = directed(along_b, stretch)
-        origin = y[:1].sum(
-            axis=0
-        )  # a shift to the first point, as differences of small numbers round less
+        # a shift to the first point, as differences of small numbers round less
+        origin = y[:1].sum(axis=0)
         x = x - origin
         y = y - origin
         left = 2 * scale * (u @ y.T - np.vecdot(x[i], u)[:, None])  # (I', B)

@@ -163,9 +163,8 @@ def mixture_of(
         **initial,
     )
     try:
-        with threadpool_limits(
-            1
-        ):  # k-means sums its threads' results in the order in which they finish
+        # k-means sums its threads' results in the order in which they finish
+        with threadpool_limits(1):
             fitted = estimator.fit(data)
         return GaussianMixture(fitted.weights_, fitted.means_, symmetric(fitted.covariances_))
     except ValueError:  # a covariance is not positive definite

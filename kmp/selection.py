@@ -34,9 +34,8 @@ _STEP = 4.0  # of the search around the best
 _SWEEPS = 2
 _AS_GOOD = 1.03  # times the least RMSE: among these the shortest lengths are taken
 _AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with each of these
-_SHORTER = 2.0 ** np.arange(
-    1, 9
-)  # times the best ell, that are tried for it, up to the last of _ELLS
+# times the best ell, that are tried for it, up to the last of _ELLS
+_SHORTER = 2.0 ** np.arange(1, 9)
 _ROUNDED = 1 + 1e-9
 _PLACES = 9  # reference points at which the reach of a via-point is measured
 _COARSEST = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
@@ -338,9 +337,8 @@ def _check_scale(
 def _variances(inputs: Array) -> Array:
     """The variances (I,) of inputs (N, I), above 0."""
     variances = np.var(inputs, axis=0)
-    return np.where(
-        variances > 0, variances, variances.max() or 1.0
-    )  # one that never changed has no length
+    # one that never changed has no length
+    return np.where(variances > 0, variances, variances.max() or 1.0)
 
 
 def _best_first(score: Score) -> tuple[float, float]:

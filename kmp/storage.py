@@ -19,9 +19,8 @@ from kmp.named_arrays import from_arrays, to_arrays
 from kmp.primitive import KMP
 
 _FORMAT = 1  # number of the file format
-_LFS_POINTER = (
-    b"version https://git-lfs.github.com/spec/"  # begin of a file that Git LFS has not fetched
-)
+# begin of a file that Git LFS has not fetched
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 class Stored(NamedTuple):

@@ -24,13 +24,11 @@ from thirdhand.viewer import vulkan
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
-os.environ.pop(
-    "PYTHONDONTWRITEBYTECODE", None
-)  # each of a thousand processes would compile what it imports
+# each of a thousand processes would compile what it imports
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-signal.signal(
-    signal.SIGINT, signal.default_int_handler
-)  # a script's `&` has it ignored, and children inherit that
+# a script's `&` has it ignored, and children inherit that
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest_plugins = ["support.busy"]
 PREPARING = pytest.StashKey[subprocess.Popen[bytes]]()

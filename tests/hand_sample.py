@@ -37,10 +37,11 @@ from thirdhand.settings.config import Settings, robot_description
 
 ROOT = Path(__file__).parents[1]
 LOOP = str(Path(daemon.__file__))  # this file does what the loop there does
+# left out, as operators are
 ARITHMETIC = {
     str(ROOT / "service/thirdhand/core/vectors.py"),
     str(ROOT / "kmp/elementary.py"),
-}  # left out, as operators are
+}
 PERIODS = 80
 
 

@@ -44,9 +44,8 @@ VAGUE = {
     "interface",
     "misc",
 }
-PRIVATE = (
-    r"[a-z]\._[a-z]|, \"_[a-z]"  # of something in code that a test runs, or a name that it patches
-)
+# of something in code that a test runs, or a name that it patches
+PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"
 MODULES = sorted(
     path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py")
 )
@@ -86,22 +85,13 @@ STRUCTURAL = {  # numbers of the core's stages that are codes or sizes of arrays
         "UNUSABLE",
         "NO_SEGMENT",
     ),
-    *(
-        "NO_GRIPPER",
-        "MAX_SKILL_DISTANCE_M",
-        "FARTHEST_REPORTED_M",
-        "TABLE_DEPTH_M",
-    ),  # of files, of reports, of a shape
-    *(
-        "MOTION_ROUND_TO",
-        "COVARIANCE_ROUND_TO",
-        "TURN_ROUND_TO",
-        "CLOSURE_ROUND_TO",
-    ),  # of what is recorded
+    # of files, of reports, of a shape
+    *("NO_GRIPPER", "MAX_SKILL_DISTANCE_M", "FARTHEST_REPORTED_M", "TABLE_DEPTH_M"),
+    # of what is recorded
+    *("MOTION_ROUND_TO", "COVARIANCE_ROUND_TO", "TURN_ROUND_TO", "CLOSURE_ROUND_TO"),
 }
-CONVENIENCES = {
-    ("kmp.primitive", "kmp.storage")
-}  # `KMP.save` and `KMP.load` import what stores primitives
+# `KMP.save` and `KMP.load` import what stores primitives
+CONVENIENCES = {("kmp.primitive", "kmp.storage")}
 IN_EVERY_STAGE = {"FRAME", "STATE"}  # the fields that a stage owns in the frame and in the state
 # Names of constants and classes that are still defined twice. This list only becomes shorter.
 NAMED_TWICE = """

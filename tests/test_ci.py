@@ -79,9 +79,8 @@ def test_every_part_runs_and_the_end_names_those_that_failed(
 
 
 def test_a_part_that_cannot_run_has_failed(tmp_path: Path) -> None:
-    environment = checkout(
-        tmp_path, readme="true", python='[ "$1" != -c ]'
-    )  # a Python that cannot make environments
+    # a Python that cannot make environments
+    environment = checkout(tmp_path, readme="true", python='[ "$1" != -c ]')
     (tmp_path / "README.md").write_text("# A\n", encoding="utf-8")
     done = subprocess.run(
         ["bash", ".ci/run"],

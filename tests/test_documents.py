@@ -207,9 +207,8 @@ PAGES = sorted(
 
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser."""
-    actions = (
-        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
-    )  # noqa: SLF001
+    kind = argparse._SubParsersAction  # noqa: SLF001
+    actions = (action for action in parser._actions if isinstance(action, kind))  # noqa: SLF001
     return {name: command for action in actions for name, command in action.choices.items()}
 
 

@@ -28,10 +28,11 @@ RATE_HZ = 500
 MOST_WORK = 14.0
 MOST_LATENCY = 1.4
 MOST_MISSED = 0.03
+# shares of a period; a busy thread exceeds one of them, seldom both
 MOST_LATE = {
     "p50": 0.02,
     "p99": 0.5,
-}  # shares of a period; a busy thread exceeds one of them, seldom both
+}
 PLANTED = """
 from thirdhand.process import one_blas_thread
 import sys, threading, time

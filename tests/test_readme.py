@@ -30,9 +30,8 @@ def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follo
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
     with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = {"THIRDHAND_CONNECT": daemon.endpoint, "HOME": str(tmp_path)}
-        for _ in range(
-            3
-        ):  # a busy machine may leave the hands stale, or the skill worker without time
+        # a busy machine may leave the hands stale, or the skill worker without time
+        for _ in range(3):
             done = isolated(site, program(), "zenoh", "msgspec", env=environment)
             held = daemon.client.status().reason
             daemon.client.resume()

@@ -77,11 +77,12 @@ DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a p
     *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+# of `thirdhand.client`, for the service's own programs
 INSIDE = {
     "decoded",
     "no_room_to_brake",
     "publisher",
-}  # of `thirdhand.client`, for the service's own programs
+}
 
 
 def program(name: str) -> ModuleType:

@@ -87,14 +87,12 @@ class DirectSelection:
     outputs: Array
     group: NDArray[np.intp]
     scales: Scales
-    isotropic: bool = (
-        False  # True if S is a multiple of I at each point, which costs a ninth of the time
-    )
+    # True if S is a multiple of I at each point, which costs a ninth of the time
+    isotropic: bool = False
     joint: bool = False  # True if the prior mean is chosen with the kernel, not after it
     factors: Array | None = None  # (N,) f_n; None if all are 1
-    judged: NDArray[np.bool_] | None = (
-        None  # (N,) True for points whose residuals count; None if all do
-    )
+    # (N,) True for points whose residuals count; None if all do
+    judged: NDArray[np.bool_] | None = None
 
     @cached_property
     def _constant(self) -> Array:

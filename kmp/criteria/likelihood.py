@@ -21,10 +21,8 @@ from kmp.time_kernels import VelocityKernel
 
 _STARTS = (0.1, 1.0, 10.0)  # factors on the initial ell, as the likelihood has several maxima
 _LAMBDA = 1e-2  # initial lambda times the mean variance of the reference
-_ELL_BOUNDS = (
-    np.log(1e-6),
-    np.log(1e4),
-)  # log ell / initial ell: the input has no effect, or every effect
+# log ell / initial ell: the input has no effect, or every effect
+_ELL_BOUNDS = (np.log(1e-6), np.log(1e4))
 _LAMBDA_BOUNDS = np.log(1e-7), np.log(1e3)  # log lambda / initial lambda: rounding limits it
 _UNLIKELY = 1e12  # [nat] value without a Cholesky factor, from which the search turns back
 

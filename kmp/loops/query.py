@@ -25,9 +25,8 @@ from kmp.loops.kernel_row import kernel_value
 from kmp.loops.mean import means, slopes, table_of
 from kmp.query import MotionPrediction, Query
 
-_MOST_EXACT = (
-    1500  # rows and columns of a factor that is computed in a fixed order, in less than 2 s
-)
+# rows and columns of a factor that is computed in a fixed order, in less than 2 s
+_MOST_EXACT = 1500
 MEANS = 4  # rows of a motion's output before the Jacobian: mean, velocity, acceleration, curvature
 
 
@@ -91,9 +90,8 @@ class CompiledQuery(Immutable):
         Equal to `Query.mean` but for rounding; None if a query or a result is not finite.
         """
         table, places, along, coordinates, prior = self._reads
-        query_array = np.array(
-            queries, np.float64, order="C"
-        )  # one type of array, and so compiled once
+        # one type of array, and so compiled once
+        query_array = np.array(queries, np.float64, order="C")
         values = np.empty(table.shape[1])
         out = np.empty((len(query_array), len(prior)))
         finite = means(query_array, table, places, along, coordinates, prior, values, out)

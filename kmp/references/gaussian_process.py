@@ -29,12 +29,8 @@ from kmp.gaussians import Gaussians, covariances
 _SIGNAL = 1e-3, 1e3  # bounds of the function's variance over the variance of the output
 _LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
 _NOISE = 1e-6, 1e1  # bounds of the noise's variance over the variance of the output
-_LONGER = (
-    1.0,
-    1.5,
-    2.5,
-    4.0,
-)  # factors on the likeliest lengths, evaluated on held-out demonstrations
+# factors on the likeliest lengths, evaluated on held-out demonstrations
+_LONGER = (1.0, 1.5, 2.5, 4.0)
 _NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # noises, evaluated on the same
 
 
@@ -113,9 +109,8 @@ def _process(
         np.full(count, np.sqrt(count)), _LENGTH
     ) + WhiteKernel(0.01, _NOISE)
     with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter(
-            "ignore", ConvergenceWarning
-        )  # an input without effect has no finite length
+        # an input without effect has no finite length
+        warnings.simplefilter("ignore", ConvergenceWarning)
         likeliest = GaussianProcessRegressor(kernel).fit(s, y).kernel_
         tried = [likeliest]
         if of[-1] > 0:
@@ -144,9 +139,8 @@ def _left_out(gram: Array, y: Array, of: NDArray[np.intp]) -> tuple[Array, Array
     pull = precision @ y
     errors = np.empty_like(y)
     deviations = np.empty_like(y)
-    for h in np.unique(
-        of
-    ):  # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
+    # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
+    for h in np.unique(of):
         rows = of == h
         covariance = np.linalg.inv(precision[np.ix_(rows, rows)])
         deviations[rows] = np.sqrt(np.diag(covariance))

@@ -2,9 +2,8 @@
 watch, teach, request. See `thirdhand.client`.
 """
 
-TYPE_CHECKING = (
-    False  # for type checkers; this module imports nothing, as each command begins with it
-)
+# for type checkers; this module imports nothing, as each command begins with it
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from thirdhand.client import *  # noqa: F403
 

@@ -3,9 +3,8 @@
 import signal  # before all else: until the next statement, Ctrl-C shows a traceback
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(
-        signal.SIGINT, signal.SIG_DFL
-    )  # Ctrl-C ends it without a traceback, until it is watched for
+    # Ctrl-C ends it without a traceback, until it is watched for
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # isort: split
 from thirdhand.process import one_blas_thread  # noqa: F401

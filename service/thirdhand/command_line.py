@@ -27,14 +27,8 @@ GROUPS = {
     "check": ("doctor", "metrics", "bundle", "replay", "bench"),
     "set up": ("arm", "calibrate"),
 }
-CLEAN_UP_FIRST = (
-    "demo",
-    "bench",
-    "view",
-    "record",
-    "hands",
-    "calibrate",
-)  # on Ctrl-C these first end their processes
+# on Ctrl-C these first end their processes
+CLEAN_UP_FIRST = ("demo", "bench", "view", "record", "hands", "calibrate")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -241,9 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
         if args.tracked_hands is not None:
             script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
         if target and target != "-":
-            Path(target).write_text(
-                "", encoding="utf-8"
-            )  # a file that cannot be written is reported before the run
+            # a file that cannot be written is reported before the run
+            Path(target).write_text("", encoding="utf-8")
         before_others()
         listener = (
             open_session(connect=args.connect or (), listen=args.listen) if args.listen else None

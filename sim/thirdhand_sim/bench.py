@@ -37,22 +37,18 @@ from thirdhand_sim.world import (
     seen_from,
 )
 
-SETTLE_RANGE_S = (
-    0.5,
-    2.5,
-)  # shortest and longest time for the arm to settle before the script begins
+# shortest and longest time for the arm to settle before the script begins
+SETTLE_RANGE_S = (0.5, 2.5)
 SETTLED_STILL_S = 0.25  # the arm has settled after resting for this time
 # after a silence, a command must be within this of the standing arm
 STAND_RAD = 0.02
 STAND_RADPS = 0.05
 HOLDS = 0.5  # fingers that are closed this far hold a thing between them
 TAIL_S = 0.5  # the task is observed until this time after the script's end
-CATCH_UP_RADPS = (
-    0.25  # the joint that is farthest behind exceeds its commanded speed by at most this
-)
-STILL_WITHIN = (
-    0.005  # [m] a resting tool moves by up to this, because the hand that leads it trembles
-)
+# the joint that is farthest behind exceeds its commanded speed by at most this
+CATCH_UP_RADPS = 0.25
+# [m] a resting tool moves by up to this, because the hand that leads it trembles
+STILL_WITHIN = 0.005
 
 
 class TaskEvent(msgspec.Struct, frozen=True):
@@ -175,9 +171,8 @@ class Bench:
         self._since_command = 0
         self.refused = 0  # commands that after a silence did not begin at the standing arm
         self._still = 0
-        self._gripper: float | None = (
-            None  # newest command; None without commands: near things are then grasped
-        )
+        # newest command; None without commands: near things are then grasped
+        self._gripper: float | None = None
         self._lay_out()
         self._observation = self._observe()
         self._still_at = self._observation.tool.position

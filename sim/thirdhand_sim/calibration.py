@@ -154,12 +154,13 @@ def error_m(found: Calibration, bench: Array = BENCH) -> float:
     )
 
 
+# points, or seconds
 METHODS = {
     "points, 4": 4,
     "points, 8": 8,
     "held, 15 s": 15.0,
     "held, 40 s": 40.0,
-}  # points, or seconds
+}
 
 
 def errors_mm(arm: str, kind: TrackerKind, method: float, seeds: range) -> Array:

@@ -11,9 +11,8 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.urdf import Urdf
 
 NO_INERTIA = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-UNKNOWN_KG = (
-    "1"  # mass of moving links without one in the URDF, because engines move no link without a mass
-)
+# mass of moving links without one in the URDF, because engines move no link without a mass
+UNKNOWN_KG = "1"
 UNKNOWN_INERTIA = {**NO_INERTIA, "ixx": "0.01", "iyy": "0.01", "izz": "0.01"}  # [kg m²]
 SHORTEST = 1e-3  # [m] a capsule with a shorter axis becomes a sphere
 
@@ -37,9 +36,8 @@ def simulated(settings: Settings, **compiler: str) -> str:
         if not _is_massive(link):
             for without in link.findall("inertial"):
                 link.remove(without)
-            inertial = SubElement(
-                link, "inertial"
-            )  # without it, PyBullet gives 1 kg also to links without a body
+            # without it, PyBullet gives 1 kg also to links without a body
+            inertial = SubElement(link, "inertial")
             SubElement(inertial, "mass", value=UNKNOWN_KG if name in driven else "0")
             SubElement(inertial, "inertia", UNKNOWN_INERTIA if name in driven else NO_INERTIA)
     if robot.find(".//mesh") is not None:

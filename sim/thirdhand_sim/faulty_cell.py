@@ -38,9 +38,8 @@ SWING_TIMEOUT_S = 5.0  # longer than a period of the hands' swing
 
 
 Network = Literal["relays", "router", "link"]
-Command = tuple[
-    float, int, bytes
-]  # time of leaving the service (time.monotonic() [s]), tick, bytes
+# time of leaving the service (time.monotonic() [s]), tick, bytes
+Command = tuple[float, int, bytes]
 
 
 class FaultError(RuntimeError):

@@ -356,9 +356,8 @@ def _moved(task: Plan, usual: Sequence[Array], random: np.random.Generator) -> T
                 and (not carries or _reached(tried + CARRIED_M))
             ):
                 return np.asarray(tried)
-        raise ValueError(
-            f"no room for place {index} near {usual[part][index]}"
-        )  # the boxes above prevent this
+        # the boxes above prevent this
+        raise ValueError(f"no room for place {index} near {usual[part][index]}")
 
     parts = []
     for part in range(3):
@@ -456,9 +455,8 @@ def _legs(
                 free[side] + 0.1,
                 ready_s - who.lead_s * (side == 0) + 0.1 * random.standard_normal(),
             )
-            if (
-                task.segments[a, side] == task.segments[b, side]
-            ):  # the hand rests, and the other does not wait for it
+            # the hand rests, and the other does not wait for it
+            if task.segments[a, side] == task.segments[b, side]:
                 start = ends[side, a]
                 begin = max(free[side], begin - 0.6)
                 at_once = np.linspace(0, 1, SHAPE_STEPS)

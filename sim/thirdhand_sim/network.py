@@ -29,9 +29,8 @@ from thirdhand_sim.script import Array
 from thirdhand_sim.tracked_hands import TrackedHands
 
 THINGS_HZ = 10
-FINAL_STOP_S = (
-    1.0  # the bench runs for this time after the last hands, so that the service can stop the arm
-)
+# the bench runs for this time after the last hands, so that the service can stop the arm
+FINAL_STOP_S = 1.0
 QUIET_S = 1.0  # missing commands are reported after this time
 MOST_QUEUED = 256  # commands wait in a queue of this length while the bench is held up
 DRIVE_HEADROOM = 1.25  # drive limits / command limits, so that the arm can catch up after a hold-up
@@ -46,9 +45,8 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
     success: bool
     events: TaskEvents
-    latency_ms: (
-        requests.Percentiles
-    )  # from a published hand to the first received command that answers it
+    # from a published hand to the first received command that answers it
+    latency_ms: requests.Percentiles
     answered: int  # number of hand samples among `hands` that a command answered
     hands: int
     commands: int
@@ -332,9 +330,8 @@ class _Run:
         self._key = channels.key(live.cell, "joints/command")
 
         self._index = -1  # of the newest period
-        self._ready_s: float | None = (
-            None  # time from which commands arrive and the hands wait at their start
-        )
+        # time from which commands arrive and the hands wait at their start
+        self._ready_s: float | None = None
         self._is_running = False  # the script runs
         self._commanded_s = 0.0
         self._is_quiet = False  # missing commands were reported

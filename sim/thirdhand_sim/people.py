@@ -20,11 +20,8 @@ PROJECT_SEED = 2024
 LEAST_DWELL_S = 0.9
 MOST_DWELL_S = 1.8
 LONGEST_LEAD_S = 2.0
-HABITS_M = (
-    0.020,
-    0.008,
-    0.008,
-)  # standard deviation per axis of a hand in the air, at the board, at the iron
+# standard deviation per axis of a hand in the air, at the board, at the iron
+HABITS_M = (0.020, 0.008, 0.008)
 
 
 class Places(NamedTuple):

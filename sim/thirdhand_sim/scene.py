@@ -27,19 +27,13 @@ from thirdhand.settings.file_content import SettingsError, UnusableError, text_i
 Point = tuple[float, float, float]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=60)]
 
-TOOL_FROM_OBJECT: Point = (
-    -0.13,
-    0.0,
-    0.20,
-)  # [m] position of the tool with the glass, relative to the soldering place
+# [m] position of the tool with the glass, relative to the soldering place
+TOOL_FROM_OBJECT: Point = (-0.13, 0.0, 0.20)
 # Position of the tool that offers the board, relative to the hand that takes it: the arm is 4 cm
 # away, and the board's edge is in the hand.
 TOOL_FROM_HAND: Point = (-0.08, 0.0, 0.08)  # [m]
-RIGHT_FROM_OBJECT: Point = (
-    0.03,
-    0.06,
-    0.05,
-)  # [m] position of the hand with the iron, relative to the soldering place
+# [m] position of the hand with the iron, relative to the soldering place
+RIGHT_FROM_OBJECT: Point = (0.03, 0.06, 0.05)
 GRASP_DISTANCE = 0.03  # [m] within this distance a thing is taken over, or is at its target
 ARRIVED_M = 0.04  # a hand within this distance of a place has arrived there
 # The tool's +z points 45° forward and down, and its y axis is level: a turn of 135° about y.
@@ -49,9 +43,8 @@ HAND_ORIENTATION = (0.0, 0.0, 1.0, 0.0)
 
 FAR_OFF = 5.0  # [m] a place farther off is probably in other units
 IN_REACH = 0.01  # [m] places are moved this far into the arm's reach
-MOST_MOVED = (
-    0.15  # [m] with a larger distance from the nominal places, the arm cannot reach every scene
-)
+# [m] with a larger distance from the nominal places, the arm cannot reach every scene
+MOST_MOVED = 0.15
 MIN_HEIGHT_M = {  # least height of places above the table
     "robot_start": 0.05,
     "handover": 0.05,
@@ -79,16 +72,10 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     solder: Point = (0.88, 0.22, 0.015)
     left_start: Point = (0.98, -0.32, 0.06)
     right_start: Point = (0.98, 0.32, 0.06)
-    phases_s: tuple[Duration, Duration, Duration] = (
-        3.0,
-        3.5,
-        3.0,
-    )  # handover; fetch the glass; work over the board
-    dwells_s: tuple[Duration, Duration, Duration] = (
-        0.4,
-        0.4,
-        0.3,
-    )  # the hands rest after each phase
+    # handover; fetch the glass; work over the board
+    phases_s: tuple[Duration, Duration, Duration] = (3.0, 3.5, 3.0)
+    # the hands rest after each phase
+    dwells_s: tuple[Duration, Duration, Duration] = (0.4, 0.4, 0.3)
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
 
     def __post_init__(self) -> None:
@@ -233,9 +220,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the request that teaches a scene's via-points; exit code 0, 1 on failure, 2 on bad
     usage.
     """
-    from thirdhand.cli.usage import (
-        option,
-    )  # its import is slow, and most users of this module do not need it
+    # its import is slow, and most users of this module do not need it
+    from thirdhand.cli.usage import option
 
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.scene",

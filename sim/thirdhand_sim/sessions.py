@@ -69,9 +69,8 @@ class Session:
     places: Places  # true places
     told: Places  # perceived places
     legs: tuple[tuple[Leg, ...], tuple[Leg, ...]]
-    windows: tuple[
-        tuple[float, float], ...
-    ]  # [s] times in which the tool must be at each of SESSION_EVENTS
+    # [s] times in which the tool must be at each of SESSION_EVENTS
+    windows: tuple[tuple[float, float], ...]
     lasts_s: float
     seed: tuple[int, ...]
     swapped_s: tuple[float, float] = (np.inf, np.inf)

@@ -16,9 +16,8 @@ from thirdhand_sim.scene import ARRIVED_M, HAND_ORIENTATION, Point, Scene
 from thirdhand_sim.script import Array, HandMotions, PointMotion, TaskProgress
 from thirdhand_sim.world import LEVEL
 
-OBSERVED_S = (
-    0.8  # an event is observed for this time after it was reached, as it is in the scripted scene
-)
+# an event is observed for this time after it was reached, as it is in the scripted scene
+OBSERVED_S = 0.8
 PLACE_OPACITY = 0.3
 HAND_COLOURS = dict(zip(SIDES, (palette.LEFT, palette.RIGHT), strict=True))
 AT_REST = np.zeros(3)
@@ -65,9 +64,8 @@ class TrackedHands:
         self._timeout_s = timeout_s
         self._places = hand_places(scene)
         self._newest: dict[str, Point] = {}  # [m] frame `base`
-        self.foreign = (
-            ""  # a frame that the settings do not know, in which hands arrived; they are ignored
-        )
+        # a frame that the settings do not know, in which hands arrived; they are ignored
+        self.foreign = ""
         self.begin()
 
     def receive(self, side: str, pose: PoseStamped) -> None:

@@ -44,9 +44,8 @@ class Pose(NamedTuple):
 
 
 AT_ITS_FRAME = Pose((0.0, 0.0, 0.0), LEVEL)
-BOARD_IN_TOOL = Pose(
-    (0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
-)  # held by its edge
+# held by its edge
+BOARD_IN_TOOL = Pose((0.0, 0.0, 0.05), (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))
 
 
 class Look(NamedTuple):

@@ -51,9 +51,8 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
     assert 'urdf = "my.urdf"  # beside this file' in (folder / "cell.toml").read_text()
     with Image.open(folder / "cell.png") as picture:
         assert min(picture.size) > 500
-        assert (
-            len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20
-        )  # something is drawn
+        # something is drawn
+        assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20
 
 
 def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:

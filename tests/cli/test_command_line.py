@@ -166,9 +166,8 @@ def folder(
 ) -> Path:
     """The working folder, with files that cannot be used; commands soon give up to connect."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv(
-        "MPLCONFIGDIR", str(tmp_path_factory.getbasetemp())
-    )  # else Matplotlib keeps its own folder
+    # else Matplotlib keeps its own folder
+    monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp()))
     for command in ("record", "calibrate"):
         monkeypatch.setattr(f"thirdhand.workbench.cli.{command}.CONNECT_TIMEOUT_S", 0.2)
     working = tmp_path / "working"

@@ -416,9 +416,8 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
         "sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False),
         "hand_age_ms": HEALTHY.hand_age_ms,
     }
-    assert (
-        "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]
-    )  # it may be anywhere
+    # it may be anywhere
+    assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
     assert (

@@ -57,9 +57,8 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
     is_recording = takes in ("recording", "played", "replayed")
     path = tmp_path / f"given{suffix.get(takes, '.mcap' if is_recording else '')}"
     WRONG[wrong](path)
-    run = (
-        thirdhand if takes in ("skill", "arm of the bench", "scene") else told
-    )  # the others leave no process behind
+    # the others leave no process behind
+    run = thirdhand if takes in ("skill", "arm of the bench", "scene") else told
     done = run(*TAKES[takes], str(path))
     assert done.returncode in (1, 2), done.stdout
     assert not INTERNAL.search(done.stderr), done.stderr

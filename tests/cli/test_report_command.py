@@ -62,12 +62,8 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
     assert [url for url in fetched if not url.startswith("#")] == []
     assert "far_from_demonstrations" in text
-    for colour in (
-        palette.LEFT,
-        palette.RIGHT,
-        palette.TOOL,
-        *palette.BY_MODE.values(),
-    ):  # as in the viewer
+    # as in the viewer
+    for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.BY_MODE.values()):
         assert palette.written(colour) in text
 
     assert {path.name for path in folder.iterdir()} == {"golden", "golden-2", "comparison.csv"}

@@ -202,9 +202,8 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
             pytest.skip(f"other users cannot read {folder}")
     lines(tmp_path, code=0)  # all imports and files of this check have been read
     for folder in tmp_path.parents:
-        if (
-            folder.stat().st_mode & 0o005 != 0o005
-        ):  # the folders of this run, which only its user can read
+        # the folders of this run, which only its user can read
+        if folder.stat().st_mode & 0o005 != 0o005:
             folder.chmod(0o755)
     tmp_path.chmod(0o555)
     try:

@@ -94,12 +94,8 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     )
     for origin in ("null", "http://[", f"http://{page.host}.example"):
         assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin=origin)[0] == 403
-    for host in (
-        "elsewhere.example",
-        '"@127.0.0.1',
-        "[",
-        "",
-    ):  # the first is a name that was made to point here
+    # the first is a name that was made to point here
+    for host in ("elsewhere.example", '"@127.0.0.1', "[", ""):
         assert page.ask("GET", "/", Host=host)[0] == 403
     for method, path in (
         ("POST", "/shutdown"),

@@ -57,9 +57,8 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(
                     and watch.taken + watch.lost == COUNT + len(sent)
                 ):
                     return True
-                streams.publish(
-                    "joints/command", b""
-                )  # what was lost before it is counted when it arrives
+                # what was lost before it is counted when it arrives
+                streams.publish("joints/command", b"")
                 sent.append(1)
                 return False
 

@@ -65,10 +65,8 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Condition.ARM_UNSETTLED, f"for {TUNING.intake.max_late_s:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
-    assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (
-        0.25,
-        3,
-    )  # in words: a quarter, three
+    # in words: a quarter, three
+    assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (0.25, 3)
 
 
 @pytest.mark.parametrize("busy", ["", "the loop was up to 45 ms late"])

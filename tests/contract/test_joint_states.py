@@ -73,9 +73,8 @@ def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(sp
     for k in range(500):
         at_s = k / 1000
         for number in dice.sample(range(len(parts)), len(parts)):
-            if (
-                k % (1 + 9 * (number == 0)) == 0
-            ):  # the first publishes at 100 Hz, the others at 1000 Hz
+            # the first publishes at 100 Hz, the others at 1000 Hz
+            if k % (1 + 9 * (number == 0)) == 0:
                 state = states.take(part(parts[number], k + 1, value=at_s), at_s)
                 samples += [] if state is None else [(at_s, state)]
     assert len(samples) >= 49
@@ -85,9 +84,8 @@ def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(sp
         assert state.velocity == (0.0, 0.0, 0.0)
     stamps = [state.stamp_ns for _, state in samples]
     assert stamps == sorted(stamps)
-    assert (
-        len(set(stamps)) == len(stamps) or split == "ab bc ca"
-    )  # two publishers of a joint may repeat a stamp
+    # two publishers of a joint may repeat a stamp
+    assert len(set(stamps)) == len(stamps) or split == "ab bc ca"
 
 
 def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> None:

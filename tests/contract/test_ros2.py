@@ -71,9 +71,8 @@ def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -
         *LATCHED,
         *FRAMES,
     }
-    once = [
-        *{(topic.name, topic.heard): topic for topic in topics}.values()
-    ]  # three frames are heard on two topics
+    # three frames are heard on two topics
+    once = [*{(topic.name, topic.heard): topic for topic in topics}.values()]
     assert [(topic.frame, topic.channel) for topic in topics if topic.frame] == [
         ("left_wrist", "hands/left"),
         ("right", "hands/right"),

@@ -36,15 +36,8 @@ DH = (
 )
 START = np.array([0.45, -0.05, 0.35])  # [m]
 AHEAD_AND_DOWN = np.array([1.0, 0.0, -1.0]) / math.sqrt(2.0)
-POSTURE = (
-    0.1761,
-    0.8604,
-    -0.5,
-    2.5414,
-    -0.4273,
-    -1.0823,
-    0.0,
-)  # [rad] at START, pointing ahead and down
+# [rad] at START, pointing ahead and down
+POSTURE = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)
 CELL = Settings(arm=ArmSettings(posture=POSTURE))
 LOWER, UPPER, FASTEST = (
     np.array(getattr(CELL.joints, name)) for name in ("lower", "upper", "velocity")

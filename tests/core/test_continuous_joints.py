@@ -95,9 +95,8 @@ def test_any_turn_is_followed_alike(
     np.testing.assert_allclose(sent[0], counts(start), atol=1e-3)
     assert_limits_hold(frames, cell)
     in_turn = sent - TURN * np.rint((sent - reference) / TURN)
-    np.testing.assert_allclose(
-        in_turn, reference, atol=1e-3
-    )  # rounding differs by the turn, and grows
+    # rounding differs by the turn, and grows
+    np.testing.assert_allclose(in_turn, reference, atol=1e-3)
     assert np.ptp(np.rint((sent - reference) / TURN), axis=0).max() == 0.0
     assert not frames["rejected"][-1].any()
 
@@ -117,9 +116,8 @@ def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_
 
 def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
     """A silence of the longest accepted duration changes no turn."""
-    loop = session(
-        cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05
-    )  # beyond the seam
+    # beyond the seam
+    loop = session(cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05)
     loop.joints[0] = math.pi + 0.01
     for k in range(1500):
         loop.step(is_heard=k <= 300 or k % 50 == 0)

@@ -46,9 +46,8 @@ def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, firs
     led = lead(loop, 800)
     assert (led["reason"] == Reason.GUIDED).all()
     assert not led["commanded"][200:].any()  # after the stop of an arm that followed
-    np.testing.assert_allclose(
-        led["joints"][-1], loop.joints, atol=1e-2
-    )  # what is drawn is the led arm
+    # what is drawn is the led arm
+    np.testing.assert_allclose(led["joints"][-1], loop.joints, atol=1e-2)
     ended = loop.run(300, {0: guided(False)})
     assert (ended["reason"][100:] == Reason.OPERATOR).all()
     assert (np.abs(ended["joints"][100:] - loop.joints) < 1e-9).all()
@@ -82,9 +81,8 @@ def test_hold_knows_hands_that_were_seen(taught: Skill) -> None:
     assert loop.controller.state["held"] == HELD_UNSEEN
     loop.hands = lambda k: np.array((LEFT, RIGHT))
     loop.run(100)
-    assert (
-        loop.controller.state["held"] == HELD_UNSEEN
-    )  # hands that come later are not those of this hold
+    # hands that come later are not those of this hold
+    assert loop.controller.state["held"] == HELD_UNSEEN
     loop.run(100, {0: order("resume"), 50: order("hold")})
     assert loop.controller.state["held"] == HELD_SEEN
 

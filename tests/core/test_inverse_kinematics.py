@@ -81,9 +81,8 @@ def test_setpoint_waits_for_a_late_tool() -> None:
     setpoint[0, 0] = GAP_FREE_M + GAP_SLOW_M
     setpoint[1, 0] = 0.2
     assert slow_down(setpoint, tool, 1.0, limits) == pytest.approx(0.5)
-    assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(
-        0.1
-    )  # of 0.8 m/s, where 0.08 are allowed
+    # of 0.8 m/s, where 0.08 are allowed
+    assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(0.1)
     setpoint[1, 0] = -0.2  # it comes back
     assert slow_down(setpoint, tool, 1.0, limits) == 1.0
 

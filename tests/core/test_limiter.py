@@ -25,9 +25,8 @@ LOWER = np.array(LIMITS.lower)
 UPPER = np.array(LIMITS.upper)
 REST = np.zeros(7)
 START = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])  # amid the limits
-HOME = np.array(
-    [0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0]
-)  # as published: joints 2 and 4 outside their limits
+# as published: joints 2 and 4 outside their limits
+HOME = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])
 Vector = npt.NDArray[np.float64]
 
 

@@ -95,9 +95,8 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
         if k == 2 * rate_hz + 2:
             assert np.linalg.norm(estimate_m - place) < 0.005  # it would run off otherwise
             assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 1]) < 0.1
-            assert (
-                hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05
-            )  # separation counts with both places
+            # separation counts with both places
+            assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
     assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
 

@@ -42,9 +42,8 @@ def test_every_round_is_as_the_first(taught: Skill) -> None:
         if number:
             hands.append(way(hands[-1][-1], whole[0], period_s))
         rests = round(rest_s / period_s)
-        rests += (
-            -(sum(map(len, hands)) + rests) % 5
-        )  # the tracker samples each round at the same moments
+        # the tracker samples each round at the same moments
+        rests += -(sum(map(len, hands)) + rests) % 5
         hands.append(np.repeat(whole[:1], rests, axis=0))
         begins.append(sum(map(len, hands)))
         hands.append(whole[: len(whole) // 2] if number == HALF else whole)

@@ -296,9 +296,8 @@ def test_table_and_box_are_not_touched(taught: Skill, arm: str) -> None:
         distances_m = np.array(
             [_apart_from(corners, placed(q, body), body) for q in frames["joints"][::5]]
         )
-        least = np.minimum(
-            distances_m[0], settings.obstacles.clearance
-        )  # one that starts nearer goes away
+        # one that starts nearer goes away
+        least = np.minimum(distances_m[0], settings.obstacles.clearance)
         assert (distances_m > least - 0.001).all(), distances_m.min(axis=0)
 
 
@@ -400,9 +399,8 @@ def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
         )
         assert tool.sum() == 1
         assert all(limit >= 0 for limit in limits)
-        state["hands"][0, 0] = (
-            pose.position
-        )  # the hand is at the tool: only where it receives it may be touched
+        # the hand is at the tool: only where it receives it may be touched
+        state["hands"][0, 0] = pose.position
         if gentle:
             place, *others = taught.via_points
             separation.set_contacts(

@@ -44,9 +44,8 @@ def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings
     assert (
         np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
     )
-    trapezia = (
-        0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])
-    )  # of constant jerk: wrong by jerk period³ / 12
+    # of constant jerk: wrong by jerk period³ / 12
+    trapezia = 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])
     np.testing.assert_allclose(
         np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.jerk * PERIOD_S**3 / 12
     )

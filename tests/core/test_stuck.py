@@ -135,9 +135,8 @@ def test_stuck_tool_is_reported_and_led_out(
     flagged = int(np.flatnonzero(frames["flags"] & Flag.STUCK)[0])
     off_m = np.linalg.norm(frames["tool"] - frames["target"], axis=1)
     before = flagged - round(1.0 / cell.period_s)
-    assert (
-        off_m[before] - off_m[flagged] < 0.1 * off_m[before]
-    )  # within a second of no real progress
+    # within a second of no real progress
+    assert off_m[before] - off_m[flagged] < 0.1 * off_m[before]
     assert ran.there_s is not None
     assert 2 <= len(ran.ways[0]) <= WAY
     assert (frames["mode"][frames["reason"] == Reason.BLOCKED] == Mode.HOLD).all()

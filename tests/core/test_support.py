@@ -147,9 +147,8 @@ def test_possible_other_segment_is_unsure() -> None:
     model = segmented()
     begin = model.hands[0].reshape(2, 3)
     places = model.nominal.at.copy()
-    places[2, :6] = model.hands[
-        0
-    ]  # the hands return to where they began, and the tool is elsewhere then
+    # the hands return to where they began, and the tool is elsewhere then
+    places[2, :6] = model.hands[0]
     places[2, 6:] = places[0, 6:] + (0.0, 0.3, 0.0)
     task = model.task._replace(corners=np.tile(np.arange(len(places))[:, None], 2))
     variant = replace(model, task=task, nominal=model.nominal._replace(at=places))

@@ -61,42 +61,21 @@ def along(
         (RUNS, [("move", 20.0, AWAY)], 5.1),  # it ends with the longest demonstration
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # it returns by itself
-        (
-            RUNS,
-            [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)],
-            2.1,
-        ),  # a hesitation
-        (
-            RUNS,
-            [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)],
-            5.1,
-        ),  # not where demonstrations begin
-        (
-            RUNS,
-            [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)],
-            0.0,
-        ),  # where this person began
+        # a hesitation
+        (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),
+        # not where demonstrations begin
+        (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),
+        # where this person began
+        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)], 0.0),
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, AWAY + 0.2)], 1.4),
-        (
-            RUNS,
-            [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)],
-            1.4,
-        ),  # a pause before leaving
-        (
-            RUNS,
-            [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)],
-            2.4,
-        ),  # first seen in motion
-        (
-            RUNS,
-            [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)],
-            0.9,
-        ),  # the task was over
-        (
-            RUNS,
-            [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)],
-            5.1,
-        ),  # too short a rest
+        # a pause before leaving
+        (RUNS, [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)], 1.4),
+        # first seen in motion
+        (RUNS, [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)], 2.4),
+        # the task was over
+        (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),
+        # too short a rest
+        (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),
     ],
 )
 def test_clock_counts_from_first_motion(

@@ -124,9 +124,8 @@ def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None
     before = deadlines.stamp_ns
     deadlines.wait()
     assert deadlines.stamp_ns - before == 98 * PERIOD_NS
-    assert (
-        deadlines.stamp_ns == WALL_NS + clock.now - 300_000
-    )  # the deadline's time, not that of waking
+    # the deadline's time, not that of waking
+    assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000
 
 
 def test_stamps_follow_a_system_clock_that_is_set_ahead_at_once() -> None:
@@ -187,9 +186,8 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
     reports = []
     for k in range(100):
         clock.now += 100_000_000
-        clock.set_by_ns += (
-            round(set_by_s * 1e9) * (k == 50) + 50_000
-        )  # slewed by 500 parts in a million
+        # slewed by 500 parts in a million
+        clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000
         reports.append(system.set_by())
     assert [(k, text) for k, text in enumerate(reports) if text] == [(50, words)]
 

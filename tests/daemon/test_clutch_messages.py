@@ -103,7 +103,6 @@ def test_the_arm_holds_in_the_tick_in_which_a_release_arrives_and_after_a_silenc
             until = step.tick + 150
         is_pressed = newest and step.tick < until
         expected = {Reason.NONE, Reason.NO_HANDS} if is_pressed else {Reason.CLUTCH}
-        assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, (
-            step.tick
-        )  # by the operator at the end
+        # by the operator at the end
+        assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, step.tick
         assert (step.frame["mode"] == Mode.FOLLOW) <= is_pressed, step.tick

@@ -111,10 +111,8 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
         "correction-1",
         ("start", "handover"),
     )
-    assert held.kinds()[-2:] == [
-        "skill",
-        "segment",
-    ]  # the segment of the hold, whatever the hand did that led
+    # the segment of the hold, whatever the hand did that led
+    assert held.kinds()[-2:] == ["skill", "segment"]
     first_places = held.client.places()
     held.state["measured"][0] += 0.1
     second = held.client.correct()

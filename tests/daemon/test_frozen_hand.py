@@ -39,10 +39,8 @@ def test_each_loss_of_a_tracked_hand_is_noticed_after_half_a_second(
     rate_hz: float, unit_m: float
 ) -> None:
     lost = round(2.0 * rate_hz)
-    for default in (
-        None,
-        (0.25, -0.25, 0.1),
-    ):  # the last pose again and again, or one of the tracker's own
+    # the last pose again and again, or one of the tracker's own
+    for default in (None, (0.25, -0.25, 0.1)):
         tracked = measured(3.0, rate_hz)
         pieces = [tracked, np.tile(tracked[-1] if default is None else default, (lost, 1))]
         pieces += [measured(3.0, rate_hz, (0.8, -0.1, 0.2), 1)]
@@ -71,9 +69,8 @@ def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
         )
     assert not len(refused(np.tile(LEFT, (1000, 1)), rate_hz))
     share = np.linspace(0.0, 1.0, round(3 * rate_hz))
-    along = 0.4 * (
-        10 * share**3 - 15 * share**4 + 6 * share**5
-    )  # with the least jerk, and no rest before
+    # with the least jerk, and no rest before
+    along = 0.4 * (10 * share**3 - 15 * share**4 + 6 * share**5)
     stop = np.concatenate([along[1:], np.full(round(2 * rate_hz), along[-1])])
     assert not len(refused(np.outer(stop, (1.0, 0.5, 0.0)), rate_hz))
 

@@ -99,8 +99,7 @@ def test_controllers_follow_and_are_left_at_rest(
     time.sleep(0.2)
     np.testing.assert_allclose(positions[-1].data, ways[-1].points[0].positions)
     steps = np.abs(np.diff([message.data for message in positions[-40:]], axis=0))
-    assert (
-        steps.max() < 3 * 1.6 / RATE_HZ
-    )  # without a jump; a busy machine loses one message or two
+    # without a jump; a busy machine loses one message or two
+    assert steps.max() < 3 * 1.6 / RATE_HZ
     for node in (*heard, states):
         node.close()

@@ -165,9 +165,8 @@ def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_t
             assert added.tolerance == 0.03
             assert stat.S_IMODE(aside.stat().st_mode) == 0o600
         caplog.clear()
-    assert (
-        len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3
-    )  # none replaced another
+    # none replaced another
+    assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3
     assert saved.read(skill) == (POINTS, 0.03)
 
 

@@ -96,9 +96,8 @@ def test_a_killed_process_is_replaced_at_the_next_request(
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     os.kill(started, signal.SIGKILL)
-    os.waitid(
-        os.P_PID, started, os.WEXITED | os.WNOWAIT
-    )  # until it is dead; the skill worker finds that out itself
+    # until it is dead; the skill worker finds that out itself
+    os.waitid(os.P_PID, started, os.WEXITED | os.WNOWAIT)
     assert_same_bits(skill_worker.load(SOLDERING), skill)
     assert process_of(skill_worker) != started
     assert not is_there(started)

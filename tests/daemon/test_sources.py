@@ -240,9 +240,8 @@ def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(
     for clock in (held, stepped):
         for _ in range(50):
             clock.tell(clock.now_ns + apart_s * S - 5_000_000)
-    for k in range(
-        300
-    ):  # a network that delivers nothing for 3 s, then one old sample, then the newest
+    # a network that delivers nothing for 3 s, then one old sample, then the newest
+    for k in range(300):
         held.cell.tell()
         held.now_ns += 2_000_000 if k else 2 * S
     held.tell(held.now_ns + apart_s * S - 2 * S)

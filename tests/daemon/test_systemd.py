@@ -166,9 +166,8 @@ def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
         "thirdhand.cli.serve.serve",
     ]
     assert options["ExecStart"].hold
-    assert "RestartPreventExitStatus" not in UNIT.read_text(
-        encoding="utf-8"
-    )  # it does not see the check's exit code
+    # it does not see the check's exit code
+    assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")
     assert {str(parsed.config) for parsed in options.values()} == {"/etc/thirdhand/%i.toml"}
 
 
@@ -181,10 +180,8 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     program.chmod(0o755)
     unit = tmp_path / UNIT.name
     text = UNIT.read_text(encoding="utf-8").replace(commands()["ExecStart"][0], str(program))
-    for spoilt in (
-        "",
-        "WatchdogSec=soon\n",
-    ):  # the second one is refused, so the tool reads the file
+    # the second one is refused, so the tool reads the file
+    for spoilt in ("", "WatchdogSec=soon\n"):
         unit.write_text(text.replace("[Install]", f"{spoilt}[Install]"))
         done = subprocess.run(
             ["systemd-analyze", "verify", str(tmp_path / "thirdhand@bench.service")],

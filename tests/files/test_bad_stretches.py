@@ -22,10 +22,11 @@ SEEDS = 3
 # a shorter stretch is bridged: positions may be off by this much then
 BRIDGED_S = 0.5
 OFF_M = 0.02
+# [s] clean samples that may be lost with the bad ones
 SLOW_TO_SETTLE = {
     spoiled.two_sources: 2.2,
     spoiled.swap: 2.2,
-}  # [s] clean samples that may be lost with the bad ones
+}
 LOST_S = 0.5
 
 

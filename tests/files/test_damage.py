@@ -87,11 +87,8 @@ def test_what_follows_a_damaged_chunk_is_read(
     assert all(encode(step.frame) == frames[step.tick] for step in steps if step.frame is not None)
     missing = sorted(set(range(COUNT)) - set(read_ticks))
     assert missing == (list(range(missing[0], missing[-1] + 1)) if missing else [])
-    assert missing or at in (
-        1,
-        17,
-        28,
-    )  # what is wrong there, only the checksum over all data knows
+    # what is wrong there, only the checksum over all data knows
+    assert missing or at in (1, 17, 28)
     assert len(missing) <= 60
     if missing and missing[-1] < COUNT - 1:
         (behind,) = (step for step in steps if step.damage)

@@ -49,9 +49,8 @@ def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
 
 
 def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstration) -> None:
-    middle = int(
-        np.argmax(np.abs(np.gradient(taken.tool[:, 1])))
-    )  # on the way to the glass, as fast as it goes
+    # on the way to the glass, as fast as it goes
+    middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))
     period_ns = round(1e9 * taken.period_s)
     lasts = round(0.8 / taken.period_s)
     rows = np.concatenate(

@@ -17,9 +17,8 @@ from kmp.solution import mean_of
 from support.primitives import KERNELS, curve
 
 POSITIONS = AffineMean([[0.5, -1.0, 2.0], [1.5, 0.25, -0.75]], [0.3, -0.2])
-OVER_TIME = AffineMean(
-    [[0.5], [-1.5], [0.0], [0.0]], [0.3, -0.2, 0.5, -1.5]
-)  # the rates' offset is the values' slope
+# the rates' offset is the values' slope
+OVER_TIME = AffineMean([[0.5], [-1.5], [0.0], [0.0]], [0.3, -0.2, 0.5, -1.5])
 
 
 def at(prior, points):
@@ -74,10 +73,8 @@ def test_equals_learning_the_remainder(kernel, representation, how):
     for s in queries:
         v, a = np.random.default_rng(2).normal(size=(2, len(s)))
         for motion, left in (
-            (
-                primitive.predict_motion(s, v, a),
-                remainder.predict_motion(s, v, a),
-            ),  # compiled, where Numba is
+            # compiled, where Numba is
+            (primitive.predict_motion(s, v, a), remainder.predict_motion(s, v, a)),
             (
                 primitive.inner.query.motion(s, v, a, covariance=True),
                 remainder.inner.query.motion(s, v, a, covariance=True),

@@ -120,9 +120,8 @@ def test_exponentials_are_exact_to_one_unit():
     assert result[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
-LISTENS = (
-    r"from numba.core import (dispatcher, )?event"  # to compilations, of which a start reports
-)
+# to compilations, of which a start reports
+LISTENS = r"from numba.core import (dispatcher, )?event"
 
 
 def test_nothing_is_compiled_otherwise():

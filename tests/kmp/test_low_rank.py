@@ -236,17 +236,15 @@ def test_the_error_bound_holds(seed, left, adapted):
     assert dense.error_bound == dense.error_bound_at_points == 0
 
 
-@pytest.mark.filterwarnings(
-    "ignore::kmp.ViaPointMissed"
-)  # the rate wanted is another than the neighbours'
+# the rate wanted is another than the neighbours'
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 @pytest.mark.parametrize("ell", [2.0, 8.0, 200.0])
 @pytest.mark.parametrize("count", [12, 60])
 def test_derivatives_are_features_too(count, ell):
     """Derivatives of values and rates are features too."""
     t = np.linspace(0, 2, count)[:, None]
-    along = np.where(np.arange(count) % 3 == 0, 1.0, 0.0)[
-        :, None
-    ]  # of value and rate: rate and acceleration
+    # of value and rate: rate and acceleration
+    along = np.where(np.arange(count) % 3 == 0, 1.0, 0.0)[:, None]
     values = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t)])
     mean = np.where(along > 0, values[:, 1:], values[:, :2])
     reference = Gaussians(mean, np.tile(np.diag([1e-4, 1e-2]), (count, 1, 1)))

@@ -95,9 +95,8 @@ def test_outputs_solved_as_one_change(first):
     options = {"kernel": GaussianKernel(0.05), "lambda_mean": 1.0, "representation": "dense"}
     base = KMP.fit(S, REFERENCE if first == "alike" else mixed, **options)
     points = Gaussians(np.ones((3, 2)), tilted if first == "alike" else alike)
-    where = (
-        S[:3] + 0.01 if first == "alike" else S[37:]
-    )  # in the place of those that tell them apart
+    # in the place of those that tell them apart
+    where = S[:3] + 0.01 if first == "alike" else S[37:]
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
     assert (base.inner.solution.distinct, adapted.inner.solution.distinct) == (
         (1, 2) if first == "alike" else (2, 1)

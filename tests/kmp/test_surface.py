@@ -11,9 +11,8 @@ import kmp
 from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
 from support.paths import ROOT
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::kmp.ViaPointMissed"
-)  # points of other deviations are near
+# points of other deviations are near
+pytestmark = pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 
 T = np.linspace(0, 2, 80)[:, None]
 VALUES = np.hstack([np.sin(3 * T), np.cos(2 * T)])

@@ -17,9 +17,8 @@ def test_tutorial_runs_as_it_stands():
     """The tutorial runs as it stands and shows what it says."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:
-        code = compile(
-            "\n" * line + block, str(PAGE), "exec"
-        )  # so that a failure names the page's line
+        # so that a failure names the page's line
+        code = compile("\n" * line + block, str(PAGE), "exec")
         exec(code, names)
 
 

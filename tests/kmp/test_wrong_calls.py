@@ -395,9 +395,8 @@ def calls():
     for function, right in RIGHT.items():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
-            must_fail = (
-                name in OF_KNOWN_COLUMNS and function is not CoordinateFrame
-            )  # which names its matrix
+            # which names its matrix
+            must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame
             for candidate in wrong:
                 if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(
                     candidate, float

@@ -65,9 +65,8 @@ def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]
     assert figures.orientation_error_deg < 5
     for row in (0, -1):
         take = shown[0]
-        assert (
-            angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15
-        )  # smoothed, not averaged: that would be 60
+        # smoothed, not averaged: that would be 60
+        assert angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15
     assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(
         np.radians(120)
     )

@@ -53,9 +53,8 @@ def test_unreachable_place_has_its_distance(arm: str, tmp_path: Path) -> None:
         outward /= np.linalg.norm(outward)
         away_m = random.uniform(0.3, 0.8)
         (distance_m,) = beyond_m(cell, (shoulder + (length + away_m) * outward)[None])
-        assert (
-            away_m - 0.1 < distance_m < away_m + 0.5
-        )  # an arm reaches less far in some directions
+        # an arm reaches less far in some directions
+        assert away_m - 0.1 < distance_m < away_m + 0.5
 
 
 def test_distance_from_reach_is_exact() -> None:

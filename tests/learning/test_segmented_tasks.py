@@ -152,9 +152,8 @@ def cyclic() -> Skill:
 def test_place_is_visited_twice(cyclic: Skill) -> None:
     """Once the hands left it, what was before tells which visit it is."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
-    assert (
-        rms_mm("cyclic", cyclic) < 50.0
-    )  # a Gaussian process with 2 s of memory: 51, one without: 101
+    # a Gaussian process with 2 s of memory: 51, one without: 101
+    assert rms_mm("cyclic", cyclic) < 50.0
     places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
     aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
     visit = places["left out"]
@@ -169,9 +168,8 @@ def test_delay_of_teacher_is_learned(cyclic: Skill) -> None:
     figures = figures_of(cyclic)
     late_s = figures.delay_s
     std_s = figures.delay_std_s
-    assert (
-        cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)
-    )  # the mean of 0.09 to 0.34 s
+    # the mean of 0.09 to 0.34 s
+    assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)
     assert 0.0 < std_s < 0.2
     assert f"the teacher was {late_s:.2f} s late" in table(figures)
 
@@ -237,9 +235,8 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
-    assert (
-        rms_mm("heading", carried) < 22.0
-    )  # without the orientation: 39; a Gaussian process told the places: 80
+    # without the orientation: 39; a Gaussian process told the places: 80
+    assert rms_mm("heading", carried) < 22.0
     restored = decoded(carried.file, origin="a file")
     assert (
         restored.model.own_arrays()["levers"].tobytes()

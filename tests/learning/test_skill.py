@@ -44,7 +44,6 @@ def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> N
         np.testing.assert_array_equal(value, np.round(value, 6))
     np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)
     assert np.linalg.eigvalsh(prediction.covariance).min() > 0
-    gate_m = learned.model.gates_m(taught[4].hands[300:301])[
-        0
-    ]  # of the primitive's covariance, not of held-out errors
+    # of the primitive's covariance, not of held-out errors
+    gate_m = learned.model.gates_m(taught[4].hands[300:301])[0]
     assert prediction.gate_m == pytest.approx(gate_m, rel=1e-4)

@@ -217,9 +217,8 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
     np.testing.assert_allclose(
         [time_s for time_s, _ in pictures], np.arange(len(pictures)) / fps, atol=1e-4
     )
-    began = (
-        3000 - 1 - round((first["length"] - 1) / fps * 500)
-    )  # the tick of the first row, up to half a row
+    # the tick of the first row, up to half a row
+    began = 3000 - 1 - round((first["length"] - 1) / fps * 500)
     expected = [(began + row / fps * 500) // 50 * 2.5 for row in rows["frame_index"]]
     assert np.abs(np.array([level for _, level in pictures]) - expected).max() < 5.0
     stats = json.loads((filmed / "meta" / "stats.json").read_text())[name]

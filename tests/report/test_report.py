@@ -172,10 +172,8 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand comes back by a jump
     for reason, (begin_s, end_s) in {
-        Reason.STALE_HAND: (
-            DROPOUT_S[0] + 0.45,
-            DROPOUT_S[1],
-        ),  # until then the tool does not depend on that hand
+        # until then the tool does not depend on that hand
+        Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: (AWAY_S[0], far_end_s),
     }.items():
@@ -426,9 +424,8 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_mm.largest > 400.0
     if far_ticks is None:
         assert report.lag_mm is None
-        report.spans = tuple(
-            span for span in report.spans if span.mode is Mode.FOLLOW
-        )  # else a stop is the worst
+        # else a stop is the worst
+        report.spans = tuple(span for span in report.spans if span.mode is Mode.FOLLOW)
         assert "did not reach the target" in verdict(report)
         return
     assert report.initial_mm.samples == far_ticks

@@ -101,9 +101,8 @@ def test_what_is_told_is_recorded(tmp_path: Path) -> None:
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in sent
     ]
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in sent]
-    assert [step.tick for step in steps if step.state is not None] == [
-        49
-    ]  # the next one is due 10 s later
+    # the next one is due 10 s later
+    assert [step.tick for step in steps if step.state is not None] == [49]
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
 
 
@@ -180,11 +179,8 @@ def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(
         assert writer.ready(60)
         status = writer.status()
         assert status["pid"] != killed
-        assert (status["alive"], status["restarts"], status["lost"]) == (
-            True,
-            1,
-            20,
-        )  # those not yet on disk
+        # those not yet on disk
+        assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)
         assert status["errors"] == ["the scribe ended with code -9"]
     recording = Recording.open(tmp_path / "a-2.mcap")
     steps = list(recording.steps())

@@ -97,11 +97,8 @@ def described(name: str, scale: str = "") -> str:
         ("../a%20b.stl", "a%20b.stl", ""),
         ("meshes/arm.stl", "linked/meshes/arm.stl", ""),  # the URDF is a link
         ("package://linked/arm.stl", "linked/arm.stl", ""),
-        (
-            "package://my_arm/meshes/arm.stl",
-            "meshes/arm.stl",
-            "",
-        ),  # the folder above the URDF is the package
+        # the folder above the URDF is the package
+        ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),
         ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
         ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
     ],
@@ -214,12 +211,8 @@ TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
         ("a.stl", stl(LEG), ' scale="1 -1 1"', LEG * (1, -1, 1)),
         ("a.stl", stl(LEG), ' scale="-1 2 0.5"', LEG * (-1, 2, 0.5)),
         ("a.dae", collada(1000 * LEG, "0.001"), "", LEG),
-        (
-            "a.dae",
-            collada(1000 * LEG, "0.001", QUARTER, "Y_UP"),
-            "",
-            TURNED,
-        ),  # as RViz and MoveIt have it
+        # as RViz and MoveIt have it
+        ("a.dae", collada(1000 * LEG, "0.001", QUARTER, "Y_UP"), "", TURNED),
         (
             "a.obj",
             "".join(f"v {x} {y} {z}\n" for x, y, z in LEG) + "f 1 2 3\nf 4 5 6\nf 6 7 8\n",

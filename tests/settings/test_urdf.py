@@ -52,9 +52,8 @@ def test_link_frames_are_where_another_implementation_has_them(
     data = model.createData()
     assert list(model.names)[1:] == names
     q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + around
-    turns = [
-        joint.nq == 2 for joint in list(model.joints)[1:]
-    ]  # these are given by cosine and sine
+    # these are given by cosine and sine
+    turns = [joint.nq == 2 for joint in list(model.joints)[1:]]
     pairs = zip(turns, q.tolist(), strict=True)
     pin.framesForwardKinematics(
         model, data, np.concatenate([[np.cos(x), np.sin(x)] if turn else [x] for turn, x in pairs])

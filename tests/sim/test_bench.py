@@ -75,9 +75,8 @@ def test_opening_fingers_let_go() -> None:
         assert closures[-1] == pytest.approx(0.0, abs=1e-9)
         assert closures[len(closures) // 2] == pytest.approx(0.5, abs=0.02)
         assert held[2] > 0.2
-        assert bench.world.pose(bench.world.board).position[2] == pytest.approx(
-            0.0
-        )  # no hand was there to take it
+        # no hand was there to take it
+        assert bench.world.pose(bench.world.board).position[2] == pytest.approx(0.0)
         assert not bench.events().handover.reached
 
 
@@ -127,9 +126,8 @@ def test_taught_path_does_the_task(bench: Bench) -> None:
         10.3,
     ]
     world = bench.world
-    assert (
-        np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.11
-    )  # it lies at the hand
+    # it lies at the hand
+    assert np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.11
     assert np.linalg.norm(np.subtract(world.pose(world.glass).position, SCENE.carry)) < 0.06
     assert np.linalg.norm(np.subtract(world.pose(world.iron).position, SCENE.right_final)) < 0.06
 
@@ -177,9 +175,8 @@ def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     speeds = []
     for tick in range(400):
-        joints = (
-            joints + (26 if tick == 100 else 1) * 0.002 * speed
-        )  # the bench had slept for 50 ms
+        # the bench had slept for 50 ms
+        joints = joints + (26 if tick == 100 else 1) * 0.002 * speed
         observation = bench.step(tuple(joints), tuple(speed))
         speeds.append(max(map(abs, observation.joint_velocities)))
     assert max(speeds) < 0.8 + 0.3
@@ -468,14 +465,8 @@ def test_first_answer_counts_for_latency() -> None:
     commands = Commands(JOINT_NAMES)
     payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
     now = time.time_ns()
-    for stamp in (
-        now - 10**10,
-        now,
-        now,
-        now + 1,
-        now,
-        now + 1,
-    ):  # the first is older than the counting
+    # the first is older than the counting
+    for stamp in (now - 10**10, now, now, now + 1, now, now + 1):
         commands.receive(_Sample(payload, cdr.encode_attachment(messages.Attachment(1, 0, stamp))))  # type: ignore[arg-type]
     assert commands.count == 6
     assert len(commands.latencies_ms) == 2

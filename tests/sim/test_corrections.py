@@ -22,9 +22,8 @@ from thirdhand.settings.config import Settings
 
 RATE_HZ = 100  # a tick of 10 ms leaves a busy machine room for a simulated arm beside the daemon
 HALFWAY = (0.80, -0.31, 0.19)  # of the left hand, on its way to the handover
-LED = np.array(
-    [0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0]
-)  # [rad] more than an arm may be off its command
+# [rad] more than an arm may be off its command
+LED = np.array([0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0])
 NEAR_M = 0.004
 
 

@@ -81,9 +81,8 @@ def follows_better(found: dict[str, Any]) -> bool:
     for rival in (name for name in rivals if not name.startswith("ours")):
         for group in ("clean", "recorded"):
             assert ours[group]["jerk_ratio"] < 0.7 * rivals[rival][group]["jerk_ratio"], rival
-            assert rivals[rival][group]["error_rms_mm"] < 35, (
-                rival
-            )  # a rival that does not follow is none
+            # a rival that does not follow is none
+            assert rivals[rival][group]["error_rms_mm"] < 35, rival
             if rival != "no smoothing":  # it is as near, and shakes
                 assert ours[group]["error_rms_mm"] < rivals[rival][group]["error_rms_mm"], rival
     assert all(group["top_speed"] <= 0.8 + 1e-6 for group in ours.values())

@@ -47,9 +47,8 @@ def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
     assert 80 <= fault["hold_ms"] <= 120
     assert fault["rest_ms"] < 700
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
-    assert fault["travelled_mm"] == pytest.approx(
-        fault["commanded_mm"], abs=10
-    )  # the arm did as it was told
+    # the arm did as it was told
+    assert fault["travelled_mm"] == pytest.approx(fault["commanded_mm"], abs=10)
     assert fault["lost_ticks"] == 0
 
 

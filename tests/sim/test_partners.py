@@ -194,9 +194,8 @@ def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut])
     )
     assert alone["in_spite_of_refusal"] == {"takes": 0}
     assert pooled["in_spite_of_refusal"]["takes"] == len(asked)
-    assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(
-        alone["rms_mm"], rel=0.2
-    )  # the same takes elsewhere
+    # the same takes elsewhere
+    assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)
     nothing = numbers_of([refused])["methods"]["service, told"]
     assert nothing["takes"] == 0
     assert "rms_mm" not in nothing

@@ -112,9 +112,8 @@ class TestJudging:
         assert not any(event.reached for event in judgement.events)
         assert all(event.held for event in judgement.events)
         due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
-        assert judgement.falsely_held == pytest.approx(
-            1.0 - due
-        )  # stale and swapped hands are held for rightly
+        # stale and swapped hands are held for rightly
+        assert judgement.falsely_held == pytest.approx(1.0 - due)
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
         """By one that is not where the tracker says."""

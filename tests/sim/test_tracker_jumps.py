@@ -11,11 +11,12 @@ from thirdhand_sim.lab.people.tracker_jumps import repair
 from thirdhand_sim.lab.results import Array
 
 WAY = np.array([0.6, 0.64, 0.48])
+# rate, noise [m]
 TRACKERS = {
     "24 Hz": (24.0, 0.0002),
     "30 Hz": (30.0, 0.002),
     "120 Hz": (120.0, 0.0003),
-}  # rate, noise [m]
+}
 Position = Callable[[Array], Array]
 
 

@@ -27,15 +27,13 @@ STOP_RISE = 1.01
 STOP_RISE_MPS = 0.01
 SLOW_RISE_MPS = 0.1  # the same, beyond its speed at the start of the stop
 BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
-WAITING_M = (
-    0.12  # ... or this and the way of the setpoint's stop: from there on it waits for the tool
-)
+# ... or this and the way of the setpoint's stop: from there on it waits for the tool
+WAITING_M = 0.12
 OUTSIDE_M = 0.03  # the tool may leave the workspace so far
 SLIP_MPS = 0.01  # joints that start one after the other approach so fast
 RESTING_S = 0.6  # a hand that has been still for this time is at rest, also as it is estimated
-ESTIMATE_M = (
-    0.006  # error of a resting hand's estimate, beside 3 standard deviations of the tracker's noise
-)
+# error of a resting hand's estimate, beside 3 standard deviations of the tracker's noise
+ESTIMATE_M = 0.006
 # excess speed toward a hand at rest, and toward a hand as it is estimated
 RESTING_MPS = 0.03
 ESTIMATED_MPS = 0.02
@@ -60,9 +58,8 @@ AT_REST_NOISY_RADPS2 = 0.3
 KEPT_BACK_RADPS2 = 0.5
 THERE_M = 0.01
 NET_MOTION_M = 0.004
-STUCK_M = (
-    0.02  # a tool that is farther from its target is reported as stuck; a nearer one as kept away
-)
+# a tool that is farther from its target is reported as stuck; a nearer one as kept away
+STUCK_M = 0.02
 
 
 @dataclass(frozen=True)

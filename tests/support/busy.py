@@ -13,9 +13,8 @@ from _pytest.runner import runtestprotocol
 
 WAITING_SHARE = 0.5  # of the time in which a process could have run; see the module's text
 BUSY = "busy"
-SCHEDULED = Path(
-    "/proc/self/schedstat"
-)  # of the main thread [ns]: on a processor, and waiting for one
+# of the main thread [ns]: on a processor, and waiting for one
+SCHEDULED = Path("/proc/self/schedstat")
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:

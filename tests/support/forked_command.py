@@ -49,10 +49,10 @@ def run(channel: socket.socket) -> None:
     os.chdir(request["folder"])
     sys.argv = request["arguments"]
     sys.stdin = open(0, closefd=False, encoding="utf-8")  # noqa: SIM115
-    sys.stdout = open(1, "w", closefd=False, encoding="utf-8", buffering=1 if os.isatty(1) else -1)  # noqa: SIM115
-    sys.stderr = open(
-        2, "w", closefd=False, encoding="utf-8", errors="backslashreplace", buffering=1
-    )  # noqa: SIM115
+    buffering = 1 if os.isatty(1) else -1
+    sys.stdout = open(1, "w", closefd=False, encoding="utf-8", buffering=buffering)  # noqa: SIM115
+    errors = "backslashreplace"
+    sys.stderr = open(2, "w", closefd=False, encoding="utf-8", errors=errors, buffering=1)  # noqa: SIM115
     code = _exit_code(request["module"])
     with contextlib.suppress(BaseException):
         threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001  # as the interpreter's end does

@@ -99,9 +99,8 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
         boxes=np.tile(skill.workspace, (count, 1, 1)),
         receiving=np.zeros((count, 2), bool),
         hands=np.zeros((count, 2, 3)),
-        still_s=np.zeros(
-            (count, 2)
-        ),  # where the hands were is not recorded, only what was reported
+        # where the hands were is not recorded, only what was reported
+        still_s=np.zeros((count, 2)),
         noise_m=0.0,
         quiet_from=count,
         arm_follows=False,

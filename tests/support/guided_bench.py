@@ -68,9 +68,8 @@ class GuidedBench:
                         1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9)
                     )
                     observation = bench.step(tuple((self._joints + step).tolist()))
-                    drive = Led(
-                        bench, bridge.commands, bridge.gripper
-                    )  # it begins anew where the arm is let go
+                    # it begins anew where the arm is let go
+                    drive = Led(bench, bridge.commands, bridge.gripper)
                     bridge.commands.queued()
                 before = index
                 self._joints = np.array(observation.joints)

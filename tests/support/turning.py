@@ -11,9 +11,8 @@ from thirdhand.settings.config import Settings, load
 
 ARMS = ROOT / "service" / "thirdhand" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
-NEAR_SEAM = (
-    math.pi - 0.02
-)  # [rad] of the base's joint at the posture: the task takes it to both sides of pi
+# [rad] of the base's joint at the posture: the task takes it to both sides of pi
+NEAR_SEAM = math.pi - 0.02
 BASE = '<origin xyz="0 0 0.089159"/>'
 # What no command moves: a gripper with <mimic>, a wheel, things that float.
 BEYOND = "".join(

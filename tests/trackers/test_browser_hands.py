@@ -121,10 +121,11 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
         async with serving_page(page) as address, opened(page, address) as socket:
             await socket.send_bytes(PING.pack(PING_MAGIC, 12.5))
             while (answer := await socket.receive(10)).type != aiohttp.WSMsgType.BINARY:
+                # there is no daemon
                 assert json.loads(answer.data) == {
                     "status": {},
                     "objects": [],
-                }  # there is no daemon
+                }
             magic, sent, server_ms = struct.unpack("<I4xdd", answer.data)
             assert (magic, sent) == (PING_MAGIC, 12.5)
             assert abs(server_ms - time.time() * 1e3) < 5000

@@ -560,9 +560,8 @@ def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
     if path.is_file():
         assert path.read_text().replace("250", "200") == before
     assert not list(tmp_path.glob(".*"))
-    if (
-        path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222
-    ):  # said before the arm is led
+    # said before the arm is led
+    if path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222:
         done = told(
             "calibrate", "--held", "--config", str(path), "--from", str(tmp_path / "none.mcap")
         )

@@ -272,8 +272,7 @@ def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_
         tab.ask("document.getElementById('resume').click()")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
         tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")
-        status = daemon.until(
-            lambda now: now["reason"] == "stale_hand", TIMEOUT_S
-        )  # the move alone may be a reason
+        # the move alone may be a reason
+        status = daemon.until(lambda now: now["reason"] == "stale_hand", TIMEOUT_S)
         assert status["rejected"]["wrong_frame"] > 0
         assert tab.ask("document.getElementById('frame').textContent") == "webxr1, not calibrated"

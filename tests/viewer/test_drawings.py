@@ -101,9 +101,8 @@ def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
         texts = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
         assert len(texts) == is_drawn
         assert re.search(words, "".join(texts))
-        assert "WARN" not in "".join(
-            capfd.readouterr()
-        )  # of a library: once, in the log, is enough
+        # of a library: once, in the log, is enough
+        assert "WARN" not in "".join(capfd.readouterr())
 
 
 def test_without_vulkan_one_line_tells_what_a_picture_needs(

@@ -119,9 +119,8 @@ def test_memory_stays_within_a_bound_beside_viewers_that_stopped_and_later_ones_
             assert viewer.poll() is None
             assert time.monotonic() < until
             fed.feed(4.0)
-            with contextlib.suppress(
-                OSError, KeyError, RuntimeError
-            ):  # before it has anything, or within a message
+            # before it has anything, or within a message
+            with contextlib.suppress(OSError, KeyError, RuntimeError):
                 newest_tick = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
     fed.view.close()
     assert fed.view.problems == []

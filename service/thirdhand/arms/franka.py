@@ -24,9 +24,8 @@ CATCH_UP_RATIO = 1.1  # drive speed / commanded speed: the playback makes up for
 # [rad/s²] assumed deceleration toward a joint's end, below ACCELERATION to follow the falling limit
 BRAKE = 5.0
 LIMIT_LOOKAHEAD_S = 0.01  # the speed limit is evaluated at position + 0.01 s * velocity
-LIMIT_MARGIN_RADPS = (
-    0.03  # the speed remains below the robot's limit by this, for the jerk of a braking
-)
+# the speed remains below the robot's limit by this, for the jerk of a braking
+LIMIT_MARGIN_RADPS = 0.03
 # https://frankarobotics.github.io/docs, "Limits for Franka Research 3": the largest velocity is
 # min(MAX_VELOCITY, sqrt(TWICE * distance) - OFFSET) [rad/s], for the distance [rad] to a joint's
 # end.

@@ -21,21 +21,17 @@ from thirdhand.core.intake.arm_samples import in_turn
 from thirdhand.core.limiter.stage import Limited, Limiter
 from thirdhand.settings.config import RATES_HZ, JointSettings
 
-REJOIN_AFTER_S = (
-    0.1  # a new sequence begins after this silence, or at a tick number this far from the last
-)
+# a new sequence begins after this silence, or at a tick number this far from the last
+REJOIN_AFTER_S = 0.1
 # a new sequence must begin within this of the standing arm
 REJOIN_RAD = 0.05
 REJOIN_RADPS = 0.05
-TICK_RANGE_S = (
-    0.9 / RATES_HZ[1],
-    1.1 / RATES_HZ[0],
-)  # a difference of stamps per tick outside shows that a clock was set
+# a difference of stamps per tick outside shows that a clock was set
+TICK_RANGE_S = (0.9 / RATES_HZ[1], 1.1 / RATES_HZ[0])
 TICK_SAMPLES = 15  # the length of a tick is the mean over these samples
 TICK_OUTLIER = 0.1  # samples that differ from their median by a larger share are left out
-MAX_DELAY_S = (
-    BRAKE_AFTER_S  # with a longer delay the arm would brake before the newest command is played
-)
+# with a longer delay the arm would brake before the newest command is played
+MAX_DELAY_S = BRAKE_AFTER_S
 POSITION_GAIN_HZ = 8.0  # velocity += 8 / s * position error
 MAX_CORRECTION_RADPS = 0.25  # limit of that correction, for the error after a pause
 VELOCITY_GAIN = 30.0  # [1/s] max. gain: acceleration += gain * velocity error
@@ -109,12 +105,10 @@ class Playback:
         self._knots: deque[Knot] = deque()
         self._newest: Knot | None = None  # newest command of the present sequence
         self._newest_stamp_ns = 0
-        self._lengths_s: deque[float] = deque(
-            maxlen=TICK_SAMPLES
-        )  # lengths of ticks in the present sequence
-        self._now = self._heard = (
-            0.0  # [s] time by counting steps, and the time at which the newest command arrived
-        )
+        # lengths of ticks in the present sequence
+        self._lengths_s: deque[float] = deque(maxlen=TICK_SAMPLES)
+        # [s] time by counting steps, and the time at which the newest command arrived
+        self._now = self._heard = 0.0
         self._lateness_s = 0.0  # time of the drive's clock that is not made up yet
         self._offset = self._needed = 0.0
         knots = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
@@ -123,9 +117,8 @@ class Playback:
         self._knots.clear()
         self._moved()
         self._paused = False  # True if the loop paused before this step
-        self._offset = self._needed = (
-            0.0  # [s] present and needed delay from the motion's time to the time of writing
-        )
+        # [s] present and needed delay from the motion's time to the time of writing
+        self._offset = self._needed = 0.0
 
     @property
     def following(self) -> bool:
@@ -261,13 +254,11 @@ class Playback:
             self._lengths_s = lengths_s
             time_s = last.time_s + tick_s * _steps(last, position, velocity, ticks, tick_s)
         latest = self._now - time_s + MAX_DELAY_S
-        if (
-            self._knots
-        ):  # the segment to this command is known only now, but was needed at its begin
+        # the segment to this command is known only now, but was needed at its begin
+        if self._knots:
             begins_s = self._knots[-1].time_s
-            if (
-                time_s - begins_s < 2.5 * self.tick_s
-            ):  # a single lost command does not increase the delay
+            # a single lost command does not increase the delay
+            if time_s - begins_s < 2.5 * self.tick_s:
                 begins_s = time_s - self.tick_s
             needed = self._needed if self._paused else self._now - begins_s
             self._needed = min(max(self._needed, needed), latest)

@@ -13,9 +13,8 @@ from thirdhand.core.frame import Vector
 LAG_RANGE_S = (-0.02, 0.5)  # lags that are searched; commands arrive up to one period late
 LAG_STEPS_S = (0.004, 0.0002)  # coarse and fine step of the search
 LAG_TRAVEL_RAD = 0.03  # a joint shows the lag once it was commanded to travel this far
-LEAST_SPREAD_RAD = (
-    0.003  # standard deviation of the commands that are compared; below it they show no lag
-)
+# standard deviation of the commands that are compared; below it they show no lag
+LEAST_SPREAD_RAD = 0.003
 LAG_STD_S = 0.003  # largest standard deviation of a lag that is reported
 MAX_RESIDUAL_SHARE = 0.2  # largest error that remains / standard deviation of the commands
 MAX_COMMAND_GAP_S = 0.05  # states are not compared where commands paused for longer
@@ -98,9 +97,8 @@ def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -
         velocity = np.interp(delayed_times, command_times, np.gradient(commands, command_times))
         speeds += float(np.sum((velocity - velocity.mean()) ** 2))
         count += len(delayed_times)
-    if (
-        not speeds or spread < count * LEAST_SPREAD_RAD**2
-    ):  # the motion was outside of the compared times
+    # the motion was outside of the compared times
+    if not speeds or spread < count * LEAST_SPREAD_RAD**2:
         return Lag(lag_s, math.inf, math.inf, math.inf)
     error = math.sqrt(squares / count)
     return Lag(lag_s, error / math.sqrt(speeds), error, math.sqrt(squares / spread))

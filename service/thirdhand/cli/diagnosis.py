@@ -28,9 +28,8 @@ from thirdhand.contract.requests import Source, Status
 from thirdhand.contract.ros2 import NO_TYPE_HASH
 
 KEYS = {"left": "hands/left", "right": "hands/right", "arm": "joints/state"}
-LATE_MS = (
-    100.0  # a stamp older than this at its arrival shows that clocks differ, or a slow network
-)
+# a stamp older than this at its arrival shows that clocks differ, or a slow network
+LATE_MS = 100.0
 LEAST_RATE_SHARE = 0.9  # smallest accepted rate / least rate of the key
 REJECTED_SHARE = 0.05  # a larger share of rejected samples is no accident
 SCATTER_MM = 8.0  # a tracker that sees a hand well scatters less, on each axis
@@ -39,9 +38,8 @@ FREE_MB = 2000.0  # least free space
 DISK_LASTS_H = 1.0  # least time until the disk is full
 MISSED_SHARE = 0.01  # largest share of missed deadlines
 LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
-MAX_BELOW_TABLE_M = (
-    0.03  # a hand that is farther below the table top shows that the calibration is off
-)
+# a hand that is farther below the table top shows that the calibration is off
+MAX_BELOW_TABLE_M = 0.03
 OUTSIDE_M = 0.15  # a hand this far outside the demonstrated box is elsewhere
 COMMANDED_RAD = 0.03  # a joint is judged once it was commanded to travel this far
 LATE_ARM_MS = 30.0  # largest lag of an arm, with the delay of its driver's playback
@@ -325,9 +323,8 @@ def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
         source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz
     )
     for cause, rate in rates.items():
-        if rate and not (
-            name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")
-        ):  # found below
+        # found below
+        if rate and not (name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")):
             why = f": {source.refused}" if cause == source.cause and source.refused else ""
             level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
             advice = (

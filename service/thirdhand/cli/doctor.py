@@ -31,11 +31,8 @@ from thirdhand.process import bytecode
 
 PROBE_S = 1.0
 MAX_SERIES = 30_000  # samples of a joint: 60 s at 500 Hz
-PUBLISHED = (
-    "**/hands/*",
-    "**/joints/state",
-    f"**/{NO_TYPE_HASH}",
-)  # in any cell, because a name may be wrong
+# in any cell, because a name may be wrong
+PUBLISHED = ("**/hands/*", "**/joints/state", f"**/{NO_TYPE_HASH}")
 
 Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad] of a joint
 
@@ -144,9 +141,8 @@ class Travel:
 
     def lag_ms(self) -> float | None:
         """The measured lag of the arm behind its commands; None if it followed no motion."""
-        from thirdhand.cli.arm_lag import (
-            lag,
-        )  # numpy is slow to import, and most findings need none
+        # numpy is slow to import, and most findings need none
+        from thirdhand.cli.arm_lag import lag
 
         commanded, measured = (
             {name: list(series) for name, series in joints.copy().items()}

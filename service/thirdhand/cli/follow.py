@@ -30,10 +30,8 @@ def follow(args: argparse.Namespace) -> int:
     reach = reaching(args, settings)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
-        from thirdhand.arms.drive import (
-            Drive,
-            DriveError,
-        )  # slow imports: a missing daemon is reported before
+        # slow imports: a missing daemon is reported before
+        from thirdhand.arms.drive import Drive, DriveError
         from thirdhand.arms.drive import follow as driven
         from thirdhand.arms.franka import FrankaArm
         from thirdhand.arms.simulated import SimulatedArm

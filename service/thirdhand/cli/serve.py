@@ -76,9 +76,8 @@ def _run(args: argparse.Namespace) -> int:
     with starting(settings) as start:
         gc.disable()  # a start leaves no garbage, and collections would take a tenth of its time
         with ahead_of_others():
-            from thirdhand.daemon import (
-                daemon,
-            )  # a slow import, during which `start` answers requests
+            # a slow import, during which `start` answers requests
+            from thirdhand.daemon import daemon
             from thirdhand.scribe.scribe import Scribe
 
         gc.freeze()  # no later collection visits what was imported
@@ -106,9 +105,8 @@ def _run(args: argparse.Namespace) -> int:
             hold=args.hold or settings.arm.start == "held",
         )
     logging.shutdown()
-    os._exit(
-        1 if missing else 0
-    )  # everything is closed; this does not wait for threads of libraries
+    # everything is closed; this does not wait for threads of libraries
+    os._exit(1 if missing else 0)
 
 
 def settings_of(args: argparse.Namespace) -> Settings:

@@ -54,9 +54,8 @@ class Client:
         self._session = session
         self._cell = cell
         self._timeout_s = timeout_s
-        self._daemons: set[str] = (
-            set()
-        )  # Zenoh sessions of daemons of the cell, also of those that ended
+        # Zenoh sessions of daemons of the cell, also of those that ended
+        self._daemons: set[str] = set()
 
     def hold(self, by: str = "") -> Reply:
         """Stop the arm, which then holds; returns once that is in force. `by` names its holder."""
@@ -153,9 +152,8 @@ class Client:
                 f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"
             )
         acts = suffix != "status" and payload != LIST
-        may_repeat = (
-            not acts or suffix == "hold"
-        )  # a second hold changes nothing, and a lost one must not remain so
+        # a second hold changes nothing, and a lost one must not remain so
+        may_repeat = not acts or suffix == "hold"
         queries_left = QUERIES if may_repeat else 1  # a query, or its answer, may be lost
         query_s = self._timeout_s / queries_left
         end_s = time.monotonic() + min(RECONNECTED_S, self._timeout_s)

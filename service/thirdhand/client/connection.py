@@ -180,9 +180,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
                     f"object {scene_object.name!r}: shape {scene_object.shape!r} given; one of "
                     f"{accepted} accepted"
                 )
-        markers.decode_objects(
-            markers.encode_objects(0, scene)
-        )  # raises the error that the daemon would report
+        # raises the error that the daemon would report
+        markers.decode_objects(markers.encode_objects(0, scene))
         self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
 
     def watch(self, suffix: str, *, timeout_s: float | None = None) -> Watch:
@@ -291,9 +290,8 @@ def _position(what: str, given: Sequence[float]) -> Vector3:
 def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
     """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
     try:
-        if isinstance(
-            given, str | bytes | bytearray | Mapping | Set
-        ):  # their members are in no order, or no numbers
+        # their members are in no order, or no numbers
+        if isinstance(given, str | bytes | bytearray | Mapping | Set):
             raise TypeError
         values = tuple(itertools.islice(given, counts[-1] + 1))
         if any(isinstance(value, str | bytes) for value in values):

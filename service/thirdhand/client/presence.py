@@ -126,6 +126,5 @@ def _tokens(session: zenoh.Session, key: str, timeout_s: float) -> set[tuple[str
         for reply in session.liveliness().get(key, timeout=timeout_s)
         if reply.ok
     )
-    return {
-        (token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens
-    }  # some arrive twice
+    # some arrive twice
+    return {(token.rsplit("/", 2)[0], token.rsplit("/", 1)[1]) for token in tokens}

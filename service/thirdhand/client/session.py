@@ -137,9 +137,8 @@ def open_session(
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
-            ours = (
-                connect if folder or not zenoh_config else ()
-            )  # else the file may have certificates of its own
+            # else the file may have certificates of its own
+            ours = connect if folder or not zenoh_config else ()
             if problem := next(
                 filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""
             ):

@@ -37,9 +37,8 @@ from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Status
 
 BRAKE_AFTER_S = 0.02  # a follower brakes after this time without a command
-LATE_COMMAND_S = (
-    0.005  # at the lowest accepted rate, a command may be this late before the follower brakes
-)
+# at the lowest accepted rate, a command may be this late before the follower brakes
+LATE_COMMAND_S = 0.005
 MAX_QUEUED = 256  # received messages, half a second of commands at 500 Hz
 CTRL_C_S = 0.5  # a wait is interrupted this often, since on Windows Ctrl-C does not end one
 WATCHABLE = tuple(

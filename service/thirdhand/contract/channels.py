@@ -20,11 +20,12 @@ import msgspec
 from thirdhand.contract import cdr, markers, requests
 
 ENDPOINT = "tcp/127.0.0.1:7447"  # default endpoint of daemons and their clients
+# the streams of a take
 TAKE_KEYS = {
     "left": "hands/left",
     "right": "hands/right",
     "tool": "tool/pose",
-}  # the streams of a take
+}
 LARGEST_REQUEST = 256 * 1024  # bytes
 _LETTER = r"[^/*$?#\s\x00-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
 CellName = Annotated[
@@ -39,9 +40,8 @@ CellName = Annotated[
 ]
 _ENDPOINT = re.compile(r"(?s)^(?:([a-z0-9_-]+)(/|://))?(.*)$")
 _ON_IP = ("tcp", "udp", "tls", "quic", "ws")  # protocols whose addresses end in a port
-PRESENCE = (
-    "daemon"  # key above the liveliness tokens of daemons, which are named by their Zenoh sessions
-)
+# key above the liveliness tokens of daemons, which are named by their Zenoh sessions
+PRESENCE = "daemon"
 PRESENCE_OF_ALL = f"**/{PRESENCE}/*"
 
 
@@ -74,9 +74,8 @@ OBJECTS = Codec(
     "visualization_msgs/msg/MarkerArray", "cdr", markers.encode_objects, markers.decode_objects
 )
 TICK = Codec("thirdhand/msg/Tick", "cdr", cdr.encode_tick, cdr.decode_tick)
-CHECKED_TICK = TICK._replace(
-    type="thirdhand/msg/CheckedTick"
-)  # `tick` in recordings that leave out frames
+# `tick` in recordings that leave out frames
+CHECKED_TICK = TICK._replace(type="thirdhand/msg/CheckedTick")
 SKILL = Codec("thirdhand/msg/Skill", "cdr", cdr.encode_skill, cdr.decode_skill)
 FRAME, TIMING, STATE = (
     Codec(f"thirdhand/msg/{name}", "cdr", cdr.encode_record, cdr.decode_record)
@@ -104,9 +103,8 @@ class Channel(NamedTuple):
     rate: str = "on demand"  # in words
     every: int = 0  # ticks between messages; 0: not published by the loop
     event: EventKind | None = None  # None: nothing enters the loop here
-    stale_after: tuple[str, str] | None = (
-        None  # setting (section, name) with the time after which the source is silent
-    )
+    # setting (section, name) with the time after which the source is silent
+    stale_after: tuple[str, str] | None = None
     queryable: bool = False
     recorded: bool = True
 
@@ -339,9 +337,8 @@ EVENT_NUMBERS = {
 EVENT_KINDS = {number: key for key, number in EVENT_NUMBERS.items()}
 
 
-MESSAGE_NUMBERS = (
-    2**32
-)  # a daemon numbers a channel's messages by Zenoh's source information, modulo this
+# a daemon numbers a channel's messages by Zenoh's source information, modulo this
+MESSAGE_NUMBERS = 2**32
 LAST_PORT = 65535  # of IP
 
 

@@ -90,9 +90,8 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Exceeded | None = None  # largest joint error at the fault
-    worst_joint: tuple[str, float, str] | None = (
-        None  # the joint that is farthest from its command now, with unit
-    )
+    # the joint that is farthest from its command now, with unit
+    worst_joint: tuple[str, float, str] | None = None
     measured_speed: Exceeded | None = None  # of the tool [m/s]
     commanded_speed: Exceeded | None = None
     failure: str = ""  # of the service
@@ -104,9 +103,8 @@ class Evidence(NamedTuple):
     frames: tuple[str, ...] = ()  # accepted frames
     mistake: str = ""  # in its unit, its names or its bytes
     jump: Jump | None = None
-    held_up_s: float | None = (
-        None  # delay of the newest accepted sample beyond the others; None: the clock differs
-    )
+    # delay of the newest accepted sample beyond the others; None: the clock differs
+    held_up_s: float | None = None
     is_set_back: bool = False  # all samples since the newest accepted one are stamped before it
 
 
@@ -345,9 +343,8 @@ def _rate_too_low(seen: Evidence, name: str) -> str:
     accepted_ms = (
         seen.settings.arm.silent_ms if name == "arm" else seen.settings.hands.longest_stale_ms
     )
-    continues = (
-        source.age_ms * source.rate_hz < 2000.0
-    )  # the next sample is not overdue by a whole interval
+    # the next sample is not overdue by a whole interval
+    continues = source.age_ms * source.rate_hz < 2000.0
     if not continues or not 0.0 < source.rate_hz * accepted_ms < 1000.0:
         return ""
     return f"at {source.rate_hz:.1f} Hz, {1000 / accepted_ms:g} Hz at least needed"

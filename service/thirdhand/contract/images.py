@@ -13,10 +13,11 @@ from thirdhand.contract.messages import WireError
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 _LENGTH = struct.Struct("<I")
+# first bytes of a file, and its format
 _MAGIC = {
     b"\xff\xd8\xff": "jpeg",
     b"\x89PNG\r\n\x1a\n": "png",
-}  # first bytes of a file, and its format
+}
 
 
 class CompressedImage(NamedTuple):

@@ -39,9 +39,8 @@ class JointStates:
             str, tuple[float, int, float, float]
         ] = {}  # arrival [s], stamp [ns], position, velocity
         self._heard_s = -math.inf  # arrival of the newest message
-        self._state_s = (
-            -math.inf
-        )  # arrival of the newest state, or of the first message after a pause
+        # arrival of the newest state, or of the first message after a pause
+        self._state_s = -math.inf
 
     def take(self, message: JointState, at_s: float) -> JointState | None:
         """The state that a message completes, which arrived at a time [s]; None where it completes

@@ -254,12 +254,10 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: float = 0.0
     age_ms: float | None = None  # age of the newest accepted sample; None: none yet
     fresh: bool = False  # True if that sample is recent enough
-    clock_ms: float | None = (
-        None  # time from stamp to arrival, median of the last second; negative: the clock is ahead
-    )
-    late_ms: float | None = (
-        None  # mean delay of a hand's newest 49 samples beyond the minimum; None: no steady clock
-    )
+    # time from stamp to arrival, median of the last second; negative: the clock is ahead
+    clock_ms: float | None = None
+    # mean delay of a hand's newest 49 samples beyond the minimum; None: no steady clock
+    late_ms: float | None = None
     late_95_ms: float | None = None  # 95th percentile of these delays
     frame: str = ""  # frame in the newest message
     rejected: dict[str, int] = {}  # rejected samples by cause, `malformed` included
@@ -267,15 +265,12 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     refused: str = ""  # that rejection in words: what arrived, and what is accepted
     advice: str = ""  # what to do about that rejection
     contested: float = 0.0  # share of the arm's states in the last second that contradict the rest
-    scatter_mm: float | None = (
-        None  # standard deviation of a hand's samples about its motion, each axis
-    )
-    unit: str = (
-        ""  # the unit in which a hand's positions seem to be, if it is not that of the settings
-    )
-    batches_ms: float = (
-        0.0  # interval of the batches in which a hand's samples arrive, if it is too long; 0: none
-    )
+    # standard deviation of a hand's samples about its motion, each axis
+    scatter_mm: float | None = None
+    # the unit in which a hand's positions seem to be, if it is not that of the settings
+    unit: str = ""
+    # interval of the batches in which a hand's samples arrive, if it is too long; 0: none
+    batches_ms: float = 0.0
 
 
 ANY_DIRECTION = "in any direction"
@@ -357,24 +352,20 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     target_m: Vector3 | None = None  # None if a needed hand is not seen
     setpoint_m: Vector3 | None = None
     std_m: float | None = None  # standard deviation of the target, root mean square over the axes
-    turn_off_rad: float | None = (
-        None  # angle between commanded tool and target, or between their directions
-    )
-    turn_std_rad: float | None = (
-        None  # standard deviation of the target's orientation; None: not learned
-    )
+    # angle between commanded tool and target, or between their directions
+    turn_off_rad: float | None = None
+    # standard deviation of the target's orientation; None: not learned
+    turn_std_rad: float | None = None
     gripper: str = ""  # commanded, `open` or `closed`; empty: the skill has no gripper
     closure: float | None = None  # predicted closure of the gripper, 0 to 1
     segment: tuple[
         str, ...
     ] = ()  # the via-points at which the segment begins and ends; empty: unknown
     segment_belief: float = 0.0  # probability of that segment
-    task_clock_s: float | None = (
-        None  # time since the hands began the task; None: the skill has no clock
-    )
-    error_probability: float | None = (
-        None  # probability that the tool belongs more than 10 cm from its target
-    )
+    # time since the hands began the task; None: the skill has no clock
+    task_clock_s: float | None = None
+    # probability that the tool belongs more than 10 cm from its target
+    error_probability: float | None = None
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
     tool_limits: dict[

@@ -18,9 +18,8 @@ ARM = ("joints/state", "joints/guided", "gripper/state")
 TOOL = ("tool/pose",)
 OBJECTS = ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
-MOST_OF_A_ROLE = (
-    99  # certificates of a role; access control compares whole names, so all are listed
-)
+# certificates of a role; access control compares whole names, so all are listed
+MOST_OF_A_ROLE = 99
 
 
 class Role(NamedTuple):
@@ -29,9 +28,8 @@ class Role(NamedTuple):
     about: str
     publishes: tuple[str, ...] = ()
     hears: bool = False  # receives everything that the daemon publishes
-    asks: bool = (
-        False  # sends any request; all roles may request the status of every cell, and list daemons
-    )
+    # sends any request; all roles may request the status of every cell, and list daemons
+    asks: bool = False
     hears_inputs: bool = False  # receives what trackers and the arm publish
 
 

@@ -27,18 +27,10 @@ TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
 }
 # stands for the hash in the keys of Humble, whose subscribers match no hash
 NO_TYPE_HASH = "TypeHashNotSupported"
-OWN_FRAMES = (
-    "left_hand",
-    "right_hand",
-    "setpoint",
-    "target",
-    "tool",
-)  # of a cell, beside the arm's links
-FRAMES = (
-    "hands/left",
-    "hands/right",
-    "tool/pose",
-)  # channels whose messages may be frames of TFMessages
+# of a cell, beside the arm's links
+OWN_FRAMES = ("left_hand", "right_hand", "setpoint", "target", "tool")
+# channels whose messages may be frames of TFMessages
+FRAMES = ("hands/left", "hands/right", "tool/pose")
 HEARD = tuple(
     channel for channel in channels.CHANNELS if channel.direction == "in" and channel.event
 )

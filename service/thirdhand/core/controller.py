@@ -133,9 +133,8 @@ class Controller:
         )
         self.constants = dict(zip(STAGES, map(_digest, stages), strict=True))
         """Digests of the constants that each stage derived from settings, skill and description."""
-        self._here: Kinematics | None = (
-            None  # kinematics at the state's joints; None: not yet computed
-        )
+        # kinematics at the state's joints; None: not yet computed
+        self._here: Kinematics | None = None
 
     @property
     def state(self) -> Record:

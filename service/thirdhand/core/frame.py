@@ -100,9 +100,8 @@ Frame: TypeAlias = Record  # a record of `frame_layout`
 Lap: TypeAlias = Callable[[str], None]
 
 _PACKAGES: tuple[ModuleType, ...] = (intake, skill, decision, separation, setpoint, arm, limiter)
-STAGES = tuple(
-    package.__name__.rsplit(".", 1)[1] for package in _PACKAGES
-)  # in the order of the data
+# in the order of the data
+STAGES = tuple(package.__name__.rsplit(".", 1)[1] for package in _PACKAGES)
 _TICK = (Field("tick", "int64"),)
 FRAME = assembled(_TICK, *(package.FRAME for package in _PACKAGES))
 STATE = assembled(_TICK, *(package.STATE for package in _PACKAGES))
@@ -112,9 +111,8 @@ TIMING_FIELDS = (
     Field("missed", "int64"),  # deadlines skipped since start
     Field("lateness_us", "float32"),
     Field("work_us", "float32"),
-    Field(
-        "latency_us", "float32"
-    ),  # from the newest hand sample's stamp to the published command; 0: no new one
+    # from the newest hand sample's stamp to the published command; 0: no new one
+    Field("latency_us", "float32"),
     Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)

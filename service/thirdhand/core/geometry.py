@@ -14,9 +14,8 @@ from kmp.compiled import compiled
 from kmp.elementary import atan2, sin_cos
 from thirdhand.core.frame import Records, Vector
 
-ROUND_TO = (
-    1e9  # parts of a unit; values are rounded so that machines that differ in the last bits agree
-)
+# parts of a unit; values are rounded so that machines that differ in the last bits agree
+ROUND_TO = 1e9
 _TINY = 1e-12  # a smaller sine is rounding
 
 
@@ -185,9 +184,8 @@ def turn_on(quaternion: Vector, turn: Vector) -> None:
 
 # [m] segments at a smaller distance intersect; [m²] a segment of smaller squared length is a point
 LEAST = 1e-9
-HALVINGS = (
-    40  # bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
-)
+# bisection steps along a segment, for the point nearest to a box: 1e-12 of its length
+HALVINGS = 40
 CAPSULE = np.dtype(
     [
         ("link", np.int64),

@@ -7,9 +7,8 @@ import numpy as np
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import JointSettings
 
-LIMIT_MARGIN_RAD = (
-    1e-6  # distance kept from the position limits; rounding along a stop is below 1e-7 rad
-)
+# distance kept from the position limits; rounding along a stop is below 1e-7 rad
+LIMIT_MARGIN_RAD = 1e-6
 
 
 def acceleration_rate(limits: JointSettings) -> float:

@@ -9,9 +9,8 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.frame import Vector
 
-LEAST_BRAKE_SHARE = (
-    1e-3  # an axis that waits for the slowest one brakes with at least this share of its limit
-)
+# an axis that waits for the slowest one brakes with at least this share of its limit
+LEAST_BRAKE_SHARE = 1e-3
 BRAKE_SHARE_HALVINGS = 40  # bisection steps for the share of an axis
 
 

@@ -154,9 +154,8 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         adopted = [Event("skill", b"", other)] if index == change else []
         controller.step(Tick(index, (*adopted, *hands, measured)))
-    deviation_m(
-        as_array(controller.state), SkillStage(settings, skill).rules, 0
-    )  # runs only for a hand out of sight
+    # runs only for a hand out of sight
+    deviation_m(as_array(controller.state), SkillStage(settings, skill).rules, 0)
     controller.step(Tick(count, (order("hold"),)))
 
 

@@ -34,9 +34,8 @@ SLACK_SHARE = 0.1
 REACHED_M = 2e-3
 REACHED_RAD = 0.1
 DAMPING = 1e-5  # [m²] damping of the Gauss-Newton steps
-OPPOSITE = (
-    -0.9999
-)  # below this cosine, two directions are opposite and have no single shortest rotation
+# below this cosine, two directions are opposite and have no single shortest rotation
+OPPOSITE = -0.9999
 GOALS = 6  # largest number of postures to which a path is planned
 WAYS = 3  # planning ends when this number of paths is found
 MARGIN_M = 0.02  # clearance required along the path; that of its ends, if one of them has less

@@ -33,9 +33,8 @@ HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of th
 TAKEOVER_S = 0.5  # another publisher of a hand is heard after a silence of this time
 # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
 FROZEN_S = 0.5
-TRACKED_S = (
-    2.0  # a hand whose samples all differ for so long is measured; a program's hand rests exactly
-)
+# a hand whose samples all differ for so long is measured; a program's hand rests exactly
+TRACKED_S = 2.0
 EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
 # a hand that was lost appears this many steps away; one that rested goes on from where it was
 LEAP_STEPS = 5.0
@@ -52,12 +51,10 @@ CONFIGURED: Mapping[
 }
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
-MAX_JOINT_STATES = (
-    16  # messages of the arm's topic, on which grippers and other parts may publish too
-)
-MAX_TRANSFORM_MESSAGES = (
-    64  # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
-)
+# messages of the arm's topic, on which grippers and other parts may publish too
+MAX_JOINT_STATES = 16
+# messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
+MAX_TRANSFORM_MESSAGES = 64
 
 
 class Arrivals:
@@ -66,9 +63,8 @@ class Arrivals:
     __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "others", "why")
 
     def __init__(self) -> None:
-        self._delays: deque[tuple[int, int]] = deque(
-            maxlen=KEPT_DELAYS
-        )  # stamp, arrival - stamp [ns]
+        # stamp, arrival - stamp [ns]
+        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)
         self.count = self.malformed = self.frozen = self.others = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
         self.why = ""
@@ -162,9 +158,8 @@ class FrozenHand:
 
     def __init__(self) -> None:
         self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
-        self._steps: deque[float] = deque(
-            maxlen=50
-        )  # distances between poses that differ, in the tracker's unit
+        # distances between poses that differ, in the tracker's unit
+        self._steps: deque[float] = deque(maxlen=50)
         self._repeated_ns = 0  # stamp of its newest repetition
         self._varies_since_ns = 0  # stamp since which each sample differs from the one before
         self._is_tracked = False
@@ -190,9 +185,8 @@ class FrozenHand:
                 self._rests += 1
                 self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
             self._steps.append(step)
-            self._varies_since_ns = min(
-                self._varies_since_ns, pose.stamp_ns
-            )  # its clock may be set back
+            # its clock may be set back
+            self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)
             self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
         self._pose = pose
         self._repeated_ns = pose.stamp_ns

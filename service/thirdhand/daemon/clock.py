@@ -61,9 +61,8 @@ class Deadlines:
         self.stamp_ns = wall_ns() - self.period_ns
         self._index = -1
         self._sleeps_until_ns = 0
-        self._is_in_tick = (
-            threading.Lock()
-        )  # locked by `between_ticks`, released at the end of a tick
+        # locked by `between_ticks`, released at the end of a tick
+        self._is_in_tick = threading.Lock()
 
     def between_ticks(self) -> None:
         """Wait, on another thread, until the loop sleeps for at least BESIDE_NS more, or has just

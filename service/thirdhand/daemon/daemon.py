@@ -442,9 +442,8 @@ class Daemon:
 
     def _moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""
-        for _ in range(
-            STATUS_TRIES
-        ):  # during a tick, the frame and the state are of different ticks
+        # during a tick, the frame and the state are of different ticks
+        for _ in range(STATUS_TRIES):
             frame = self._frame
             state = self._controller.state
             if frame["tick"] == state["tick"]:
@@ -552,9 +551,8 @@ def rehearsed(settings: Settings, skill_path: Path, start: Startup) -> StoredSki
     urdf = robot_description(settings)
     warm_up(settings, skill, urdf=urdf)
     release_start_memory()  # what only imports used: 150 MB
-    warm_up(
-        settings, skill, urdf=urdf
-    )  # maps again what the loop calls, before its memory is locked
+    # maps again what the loop calls, before its memory is locked
+    warm_up(settings, skill, urdf=urdf)
     return stored
 
 

@@ -29,10 +29,11 @@ START_STALL_S = 60.0  # a start without a new report for this time has stalled
 START_POLL_S = 0.1
 STOP_TIMEOUT_S = 60.0
 BENCH_TIMEOUT_S = 120.0
+# physics of the bench; the first installed one is the default
 ENGINES = {
     "pybullet": "PyBullet",
     "mujoco": "MuJoCo",
-}  # physics of the bench; the first installed one is the default
+}
 
 
 class LaunchError(ExplainedError, RuntimeError):
@@ -45,9 +46,8 @@ def engine_of(wanted: str | None = None) -> str:
     Raises LaunchError if it is not installed.
     """
     for name in (wanted,) if wanted else ENGINES:
-        with contextlib.suppress(
-            ValueError
-        ):  # raised for a module that was removed from sys.modules
+        # raised for a module that was removed from sys.modules
+        with contextlib.suppress(ValueError):
             if importlib.util.find_spec(name) is not None:
                 return name
     needed = (
@@ -82,9 +82,8 @@ class Launched:
 
     def missing(self) -> str:
         """A message on ticks that were not recorded, from the end of the log; empty if none."""
-        from thirdhand.scribe.scribe import (
-            NOT_RECORDED,
-        )  # its import is slow, and a launch must begin at once
+        # its import is slow, and a launch must begin at once
+        from thirdhand.scribe.scribe import NOT_RECORDED
 
         last_lines = self.log.read_text().splitlines()[-1:]
         return "".join(

@@ -17,9 +17,8 @@ MISSED_SHARE = 0.01  # the machine is too busy if a larger share of deadlines is
 LATE_LOOP_MS = 20.0  # an arm brakes if its commands are this late
 # the machine is overloaded if some process waits for a processor in a larger share of the time
 WAITING_SHARE = 0.8
-PRESSURE = Path(
-    "/proc/pressure/cpu"
-)  # a file of Linux; if it is missing, only the loop is measured
+# a file of Linux; if it is missing, only the loop is measured
+PRESSURE = Path("/proc/pressure/cpu")
 
 
 def resident_mb(**processes: int | None) -> dict[str, float]:
@@ -49,9 +48,8 @@ class Machine:
         self._samples: deque[_Sample] = deque()
         self._outcome: tuple[Mode, Reason] | None = None
         self.now = ""  # message on a machine that is too busy; empty if it is not
-        self.at_stop = (
-            ""  # the message at the begin of the present hold or fault; empty while the arm follows
-        )
+        # the message at the begin of the present hold or fault; empty while the arm follows
+        self.at_stop = ""
 
     def update(
         self, now_s: float, *, tick: int, missed: int, late_ms: float, outcome: tuple[Mode, Reason]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 
-STATUS_TIMEOUT_S = (
-    2.0  # after this time without a new status, a request is answered with the last one
-)
+# after this time without a new status, a request is answered with the last one
+STATUS_TIMEOUT_S = 2.0
 MIN_STATUS_INTERVAL_S = 0.02  # a flood of requests must not take the interpreter from the loop
 
 

@@ -58,9 +58,8 @@ from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import SkillError, StoredSkill
 from thirdhand.skills.via_points import in_force, points_made_of, warnings_of
 
-MAX_TAUGHT_POINTS = (
-    400  # limit of via-points that are not the task's, with the points of their neighbourhoods
-)
+# limit of via-points that are not the task's, with the points of their neighbourhoods
+MAX_TAUGHT_POINTS = 400
 MAX_WAITING_REQUESTS = 16
 MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
 MAX_LIST_BYTES = 100  # a longer request is not a `list`
@@ -81,9 +80,8 @@ class Received(NamedTuple):
     received_s: float
 
 
-Order = Callable[
-    [str, str], Reply | RequestError
-]  # executes hold, resume or reset, by the one of a name
+# executes hold, resume or reset, by the one of a name
+Order = Callable[[str, str], Reply | RequestError]
 
 
 class Requested(Protocol):
@@ -361,13 +359,12 @@ class Queryables:
         }
         adoption = Event("skill", skill.file, skill.for_loop())
         try:
-            with self._saved.replacing(
-                skill
-            ):  # written first, because via-points that cannot be saved are not adopted
+            # written first, because via-points that cannot be saved are not adopted
+            with self._saved.replacing(skill):
                 frame = self.inbox.send(adoption, *events, check=check).wait()
         except OSError as error:  # the skill is in force already
             unsaved = f"the via-points end at a restart: they cannot be saved ({in_words(error)})"
-                remark = f"{remark} {unsaved}".strip()
+            remark = f"{remark} {unsaved}".strip()
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
         remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))

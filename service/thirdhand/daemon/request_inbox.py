@@ -86,12 +86,10 @@ class RequestInbox:
     def __init__(self) -> None:
         self._waiting: deque[PendingRequest] = deque()
         self._taken: list[PendingRequest] = []
-        self._holders: set[str] = (
-            set()
-        )  # names of those whose hold is in force; empty for one without a name
-        self.holds_received = (
-            0  # counted by the thread that receives holds, before the loop takes them
-        )
+        # names of those whose hold is in force; empty for one without a name
+        self._holders: set[str] = set()
+        # counted by the thread that receives holds, before the loop takes them
+        self.holds_received = 0
 
     def __bool__(self) -> bool:
         return bool(self._waiting)

@@ -27,9 +27,8 @@ from thirdhand.settings.config import Settings, urdf_path
 
 MAX_WAITING_MESSAGES = 256  # half a second of commands
 CLOSED_WITHIN_S = 2.0
-HEARTBEAT_S = (
-    0.5  # as in rmw_zenoh: after this time a subscriber notices that it missed a latched message
-)
+# as in rmw_zenoh: after this time a subscriber notices that it missed a latched message
+HEARTBEAT_S = 0.5
 DIAGNOSTIC_LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # OK, WARN and ERROR of diagnostic_msgs
 DIAGNOSED = (
     *(

@@ -11,9 +11,8 @@ from thirdhand.daemon.single_instance import state_folder
 from thirdhand.settings.config import Settings
 from thirdhand.settings.whole_file import whole
 
-MAX_RESTART_S = (
-    600.0  # after a longer pause the task begins again, at the segment where the hands are
-)
+# after a longer pause the task begins again, at the segment where the hands are
+MAX_RESTART_S = 600.0
 MIN_BELIEF = 0.5  # a less probable segment is not saved
 
 

@@ -28,9 +28,8 @@ MAX_SESSIONS = 64
 # with fewer, Zenoh ends while the daemon runs on, deaf
 LEAST_DESCRIPTORS = 256
 MAX_DESCRIPTORS = 65536
-MAX_HANDSHAKES = (
-    16  # pending handshakes: those that time out are closed together, which delays others
-)
+# pending handshakes: those that time out are closed together, which delays others
+MAX_HANDSHAKES = 16
 HANDSHAKE_TIMEOUT_MS = 2000
 ENVELOPE_BYTES = 1024  # key, attachment and Zenoh's headers around the largest request
 

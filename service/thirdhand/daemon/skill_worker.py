@@ -31,9 +31,8 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, skill_
 from thirdhand.skills.via_points import adapted
 
 MODULE = "thirdhand.daemon.skill_worker"
-WORK_TIMEOUT_S = (
-    ANSWER_TIMEOUT_S - 5.0
-)  # the rest is for the tick that takes a request, and for the status
+# the rest is for the tick that takes a request, and for the status
+WORK_TIMEOUT_S = ANSWER_TIMEOUT_S - 5.0
 HUNG_S = 5.0  # the process hangs if it makes no progress for this time
 WORKER_POLL_S = 0.1
 BUSY = "the skill worker was busy with earlier requests; nothing was changed, try again"

@@ -110,10 +110,8 @@ class Startup:
         """A context that counts the compiled functions that the loop may call and that are imported
         by now. Raises NotCompiledError at the first compilation, unless it `may_compile`.
         """
-        from numba.core import (
-            dispatcher,
-            event,
-        )  # its import is slow, so the start reports before it
+        # its import is slow, so the start reports before it
+        from numba.core import dispatcher, event
 
         from thirdhand.daemon.compilation import Compilations, NotCompiledError
 

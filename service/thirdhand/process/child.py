@@ -375,9 +375,8 @@ def from_memory(fd: int) -> list[memoryview]:
     """
     try:
         size = os.fstat(fd).st_size
-        populate = getattr(
-            mmap, "MAP_POPULATE", 0
-        )  # map pages now, not at the first access in the loop
+        # map pages now, not at the first access in the loop
+        populate = getattr(mmap, "MAP_POPULATE", 0)
         view = memoryview(
             mmap.mmap(fd, size, flags=mmap.MAP_SHARED | populate, prot=mmap.PROT_READ)
         )

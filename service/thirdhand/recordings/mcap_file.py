@@ -26,9 +26,8 @@ from thirdhand.settings.whole_file import whole
 
 _MEDIA = {".json": "application/json", ".urdf": "application/xml"}
 _BYTES = "application/octet-stream"
-CHUNK_BYTES = (
-    128 * 1024
-)  # between two flushes a kill loses at most this, and a reader holds at most this
+# between two flushes a kill loses at most this, and a reader holds at most this
+CHUNK_BYTES = 128 * 1024
 
 
 class RecordingError(ExplainedError, ValueError):

@@ -117,9 +117,8 @@ class _Reading:
         self._stream = stream
         self._faults = faults
         self._size = stream.seek(0, 2)
-        self._checksum: int | None = zlib.crc32(
-            self._bytes(0, len(MCAP0_MAGIC))
-        )  # None after damage
+        # None after damage
+        self._checksum: int | None = zlib.crc32(self._bytes(0, len(MCAP0_MAGIC)))
         self._chunked = False
         self.at = 0  # first byte of the record that is read
         closing = self._size - len(MCAP0_MAGIC)

@@ -37,13 +37,8 @@ from thirdhand.settings.config import Settings, robot_description, without_secre
 
 OBJECTS_NOTE = "objects"
 CHECKSUMS = "checksums.u32"  # attachment with a little-endian number for each tick from 0 on
-DECISIONS = (
-    "mode",
-    "reason",
-    "flags",
-    "commanded",
-    "segment",
-)  # a frame that changes one of these is kept
+# a frame that changes one of these is kept
+DECISIONS = ("mode", "reason", "flags", "commanded", "segment")
 NOTED_US = 1000.0  # the timing of a tick that begins or ends this late is kept
 SHOWN_HZ = 10.0  # rate of what other tools show, in a thin recording; a replay makes it anew
 STATE_EVERY_S = 10.0  # interval of states in a thin recording; each takes 60 kB
@@ -293,9 +288,8 @@ class Recording:
         about = messages.metadata.get("thirdhand")
         parts = messages.attachments
         is_cut = any(fault.cut for fault in messages.faults)
-        needed = [
-            "settings.json"
-        ]  # of a file that is damaged; one that is cut has no ticks for a report
+        # of a file that is damaged; one that is cut has no ticks for a report
+        needed = ["settings.json"]
         if is_cut or not messages.faults:
             needed += ["skill.npz", *(["arm.urdf"] if is_cut else [])]
         if about is None or any(name not in parts for name in needed):

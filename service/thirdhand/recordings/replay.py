@@ -21,14 +21,8 @@ from thirdhand.recordings.steps import Gap, Step, checksum
 from thirdhand.settings.whole_file import whole
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded
 
-MACHINE = (
-    "cpu",
-    "features",
-    "libc",
-    "kernel",
-    "numpy",
-    "blas",
-)  # what the last bits of a result depend on
+# what the last bits of a result depend on
+MACHINE = ("cpu", "features", "libc", "kernel", "numpy", "blas")
 REPLAY_TOLERANCE = 1e-5  # [m, rad] other versions of a library may differ by this
 POSITION_FIELDS = ("hands", "target", "setpoint", "tool", "joints")
 
@@ -59,9 +53,8 @@ class Replay:
     joined: int = 0
     first_difference: str = ""
     largest: dict[str, float] = field(default_factory=dict)
-    differing: set[str] = field(
-        default_factory=set
-    )  # stages whose constants are not those of the recording
+    # stages whose constants are not those of the recording
+    differing: set[str] = field(default_factory=set)
     recorded_on: str = ""
     here: str = ""
 

@@ -32,9 +32,8 @@ def skill_file(settings: Settings) -> Path:
 
 def shipped_skill() -> StoredSkill:
     """The skill that the service runs by default."""
-    from thirdhand.skills.skill_file import (
-        skill_in,
-    )  # its import is slow, and most commands do not need it
+    # its import is slow, and most commands do not need it
+    from thirdhand.skills.skill_file import skill_in
 
     return skill_in(recordings() / SHIPPED_SKILL)
 

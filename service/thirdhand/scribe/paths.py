@@ -32,9 +32,8 @@ def named_after(cell: str, folder: Path) -> list[Path]:
     OSError.
     """
     names = re.compile(re.escape(stem_of(cell)) + r"-\d{8}T\d{6}Z(-2)*")
-    paths = (
-        sorted(folder.iterdir()) if folder.exists() else []
-    )  # iterdir reports a folder that cannot be read
+    # iterdir reports a folder that cannot be read
+    paths = sorted(folder.iterdir()) if folder.exists() else []
     return [path for path in paths if path.suffix == ".mcap" and names.fullmatch(path.stem)]
 
 

@@ -52,9 +52,8 @@ CATCH_UP_NICE = 0
 MAX_WAITING = 10_000
 FLUSH_S = 0.5  # a kill loses at most this time of a recording
 LIVE_END_S = 8.0  # a live view that does not end within this time is abandoned
-MAX_WAITING_FRAMES = (
-    2500  # with more frames and images waiting for the live view, new ones are left out
-)
+# with more frames and images waiting for the live view, new ones are left out
+MAX_WAITING_FRAMES = 2500
 BEHIND_MESSAGES = 500  # while more messages wait to be recorded, nothing is drawn
 MAX_CLOSING_S = 60  # a process that does not end within these whole seconds is killed
 # Rerun's log on standard error: plain text, and no warnings of a slow viewer, for which frames are
@@ -76,17 +75,15 @@ class LiveView:
     """
 
     def __init__(self, make: Callable[[], Viewer]) -> None:
-        self.url: str | None = (
-            ""  # the address; empty while the view starts, None once it has failed
-        )
+        # the address; empty while the view starts, None once it has failed
+        self.url: str | None = ""
         self.problems: list[str] = []
         self.left_out = 0  # number of frames and images
         self.is_paused = True
         self._waiting: deque[Callable[[Viewer], object]] = deque()
         self._outcome = (-1, -1)  # mode and reason of the newest frame
-        self._gap = (
-            0  # number of frames and images that were left out last, and are not in the log yet
-        )
+        # number of frames and images that were left out last, and are not in the log yet
+        self._gap = 0
         self._overflows = False
         self._ended = threading.Event()
         self._thread = threading.Thread(
@@ -317,9 +314,8 @@ def _work(source: socket.socket) -> None:
     ended = threading.Event()
 
     def read() -> None:
-        with contextlib.suppress(
-            OSError
-        ):  # an ordinary weight: it needs little time, and its queue shows the backlog
+        # an ordinary weight: it needs little time, and its queue shows the backlog
+        with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), CATCH_UP_NICE)
         try:
             while (received := _receive(source, buffer))[0]:

@@ -151,6 +151,5 @@ class ScribeReport(msgspec.Struct, frozen=True):
     errors: tuple[str, ...] = ()  # new error messages
     free_mb: float | None = None  # free space on the disk of the recording; None: it writes nothing
     mb_per_hour: float | None = None  # recent growth of recordings; None: not known yet
-    keep_mb_left: float | None = (
-        None  # growth until each file takes an older one's place; None: without end
-    )
+    # growth until each file takes an older one's place; None: without end
+    keep_mb_left: float | None = None

@@ -39,9 +39,8 @@ _SO_SNDBUFFORCE = 32  # Linux defines it, Python does not
 READY_TIMEOUT_S = 30.0  # a starting scribe without progress for this time is replaced
 RESTART_S = 1.0  # minimum interval of starts
 NOT_RECORDED = "ticks are not recorded"
-HUNG_AFTER_S = (
-    5.0  # a scribe that reports twice a second hangs if it made no progress for this time
-)
+# a scribe that reports twice a second hangs if it made no progress for this time
+HUNG_AFTER_S = 5.0
 CLOSE_TIMEOUT_S = 45.0  # less than `thirdhand demo` waits for the daemon's end
 MAX_QUEUED_S = 10.0  # the queue holds this time of ticks for a scribe that starts or is behind
 REPORTED = ("recording", "free_mb", "mb_per_hour", "keep_mb_left")  # of a report, in the status
@@ -78,23 +77,20 @@ class Scribe:
         self._recording = recording
         self._live_port = live_port
         self._wanted = any(value is not None for value in (folder, recording, live_port))
-        self._socket: socket.socket | None = (
-            None  # socket to the child; None once the child is dead
-        )
+        # socket to the child; None once the child is dead
+        self._socket: socket.socket | None = None
         self._child: child.Child | None = None
         self._progress: child.Progress | None = None
         self._listens = False  # True once the child has reported
-        self._queue: deque[tuple[bytes, list[bytes]]] = (
-            deque()
-        )  # messages with the skills to send; for the loop
+        # messages with the skills to send; for the loop
+        self._queue: deque[tuple[bytes, list[bytes]]] = deque()
         self._most = round(MAX_QUEUED_S * settings.rate_hz)
         self._send_all = True
         self._overflows = False
         self._gap = self._lost = self._sent = self._restarts = 0
         self._since_state = 0
-        self._lost_before = self._unmarked = (
-            0  # ticks lost with dead scribes, and those that no recording marks
-        )
+        # ticks lost with dead scribes, and those that no recording marks
+        self._lost_before = self._unmarked = 0
         self._sent_before = 0  # ticks sent to dead scribes
         self._started = 0.0
         self._constants: dict[str, str] = {}
@@ -158,9 +154,8 @@ class Scribe:
             return
         if self._overflows or len(self._queue) >= self._most:
             self._drain()
-            self._overflows = (
-                bool(self._queue) or not self._most
-            )  # ends when the queue is empty: one long gap
+            # ends when the queue is empty: one long gap
+            self._overflows = bool(self._queue) or not self._most
             if self._overflows:
                 self.skip()
                 return
@@ -306,9 +301,8 @@ class Scribe:
                 if not is_shut and not self._queue:
                     is_shut = True
                     with contextlib.suppress(OSError):
-                        running.socket.shutdown(
-                            socket.SHUT_WR
-                        )  # a forked process may still hold this end
+                        # a forked process may still hold this end
+                        running.socket.shutdown(socket.SHUT_WR)
                 if time.monotonic() > end or progress.is_hung(self._ready_s):
                     self._errors.append("the scribe did not end in time: its last data are lost")
                     running.kill()

@@ -57,16 +57,14 @@ class Segments:
         self._complete: Path | None = None
         self._kept = self.lost = 0
         self._unmarked = unmarked
-        self._marked = self._marked_pending = (
-            0  # lost ticks marked in this recording; those marks not on disk yet
-        )
+        # lost ticks marked in this recording; those marks not on disk yet
+        self._marked = self._marked_pending = 0
         self._began = self._tried = self._pruned = -1e9
         self._full = self._moved = False
         self._failure: object = None  # cause of the last reported failure
         self._written = 0  # [bytes] in files that have ended
-        self._sizes: deque[tuple[float, int]] = deque(
-            maxlen=round(GROWTH_S / SAMPLE_S)
-        )  # time [s], total [bytes]
+        # time [s], total [bytes]
+        self._sizes: deque[tuple[float, int]] = deque(maxlen=round(GROWTH_S / SAMPLE_S))
 
     @property
     def kept(self) -> int:

@@ -23,9 +23,8 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
         text = _text(path)
         if not cover or "<mesh" not in text:
             return text
-        from thirdhand.settings.mesh_cover import (
-            covered,
-        )  # its import is slow, and few arms need it
+        # its import is slow, and few arms need it
+        from thirdhand.settings.mesh_cover import covered
 
         return covered(text, path, packages)
     except OSError as error:

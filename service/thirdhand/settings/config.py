@@ -31,12 +31,10 @@ from thirdhand.settings.urdf import Urdf, UrdfError
 WAM = Path(__file__).parents[1] / "arms" / "wam.urdf"
 RATES_HZ = (50, 1000)  # lowest and highest accepted rate
 MAX_CELL_BYTES = 200  # a recording's name, of cell and time, may have 255 bytes
-REACHED_SHARE = (
-    0.8  # an arm with its own URDF must reach at least this share of a configured `[reach]`
-)
-LEAST_REACHED_SHARE = (
-    0.05  # required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
-)
+# an arm with its own URDF must reach at least this share of a configured `[reach]`
+REACHED_SHARE = 0.8
+# required share of a `[reach]` that follows from the kinematics, cut by min_z and min_x
+LEAST_REACHED_SHARE = 0.05
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Point = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float]  # x y z [m], quaternion x y z w
@@ -52,9 +50,8 @@ FROM_FOLDER = (
 )
 # Relative paths in these settings start from the current folder.
 FROM_HERE = (("files", "state"), ("files", "record"))
-MAX_ACCELERATION_PER_SPEED = (
-    12.5  # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
-)
+# [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
+MAX_ACCELERATION_PER_SPEED = 12.5
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
 # sizes of numbers but 0; powers of others overflow, or are 0
 SMALLEST_NUMBER = 1e-9
@@ -87,13 +84,11 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class HandSettings(Section, frozen=True):
     """The tracker's frame and unit, and the times for which a hand may be silent."""
 
-    frame: Annotated[str, msgspec.Meta(max_length=64)] = (
-        "base"  # name of the tracker's frame; `base` is accepted too
-    )
+    # name of the tracker's frame; `base` is accepted too
+    frame: Annotated[str, msgspec.Meta(max_length=64)] = "base"
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    axes: Literal["right-handed", "left-handed"] = (
-        "right-handed"  # of left-handed axes (Unity), z is reversed first
-    )
+    # of left-handed axes (Unity), z is reversed first
+    axes: Literal["right-handed", "left-handed"] = "right-handed"
     base_from_tracker: Pose = (
         0.0,
         0.0,
@@ -103,24 +98,18 @@ class HandSettings(Section, frozen=True):
         0.0,
         1.0,
     )  # pose of the tracker's frame, after unit and axes
-    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
-        100.0  # the arm holds after this time without a sample
-    )
-    stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
-        0.0  # delays raise `stale_ms` up to this; 0: never
-    )
-    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
-        500.0  # one hand may be out of sight for this time
-    )
-    clutch: Literal["none", "key"] = (
-        "none"  # "key": the arm follows only while `clutch` says that it is pressed
-    )
-    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = (
-        300.0  # a clutch is released after this silence
-    )
-    gripper: Literal["none", "key"] = (
-        "none"  # "key": `gripper/wish` decides the gripper where the skill does not
-    )
+    # the arm holds after this time without a sample
+    stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
+    # delays raise `stale_ms` up to this; 0: never
+    stale_max_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
+    # one hand may be out of sight for this time
+    unseen_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 500.0
+    # "key": the arm follows only while `clutch` says that it is pressed
+    clutch: Literal["none", "key"] = "none"
+    # a clutch is released after this silence
+    clutch_stale_ms: Annotated[float, msgspec.Meta(ge=20, le=1000)] = 300.0
+    # "key": `gripper/wish` decides the gripper where the skill does not
+    gripper: Literal["none", "key"] = "none"
 
     @property
     def longest_stale_ms(self) -> float:
@@ -134,9 +123,8 @@ class TrackerSettings(Section, frozen=True):
     """
 
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
-    axes: Literal["right-handed", "left-handed"] = (
-        "right-handed"  # of left-handed axes (Unity), z is reversed first
-    )
+    # of left-handed axes (Unity), z is reversed first
+    axes: Literal["right-handed", "left-handed"] = "right-handed"
     base_from_tracker: Pose = (
         0.0,
         0.0,
@@ -160,32 +148,24 @@ class ToolSettings(Section, frozen=True):
         0.0,
         1.0,
     )  # pose of the tool in the frame of the plate
-    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = (
-        0.8  # [m/s] largest speed of the setpoint
-    )
-    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = (
-        0.15  # [m/s] until the tool reaches its target; 0: off
-    )
-    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = (
-        10.0  # [m/s²] largest; at most 12.5 * max_speed
-    )
-    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
-        400.0  # [m/s³] largest; at most 500 * max_speed
-    )
-    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = (
-        1.0  # [m/s] a faster tool, as measured, is a fault
-    )
-    orientation: Literal["direction", "full"] = (
-        "direction"  # follow the direction of the tool's +z, or all axes
-    )
-    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = (
-        1.0  # [rad/s] largest rate of turning the tool
-    )
+    # [m/s] largest speed of the setpoint
+    max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8
+    # [m/s] until the tool reaches its target; 0: off
+    engage_speed: Annotated[float, msgspec.Meta(ge=0, le=0.8)] = 0.15
+    # [m/s²] largest; at most 12.5 * max_speed
+    max_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 10.0
+    # [m/s³] largest; at most 500 * max_speed
+    max_jerk: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 400.0
+    # [m/s] a faster tool, as measured, is a fault
+    fault_speed: Annotated[float, msgspec.Meta(gt=0, le=1.5)] = 1.0
+    # follow the direction of the tool's +z, or all axes
+    orientation: Literal["direction", "full"] = "direction"
+    # [rad/s] largest rate of turning the tool
+    max_turn_speed: Annotated[float, msgspec.Meta(gt=0, le=2)] = 1.0
     max_turn_acceleration: Annotated[float, msgspec.Meta(gt=0, le=20)] = 4.0  # [rad/s²]
     radius: Positive = 0.02  # [m] radius of the tool, if the tool point is away from the plate
-    follow: Literal["closely", "default", "calmly"] = (
-        "default"  # less lag, or less overshoot and jerk: docs/tune.md
-    )
+    # less lag, or less overshoot and jerk: docs/tune.md
+    follow: Literal["closely", "default", "calmly"] = "default"
 
     @property
     def engaging_speed(self) -> float:
@@ -240,12 +220,10 @@ class ArmSettings(Section, frozen=True):
         str, ...
     ] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
     plate: str = "tool_plate"  # the link that carries the tool
-    source: Literal["state", "assumed"] = (
-        "state"  # wait for `joints/state`, or begin at `posture` without an arm
-    )
-    start: Literal["follow", "held"] = (
-        "follow"  # "held": after every start the arm holds until `thirdhand resume`
-    )
+    # wait for `joints/state`, or begin at `posture` without an arm
+    source: Literal["state", "assumed"] = "state"
+    # "held": after every start the arm holds until `thirdhand resume`
+    start: Literal["follow", "held"] = "follow"
     posture: PerJoint = (
         0.1761,
         0.8604,
@@ -256,12 +234,10 @@ class ArmSettings(Section, frozen=True):
         0.0,
     )  # [rad] preferred; start if assumed
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
-    fault_error_rad: Positive = (
-        0.1  # largest difference between measured and commanded joint position
-    )
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = (
-        100.0  # a moving arm is at fault after this silence
-    )
+    # largest difference between measured and commanded joint position
+    fault_error_rad: Positive = 0.1
+    # a moving arm is at fault after this silence
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 
 class JointSettings(Section, frozen=True):
@@ -316,9 +292,8 @@ class Reach(Section, frozen=True):
     centre: Point = (0.0, 0.0, 0.346)  # [m] centre of the shell, where the arm's first axes meet
     inner: Positive = 0.35  # [m] inner radius of the shell
     outer: Annotated[float, msgspec.Meta(gt=0, le=3)] = 0.88  # [m] outer radius of the shell
-    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = (
-        0.15  # [m] least x, in front of the base plate
-    )
+    # [m] least x, in front of the base plate
+    min_x: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.15
     min_z: Annotated[float, msgspec.Meta(ge=-1, le=1)] = 0.02  # [m] least z, above the table
 
 
@@ -334,24 +309,19 @@ class People(Section, frozen=True):
     """
 
     radius: Positive = 0.04  # [m] radius of hand and forearm
-    length: Annotated[float, msgspec.Meta(ge=0)] = (
-        0.24  # [m] length from the tracked point toward the elbow
-    )
+    # [m] length from the tracked point toward the elbow
+    length: Annotated[float, msgspec.Meta(ge=0)] = 0.24
     toward_elbow: Point = (1.0, 0.0, 0.0)  # direction in frame `base`; the user sits at +x
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = (
-        0.024  # [m] least distance to a hand's capsule
-    )
-    position_uncertainty: Annotated[float, msgspec.Meta(ge=0)] = (
-        0.006  # [m] of hand and arm; 3 deviations of 2 mm
-    )
+    # [m] least distance to a hand's capsule
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.024
+    # [m] of hand and arm; 3 deviations of 2 mm
+    position_uncertainty: Annotated[float, msgspec.Meta(ge=0)] = 0.006
     # [m/s²] assumed deceleration; the shipped arm's slowest joint brakes its stretched tool at 5
     brake: Positive = 3.0
-    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = (
-        30.0  # interval of samples + one tick + ramp of the braking
-    )
-    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = (
-        0.25  # [m/s] largest speed toward a receiving hand
-    )
+    # interval of samples + one tick + ramp of the braking
+    reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 30.0
+    # [m/s] largest speed toward a receiving hand
+    contact_speed: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.25
 
     @property
     def distance(self) -> float:
@@ -370,9 +340,8 @@ class Obstacles(Section, frozen=True):
     """Obstacles other than people: the table, the arm itself, and boxes."""
 
     boxes: tuple[Box, ...] = ()  # [m] boxes parallel to the axes of frame `base`
-    clearance: Annotated[float, msgspec.Meta(ge=0)] = (
-        0.01  # [m] least distance; from the arm itself at most 0.01
-    )
+    # [m] least distance; from the arm itself at most 0.01
+    clearance: Annotated[float, msgspec.Meta(ge=0)] = 0.01
     brake: Positive = 2.0  # [m/s²] assumed deceleration toward obstacles
     reaction_ms: Annotated[float, msgspec.Meta(ge=0)] = 20.0  # ramp of the braking
 
@@ -389,9 +358,8 @@ class TableTop(Section, frozen=True):
 class SkillSettings(Section, frozen=True):
     """The timing with which the skill is followed."""
 
-    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = (
-        0.0  # the tool is this far ahead of the teacher's timing
-    )
+    # the tool is this far ahead of the teacher's timing
+    lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
 
 
 class Files(Section, frozen=True):
@@ -402,16 +370,13 @@ class Files(Section, frozen=True):
     # a folder for via-points over a restart; empty: thirdhand in $XDG_STATE_HOME or ~/.local/state
     state: str = ""
     record: str = ""  # a folder; empty: nothing is recorded
-    segment_mb: Annotated[float, msgspec.Meta(ge=0.01)] = (
-        200.0  # at this size a recording ends and the next begins, without a gap
-    )
+    # at this size a recording ends and the next begins, without a gap
+    segment_mb: Annotated[float, msgspec.Meta(ge=0.01)] = 200.0
     segment_minutes: Positive = 10.0  # age at which the next recording begins, without a gap
-    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = (
-        50_000.0  # largest size of this cell's .mcap files; 0: no limit
-    )
-    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = (
-        0.0  # .mcap files older than this are deleted; 0: no limit
-    )
+    # largest size of this cell's .mcap files; 0: no limit
+    keep_mb: Annotated[float, msgspec.Meta(ge=0)] = 50_000.0
+    # .mcap files older than this are deleted; 0: no limit
+    keep_hours: Annotated[float, msgspec.Meta(ge=0)] = 0.0
 
 
 class RecordingSettings(Section, frozen=True):
@@ -420,18 +385,16 @@ class RecordingSettings(Section, frozen=True):
     also: tuple[
         CellName, ...
     ] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
-    frames_hz: Annotated[float, msgspec.Meta(ge=0)] = (
-        25.0  # whole frames a second; others as checksums; 0: every frame
-    )
+    # whole frames a second; others as checksums; 0: every frame
+    frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0
 
 
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
-    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = (
-        500  # ticks of the loop in a second
-    )
+    # ticks of the loop in a second
+    rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     trackers: dict[str, TrackerSettings] = {}
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
@@ -553,7 +516,7 @@ class Settings(Section, frozen=True):
         for path, values in uneven.items():
             quantity = "kinds" if path == "$.joints.kinds" else "numbers"
             needed = f"{count} needed, one for each of $.joints.names"
-                yield f"{path}: {len(values)} {quantity}, {needed}"
+            yield f"{path}: {len(values)} {quantity}, {needed}"
         if uneven:
             return
         widest = self._widest()

@@ -18,9 +18,8 @@ else:
     import tomli as tomllib
 
 LARGEST_CONFIGURATION = 1_000_000  # [bytes]
-LFS_POINTER = (
-    b"version https://git-lfs.github.com/spec/"  # begin of a file that stands for one of Git LFS
-)
+# begin of a file that stands for one of Git LFS
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 NOT_FETCHED = "it is a pointer of Git LFS and not the file itself; `git lfs pull` fetches that"
 MOST_DOTS = 1000  # in a line of TOML
 

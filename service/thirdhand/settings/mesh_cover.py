@@ -28,14 +28,12 @@ END_DIGITS = 4  # a capsule's ends are rounded to 0.1 mm, and its radius is enla
 MIN_AXIS2_M2 = 1e-12  # added to a squared length, so that an axis of length 0 divides nothing by 0
 CAPSULE_CACHE = Path("~/.cache/thirdhand/capsules")  # files are named by a digest of mesh and scale
 EVALUATIONS = 100  # the cost is evaluated this often for each principal axis
-SIMPLEX = np.vstack(
-    (np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1)))
-)  # first steps: two tilts, two offsets / size
+# first steps: two tilts, two offsets / size
+SIMPLEX = np.vstack((np.zeros(4), np.diag((0.3, 0.3, 0.1, 0.1))))
 RADII = np.linspace(1.0, 1.5, 12)  # tried radii / smallest radius that holds all points
 _HEIGHTS = (np.arange(100) + 0.5) / 100
-_TURNS = (
-    np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))
-)  # the golden angle spreads directions evenly
+# the golden angle spreads directions evenly
+_TURNS = np.arange(100) * math.pi * (3.0 - math.sqrt(5.0))
 DIRECTIONS = np.column_stack(
     (
         np.sqrt(1.0 - _HEIGHTS**2) * np.cos(_TURNS),
@@ -98,9 +96,8 @@ def _capsule(
     except (ValueError, RuntimeError, OSError) as error:
         if isinstance(error, UrdfError):
             raise
-        words = in_words(error, named=False).rpartition("message:")[
-            2
-        ]  # the library's source file is cut off
+        # the library's source file is cut off
+        words = in_words(error, named=False).rpartition("message:")[2]
         raise UrdfError(f"{subject} cannot be read: {' '.join(words.split())}") from None
     return capsule
 
@@ -156,9 +153,8 @@ def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
         if path.startswith("localhost/") and scheme == "file"
         else path
     )
-    folders = dict.fromkeys(
-        (urdf.absolute().parent, urdf.resolve().parent)
-    )  # of the URDF, and of a link's target
+    # of the URDF, and of a link's target
+    folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))
     if scheme not in ("package", "model"):
         return [
             folder / file for file in dict.fromkeys((path, unquote(path))) for folder in folders
@@ -203,9 +199,8 @@ def _unit_m(collada: bytes) -> float:
 
 def _kept(name: str) -> tuple[float, ...] | None:
     """A cached capsule; None if there is no such file, or it does not hold a capsule."""
-    with contextlib.suppress(
-        OSError, ValueError, RuntimeError
-    ):  # RuntimeError: a user without a home
+    # RuntimeError: a user without a home
+    with contextlib.suppress(OSError, ValueError, RuntimeError):
         capsule = tuple(
             float(number)
             for number in (CAPSULE_CACHE.expanduser() / name).read_text(encoding="ascii").split()

@@ -62,21 +62,17 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         ENDPOINT,
     )  # endpoints on which the daemon listens; port 0: a free one
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
-    certificate: str = (
-        ""  # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
-    )
+    # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
+    certificate: str = ""
     revoked: tuple[
         str, ...
     ] = ()  # names of certificates, like tracker-2, that are no longer accepted
-    zenoh_config: str = (
-        ""  # file with Zenoh's own settings, where the service sets none; empty: none
-    )
-    ros2_domain: Domain = (
-        None  # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
-    )
-    allow_insecure: bool = (
-        False  # accept a network without TLS: everyone on it, or at its router, can move the arm
-    )
+    # file with Zenoh's own settings, where the service sets none; empty: none
+    zenoh_config: str = ""
+    # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
+    ros2_domain: Domain = None
+    # accept a network without TLS: everyone on it, or at its router, can move the arm
+    allow_insecure: bool = False
 
     @property
     def reached_at(self) -> tuple[str, ...]:
@@ -134,9 +130,8 @@ class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     position_commands: Topic = ""  # forward_command_controller for positions: /<its name>/commands
     trajectory: Topic = ""  # joint_trajectory_controller: /<its name>/joint_trajectory
-    joint_states: Topic = (
-        ""  # joint_state_broadcaster: /joint_states, received in addition to the cell's own
-    )
+    # joint_state_broadcaster: /joint_states, received in addition to the cell's own
+    joint_states: Topic = ""
     joints: tuple[
         str, ...
     ] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
@@ -147,9 +142,8 @@ class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     tool: FrameSource = ""  # the tool in demonstrations, as such a frame
     # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
     tf: Topic = ""
-    robot_description: Topic = (
-        ""  # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
-    )
+    # /robot_description: the URDF, latched, if no other node has it; `tf` has its links
+    robot_description: Topic = ""
     diagnostics: Topic = ""  # /diagnostics: mode, reason and lateness each second
 
     def __post_init__(self) -> None:

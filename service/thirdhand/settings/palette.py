@@ -36,11 +36,8 @@ BY_TRACK = {"left": LEFT, "right": RIGHT, "tool": TOOL}  # the paths of hands an
 BY_JOINT = (SKY, ORANGE, GREEN, PURPLE, YELLOW, BLUE, VERMILLION)
 BY_MODE: dict[Mode, Colour] = {Mode.HOLD: ORANGE, Mode.FOLLOW: GREEN, Mode.FAULT: VERMILLION}
 ARM_BODY: Colour = (200, 203, 208)
-PAPER: Colour = (
-    248,
-    240,
-    234,
-)  # white with the tint of a hold or a fault, the darkest background of plots
+# white with the tint of a hold or a fault, the darkest background of plots
+PAPER: Colour = (248, 240, 234)
 RGB = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in the luminance
 LEAST_CONTRAST = 4.5  # WCAG 2 requires this for text
 BACKGROUND = (24, 27, 33)

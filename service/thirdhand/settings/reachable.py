@@ -24,20 +24,17 @@ from thirdhand.settings.urdf import UrdfJoint
 Vectors = NDArray[np.float64]
 POSTURES = 30_000  # with more the shell's radii change by less than 1 %
 TEST_POINTS = 8_000  # points in space are tested for being reached
-NEAR_SHARE = (
-    0.03  # a reached point is within 0.03 of the arm's extent of the tool in one of the postures
-)
+# a reached point is within 0.03 of the arm's extent of the tool in one of the postures
+NEAR_SHARE = 0.03
 RAIL_STEPS = 9  # positions of a prismatic joint below the first joint that turns
 NEAR_POSTURES = 12  # this many of the nearest postures are compared for each point
 MORE_NEAR_POSTURES = 64  # compared for a point that is near none of NEAR_POSTURES
-BEYOND_SHARE = (
-    0.08  # distance / extent of points out of reach; measured for reached points: at most 0.072
-)
+# distance / extent of points out of reach; measured for reached points: at most 0.072
+BEYOND_SHARE = 0.08
 REACHED = 0.95  # a layer is reached if this share of the best layer's share of points is reached
 LAYERS = 40  # distances from the shoulder that are tested
-FOLDED = (
-    0.4  # min. inner radius / outer radius: nearer to its shoulder an arm is folded onto itself
-)
+# min. inner radius / outer radius: nearer to its shoulder an arm is folded onto itself
+FOLDED = 0.4
 STRETCHED = 0.96  # max. outer radius / maximum distance: farther out an arm is singular
 
 

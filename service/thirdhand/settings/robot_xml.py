@@ -14,12 +14,13 @@ from xml.parsers import expat
 Element = ElementTree.Element
 MAX_DEPTH = 64  # nested elements; a URDF needs 6
 MAX_ELEMENTS = 100_000  # an arm with a hand has about 1000
+# Pinocchio requires a <limit>
 ANY_LIMIT = {
     "lower": "-1e4",
     "upper": "1e4",
     "velocity": "1e4",
     "effort": "0",
-}  # Pinocchio requires a <limit>
+}
 MAX_NUMBER = 1e6  # largest magnitude of any number of a link or joint
 NUMERIC = {  # attributes with numbers by element, in addition to xyz and rpy
     "box": ("size",),

@@ -20,9 +20,8 @@ from thirdhand.settings.robot_xml import (
 )
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic")  # an arm's chain may have these
-CONTINUOUS_RAD = (
-    6000.0  # limit of a continuous joint to either side: within 950 turns, positions remain precise
-)
+# limit of a continuous joint to either side: within 950 turns, positions remain precise
+CONTINUOUS_RAD = 6000.0
 
 
 class UrdfError(ExplainedError, ValueError):
@@ -219,9 +218,8 @@ def _joint(element: Element) -> UrdfJoint:
     )
     try:
         x, y, z = three(element.find("axis"), "xyz", "1 0 0")
-        norm = (
-            math.hypot(x, y, z) or 1.0
-        )  # a joint with the axis 0 0 0 cannot move: `movable` rejects it
+        # a joint with the axis 0 0 0 cannot move: `movable` rejects it
+        norm = math.hypot(x, y, z) or 1.0
         return UrdfJoint(
             name,
             kind,
@@ -273,12 +271,13 @@ SIZES = {
     "capsule": ("radius", "length"),
     "sphere": ("radius",),
 }
+# numbers in the attributes of SIZES
 SIZE_COUNTS = {
     "box": 3,
     "cylinder": 2,
     "capsule": 2,
     "sphere": 1,
-}  # numbers in the attributes of SIZES
+}
 VERSIONS = ("1", "1.0", "1.1", "1.2")
 ATTRIBUTES = {  # that are read, of joints of the chain
     "axis": {"xyz"},

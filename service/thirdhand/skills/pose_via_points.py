@@ -22,9 +22,8 @@ from thirdhand.skills.skill_file import SkillError
 # standard deviations of a via-point's orientation and closure
 STD_RAD = 0.004
 STD_CLOSURE = 0.02
-STEEPEST_RAD_PER_M = (
-    40.0  # largest turn between via-points: hands that tremble by 1 mm turn the tool by 2°
-)
+# largest turn between via-points: hands that tremble by 1 mm turn the tool by 2°
+STEEPEST_RAD_PER_M = 40.0
 NEAR_RAD = math.radians(1.0)  # orientations this near to each other never contradict each other
 NEAR_M = 0.01  # a gripper cannot be open and closed at hands this near to each other
 NOTED_RAD = math.radians(2.0)  # orientations missed by more are reported

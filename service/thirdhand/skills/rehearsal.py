@@ -27,10 +27,8 @@ def rehearse() -> None:
     counted(hands, still[:, 0], still[:, 1], SAMPLE_PERIOD_S, np.zeros((1, BEGIN_AT + 6)))
 
     labels = np.zeros(2, np.int64)
-    for segments in (
-        np.ones(1, SEGMENT),
-        frozen(np.ones(1, SEGMENT)),
-    ):  # of a demonstration, of a skill
+    # of a demonstration, of a skill
+    for segments in (np.ones(1, SEGMENT), frozen(np.ones(1, SEGMENT))):
         recognised(np.zeros((2, 3, 6)), SAMPLE_PERIOD_S, segments, np.zeros((2, MOST_SEGMENTS)))
         covered(hands, still, labels, segments)
         all_followed(hands, still[:, 0].copy(), labels, segments, np.zeros((2, 3)))

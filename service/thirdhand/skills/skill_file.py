@@ -431,7 +431,7 @@ def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> I
         )
     if not steep <= STEEPEST:
         change = f"changes by {steep:g} a metre where it was learned"
-            yield f"{name} {change}, up to {STEEPEST:g} accepted"
+        yield f"{name} {change}, up to {STEEPEST:g} accepted"
 
 
 def _tried(skill: Skill) -> Iterator[str]:

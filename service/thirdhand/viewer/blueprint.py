@@ -23,9 +23,8 @@ TIMELINE = "seconds"
 TABS = ("task", "timing", "learning")
 WINDOW_S = 20.0  # live curves show this time
 LEGEND_SHARE = 0.175  # this share of the time axis is kept free for legends
-NUMBERS_SHARE = (
-    0.032  # width of the numbers left of a curve, which modes lack, as share of the time axis
-)
+# width of the numbers left of a curve, which modes lack, as share of the time axis
+NUMBERS_SHARE = 0.032
 HEADROOM = 1.25  # range of an axis / usual range of its curves
 MAX_GATE_RATIO = 4.0  # a gate farther above the curves is not drawn, as it would flatten them
 EYE = (0.90, -0.72, 0.62)

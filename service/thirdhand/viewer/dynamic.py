@@ -37,9 +37,8 @@ TINY = 1e-4  # scale that makes the links of an arm invisible; the viewer reject
 LOG_NS = 100_000_000  # resolution of a log line's time: its column shows no more digits
 PAUSE_FRAMES = 2  # a longer step between two frames, in intervals of a recording's frames, is a gap
 BREAK_NS = 1000  # a curve ends this long after the last frame before a gap
-REPEAT_S = (
-    0.5  # interval at which live viewers get the mode again, as they connect late or skip frames
-)
+# interval at which live viewers get the mode again, as they connect late or skip frames
+REPEAT_S = 0.5
 Columns = Callable[..., rr.chunk.Chunk]
 
 
@@ -261,9 +260,8 @@ class DynamicScene:
             100.0 * frames["error_probability"],
             "/doubt",
         )
-        other = is_predicted & (
-            np.abs(frames["gate_m"] - std_m) > SAME_M
-        )  # a gate that compares something else
+        # a gate that compares something else
+        other = is_predicted & (np.abs(frames["gate_m"] - std_m) > SAME_M)
         yield from scalars(
             "/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation"
         )
@@ -446,9 +444,8 @@ class DynamicScene:
         self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns
     ) -> Iterator[rr.chunk.Chunk]:
         """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
-        stale = np.maximum(
-            frames["stale_ticks"], self._stale_ticks
-        )  # older recordings have no limits of their own
+        # older recordings have no limits of their own
+        stale = np.maximum(frames["stale_ticks"], self._stale_ticks)
         tracks = [
             (name, frames["hands"][:, side], frames["hand_ages"][:, side], stale[:, side])
             for side, name in enumerate(SIDES)

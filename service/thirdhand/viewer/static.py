@@ -35,11 +35,8 @@ from thirdhand.viewer.blueprint import EYE, LOOK_AT, UP
 GHOST = "measured/"  # prefix of its frames' names
 ARC_STEPS = 48
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-BANNER_AT = (
-    0.55,
-    0.66,
-    -0.44,
-)  # right of, above and in front of the point that the camera looks at
+# right of, above and in front of the point that the camera looks at
+BANNER_AT = (0.55, 0.66, -0.44)
 BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
 VISUAL = "/visual_geometries/"
@@ -55,9 +52,8 @@ class ArmModels:
     """
 
     def __init__(self, urdf: Path, settings: Settings) -> None:
-        live = urdf == urdf_path(
-            settings
-        )  # otherwise the URDF is a recording's, whose meshes are already covered
+        # otherwise the URDF is a recording's, whose meshes are already covered
+        live = urdf == urdf_path(settings)
         text = robot_description(settings) if live else urdf.read_text(encoding="utf-8")
         self.body = body_of(settings, text)
         self.covered = any(shape.kind == "mesh" for shape in Urdf(text).shapes)

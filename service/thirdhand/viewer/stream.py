@@ -38,18 +38,12 @@ from thirdhand.viewer.static import ArmModels, log_static
 
 FILE_BATCH_S = 1.0
 LIVE_BATCH_S = 0.2
-LIVE_MB = (
-    24  # memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
-)
-SCENE_REPEAT_S = (
-    10.0  # interval at which live viewers get skill and objects again, as they connect late
-)
-PEAKS = (
-    "lateness_us",
-    "work_us",
-    "latency_us",
-    "stages_us",
-)  # of the ticks between two frames, the largest is drawn
+# memory for viewers that connect later, without meshes: 20 s at 500 Hz, as curves show
+LIVE_MB = 24
+# interval at which live viewers get skill and objects again, as they connect late
+SCENE_REPEAT_S = 10.0
+# of the ticks between two frames, the largest is drawn
+PEAKS = ("lateness_us", "work_us", "latency_us", "stages_us")
 
 
 class ViewerError(ExplainedError, RuntimeError):
@@ -80,9 +74,8 @@ class Viewer:
         self._repeat_ticks = settings.ticks_in(SCENE_REPEAT_S)
         self._pending: list[DrawnFrame] = []
         self._position: tuple[float, ...] | None = None  # of the joints, as measured last
-        self._timing: Record | None = (
-            None  # of the newest tick, with the peaks since the last frame
-        )
+        # of the newest tick, with the peaks since the last frame
+        self._timing: Record | None = None
         self._after_gap = False
         self._skill = b""
         self._contents: SkillContents | None = None  # of the skill
@@ -94,9 +87,8 @@ class Viewer:
         self._repeated_tick = 0
 
         self.models = ArmModels(urdf, settings)
-        self._remarks = (
-            [self.models.remark] if self.models.remark else []
-        )  # for the log, with the next frame
+        # for the log, with the next frame
+        self._remarks = [self.models.remark] if self.models.remark else []
         start_ms = time.time_ns() // 1_000_000
         self._dynamic = DynamicScene(
             self.models, settings, start_ns=1_000_000 * start_ms if self._live else None
@@ -111,9 +103,8 @@ class Viewer:
             sink = rr.GrpcServerSink(
                 "127.0.0.1", port, server_memory_limit=f"{LIVE_MB + self.models.mesh_mb}MiB"
             )
-            recording_id = (
-                f"{settings.cell}-{start_ms}"  # from this time a page computes a picture's age
-            )
+            # from this time a page computes a picture's age
+            recording_id = f"{settings.cell}-{start_ms}"
         self._stream = rr.RecordingStream("thirdhand", recording_id=recording_id)
         self._stream.set_sinks(sink)
         self._stream.send_recording_name(settings.cell)

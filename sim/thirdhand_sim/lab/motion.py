@@ -73,11 +73,8 @@ SECONDS = 15.0
 SETTLED_MM = 5.0
 BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
 DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
-CHASES = (
-    (1.5, 8.0),
-    (2.0, 40.0),
-    (4.0, 40.0),
-)  # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
+# cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
+CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
 LABELS = {
     "ours": "ours, by [tool] follow (ringed: the default)",
@@ -88,9 +85,8 @@ LABELS = {
 TRUTH = "truth"
 SMOOTH = "minimum jerk"
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-WITH_JUMPS = (
-    "recorded, jumps in the truth"  # a group: recorded hands, where a follower should follow jumps
-)
+# a group: recorded hands, where a follower should follow jumps
+WITH_JUMPS = "recorded, jumps in the truth"
 HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"

@@ -103,9 +103,8 @@ class Fold(NamedTuple):
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
     again: list[list[Judged]]  # the further rounds of each accepted take, by their rests
-    in_spite: list[
-        Judged
-    ]  # each take of a refused fold, with the skill used in spite of the refusal
+    # each take of a refused fold, with the skill used in spite of the refusal
+    in_spite: list[Judged]
     take_refusals: list[str]  # via-points that the skill cannot be adapted to
 
 
@@ -117,9 +116,8 @@ class Found(NamedTuple):
     rivals: dict[str, list[Judged]]
     service: dict[str, Fold]
     moved: RigidMap | None = None  # of recorded takes, into the arm's reach
-    own: Fold | None = (
-        None  # the skill refined by OWN takes of the person who is left out, on the rest
-    )
+    # the skill refined by OWN takes of the person who is left out, on the rest
+    own: Fold | None = None
 
 
 @functools.lru_cache(maxsize=2)

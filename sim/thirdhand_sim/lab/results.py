@@ -51,9 +51,8 @@ class Options:
     """Options of the command line."""
 
     letters: Path | None = None  # a folder of recorded letters, for those about letters
-    hands: Path | None = (
-        None  # a folder of recorded hands, for `motion`, and for `people` to choose parameters
-    )
+    # a folder of recorded hands, for `motion`, and for `people` to choose parameters
+    hands: Path | None = None
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
     group: Literal["tuning", "test"] = "test"  # the people of `people`
     workers: str = "1"  # as `thirdhand.process.parallel.spread` takes them
@@ -68,9 +67,8 @@ class Results:
     folder: Path
     name: str
     said: bool = True
-    origin: dict[str, Any] = field(
-        default_factory=dict
-    )  # commit, date, machine, seeds, options, digests
+    # commit, date, machine, seeds, options, digests
+    origin: dict[str, Any] = field(default_factory=dict)
     figures: list[str] = field(default_factory=list)
     began_s: float = field(default_factory=time.monotonic)
 
@@ -154,9 +152,8 @@ def pyplot() -> Any:
             "'thirdhand[experiments]'"
         ) from None
     mpl.use("Agg")
-    logging.getLogger("matplotlib").setLevel(
-        logging.ERROR
-    )  # it warns of limits that equal scales change
+    # it warns of limits that equal scales change
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     from matplotlib import pyplot as plt
 
     plt.rcParams.update(

@@ -20,18 +20,16 @@ STATE = (
     Field("held_hands", "float64", (2, 3)),  # positions of the hands [m]
     Field("stuck_gap", "float64"),  # distance between tool and target at `stuck_tick` [m]
     Field("stuck_target", "float64", (3,)),  # target at `stuck_tick` [m]
-    Field(
-        "way", "float64", (WAY, PER_JOINT)
-    ),  # postures of the way out [rad]; the last one has the tool at its target
+    # postures of the way out [rad]; the last one has the tool at its target
+    Field("way", "float64", (WAY, PER_JOINT)),
     Field("mode", "uint8"),  # `contract.records.Mode`
     Field("reason", "uint8"),  # `contract.records.Reason`
     Field("operator_hold", "uint8"),  # 1: the operator holds the arm
     Field("held", "uint8"),  # `codes.Held`; 0: the operator does not hold the arm
     Field("arm_ready", "uint8"),  # `codes.ArmReady`; 0: the arm is not ready
     Field("stuck", "uint8"),  # `codes.Stuck`; 0: the tool comes nearer to its target
-    Field(
-        "leaves", "uint8"
-    ),  # 1: the operator has confirmed that the arm may leave the thing that it is inside of
+    # 1: the operator has confirmed that the arm may leave the thing that it is inside of
+    Field("leaves", "uint8"),
 )
 FRAME = (
     Field("mode", "uint8"),

@@ -1,6 +1,6 @@
 """Tuned numbers of the decision.
 
-docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+docs/tuning.md has them as a table, with their measured sensitivity. The comment above one has the
 range of sensible values, and what more and less of it are expected to do.
 """
 
@@ -14,12 +14,10 @@ class DecisionTuning(NamedTuple):
 
     # A tool that is stuck: it comes no nearer to its target.
     # 5e-3 to 0.05. More: fewer tools are stuck. Less: a lag looks stuck.
-    stuck_gap_m: float = (
-        0.02  # a tool nearer than this is at its target; a target that moves farther is a new one
-    )
+    # a tool nearer than this is at its target; a target that moves farther is a new one
+    stuck_gap_m: float = 0.02
     # 0.3 to 3. More: a stuck tool is noticed later. Less: slow progress looks stuck.
-    stuck_s: float = (
-        0.8  # time within which progress is expected, toward a target or out of a thing
-    )
+    # time within which progress is expected, toward a target or out of a thing
+    stuck_s: float = 0.8
     # 0.02 to 0.3. More: slow progress looks stuck. Less: a stuck tool is missed.
     progress_share: float = 0.08  # expected progress, as share of the distance

@@ -5,20 +5,17 @@ from __future__ import annotations
 from thirdhand.contract.records import PER_JOINT, Cause, Field
 
 MODES = 3  # modes of the hand filter: rest, reach, change
-STATES = (
-    5  # states of each mode and axis: position, velocity, acceleration, tremor and its velocity
-)
+# states of each mode and axis: position, velocity, acceleration, tremor and its velocity
+STATES = 5
 # rates of tremor that are distinguished, from slow to fast, and the usual one
 TREMOR_RATES = 10
 USUAL_RATE = 8
 NO_TREMOR = 2  # filters without tremor in the bank of tremor filters
 BANK = NO_TREMOR + TREMOR_RATES  # filters of that bank
-CONFIRMED_SAMPLES = (
-    STATES - 2
-)  # agreeing samples that confirm a jump: they show all states but tremor
-SETTLED_SAMPLES = (
-    CONFIRMED_SAMPLES + 1
-)  # a sample is settled with this number of newer ones: a jump is confirmed
+# agreeing samples that confirm a jump: they show all states but tremor
+CONFIRMED_SAMPLES = STATES - 2
+# a sample is settled with this number of newer ones: a jump is confirmed
+SETTLED_SAMPLES = CONFIRMED_SAMPLES + 1
 # retained samples of each hand, among which late ones are inserted: 0.1 s of the fastest tracker
 KEPT = 49
 STATE = (

@@ -9,10 +9,8 @@ from thirdhand.contract.evidence import figures
 from thirdhand.core.intake.stage import UNIT_M
 from thirdhand.core.tuning import TUNING
 
-PLAUSIBLE_DISTANCES_M = (
-    0.05,
-    2.5,
-)  # distances of hands and tool from the tracker's origin, in the unit that was meant
+# distances of hands and tool from the tracker's origin, in the unit that was meant
+PLAUSIBLE_DISTANCES_M = (0.05, 2.5)
 
 
 def unit_meant(position: Sequence[float], unit: str) -> str:

@@ -217,6 +217,5 @@ class Intake:
         self.refused[SOURCES[source], Cause(cause)] = Refused(
             Cause(cause), sample, newest_ns, joints
         )
-        self.rejected[source, cause] += (
-            1  # last, so that another thread that sees the count finds `refused`
-        )
+        # last, so that another thread that sees the count finds `refused`
+        self.rejected[source, cause] += 1

@@ -1,6 +1,6 @@
 """Tuned numbers of the intake and of the hand filter.
 
-docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+docs/tuning.md has them as a table, with their measured sensitivity. The comment above one has the
 range of sensible values, and what more and less of it are expected to do.
 """
 
@@ -21,9 +21,8 @@ class IntakeTuning(NamedTuple):
     """Tuned numbers of the intake and of the hand filter."""
 
     # 2 to 5. More: noise and outliers are trusted. Less: ordinary noise counts as an outlier.
-    outlier_stds: float = (
-        3.0  # what differs by more than this number of standard deviations is an outlier
-    )
+    # what differs by more than this number of standard deviations is an outlier
+    outlier_stds: float = 3.0
 
     # 0.4 to 0.95. More: holds end sooner. Less: holds last longer, but do not flicker.
     # a hold for a measured reason lasts until its measure is below this share of the threshold
@@ -31,57 +30,38 @@ class IntakeTuning(NamedTuple):
 
     # The hand filter's modes: rest, reach, change.
     # 0.05 to 0.8. More: a mode is entered more often. Less: a mode is entered less often.
-    mode_prior: Modes = (
-        0.3,
-        0.5,
-        0.2,
-    )  # probabilities before anything is known, and after a switch
+    # probabilities before anything is known, and after a switch
+    mode_prior: Modes = (0.3, 0.5, 0.2)
     # 0.01 to 10. More: changes are seen sooner. Less: estimates are smoother.
-    mode_switch_rates_per_s: Modes = (
-        0.03,
-        3.0,
-        3.0,
-    )  # [1/s] rates at which the mode is drawn anew; low in rest
+    # [1/s] rates at which the mode is drawn anew; low in rest
+    mode_switch_rates_per_s: Modes = (0.03, 3.0, 3.0)
     # 1e-7 to 100. More: the estimate follows faster. Less: noise is reduced more.
     mode_intensities_m2ps5: Modes = (1e-6, 1.0, 30.0)  # [m²/s⁵] intensity of the white jerk
     # 3 to 40. More: accelerations end sooner. Less: accelerations last longer.
-    mode_acceleration_reversions_per_s: Modes = (
-        10.0,
-        14.0,
-        14.0,
-    )  # [1/s] decay of the acceleration
+    # [1/s] decay of the acceleration
+    mode_acceleration_reversions_per_s: Modes = (10.0, 14.0, 14.0)
     # 0.1 to 300. More: motions are expected to end sooner. Less: motions are expected to go on.
-    mode_velocity_reversions_per_s2: Modes = (
-        0.3,
-        95.0,
-        95.0,
-    )  # [1/s²] low in rest, where drift goes on; reaches end
+    # [1/s²] low in rest, where drift goes on; reaches end
+    mode_velocity_reversions_per_s2: Modes = (0.3, 95.0, 95.0)
     # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
-    tremor_stds_m: Modes = (
-        5e-4,
-        3e-4,
-        0.0,
-    )  # standard deviation on each axis; larger tremor has the same frequency
+    # standard deviation on each axis; larger tremor has the same frequency
+    tremor_stds_m: Modes = (5e-4, 3e-4, 0.0)
     # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
-    tremor_rate_per_s: float = (
-        20.0 * math.pi
-    )  # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
+    # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
+    tremor_rate_per_s: float = 20.0 * math.pi
     # 0.05 to 0.5. More: irregular tremor is removed. Less: only regular tremor is removed.
     tremor_damping: float = 0.1  # damping ratio of the tremor's oscillator
     # 2e-3 to 0.02. More: rest is left later. Less: strong tremor counts as motion.
-    max_tremor_m: float = (
-        6e-3  # upper limit of the amplitude, which only pathological tremor exceeds
-    )
+    # upper limit of the amplitude, which only pathological tremor exceeds
+    max_tremor_m: float = 6e-3
     # 3e-3 to 0.03. More: faster drift counts as rest. Less: rest is left sooner.
-    rest_speed_std_mps: float = (
-        0.01  # standard deviation of a resting hand, each axis: hands that hold something drift
-    )
+    # standard deviation of a resting hand, each axis: hands that hold something drift
+    rest_speed_std_mps: float = 0.01
 
     # Measurement noise, estimated from third differences of the samples.
     # 1e-4 to 2e-3. More: estimates are smoother. Less: good trackers are followed faster.
-    least_noise_m: float = (
-        7e-4  # lower limit of the standard deviation; below it, samples differ by the hand's tremor
-    )
+    # lower limit of the standard deviation; below it, samples differ by the hand's tremor
+    least_noise_m: float = 7e-4
     # 20 to 300. More: the noise is steadier. Less: the noise adapts faster.
     noise_samples: int = 60  # number of samples over which the noise is averaged
 
@@ -91,43 +71,35 @@ class IntakeTuning(NamedTuple):
 
     # Late samples.
     # 0.03 to 0.3. More: later samples are used. Less: late samples are rejected sooner.
-    max_late_s: float = (
-        0.1  # samples older than the newest one by more are rejected; longer delays count as this
-    )
+    # samples older than the newest one by more are rejected; longer delays count as this
+    max_late_s: float = 0.1
     # 0.3 to 5. More: judgements are steadier. Less: drift and a second arm are seen sooner.
-    tracker_memory_s: float = (
-        1.0  # time over which a tracker's minimum delay and the arm's contradictions are judged
-    )
+    # time over which a tracker's minimum delay and the arm's contradictions are judged
+    tracker_memory_s: float = 1.0
     # 2e-3 to 0.05. More: worse clocks are trusted. Less: good clocks are doubted.
-    delay_tolerance_s: float = (
-        0.01  # minimum delays of two windows agree within this: 1 % of drift between two clocks
-    )
+    # minimum delays of two windows agree within this: 1 % of drift between two clocks
+    delay_tolerance_s: float = 0.01
 
     # Jumps, and two sources of the arm.
     # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
-    max_hand_distance_m: float = (
-        5.0  # samples farther from the base plate are rejected; their unit is probably wrong
-    )
+    # samples farther from the base plate are rejected; their unit is probably wrong
+    max_hand_distance_m: float = 5.0
     # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
     confirmed_s: float = 0.02  # successive samples that confirm a jump span at least this time
     # 0.1 to 0.5. More: two arms are tolerated longer. Less: outliers hold the arm.
-    contested_on_share: float = (
-        0.25  # the arm is contested above this share of contradicting states
-    )
+    # the arm is contested above this share of contradicting states
+    contested_on_share: float = 0.25
 
     # Joint states. Radians hold for revolute joints; a prismatic joint has them times `per_rad`.
     # 0.05 to 1. More: jumps of the arm pass. Less: coarse joint states are rejected.
-    joint_jump_rad: float = (
-        0.2  # a joint may differ from its newest sample by this + jump speed * elapsed time
-    )
+    # a joint may differ from its newest sample by this + jump speed * elapsed time
+    joint_jump_rad: float = 0.2
     # 1 to 20. More: jumps of the arm pass. Less: an arm moved by hand is rejected.
-    joint_jump_radps: float = (
-        5.0  # least jump speed, as an arm can be moved by hand; else the fastest joint's limit
-    )
+    # least jump speed, as an arm can be moved by hand; else the fastest joint's limit
+    joint_jump_radps: float = 5.0
     # 2e-3 to 0.1. More: a moving arm counts as still. Less: a noisy arm never starts.
-    arm_still_rad: float = (
-        0.02  # an arm is at rest if no joint moves by more than this within max_late_s
-    )
+    # an arm is at rest if no joint moves by more than this within max_late_s
+    arm_still_rad: float = 0.02
 
     # Hands without an estimate yet, and hands that move.
     # 1e-4 to 0.01. More: the first second is filtered more. Less: the first second is noisier.

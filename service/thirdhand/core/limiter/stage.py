@@ -110,9 +110,8 @@ class Limiter:
             return _stuck(state[0])
         if met & CHASED:
             self._chase(state, target, moved)
-            if forget_fast(
-                state, moved, self._parameters
-            ):  # joints that become too fast: again, without the ramp
+            # joints that become too fast: again, without the ramp
+            if forget_fast(state, moved, self._parameters):
                 target[1] = 0.0
                 self._chase(state, target, moved)
             make_safe(state, moved, self._parameters)

@@ -16,9 +16,8 @@ from thirdhand.core.stops import braking_together, fastest_stop
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited
 CHASED = 2  # flag of a step: a joint cannot reach its velocity in a tick at constant jerk
-UNSAFE = (
-    4  # flag of a step: a joint could not stop within its limits after the step, so it stops now
-)
+# flag of a step: a joint could not stop within its limits after the step, so it stops now
+UNSAFE = 4
 UNUSABLE = -1  # result of a step: the state is not finite, or too large
 
 
@@ -89,9 +88,8 @@ def _toward(
         wanted[1, i] = min(max(ramp, -most), most)
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
-        crest = v_then + acceleration * abs(acceleration) / (
-            2.0 * max_jerk
-        )  # speed once the acceleration is 0
+        # speed once the acceleration is 0
+        crest = v_then + acceleration * abs(acceleration) / (2.0 * max_jerk)
         outside = int(q > config.upper[i]) - int(q < config.lower[i])
         if (
             outside * crest <= 0.0

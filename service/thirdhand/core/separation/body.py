@@ -67,9 +67,8 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
         if number not in covered:
             end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
             parts.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
-            if (
-                number < len(chain) and chain[number].kind == "prismatic"
-            ):  # the guide of the next link
+            # the guide of the next link
+            if number < len(chain) and chain[number].kind == "prismatic":
                 travel = np.outer(
                     [chain[number].lower, chain[number].upper],
                     frames[number][:, :3] @ chain[number].axis,

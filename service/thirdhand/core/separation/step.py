@@ -15,9 +15,8 @@ from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
 from thirdhand.core.vectors import norm
 
-NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(
-    3
-)  # figures of a step: nearest_m, speed_limit, setpoint_share
+# figures of a step: nearest_m, speed_limit, setpoint_share
+NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)
 
 Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records]
 """States, heres, parameters, capsules, contacts and constraints of a step."""

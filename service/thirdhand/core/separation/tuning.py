@@ -1,6 +1,6 @@
 """Tuned numbers of separation.
 
-docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+docs/tuning.md has them as a table, with their measured sensitivity. The comment above one has the
 range of sensible values, and what more and less of it are expected to do.
 """
 
@@ -16,48 +16,37 @@ class SeparationTuning(NamedTuple):
     # 0 to 0.05. More: the arm stays farther away. Less: the rule itself limits the arm.
     planned_margin_m: float = 0.01  # distance kept beyond the clearance
     # 0.4 to 1. More: the arm comes faster. Less: ramps are never too short.
-    planned_brake_share: float = (
-        0.8  # share of braking and of contact speed that is planned with; ramps need the rest
-    )
+    # share of braking and of contact speed that is planned with; ramps need the rest
+    planned_brake_share: float = 0.8
     # 0.2 to 1. More: the arm comes faster. Less: braking is gentle.
-    planned_brake_limits: tuple[float, ...] = (
-        1.0,
-        0.5,
-        0.5,
-    )  # largest / tool's deceleration: people, things, arm
+    # largest / tool's deceleration: people, things, arm
+    planned_brake_limits: tuple[float, ...] = (1.0, 0.5, 0.5)
     # 5e-3 to 0.1. More: the arm slows down early. Less: joints oscillate.
-    planned_reaction_s: float = (
-        0.02  # smallest reaction time that is planned with; joints oscillate with a shorter one
-    )
+    # smallest reaction time that is planned with; joints oscillate with a shorter one
+    planned_reaction_s: float = 0.02
 
     # Inside of a clearance.
     # 1 to 20. More: the arm returns faster. Less: the arm returns softly.
-    clearance_gain_per_s: float = (
-        5.0  # [1/s] planned speed / distance left to the clearance; negative inside
-    )
+    # [1/s] planned speed / distance left to the clearance; negative inside
+    clearance_gain_per_s: float = 5.0
     # 2e-3 to 0.05. More: the rule is exceeded more. Less: the arm stops for rounding.
-    slip_speed_mps: float = (
-        0.01  # tolerated excess, as joints do not all reach their velocities at the same time
-    )
+    # tolerated excess, as joints do not all reach their velocities at the same time
+    slip_speed_mps: float = 0.01
 
     # Speeds of hands.
     # 0.5 to 3. More: the arm keeps farther away from a hand that appears. Less: it reacts later.
     unknown_speed_mps: float = 1.6  # assumed speed of a hand that was only just seen
     # 0.02 to 0.3. More: slow approaches are ignored. Less: the arm gives way to a tremor.
-    tremor_speed_mps: float = (
-        0.1  # a slower hand's motion is ignored as tremor; from twice that it counts in full
-    )
+    # a slower hand's motion is ignored as tremor; from twice that it counts in full
+    tremor_speed_mps: float = 0.1
 
     # Hands: what may happen until the arm reacts.
     # 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
-    brake_ramp_s: float = (
-        0.08  # time until a deceleration has built up, and until a hand's new velocity is measured
-    )
+    # time until a deceleration has built up, and until a hand's new velocity is measured
+    brake_ramp_s: float = 0.08
     # 1 to 20. More: the arm retreats sooner. Less: hands may appear closer than planned.
-    unseen_acceleration_mps2: float = (
-        5.0  # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
-    )
+    # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
+    unseen_acceleration_mps2: float = 5.0
     # 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
-    contact_margin_m: float = (
-        0.02  # a hand may be touched this far beyond a via-point's radius, on each axis
-    )
+    # a hand may be touched this far beyond a via-point's radius, on each axis
+    contact_margin_m: float = 0.02

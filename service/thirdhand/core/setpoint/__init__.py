@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from thirdhand.contract.records import Field
 
-HULL_SPANS = (
-    7  # the last targets are kept as bounds of this many spans of time; the newest one grows
-)
+# the last targets are kept as bounds of this many spans of time; the newest one grows
+HULL_SPANS = 7
 STATE = (
     Field("hull_ticks", "int64"),  # number of targets in the newest span
     Field("gripper_tick", "int64"),  # tick of the last change of the gripper
-    Field(
-        "setpoint", "float64", (3, 3)
-    ),  # position [m], velocity [m/s], acceleration [m/s²]; by axis
-    Field(
-        "hull", "float64", (HULL_SPANS, 2, 3)
-    ),  # smallest and largest target [m] of each span, newest first
+    # position [m], velocity [m/s], acceleration [m/s²]; by axis
+    Field("setpoint", "float64", (3, 3)),
+    # smallest and largest target [m] of each span, newest first
+    Field("hull", "float64", (HULL_SPANS, 2, 3)),
     Field("orientation", "float64", (4,)),  # orientation setpoint, a quaternion x y z w
     Field("turning", "float64", (3,)),  # angular velocity of the orientation setpoint [rad/s]
     Field("gripper", "uint8"),
-    Field(
-        "engaging", "uint8"
-    ),  # 1: the setpoint has not been at its target since a start or a hold
+    # 1: the setpoint has not been at its target since a start or a hold
+    Field("engaging", "uint8"),
 )
 FRAME = (
     Field("setpoint", "float64", (3,)),  # position setpoint [m]

@@ -1,6 +1,6 @@
 """Tuned numbers of the setpoint.
 
-docs/tuning.md has them as a table, with their measured sensitivity. The line above a number has the
+docs/tuning.md has them as a table, with their measured sensitivity. The comment above one has the
 range of sensible values, and what more and less of it are expected to do.
 """
 
@@ -16,15 +16,13 @@ class SetpointTuning(NamedTuple):
     # 1e-9 to 1e-7. More: the setpoint follows calmly. Less: it follows faster, if joints can.
     jerk_weight: float = 2.8e-9  # [s⁶] weight of a squared jerk beside that of a squared distance
     # 0.5 to 2. More: the setpoint follows faster. Less: the joints follow calmly.
-    tracker_rate_share: float = (
-        1.1  # largest tracker rate / (jerk / acceleration); joints oscillate with a larger one
-    )
+    # largest tracker rate / (jerk / acceleration); joints oscillate with a larger one
+    tracker_rate_share: float = 1.1
 
     # Stopping where the hands would stop at the soonest.
     # 2 to 20. More: more lag, less overshoot. Less: less lag, more overshoot and jerk.
-    hand_brake_mps2: float = (
-        5.0  # [m/s²] largest mean deceleration of a hand, from when it begins to brake
-    )
+    # [m/s²] largest mean deceleration of a hand, from when it begins to brake
+    hand_brake_mps2: float = 5.0
     # 0.03 to 0.3. More: ends of reaches are braked early. Less: stops are passed.
     deceleration_lookahead_s: float = 0.12  # predicted speed = speed + this * min(acceleration, 0)
 
@@ -36,9 +34,8 @@ class SetpointTuning(NamedTuple):
     # 0.1 to 2. More: old targets stay in bounds. Less: the bounds follow closely.
     hull_time_s: float = 0.35  # the setpoint stays near the targets of this last time
     # 5e-3 to 0.1. More: more overshoot is possible. Less: the bounds brake the setpoint.
-    hull_margin_m: float = (
-        0.03  # the setpoint may be this far outside of the box around those targets
-    )
+    # the setpoint may be this far outside of the box around those targets
+    hull_margin_m: float = 0.03
 
     @property
     def gap_free_m(self) -> float:

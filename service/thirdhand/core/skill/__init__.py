@@ -6,21 +6,17 @@ from __future__ import annotations
 
 from thirdhand.contract.records import Field
 
-ORDER = (
-    4  # cascaded filters of a hand's memory: the last one has its position 2 s ago, blurred by 1 s
-)
-TURNS = (
-    3  # cascaded filters of a hand's orientation, so that its angular acceleration is continuous
-)
+# cascaded filters of a hand's memory: the last one has its position 2 s ago, blurred by 1 s
+ORDER = 4
+# cascaded filters of a hand's orientation, so that its angular acceleration is continuous
+TURNS = 3
 
 MAX_SKILL_DISTANCE_M = 10.0  # largest distance of anything in a skill's file from the base plate
 STATE = (
-    Field(
-        "covariance", "float64", (3, 3)
-    ),  # of the prediction at the newest hand sample [m²]; zeros: none
-    Field(
-        "orientation_covariance", "float64", (3, 3)
-    ),  # of the prediction at the newest hand sample [rad²]
+    # of the prediction at the newest hand sample [m²]; zeros: none
+    Field("covariance", "float64", (3, 3)),
+    # of the prediction at the newest hand sample [rad²]
+    Field("orientation_covariance", "float64", (3, 3)),
     Field("closure", "float64"),  # of the gripper, as predicted at the newest hand sample
     Field("known_gate_m", "float64"),  # `gate_m` at the newest hand sample [m]
     Field("unsure", "uint8"),  # 1: the tool may be too far from its target

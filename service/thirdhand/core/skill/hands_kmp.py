@@ -70,9 +70,8 @@ class HandsKMP:
         "error_samples": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
         "error_unknown_std": (0.0, MAX_SKILL_DISTANCE_M, "m"),
     }
-    gripper_ell: ClassVar[float] = (
-        1000.0  # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
-    )
+    # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
+    gripper_ell: ClassVar[float] = 1000.0
     names: ClassVar[tuple[str, ...]] = ()
     delay_s: ClassVar[float] = 0.0
 

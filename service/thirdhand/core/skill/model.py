@@ -20,18 +20,10 @@ if TYPE_CHECKING:
 MOTION_ROUND_TO = 1e6  # [1/m] positions and their derivatives are rounded to micrometres
 COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the calibrated regions
-CHI_SQUARE = (
-    0.5844,
-    1.2125,
-    2.3660,
-    4.1083,
-    6.2514,
-    7.8147,
-    11.3449,
-)  # χ² with 3 degrees of freedom
-NORMAL_RATIOS = tuple(
-    square / 3.0 for square in CHI_SQUARE
-)  # |e|² / tr C of isotropic normal errors
+# χ² with 3 degrees of freedom
+CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)
+# |e|² / tr C of isotropic normal errors
+NORMAL_RATIOS = tuple(square / 3.0 for square in CHI_SQUARE)
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
 NO_CLOCK = np.zeros(3)
@@ -89,9 +81,8 @@ class Seen(NamedTuple):
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
     belief: Vector  # (MOST_SEGMENTS,) probability of each segment; zeros: not yet known
     period_s: float  # time since the belief was updated; 0: it is not updated
-    clock: Vector = (
-        NO_CLOCK  # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
-    )
+    # (3,) or more: clock of the task [s] and its two derivatives; see `task_clock`
+    clock: Vector = NO_CLOCK
 
 
 class Target(NamedTuple):

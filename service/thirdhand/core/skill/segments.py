@@ -62,11 +62,8 @@ OUTPUTS = 4  # outputs of the primitive: the tool's share of its path, and its o
 SEGMENT = np.dtype(
     [
         ("begins", np.float64, (2, 3)),  # [m] each hand's first via-point
-        (
-            "way",
-            np.float64,
-            (2, 3),
-        ),  # [m] each hand's path, from the first via-point to the second one
+        # [m] each hand's path, from the first via-point to the second one
+        ("way", np.float64, (2, 3)),
         (
             "square",
             np.float64,

@@ -21,9 +21,8 @@ from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.model import LEVELS
 from thirdhand.core.skill.tuning import LEAST_STD_M, SUPPORT_MASS, SUPPORT_SHARPNESS, UNSURE_M
 
-SURVIVAL = np.round(
-    -np.log1p(-np.array(LEVELS)), 12
-)  # -log of the share of errors beyond each level
+# -log of the share of errors beyond each level
+SURVIVAL = np.round(-np.log1p(-np.array(LEVELS)), 12)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -43,9 +43,8 @@ PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
 OUTCOME_S = 1.0  # the page shows the outcome before its server ends
 NEVER_THERE = "the hands were never at its places"
-REACHED_LINE = re.compile(
-    r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s"
-)  # a line of the bench
+# a line of the bench
+REACHED_LINE = re.compile(r"\s*(handover|grasp|carry): ([\d.]+ mm) at [\d.]+ s")
 CAUSE_AFTER_S = 1.0  # the cause of a missed event is searched until 1 s after the closest approach
 VIA_POINT_OF_EVENT = {"handover": "handover", "grasp": "glass", "carry": "soldering"}
 EVENT_TITLES = {
@@ -228,9 +227,8 @@ def _played_on_page(
 
 
 def _report(report: dict[str, Any], status: Status) -> dict[str, Any]:
-    from thirdhand.workbench.report.report import (
-        reported,
-    )  # its import is slow: the first messages must come before
+    # its import is slow: the first messages must come before
+    from thirdhand.workbench.report.report import reported
 
     recording = status.scribe["recording"]
     if recording is None:

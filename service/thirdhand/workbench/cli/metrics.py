@@ -23,9 +23,8 @@ from thirdhand.contract.requests import Status
 from thirdhand.process.progress import say
 from thirdhand.workbench.cli.web_address import web_address
 
-SCRAPE_TIMEOUT_S = (
-    2.0  # a cell that does not answer within this time is down, and so is a silent client
-)
+# a cell that does not answer within this time is down, and so is a silent client
+SCRAPE_TIMEOUT_S = 2.0
 MOST_REQUESTS = 64  # threads at once, of which each request takes one
 Figure = tuple[str, str, float | None, dict[str, str]]  # name, explanation, value, labels
 

@@ -172,9 +172,8 @@ def learn(args: argparse.Namespace) -> int:
             show=evidence.append,
         )
     figures = evidence[0].figures
-    print(
-        printable_lines(table(msgspec.structs.replace(figures, unsafe=())))
-    )  # the error lists what is unsafe
+    # the error lists what is unsafe
+    print(printable_lines(table(msgspec.structs.replace(figures, unsafe=()))))
     if args.plot:
         draw(evidence[0], args.plot)
     if figures.unsafe:

@@ -285,9 +285,8 @@ def screenshot(
     if not live and not Path(source).is_file():
         raise ViewerError(f"no picture: there is no file {source}")
     os.environ.setdefault("RUST_LOG", "error")  # else notifications cover the picture
-    os.environ.setdefault(
-        "XDG_RUNTIME_DIR", tempfile.gettempdir()
-    )  # else its graphics library logs errors
+    # else its graphics library logs errors
+    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     try:
         with ViewerClient.spawn(
             headless=True,

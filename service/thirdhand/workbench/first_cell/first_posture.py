@@ -17,18 +17,15 @@ from thirdhand.settings.urdf import Urdf, UrdfJoint
 
 LOW_SHARE = 0.15  # the tool is at least this share of the reach above min_z
 HIGH_SHARE = 0.2  # the tool is at most this share of the reach above the shoulder
-WELL_WITHIN = (
-    0.4,
-    0.75,
-)  # the tool is within these shares of the way from the inner to the outer end of the reach
+# the tool is within these shares of the way from the inner to the outer end of the reach
+WELL_WITHIN = (0.4, 0.75)
 TILTS = (0.2, 0.5, 0.785)  # [rad] tried angles of the tool between straight down and forward
 POSTURE_STARTS = 20  # the inverse kinematics start from this many postures
 # these errors of position and direction cost 1
 UNIT_ERROR_M = 0.01
 UNIT_ERROR_RAD = 0.1
-MIDDLE_WEIGHT = (
-    0.2  # cost of a joint at its limit, proportional to its distance from the middle of its range
-)
+# cost of a joint at its limit, proportional to its distance from the middle of its range
+MIDDLE_WEIGHT = 0.2
 END_WEIGHT = 10.0  # cost per half range, within the last fifth before a limit
 POSTURE_MARGIN_RAD = 0.001  # the posture keeps this distance from the limits, because of rounding
 # a posture with a larger error is not a solution

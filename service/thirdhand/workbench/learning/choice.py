@@ -13,13 +13,11 @@ from kmp.criteria.direct import DirectSelection, Scales
 from thirdhand.core.frame import Vector
 from thirdhand.skills.via_points import MAX_GAIN
 
-RIDGE_M = (
-    0.005  # an input that varies by less, as trembling hands do, does not move the affine mean
-)
+# an input that varies by less, as trembling hands do, does not move the affine mean
+RIDGE_M = 0.005
 NOISE_M = 0.001  # noise of a good tracker on each axis
-DWELL_SHARE = (
-    0.25  # this share of the reference points is even in time, the rest along the hands' path
-)
+# this share of the reference points is even in time, the rest along the hands' path
+DWELL_SHARE = 0.25
 LEAST_POINTS = 4  # reference points of a demonstration
 POSITION_SCALES = Scales(
     ells=(

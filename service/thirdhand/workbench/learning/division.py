@@ -32,9 +32,8 @@ from thirdhand.skills.recognition import all_followed, covered
 from thirdhand.skills.skill_file import SkillError
 
 SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
-SAME_M = (
-    0.05  # positions of a hand that are this near to each other in all demonstrations are the same
-)
+# positions of a hand that are this near to each other in all demonstrations are the same
+SAME_M = 0.05
 OFF_M = 0.06  # unit of the distances d_i
 FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
 DIRECTED = 2.0  # gain of moving along the path
@@ -44,9 +43,8 @@ ANOTHER = 12.0  # cost of any other change
 LATER = 3.0  # cost of each segment that is left out at the beginning
 NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
-LEAST_WEIGHT = (
-    1e-6  # of a sample far from a via-point: a via-point that no sample is near has the mean lever
-)
+# of a sample far from a via-point: a via-point that no sample is near has the mean lever
+LEAST_WEIGHT = 1e-6
 FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 

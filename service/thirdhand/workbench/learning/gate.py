@@ -19,9 +19,8 @@ import numpy as np
 from thirdhand.core.frame import Vector
 
 HELD_OUT_TIMES = 2.0  # the gate is at most this multiple of the largest held-out value
-CEILING_M = (
-    0.15  # no target with a larger deviation on each axis is followed: objects have about this size
-)
+# no target with a larger deviation on each axis is followed: objects have about this size
+CEILING_M = 0.15
 # twice the standard deviation of the noisiest tracker, whose noise must not look like a detour
 FLOOR_M = 0.02
 MISSED_SHARE = 0.05  # this share of the wrong samples may pass

@@ -19,9 +19,8 @@ from thirdhand.workbench.learning.records import Evidence, Fitted, Options, Pose
 from thirdhand.workbench.learning.store import stored
 from thirdhand.workbench.learning.takes import Division, divided, standing_out
 
-EXCHANGED_SHARE = (
-    0.5  # a take fits with its hands exchanged if that reduces its error to less than this share
-)
+# a take fits with its hands exchanged if that reduces its error to less than this share
+EXCHANGED_SHARE = 0.5
 
 
 def learn(

@@ -172,9 +172,8 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
     axes.plot(
         times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration"
     )
-    highest_mm = max(
-        float(off_mm.max()), float(np.percentile(predicted_mm, 98))
-    )  # the first predictions are uncertain
+    # the first predictions are uncertain
+    highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))
     axes.set(
         title=f"{rows[h].name}, held out: its most probable segment, and the error",
         xlabel="[s]",

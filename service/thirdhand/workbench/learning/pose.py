@@ -25,12 +25,10 @@ from thirdhand.workbench.learning.ambiguity import contradictions
 from thirdhand.workbench.learning.choice import selection_of
 from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, persons_of
 
-CONSTANT_RAD = math.radians(
-    5.0
-)  # an orientation that stays this near to its mean counts as constant
-DIFFERENT_RAD = math.radians(
-    30.0
-)  # orientations this far from each other contradict each other at the same hands
+# an orientation that stays this near to its mean counts as constant
+CONSTANT_RAD = math.radians(5.0)
+# orientations this far from each other contradict each other at the same hands
+DIFFERENT_RAD = math.radians(30.0)
 # limits of the share of samples that contradict others
 NOTED_SHARE = 0.01
 UNSAFE_SHARE = 0.10
@@ -38,12 +36,10 @@ UNSAFE_SHARE = 0.10
 NOTED_DEG = 15.0
 UNSAFE_DEG = 60.0
 SIGN_SAMPLES = 100  # samples of a take by which its quaternions' sign is chosen
-MOST_TURN_DEG = (
-    480.0  # a tool that turns farther comes too near to the opposite of the mean orientation
-)
-SINGLE_TAKE = Parameters(
-    8.0, 1e-2, 1e-2, 0.2
-)  # hyper-parameters if there is one person, and nothing to choose by
+# a tool that turns farther comes too near to the opposite of the mean orientation
+MOST_TURN_DEG = 480.0
+# hyper-parameters if there is one person, and nothing to choose by
+SINGLE_TAKE = Parameters(8.0, 1e-2, 1e-2, 0.2)
 GRIPPER_WRONG_SHARE = 0.15  # a gripper that is wrong in a larger share of held-out samples is noted
 
 

@@ -149,9 +149,8 @@ class HeldOut(NamedTuple):
     gate_m: Vector
     inputs: Vector
     known: Vector
-    belief: Vector | None = (
-        None  # (T, K) probability of each of K segments; None if there are no segments
-    )
+    # (T, K) probability of each of K segments; None if there are no segments
+    belief: Vector | None = None
     timed: TimedErrors | None = None  # None: they follow from the errors
 
 
@@ -212,9 +211,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     within_50: float  # [%] of the samples inside the region that should contain 50 %
     within_95: float
     held: float  # [%] of the time in which the gate would hold
-    wrong: float = (
-        0.0  # [%] of the samples at which the tool is more than 10 cm from its prediction
-    )
+    # [%] of the samples at which the tool is more than 10 cm from its prediction
+    wrong: float = 0.0
     told: float | None = None  # [%] of these at which the skill is unsure; None if there are none
     falsely_told: float = 0.0  # [%] of the other samples at which it is
     other_mm: dict[str, float] = {}  # errors of baselines
@@ -232,12 +230,10 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     one_beside: float  # the same with one hand displaced by 30 cm
     ambiguous: float  # share of the samples that contradict another: same hands, other tool
     beyond_reach: float  # share of the tool's path
-    explained: float | None = (
-        None  # share of the tool's variance that held-out predictions explain, see `judged`
-    )
-    orientation_error_deg: float | None = (
-        None  # held out, root mean square; None if it was not learned
-    )
+    # share of the tool's variance that held-out predictions explain, see `judged`
+    explained: float | None = None
+    # held out, root mean square; None if it was not learned
+    orientation_error_deg: float | None = None
     gripper_right: float | None = None  # share of held-out samples
     warnings: tuple[str, ...] = ()
     residual: tuple[
@@ -252,9 +248,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     by_person: bool = False  # true if all demonstrations of a person were held out at once
     delay_s: float | None = None  # the teacher's delay; None if it was not learned
     delay_std_s: float = 0.0  # its standard deviation over the demonstrations
-    alone: bool | msgspec.UnsetType = (
-        msgspec.UNSET
-    )  # true if one hand conducts alone, and `beside` refers to it
+    # true if one hand conducts alone, and `beside` refers to it
+    alone: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class Evidence(NamedTuple):

@@ -55,13 +55,10 @@ LEAST_RADIUS = 1e-9  # a squared radius is at least this large
 FALSE_ALARM_SHARE = 0.12
 ALARM_SHARE = 0.95
 LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
-ALARMS = (
-    0.005,
-    0.5,
-)  # what is that improbable is no alarm, and what is more probable than not is one
-LOCAL_ERRORS_RETAINED = (
-    300  # errors that a model of the hands' inputs keeps, which bound the duration of a tick
-)
+# what is that improbable is no alarm, and what is more probable than not is one
+ALARMS = (0.005, 0.5)
+# errors that a model of the hands' inputs keeps, which bound the duration of a tick
+LOCAL_ERRORS_RETAINED = 300
 LEAST_RETAINED = 4  # errors of a demonstration
 
 

@@ -35,10 +35,11 @@ HELD = 5.0  # [%] limit of the time that the gate holds in demonstrations
 # [%] limits of the wrong samples that the gate must hold
 CAUGHT = 95.0
 CAUGHT_RESIDUAL = 50.0
+# [%] ranges of the samples inside the regions of 50 and 95 %
 COVERAGE = {
     "50": (30.0, 80.0),
     "95": (88.0, 100.0),
-}  # [%] ranges of the samples inside the regions of 50 and 95 %
+}
 
 
 # [%] from this share of wrong samples on, the skill must be unsure at this share of them

@@ -21,10 +21,11 @@ from thirdhand.recordings.recording import Recording
 
 CODEC = "h264"
 PIXELS = "yuv420p"
+# a key frame at every second picture, as training reads at random
 OPTIONS = {
     "g": "2",
     "crf": "23",
-}  # a key frame at every second picture, as training reads at random
+}
 SAMPLED = 10  # the statistics are those of one picture in this number
 
 
@@ -80,10 +81,8 @@ class _Video:
 
     def _write(self, picture: Image.Image, row: int) -> None:
         if self._size is None:
-            self._size = (
-                max(2, picture.width // 2 * 2),
-                max(2, picture.height // 2 * 2),
-            )  # even, for the colours
+            # even, for the colours
+            self._size = (max(2, picture.width // 2 * 2), max(2, picture.height // 2 * 2))
             self._stream.width, self._stream.height = self._size
         frame = picture if picture.size == self._size else picture.resize(self._size)
         if row == 0:

@@ -110,22 +110,18 @@ class Columns:
     recording: Recording
     frames: Records = field(default_factory=lambda: np.empty(0, TIMING))
     timing: Records = field(default_factory=lambda: np.empty(0, TIMING))
-    ticks: NDArray[np.int64] = field(
-        default_factory=lambda: np.empty(0, np.int64)
-    )  # of all ticks with a decision
-    times_ns: NDArray[np.int64] = field(
-        default_factory=lambda: np.empty(0, np.int64)
-    )  # their system clock's times
+    # of all ticks with a decision
+    ticks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    # their system clock's times
+    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     gaps: list[str] = field(default_factory=list)
-    breaks: list[int] = field(
-        default_factory=list
-    )  # rows of `frames` before which some are missing
+    # rows of `frames` before which some are missing
+    breaks: list[int] = field(default_factory=list)
     orders: list[Order] = field(default_factory=list)
     skills: list[InForce] = field(default_factory=list)
     statuses: list[Said] = field(default_factory=list)
-    stops: dict[int, list[Any]] = field(
-        default_factory=dict
-    )  # measured joints by the last tick before
+    # measured joints by the last tick before
+    stops: dict[int, list[Any]] = field(default_factory=dict)
     samples: Counter[str] = field(default_factory=Counter)  # events by kind
     remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
 
@@ -230,9 +226,8 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
     parts = np.cumsum(parts)
     part_of = parts[np.searchsorted(ticks, frames["tick"])]
     row = np.searchsorted(frames["tick"], ticks, side="right") - 1
-    is_known = (row >= 0) & (
-        part_of[row] == parts
-    )  # after damage, those before the next frame are unknown
+    # after damage, those before the next frame are unknown
+    is_known = (row >= 0) & (part_of[row] == parts)
     found.breaks = (np.flatnonzero(np.diff(parts[is_known])) + 1).tolist()
     ticks = ticks[is_known]
     row = row[is_known]

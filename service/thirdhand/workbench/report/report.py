@@ -163,9 +163,8 @@ class Report:
         )
         self.week = begins.strftime("%G-W%V") if len(frames) else "never"
         self.skill = columns.skills[-1].skill.name if columns.skills else "not understood"
-        self.offer = (
-            offer_of(columns.skills[-1].skill) if columns.skills else ""
-        )  # of its last skill
+        # of its last skill
+        self.offer = offer_of(columns.skills[-1].skill) if columns.skills else ""
         self.lasts_s = lasts_s
         self.lacks = (*columns.gaps, *columns.remarks)  # gaps, damage, a cut, unreadable parts
         self.spans = tuple(_spans(columns))
@@ -178,14 +177,12 @@ class Report:
         reached = (
             int(np.argmax(lag_mm < REACHED_MM)) if (lag_mm < REACHED_MM).any() else len(lag_mm)
         )
-        self.initial_mm = Percentiles.of(
-            lag_mm[:reached]
-        )  # tool to target, before it reached the first target
+        # tool to target, before it reached the first target
+        self.initial_mm = Percentiles.of(lag_mm[:reached])
         self.initial_s = reached * columns.period_s
         engaging = following["flags"][reached:] & int(Flag.ENGAGING) > 0
-        self.lag_mm = Percentiles.of(
-            lag_mm[reached:][~engaging]
-        )  # tool to target afterwards, once it has engaged
+        # tool to target afterwards, once it has engaged
+        self.lag_mm = Percentiles.of(lag_mm[reached:][~engaging])
         self.approach = _approach(columns, self.spans)
         self.stop_mm, self.stop_excess_mm = map(
             Percentiles.of, np.array([*_stops_mm(columns)]).reshape(-1, 2).T
@@ -198,9 +195,8 @@ class Report:
         self.joints = tuple(_joints(columns, sent)) if len(sent) else ()
         self.rejections = tuple(_rejections(columns))
         is_seen = (frames["hand_ages"] >= 0) & (frames["hand_ages"] < columns.stale_ticks)
-        seen_s = (
-            np.maximum(is_seen.sum(axis=0), 1) * columns.period_s
-        )  # time in which each hand was seen
+        # time in which each hand was seen
+        seen_s = np.maximum(is_seen.sum(axis=0), 1) * columns.period_s
         self.hands_hz = {
             side: columns.samples[f"hands/{side}"] / seen_s[i] for i, side in enumerate(SIDES)
         }
@@ -363,9 +359,8 @@ def _limit(columns: Columns, name: str, met: NDArray[np.bool_]) -> Limit:
 
 def _binding(columns: Columns) -> Iterator[Limit]:
     """The limits that the motion met, the one that bound longest first."""
-    from thirdhand.core.tool_limits import (
-        binding,
-    )  # its import is slow, and other parts of this module need none
+    # its import is slow, and other parts of this module need none
+    from thirdhand.core.tool_limits import binding
 
     limits = [
         _limit(columns, *entry) for entry in binding(columns.recording.settings, columns.frames)

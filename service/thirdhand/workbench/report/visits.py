@@ -11,9 +11,8 @@ from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Records, Vector
 from thirdhand.workbench.report.columns import Columns, runs
 
-NEAR_M = (
-    0.03  # hands visit a via-point if nearer than this, or than its radius, to where it was taught
-)
+# hands visit a via-point if nearer than this, or than its radius, to where it was taught
+NEAR_M = 0.03
 PAUSE_S = 0.3  # hands that leave for a shorter time have not left
 LEAST_S = 0.1  # a shorter visit does not count
 SETTLED_S = 0.1  # the tool's final distance is averaged over this time at the end of a visit

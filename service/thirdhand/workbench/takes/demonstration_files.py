@@ -25,9 +25,8 @@ from thirdhand.workbench.takes.track import Track
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # after this time without a sample the daemon holds for a stale hand
 GAP_RATIO = 5.0  # nothing was seen in a gap longer than GAP_S and 5 usual gaps
-EDGE_S = (
-    0.3  # a take begins or ends in motion if this first or last time is faster than EDGE_SPEED_MPS
-)
+# a take begins or ends in motion if this first or last time is faster than EDGE_SPEED_MPS
+EDGE_S = 0.3
 EDGE_SPEED_MPS = 0.1
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLOT_COLUMNS = 60  # characters in a line of the speed plot
@@ -89,9 +88,8 @@ def demonstration_paths(folder: Path) -> list[Path]:
     """The files of the takes in a folder, sorted by number: `take-2` before `take-10`. Raises
     OSError.
     """
-    paths = [
-        path for path in folder.iterdir() if path.suffix == ".mcap"
-    ]  # glob finds nothing where it may not read
+    # glob finds nothing where it may not read
+    paths = [path for path in folder.iterdir() if path.suffix == ".mcap"]
     return sorted(
         paths,
         key=lambda path: [int(x) if x.isdigit() else 0 for x in re.split(r"(\d+)", path.stem)],
@@ -232,9 +230,8 @@ def draw(found: Summary, path: Path) -> None:
     above = figure.add_subplot(grid[:, 1])
     begins = list(demonstration.begins)
     for side in (stream.name for stream in found.streams):
-        positions_m = np.insert(
-            getattr(demonstration, side), begins, np.nan, axis=0
-        )  # breaks the line where a part is left out
+        # breaks the line where a part is left out
+        positions_m = np.insert(getattr(demonstration, side), begins, np.nan, axis=0)
         for i, axis in enumerate(axes):
             axis.plot(
                 np.insert(seconds, begins, np.nan),

@@ -40,9 +40,8 @@ _STREAMS = tuple(TAKE_KEYS.values())
 MIN_USABLE_SHARE = 0.5  # takes with a smaller usable share are refused
 MIN_SEEN_SHARE = 0.1  # a hand that is seen for a smaller share of the time does not lead the tool
 MAX_NAMED_STRETCHES = 10  # a message names at most this many bad stretches
-UNSEEN_INTERVALS = (
-    5.0  # a tool with a low rate is out of sight after this many of its usual intervals
-)
+# a tool with a low rate is out of sight after this many of its usual intervals
+UNSEEN_INTERVALS = 5.0
 
 
 def write_demonstration(
@@ -330,10 +329,8 @@ def _in_order(path: str | Path, track: Track) -> Track:
 
 def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
     """True if the poses of a stream, like `hands/left`, are in the tracker's axes and unit."""
-    tracker_frames = (
-        "",
-        *([BASE] if hands.frame in ("", BASE) else []),
-    )  # the daemon has the same rule
+    # the daemon has the same rule
+    tracker_frames = ("", *([BASE] if hands.frame in ("", BASE) else []))
     return frame not in ("", BASE) or (name != TAKE_KEYS["tool"] and frame in tracker_frames)
 
 

@@ -48,9 +48,8 @@ def dwells(demonstration: Demonstration) -> Iterator[tuple[float, float]]:
     grid = np.arange(0.0, float(seconds[-1]), GRID_S)
     path = np.stack([np.interp(grid, seconds, column) for column in positions_m.T], axis=1)
     for begin in demonstration.begins:
-        path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = (
-            np.nan
-        )  # motion is unknown where a part is left out
+        # motion is unknown where a part is left out
+        path[(grid > seconds[begin - 1]) & (grid < seconds[begin])] = np.nan
     count = round(DWELL_S / GRID_S)
     if len(path) <= count:
         return

@@ -24,11 +24,8 @@ UNITS_M = {
     "cm": 0.01,
     "mm": 0.001,
 }
-POSED_TYPES = (
-    "Rigid Body",
-    "Bone",
-    "Marker",
-)  # columns of these types are read; markers of a body are ignored
+# columns of these types are read; markers of a body are ignored
+POSED_TYPES = ("Rigid Body", "Bone", "Marker")
 POSE_COLUMNS = tuple(("Position", axis) for axis in "XYZ") + tuple(
     ("Rotation", axis) for axis in "XYZW"
 )
@@ -84,10 +81,8 @@ def read_motive(path: Path) -> Captured:
         if head[0] in POSED_TYPES and head[2:] in POSE_COLUMNS:
             columns.setdefault(head[1], {})[head[2:]] = i
     table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
-    numeric = [
-        1,
-        *(i for body_columns in columns.values() for i in body_columns.values()),
-    ]  # others may hold text, as a time code
+    # others may hold text, as a time code
+    numeric = [1, *(i for body_columns in columns.values() for i in body_columns.values())]
     for values, row in zip(table, rows[axes_at + 1 :], strict=True):
         try:
             for i in numeric:
@@ -131,9 +126,8 @@ def read_c3d(path: Path) -> Captured:
         )
     raw = path.read_bytes()
     order = ">u2" if raw[512 * (raw[0] - 1) + 3] == BIG_ENDIAN else "<u2"
-    head = np.frombuffer(
-        raw[:10], order
-    )  # words 4 and 5 are the numbers of the first and last frame
+    # words 4 and 5 are the numbers of the first and last frame
+    head = np.frombuffer(raw[:10], order)
     announced = int(head[4]) - int(head[3]) + 1
     if announced > points.shape[2]:
         raise RecordingError(

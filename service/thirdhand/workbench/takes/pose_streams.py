@@ -77,10 +77,11 @@ TF_MESSAGE = TRANSFORMS.type
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_TYPES = (POSE.type, POSE_WITH_COVARIANCE.type, TRANSFORM, POSE_ARRAY, TF_MESSAGE, ODOMETRY)
+# covariances, and a velocity
 NUMBERS_AFTER = {
     POSE_WITH_COVARIANCE.type: 36,
     ODOMETRY: 36 + 6 + 36,
-}  # covariances, and a velocity
+}
 _NUMBERS = {count: struct.Struct(f"<{count}d") for count in (7, *NUMBERS_AFTER.values())}
 
 
@@ -136,9 +137,8 @@ class PoseRecording:
         ] = {}  # time of recording [ns] and bytes of messages by topic
         self._read: dict[str, dict[str, Parts]] = {}
         self._ros_1_topics: set[str] = set()
-        self.is_captured = (
-            False  # True for motion capture: poses are in metres, in the axes of the capture system
-        )
+        # True for motion capture: poses are in metres, in the axes of the capture system
+        self.is_captured = False
         if reader := {".csv": read_motive, ".c3d": read_c3d}.get(self.path.suffix.lower()):
             self._read_captured(reader(self._existing()))
         elif self.path.is_dir() or self.path.suffix in (".db3", ".bag"):
@@ -202,9 +202,8 @@ class PoseRecording:
             )
 
     def _read_bag(self) -> None:
-        from rosbags.rosbag1 import (
-            Reader as Ros1Reader,
-        )  # its import is slow, and most recordings are MCAP files
+        # its import is slow, and most recordings are MCAP files
+        from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
 
         if (self.path / "meta" / "info.json").exists():
@@ -317,9 +316,8 @@ class PoseRecording:
                 f"{self.path}: {source}: poses in frames {frame!r} and {others[0]!r}; one needed"
             )
         poses = np.array(rows, np.float64)
-        if (
-            self.is_captured
-        ):  # `from_tracker` will multiply by the unit and apply the pose of the capture system
+        # `from_tracker` will multiply by the unit and apply the pose of the capture system
+        if self.is_captured:
             poses[:, :3] /= UNIT_M[settings.hands.unit]
             frame = frame if settings.hands.frame in ("", BASE) else settings.hands.frame
         return Track(
@@ -459,10 +457,8 @@ def _whole(data: bytes) -> bytes:
 
 @functools.cache
 def _typestore() -> Any:
-    from rosbags.typesys import (
-        Stores,
-        get_typestore,
-    )  # its import is slow, and few recordings need it
+    # its import is slow, and few recordings need it
+    from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 

@@ -176,9 +176,8 @@ def _intake_verdicts(tracks: Sequence[Track], settings: Settings) -> list[_Verdi
         _Verdict([Distrust.NONE] * len(track.poses), np.zeros(len(track.poses), bool))
         for track in tracks
     ]
-    start_ns = (
-        min(int(track.stamps_ns[0]) for track in tracks) - 1
-    )  # the intake takes a stamp of 0 for no stamp
+    # the intake takes a stamp of 0 for no stamp
+    start_ns = min(int(track.stamps_ns[0]) for track in tracks) - 1
     merged = sorted(
         (int(ns) - start_ns, side, i)
         for side, track in enumerate(tracks)

@@ -10,9 +10,8 @@ import numpy as np
 from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.takes.track import Track, clock_parts
 
-LARGEST_DELAY_S = (
-    0.2  # the delays from stamp to recording of streams with one clock may differ by this
-)
+# the delays from stamp to recording of streams with one clock may differ by this
+LARGEST_DELAY_S = 0.2
 
 
 class OneClock(NamedTuple):

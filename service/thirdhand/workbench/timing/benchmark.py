@@ -25,9 +25,8 @@ from thirdhand.workbench.timing.probe import EDGES_US, figures, percentiles
 from thirdhand.workbench.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "thirdhand")
-DURATION_PARTS = (
-    6  # the duration is divided into two parts each for the empty loop, the core and the whole
-)
+# the duration is divided into two parts each for the empty loop, the core and the whole
+DURATION_PARTS = 6
 MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (
     (
@@ -43,9 +42,8 @@ KERNEL = (
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
 LOOP_KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
-NOTHING_US = (
-    10.0  # added to both medians of lateness, because the ratio of two small numbers means nothing
-)
+# added to both medians of lateness, because the ratio of two small numbers means nothing
+NOTHING_US = 10.0
 SLOWER = 1.15  # accepted latency / (half a period + round trip + work)
 
 

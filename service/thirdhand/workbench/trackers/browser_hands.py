@@ -32,9 +32,8 @@ from thirdhand.workbench.trackers.hand_message import PageHands, decode_hands, i
 from thirdhand.workbench.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
-PAGE_SILENCE_S = (
-    10.0  # a page that sends nothing for this long is disconnected: it pings five times a second
-)
+# a page that sends nothing for this long is disconnected: it pings five times a second
+PAGE_SILENCE_S = 10.0
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
 MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
 MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
@@ -75,9 +74,8 @@ class BrowserHands:
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
         self._owned_s = 0.0
-        self.published = self.lost = self.delayed = (
-            0  # messages of hands: published, missing between others, dropped
-        )
+        # messages of hands: published, missing between others, dropped
+        self.published = self.lost = self.delayed = 0
         self._number: int | None = None
         # each page may wait for two orders; the hold of one must not wait for those of others
         self._ordering = ThreadPoolExecutor(2 * MAX_PAGES, thread_name_prefix="order")

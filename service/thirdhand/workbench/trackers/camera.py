@@ -113,9 +113,8 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
     device = cv2.VideoCapture()
     try:
         is_open = False
-        with contextlib.suppress(
-            cv2.error, ValueError
-        ):  # of a number or a name that it cannot pass on
+        # of a number or a name that it cannot pass on
+        with contextlib.suppress(cv2.error, ValueError):
             is_open = device.open(int(source) if source.isdecimal() else source)
         if not is_open:
             raise CameraError(

@@ -42,10 +42,8 @@ from thirdhand.workbench.takes.track import Track
 HAND_KEYS = ("hands/left", "hands/right")
 TOOL_KEY = TAKE_KEYS["tool"]
 CAPTURED_KEYS = (*HAND_KEYS, TOOL_KEY, JOINT_STATES, GRIPPER_STATE)
-OTHER_CELLS = (
-    "**/hands/*",
-    "**/tool/pose",
-)  # these expressions find streams of other cells, and misspelt keys
+# these expressions find streams of other cells, and misspelt keys
+OTHER_CELLS = ("**/hands/*", "**/tool/pose")
 MAX_OTHER_KEYS = 8  # an error message lists at most this many of them
 REST_RAD = 0.02  # a joint at rest moves less than this
 MIN_COVERED_SHARE = 0.7  # samples must cover this share of a rest

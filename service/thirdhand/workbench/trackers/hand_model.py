@@ -20,12 +20,8 @@ from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.settings.user_folder import user_folder
 
 PACKAGE = "mediapipe==0.10.21"
-PLATFORM = (
-    "--platform",
-    "manylinux_2_28_x86_64",
-    "--python-version",
-    "3.11",
-)  # the networks are the same for all
+# the networks are the same for all
+PLATFORM = ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11")
 NETWORKS = {  # name in the model: path in the package, SHA-256
     "hand_detector.tflite": (
         "mediapipe/modules/palm_detection/palm_detection_full.tflite",

@@ -34,9 +34,8 @@ AVERAGE_PALM = np.array(
         [0.41, -0.215, 0.0],
     ]
 )
-PALM_CORNERS = [
-    PALM.index(point) for point in (WRIST, INDEX, LITTLE)
-]  # the palm's position is their mean
+# the palm's position is their mean
+PALM_CORNERS = [PALM.index(point) for point in (WRIST, INDEX, LITTLE)]
 _AHEAD = AVERAGE_PALM[PALM_CORNERS].sum(axis=0) / np.linalg.norm(
     AVERAGE_PALM[PALM_CORNERS].sum(axis=0)
 )

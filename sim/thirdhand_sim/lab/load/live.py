@@ -17,9 +17,8 @@ from thirdhand_sim.lab.scenes import OFFSET_M, Drawn
 from thirdhand_sim.network import RunReport
 
 ATTEMPTS = 3
-SKIPPED = (
-    25  # a run with more skipped periods of the bench is no evidence: the machine was too busy
-)
+# a run with more skipped periods of the bench is no evidence: the machine was too busy
+SKIPPED = 25
 
 
 def is_evidence(skipped: int) -> bool:

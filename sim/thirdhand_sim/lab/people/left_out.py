@@ -159,9 +159,8 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
             ]
             if share == 1.0:
                 begins.append(begin)
-    seconds.append(
-        seconds[-1][-1:] + 1.0 / JUDGED_HZ
-    )  # one sample more, as rounding may cut off the last one
+    # one sample more, as rounding may cut off the last one
+    seconds.append(seconds[-1][-1:] + 1.0 / JUDGED_HZ)
     poses.append(poses[-1][-1:])
     hands = np.concatenate(poses)
     stamps = np.round(1e9 * (1.0 + np.concatenate(seconds))).astype(np.int64)

@@ -29,9 +29,8 @@ NOISY_HZ = 60.0
 CUT_HZ = 6.0
 NOISY_CUT_HZ = 2.5
 PRECISE_M = 0.0004  # [m] noise (standard deviation) of motion capture is below this
-CAMERA_AXES = np.array(
-    [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-)  # base from a camera's x right, y down
+# base from a camera's x right, y down
+CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is scaled down
 # [m/s], [s] of sudden stops
 STOP_SPEED = 0.31

@@ -72,9 +72,8 @@ def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
         local = (part - part[0]) @ np.stack([along, side, np.cross(along, side)], axis=1) / length
         local = np.stack([np.interp(u, np.arange(len(part)), column) for column in local.T], axis=1)
         eased = np.linspace(0, 1, SHAPE_STEPS)
-        eased = eased**3 * (
-            10 - 15 * eased + 6 * eased * eased
-        )  # recorded parts begin and end at SLOW_MPS, not at 0
+        # recorded parts begin and end at SLOW_MPS, not at 0
+        eased = eased**3 * (10 - 15 * eased + 6 * eased * eased)
         local = np.stack(
             [np.interp(eased, np.linspace(0, 1, SHAPE_STEPS), column) for column in local.T], axis=1
         )

@@ -36,13 +36,11 @@ RUN_GROWTH = 1.25  # ratio of the lengths of runs, above the first few
 THRESHOLD = 30.0
 THRESHOLD_EACH = 6.0
 LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
-ALIKE = (
-    0.5  # the candidates are runs with at least this share of the largest excess over the threshold
-)
+# the candidates are runs with at least this share of the largest excess over the threshold
+ALIKE = 0.5
 CANDIDATES = 40  # the shortest of these are compared
-BRIDGE_MARGIN = (
-    0.25  # share of the box around the neighbours by which a predicted sample may be outside of it
-)
+# share of the box around the neighbours by which a predicted sample may be outside of it
+BRIDGE_MARGIN = 0.25
 STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
 EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
 NOISE_ORDER = 5  # differences of this order contain a tracker's noise and hardly a hand's motion

@@ -32,14 +32,12 @@ SEED = SEEDS.method
 WRITTEN = SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
-TOLERANCE_S = (
-    0.004  # below half of the reference's step: each desired point replaces one reference point
-)
+# below half of the reference's step: each desired point replaces one reference point
+TOLERANCE_S = 0.004
 HALF_CM = 12.5  # half of the width and height of a drawn letter
 SETS = {"model": "modelled", "recorded": "recorded"}
-NEAR_S = (
-    0.5  # farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
-)
+# farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
+NEAR_S = 0.5
 
 
 class Case(NamedTuple):

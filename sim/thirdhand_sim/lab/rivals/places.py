@@ -16,9 +16,8 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import places_of
 
-FOLLOW = np.hstack(
-    [np.eye(3), np.zeros((3, 3))]
-)  # d tool / d hands where the tool follows the left hand
+# d tool / d hands where the tool follows the left hand
+FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 
 @dataclass(frozen=True)

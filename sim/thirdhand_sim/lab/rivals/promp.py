@@ -40,9 +40,8 @@ def learned_promp(
             "'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    primitive.imitate(
-        [t.copy() for t in times], list(trajectories)
-    )  # divides the given times in place
+    # divides the given times in place
+    primitive.imitate([t.copy() for t in times], list(trajectories))
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
         primitive.weight_mean, primitive.weight_cov + variance * np.eye(len(primitive.weight_cov))

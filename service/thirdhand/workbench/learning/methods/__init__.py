@@ -29,11 +29,8 @@ class Method(Protocol):
         """
 
 
-METHODS: tuple[type[Method], ...] = (
-    Mixture,
-    Segmented,
-    HandInputs,
-)  # the last one applies to all demonstrations
+# the last one applies to all demonstrations
+METHODS: tuple[type[Method], ...] = (Mixture, Segmented, HandInputs)
 
 
 def method_of(demonstrations: Sequence[Demonstration], options: Options) -> Method:

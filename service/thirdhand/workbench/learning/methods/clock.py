@@ -23,12 +23,10 @@ LEAST_REST_S = 1.0  # a shorter rest is no pause
 LEAST_HOME_S = 0.25  # a shorter rest where demonstrations begin may be a hesitation
 # on this share of the way to the end, or to another segment's begin, hands are not at the begin
 HALF_WAY = 0.5
-LEAST_NEAR_M = (
-    2.0 * OWN_NEAR_M
-)  # hands within this distance of where demonstrations begin have returned there
-NEAR_TIMES = (
-    2.0  # so have those within this multiple of the largest distance of their begins from the mean
-)
+# hands within this distance of where demonstrations begin have returned there
+LEAST_NEAR_M = 2.0 * OWN_NEAR_M
+# so have those within this multiple of the largest distance of their begins from the mean
+NEAR_TIMES = 2.0
 MOST_TEMPO_HZ = 125.0  # samples beyond this rate are left out: the intake takes as long for each
 LEAST_PAIRS = 3  # with fewer blocks, too few takes remain to learn from
 FIRST_STAMP_NS = 1_000_000_000

@@ -42,11 +42,8 @@ def held_out_takes(
 def gate_of(primitive: KMP, held_out: Sequence[HeldOut], order: int, ceiling_m: float) -> Gate:
     """The gate on the primitive's standard deviation; its inputs hold `order` rows of memory."""
     inputs = np.concatenate([every_few(result.inputs) for result in held_out])
-    beyond = (
-        swapped(inputs, order)[:, 6:],
-        inputs[:, 6:],
-        inputs[:, 6:],
-    )  # the inputs beyond the positions
+    # the inputs beyond the positions
+    beyond = (swapped(inputs, order)[:, 6:], inputs[:, 6:], inputs[:, 6:])
     wrong = [
         _deviations(primitive, np.hstack([hands, tail.repeat(len(hands) // len(inputs), axis=0)]))
         for hands, tail in zip(nonsense(inputs[:, :6]), beyond, strict=True)

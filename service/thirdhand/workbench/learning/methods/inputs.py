@@ -38,9 +38,8 @@ AS_GOOD = 1.02
 AS_GOOD_M = 0.002
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
 LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
-LEAST_PERSONS = (
-    3  # hyper-parameters are chosen anew without each block of takes from this number of persons on
-)
+# hyper-parameters are chosen anew without each block of takes from this number of persons on
+LEAST_PERSONS = 3
 
 
 class Inputs(NamedTuple):
@@ -85,14 +84,14 @@ KINDS = (  # from simple to rich
     Inputs("orientations", turned=True),
     Inputs("memory", order=ORDER),
 )
+# names; the first is simpler
 CLOCKS = {
     True: ", and a clock that waits for resting hands",
     False: ", and a clock",
-}  # names; the first is simpler
+}
 WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
-CLOCK_ERROR_SHARE = (
-    0.9  # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
-)
+# a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
+CLOCK_ERROR_SHARE = 0.9
 
 
 @dataclass(frozen=True)

@@ -79,35 +79,24 @@ from thirdhand.workbench.learning.regions import LEAST_BLOCKS, blocks_of, unknow
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
-SAMPLES_TRIED = (
-    200  # delays and inputs are compared with about this number of samples of a demonstration
-)
+# delays and inputs are compared with about this number of samples of a demonstration
+SAMPLES_TRIED = 200
 # lower limit of the hands' distance from a path, root mean square; few takes may show less
 LEAST_OFF_M = 0.03
 LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for this time
-CORNERS = (
-    (1.0, 0.0),
-    (0.0, 1.0),
-)  # one hand is at the end of its path, the other still at the start
-SEEN_SHARES = (
-    0.5,
-    1.0,
-)  # the tool waits at these shares of the path to a corner that was demonstrated
+# one hand is at the end of its path, the other still at the start
+CORNERS = ((1.0, 0.0), (0.0, 1.0))
+# the tool waits at these shares of the path to a corner that was demonstrated
+SEEN_SHARES = (0.5, 1.0)
 UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
-KNOWN_TIMES = (
-    0.0,
-    0.25,
-    0.5,
-    0.75,
-    1.0,
-)  # shares of the longest clock at which the tool's share is known
+# shares of the longest clock at which the tool's share is known
+KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock
 KNOWN_STD = 1e-3  # standard deviation of the tool's share where it is known
 # share of the time that the gate may hold: the tool follows hands that come from elsewhere
 HOLD_SHARE = 0.005
-OWN_DELAY_SHARE = (
-    0.75  # the new takes get a delay of their own if it reduces their error to this share
-)
+# the new takes get a delay of their own if it reduces their error to this share
+OWN_DELAY_SHARE = 0.75
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
 WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the path, no offset
@@ -555,9 +544,8 @@ class Segmented:
             predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
-        known_places = unknown._replace(
-            scatters=np.zeros_like(unknown.scatters)
-        )  # the places of held-out takes are given
+        # the places of held-out takes are given
+        known_places = unknown._replace(scatters=np.zeros_like(unknown.scatters))
         progress(f"learning from all {len(takes)}")
         model = SegmentedKMP(
             best.samples.fitted(best.parameters),

@@ -48,9 +48,8 @@ STREAM_ENDS_S = 1.0  # a stream that is silent for longer has ended
 LARGEST_POSITION = 1e9  # in any unit; squares of larger numbers overflow
 # positions are left out if they are this many times as far from the median as half of them
 FAR_RATIO = 100.0
-MIN_MEDIAN_OFF = (
-    0.05  # in the tracker's unit: a hand that rested for most of the time may still move by 5 m
-)
+# in the tracker's unit: a hand that rested for most of the time may still move by 5 m
+MIN_MEDIAN_OFF = 0.05
 TOUCH_S = 0.5  # a touch is the median over this time
 MAX_TOUCH_M = 0.015  # during a touch, the hand moves at most this far
 LEAST_TOUCH_SAMPLES = 5

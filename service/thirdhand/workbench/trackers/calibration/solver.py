@@ -31,10 +31,8 @@ from thirdhand.settings.config import Point, Pose, Settings
 from thirdhand.workbench.trackers.calibration.noise import WanderingNoise, estimated
 
 FIRST_SCALE_M = 0.01  # in the first fit, larger residuals have a bounded influence
-SCALES_M = (
-    0.001,
-    0.05,
-)  # bounds of that scale in the next fits, where it is 2 robust standard deviations
+# bounds of that scale in the next fits, where it is 2 robust standard deviations
+SCALES_M = (0.001, 0.05)
 OUTLIER_DEVIATIONS = 6.0  # a sample with a residual of more robust standard deviations is not used
 NOISE_ROUNDS = 2  # estimates of the noise, each followed by a fit
 MAX_STAMP_DELAY_S = 0.5  # a longer delay shows that clocks differ
@@ -48,16 +46,14 @@ MIN_POINTS = 4
 MIN_EXTENT_M = 0.05  # the positions must extend this far in their narrowest direction
 EXTENT_DEVIATIONS = 4.0  # extent of positions or orientations / their standard deviation
 TRACKER_UNITS_M = {"mm": 0.001, "cm": 0.01, "inches": 0.0254, "feet": 0.3048, "m": 1.0}
-MAX_SCALE_ERROR = (
-    1.35  # largest ratio of distances of hand and tool that a tracker's errors explain
-)
+# largest ratio of distances of hand and tool that a tracker's errors explain
+MAX_SCALE_ERROR = 1.35
 # The residual with the right sense of the axes is below this share of that with the other sense: of
 # points, of which a few agree by chance, and of a held tool.
 MIRRORED_RATIO = 0.5
 HELD_MIRRORED_RATIO = 0.75
-MAX_UNEXPLAINED = (
-    0.5  # the residual of a hand at the tool is at most this share of the tool's motion
-)
+# the residual of a hand at the tool is at most this share of the tool's motion
+MAX_UNEXPLAINED = 0.5
 BENCH_HEIGHT_M = 0.4  # the bench extends from the table top to this height
 CONFIDENCE = 0.99  # of the upper limit of the errors' variance: few samples may agree by chance
 EPSILON = 1e-7  # step of numerical derivatives
@@ -188,9 +184,8 @@ def solve_held(
     cover = coverage(held.tool, held.turn)
     _check_extent(cover)
     flips = np.where(np.sum(held.turn[1:] * held.turn[:-1], axis=1) < 0, -1.0, 1.0)
-    turn = (
-        held.turn * np.cumprod(np.r_[1.0, flips])[:, None]
-    )  # without changes of sign, to interpolate neighbours
+    # without changes of sign, to interpolate neighbours
+    turn = held.turn * np.cumprod(np.r_[1.0, flips])[:, None]
     poses = [*held.tool.T, *turn.T]
     rows = np.arange(0, len(held.hand), math.ceil(len(held.hand) / max_samples), dtype=np.intp)
     span_s = (held.tool_s[0], held.tool_s[-1])
@@ -377,9 +372,8 @@ def _affine(problem: _Problem) -> tuple[float, Vector, Vector]:
         tool, turn = problem.tool_at(delay_s)
         rows[:, :, 12:] = -turn.as_matrix()
         weights = np.ones((count, 1))
-        for _ in range(
-            5
-        ):  # reweighted, so that it minimises the distances rather than their squares
+        # reweighted, so that it minimises the distances rather than their squares
+        for _ in range(5):
             weighted = (weights[:, :, None] * rows).reshape(3 * count, -1)
             solution = np.linalg.lstsq(weighted, (weights * tool).ravel(), rcond=1e-9)[0]
             distances_m = np.linalg.norm(rows @ solution - tool, axis=1)
@@ -407,9 +401,8 @@ def _check_motion(problem: _Problem, delay_s: float, matrix: Vector, centre: Vec
 
 def _check_scale(matrix: Vector, section: str) -> None:
     """Raise CalibrationError if the tracker's positions are not in metres."""
-    scale = max(
-        float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9
-    )  # the widest direction has the least error
+    # the widest direction has the least error
+    scale = max(float(np.linalg.svd(matrix, compute_uv=False)[0]), 1e-9)
     if 1 / MAX_SCALE_ERROR < scale < MAX_SCALE_ERROR:
         return
     unit = min(TRACKER_UNITS_M, key=lambda name: abs(math.log(TRACKER_UNITS_M[name] / scale)))
