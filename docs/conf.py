@@ -33,7 +33,7 @@ GROUPS = {
         "record-takes",
         "other-recordings",
         "arrays",
-        "places",
+        "via-points",
         "correct",
         "pose",
         "unseen-hands",

@@ -50,7 +50,7 @@ BLOCKS = {  # templates of a paragraph in a page
 With modelled people who did not demonstrate it, the soldering task succeeds in
 {{ people.methods.ours.success.mean | percent }} % of the scenes; in
 {{ people.methods.ours.success_on_the_way.mean | percent }} % the tool also takes the path that a
-teacher would take. A mere look-up of the taught places succeeds in
+teacher would take. A mere look-up of the via-points succeeds in
 {{ people.methods.look_up.success.mean | percent }} %, but its tool takes that path in
 {{ people.methods.look_up.success_on_the_way.mean | percent }} %.
 [docs/experiments.md](docs/experiments.md) has all results, and how they were measured.""",

@@ -36,7 +36,7 @@ def main() -> None:
     tutorial["above"].figure.savefig(HERE / "kmp-plane.png", dpi=DPI)
     page = values_of(HERE / "coming-from.md", "through = ")
     axes = page["skill"].plot(label="as learned")
-    page["through"].plot(axes=axes, label="through the place")
+    page["through"].plot(axes=axes, label="through the via-point")
     axes[0].figure.savefig(HERE / "kmp-coming-from.png", dpi=DPI)
     plt.close("all")
 

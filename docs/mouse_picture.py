@@ -52,7 +52,9 @@ def main(path: Path = PICTURE) -> None:
                 url = found[0]
                 threading.Thread(target=demo.stderr.read, daemon=True).start()
                 with chromium.opened(url, folder, size=(1000, 700), timeout_s=TIMEOUT_S) as tab:
-                    tab.until("typeof hands !== 'undefined' && !!hands.left && places().length > 0")
+                    tab.until(
+                        "typeof hands !== 'undefined' && !!hands.left && handGoals().length > 0"
+                    )
                     play(Person(tab))
                     tab.picture(path)
             finally:
@@ -65,7 +67,7 @@ def play(person: Person) -> None:
     tab = person.tab
     for goal in person.goals():
         person.drag(goal.side, goal.at)
-    tab.until("document.getElementById('done').textContent !== '' && places().length > 1")
+    tab.until("document.getElementById('done').textContent !== '' && handGoals().length > 1")
     for goal in sorted(person.goals()):
         x, y, z = goal.at
         to = goal.at if goal.side == "left" else (x + 0.08, y - 0.1, z - 0.04)

@@ -33,7 +33,7 @@ PAUSE_S = 0.6  # a rest between the first and the last motion is a pause from th
 
 def missed_m(skill: StoredSkill, take: LeftOut) -> Vector:
     """Distance (T,) [m] of the predicted tool from the teacher's, the via-points being given."""
-    said = predicted(taught(skill, take.demonstration.places), take)
+    said = predicted(taught(skill, take.demonstration.via_points), take)
     return np.asarray(np.linalg.norm(said.mean - take.tool, axis=1))
 
 

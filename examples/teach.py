@@ -1,4 +1,4 @@
-"""Teaches one place to a running daemon, looks how well it is met, and forgets it again.
+"""Teaches one via-point to a running daemon, looks how well it is met, and forgets it again.
 Try: python examples/teach.py
 """
 
@@ -32,10 +32,10 @@ def main(arguments: list[str] | None = None) -> None:
         client.wait_until_ready(timeout_s=None)
         reply = client.add([HANDOVER])
         print(f"in force since tick {reply.tick}")
-        for point in client.places():
+        for point in client.via_points():
             print(f"{point.name}: missed by {1000 * point.missed_by_m:.1f} mm")
         try:
-            client.remove("no such place")
+            client.remove("no such via-point")
         except RefusedError as error:
             print(f"refused: {error}")
         client.remove(HANDOVER.name)

@@ -125,7 +125,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session")
 def skill() -> Skill:
-    """The shipped soldering skill, without places."""
+    """The shipped soldering skill, without via-points."""
     path = RECORDINGS / "soldering.npz"
     return decoded(path.read_bytes(), origin=str(path))
 

@@ -247,7 +247,7 @@ class Run:
         return between(self.scene.tool + scatter) + arc * (1.0 - follow) + hand_offset, turns
 
     def demonstration(self) -> Demonstration:
-        """The run as measured by a tracker and the arm, with the places as perceived."""
+        """The run as measured by a tracker and the arm, with the via-points as perceived."""
         random = np.random.default_rng([*self.key, 4])
         habit = np.random.default_rng([*self.key[:2], self.number])
         steps = np.arange(int(self.lasts_s * TAKE_HZ))
@@ -278,11 +278,11 @@ class Run:
                     _quaternions(turned, count),
                 ]
             ),
-            places=self._perceived(random),
+            via_points=self._perceived(random),
         )
 
     def _perceived(self, random: np.random.Generator) -> tuple[ViaPoint, ...]:
-        """The places with errors of PERCEIVED_M; a place that is visited twice has one error."""
+        """The via-points with errors of PERCEIVED_M, one for each position."""
         parts = []
         for part, column in zip(self.scene[:3], self.task.segments.T, strict=True):
             error_m = PERCEIVED_M / np.sqrt(3.0) * random.standard_normal((column.max() + 1, 3))

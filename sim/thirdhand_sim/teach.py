@@ -32,7 +32,7 @@ from thirdhand_sim.scene import TOOL_FROM_HAND, TOOL_ORIENTATION, Scene, SceneEr
 from thirdhand_sim.script import Array, Clock, HandScript, Teacher
 
 RADIUS_M = 0.03  # radius of via-points
-MIN_PLACE_STD_M = 0.001  # least standard deviation of via-points
+MIN_VIA_POINT_STD_M = 0.001  # least standard deviation of via-points
 TEACH_EXAMPLE = """example:
   python -m thirdhand_sim.teach --live --count 1 & thirdhand record take-1 --until rest
   python -m thirdhand_sim.teach --output demonstrations --count 6
@@ -108,16 +108,16 @@ def recorded(shown: sessions.SessionDemonstration, *, begin_s: int = 1) -> Demon
         np.hstack([shown.hands[:, :3], still]),
         np.hstack([shown.hands[:, 3:], still]),
         np.hstack([shown.tool, turned]),
-        places=places_of(shown.places),
+        via_points=via_points_of(shown.places),
     )
 
 
-def places_of(places: Places) -> tuple[ViaPoint, ...]:
+def via_points_of(places: Places) -> tuple[ViaPoint, ...]:
     """The via-points of the task in the order of the tool's motion, with their standard deviations
     per axis: the error of the places (3-D rms) / sqrt(3).
     """
     p = places
-    std = max(places.std_m / math.sqrt(3.0), MIN_PLACE_STD_M)
+    std = max(places.std_m / math.sqrt(3.0), MIN_VIA_POINT_STD_M)
     named = (
         ("start", p.left_start, p.right_start, p.robot_start),
         ("handover", p.handover, p.right_start, p.handover + TOOL_FROM_HAND),
@@ -128,8 +128,8 @@ def places_of(places: Places) -> tuple[ViaPoint, ...]:
         {
             "name": name,
             **{
-                part: np.round(position, 6).tolist()
-                for part, position in zip(("left", "right", "tool"), ends, strict=True)
+                part: np.round(at, 6).tolist()
+                for part, at in zip(("left", "right", "tool"), ends, strict=True)
             },
             "std": std,
             "radius": RADIUS_M,
@@ -171,7 +171,7 @@ def perform(
 def perform_visits(
     number: int, *, connect: Sequence[str], cell: str, speed: float, wait_s: float
 ) -> bool:
-    """Publish a person's run of the task that visits a place twice, see `publish`."""
+    """Publish a person's run of the task that visits a via-point twice, see `publish`."""
     demonstration = visits(number)
     times = demonstration.period_s * np.arange(len(demonstration.tool)) / speed
 
@@ -271,11 +271,13 @@ def main(arguments: list[str] | None = None) -> int:
     people = "two demonstrations each by modelled people, with moved things and via-points"
     p.add_argument("--people", action="store_true", help=people)
     visit = (
-        "another task, between five named via-points, with one place visited twice; with --live or "
-        "--places"
+        "another task, between five named via-points, with one visited twice; with --live or "
+        "--via-points"
     )
     p.add_argument("--visits", action="store_true", help=visit)
-    option(p, "--places", "FILE", "with --visits: write its via-points for `record --places`")
+    option(
+        p, "--via-points", "FILE", "with --visits: write its via-points for `record --via-points`"
+    )
     option(p, "--cell", "NAME", "prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument("--gripper", action="store_true", help="include the closure of the gripper")
     args = p.parse_args(arguments)
@@ -283,10 +285,10 @@ def main(arguments: list[str] | None = None) -> int:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
-    if [args.live, args.output is not None, args.places is not None].count(True) != 1:
-        p.error("exactly one of --output DIR, --live and --places FILE needed")
-    if args.visits == (args.output is not None) and (args.visits or args.places):
-        p.error("--visits needs --live or --places, and --places needs --visits")
+    if [args.live, args.output is not None, args.via_points is not None].count(True) != 1:
+        p.error("exactly one of --output DIR, --live and --via-points FILE needed")
+    if args.visits == (args.output is not None) and (args.visits or args.via_points):
+        p.error("--visits needs --live or --via-points, and --via-points needs --visits")
     if args.live and args.people:
         p.error("--people needs --output, not --live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
@@ -294,9 +296,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         scene = Scene.load(args.scene) if args.scene else Scene()
         reach = client_settings(connect=args.connect, cell=args.cell)
-        if args.places:
-            points = msgspec.json.encode({"op": "add", "points": visits(1).places})
-            args.places.write_bytes(msgspec.json.format(points) + b"\n")
+        if args.via_points:
+            points = msgspec.json.encode({"op": "add", "points": visits(1).via_points})
+            args.via_points.write_bytes(msgspec.json.format(points) + b"\n")
             return 0
         if args.live:
             return _perform_all(scene, args, reach)

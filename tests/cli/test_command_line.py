@@ -100,7 +100,7 @@ REFUSED = [  # exit code, words on standard error, command
     (
         1,
         "points, entry 2, name: 'glass' given twice, names once each needed",
-        "record a --places twice.json",
+        "record a --via-points twice.json",
     ),
     (1, "Without a daemon, use --listen tcp/127.0.0.1:7447", "record a {nobody}"),
     (1, "cannot read configuration nowhere.toml", "calibrate --config nowhere.toml"),

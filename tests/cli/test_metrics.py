@@ -111,7 +111,7 @@ STATUS = {
     "realtime": True,
     "memory_locked": False,
     "skill": 'a "skill"\\',
-    "places": [],
+    "via_points": [],
     "rejected": {"jumped": 3},
     "hand_age_ms": {},
     "hand_distance_m": 0.25,

@@ -76,7 +76,7 @@ STATUS = requests.Status(
     skill="",
     version="",
     flags=(),
-    places=(),
+    via_points=(),
     endpoints=(),
     rejected={},
     hand_age_ms={},
@@ -135,7 +135,7 @@ def test_a_refusal_is_raised_with_the_daemons_words(
         client.ask("hold")
 
 
-def test_places_are_asked_for_as_the_wire_says(
+def test_via_points_are_asked_for_as_the_wire_says(
     session: zenoh.Session, answering: Callable[[str, Answer], None]
 ) -> None:
     asked: list[bytes] = []
@@ -149,8 +149,8 @@ def test_places_are_asked_for_as_the_wire_says(
     answering("bench/via_points", take)
     client = Client(session, "bench")
     client.wait_until_ready()
-    point = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
-    assert client.add([point], tolerance=0.1) == requests.Reply(3)
+    there = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
+    assert client.add([there], tolerance=0.1) == requests.Reply(3)
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
@@ -223,7 +223,7 @@ def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[]
         relay.__exit__()
 
 
-def test_status_places_and_hold_survive_a_connection_that_breaks_before_the_answer(
+def test_status_via_points_and_hold_survive_a_connection_that_breaks_before_the_answer(
     breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
 ) -> None:
     session, cut = breaking
@@ -244,7 +244,7 @@ def test_status_places_and_hold_survive_a_connection_that_breaks_before_the_answ
     client = Client(session, "bench")
     assert client.status() == STATUS
     assert client.hold() == requests.Reply(3)
-    assert client.places() == ()
+    assert client.via_points() == ()
     assert client.ask("via_points", {"op": "list"}) == {"tick": 3}
     assert asked == ["bench/status"] * 2 + ["bench/hold"] * 2 + ["bench/via_points"] * 3
 

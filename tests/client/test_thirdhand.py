@@ -238,7 +238,7 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
         lambda cell: cell.objects(None),
         "objects: None given; SceneObjects needed",
     ),  # type: ignore[arg-type]
-    "a place": (
+    "a point": (
         lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)),
         "left: 2 numbers given; x",
     ),
@@ -339,7 +339,7 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
             lambda: cell.clutch(True),
             cell.hold,
             cell.status,
-            cell.places,
+            cell.via_points,
             lambda: cell.watch("status"),
             lambda: tracker.publish("left", (0, 0, 0)),
             lambda: follower.tell([0.0], [0.0]),

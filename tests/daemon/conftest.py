@@ -10,7 +10,7 @@ import pytest
 import zenoh
 from zenoh_ros2_sdk.session import ZenohSession
 
-from support.request_cell import PLACES, Cell
+from support.request_cell import VIA_POINTS, Cell
 from thirdhand.client import endpoints, open_session
 from thirdhand.core.skill.skill import Skill
 from thirdhand.daemon.skill_worker import SkillWorker
@@ -64,9 +64,9 @@ def taught_cell(
     skill: Skill,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Cell]:
-    """A cell with three places taught, for requests that change nothing."""
+    """A cell with three via-points taught, for requests that change nothing."""
     with contextlib.closing(
         Cell(*sessions, skill, skill_worker, tmp_path_factory.mktemp("cell"))
     ) as cell:
-        cell.client.add(PLACES)
+        cell.client.add(VIA_POINTS)
         yield cell

@@ -74,7 +74,7 @@ def test_a_cell_is_restored_from_its_backup_by_the_commands_of_the_page(tmp_path
     folder.mkdir()
     shutil.copytree(home / ".local/state/thirdhand", folder / "state")
     with serving(folder, "--joints", "assumed") as daemon:
-        assert Client(daemon.session).status().places == tuple(
+        assert Client(daemon.session).status().via_points == tuple(
             point.name for point in Scene().via_points()
         )
         assert "via-points of an earlier run are in force (3)" in daemon.log.read_text()

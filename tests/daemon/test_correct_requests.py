@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from support.request_cell import PLACES, Cell
+from support.request_cell import VIA_POINTS, Cell
 from thirdhand.client import RefusedError
 from thirdhand.contract.records import Mode
 from thirdhand.core.codes import HELD_SEEN, HELD_UNSEEN
@@ -20,13 +20,13 @@ ADD = {"op": "add"}
 @pytest.fixture(scope="module")
 def taught(skill: Skill) -> Skill:
     """The shipped skill as the cell has it, with the via-points of the nominal scene."""
-    return adapted(skill, PLACES, tolerance=0.05)
+    return adapted(skill, VIA_POINTS, tolerance=0.05)
 
 
 @pytest.fixture
 def held(cell: Cell, taught: Skill) -> Cell:
     """A cell whose arm holds, with the hands halfway to the handover, and was led away."""
-    cell.client.add(PLACES)
+    cell.client.add(VIA_POINTS)
     state = cell.state
     hands = taught.model.hands
     state["tick"] = 1000
@@ -113,19 +113,21 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     )
     # the segment of the hold, whatever the hand did that led
     assert held.kinds()[-2:] == ["skill", "segment"]
-    first_places = held.client.places()
+    one = held.client.via_points()
     held.state["measured"][0] += 0.1
     second = held.client.correct()
     assert second.correction is not None
     assert (second.correction.name, second.correction.corrections) == ("correction-2", 2)
-    two = held.client.places()
-    assert [point.name for point in two] == [*(point.name for point in PLACES), "correction-2"]
+    two = held.client.via_points()
+    assert [point.name for point in two] == [*(point.name for point in VIA_POINTS), "correction-2"]
     undone = held.client.undo_correction().correction
     assert undone is not None
     assert (undone.name, undone.undone) == ("correction-2", True)
-    assert held.client.places() == first_places
+    assert held.client.via_points() == one
     held.client.undo_correction()
-    assert [point.name for point in held.client.places()] == [point.name for point in PLACES]
+    assert [point.name for point in held.client.via_points()] == [
+        point.name for point in VIA_POINTS
+    ]
     with pytest.raises(RefusedError, match="no correction is in force"):
         held.client.undo_correction()
     assert not held.failures

@@ -50,7 +50,7 @@ def following(status: dict[str, Any]) -> bool:
 
 @pytest.mark.quick
 def test_a_session_from_start_to_end(tmp_path: Path) -> None:
-    """Hands are followed, lost, and followed again; places are taught; SIGTERM ends it all, and
+    """Hands are followed, lost, and followed again; via-points are taught; SIGTERM ends it all, and
     what was recorded replays identically.
     """
     records = tmp_path / "records"
@@ -71,7 +71,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
             (point,) = reply.points or ()
             assert point.name == "handover"
             assert point.missed_by_m < 0.005
-            assert daemon.until(lambda s: s["tick"] >= reply.tick)["places"] == ["handover"]
+            assert daemon.until(lambda s: s["tick"] >= reply.tick)["via_points"] == ["handover"]
 
             tracker.left = None
             assert daemon.until(lambda s: s["mode"] == "hold")["reason"] == "stale_hand"
@@ -131,7 +131,7 @@ def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Pa
             assert taken[end - len(burst) : end] == burst
 
 
-def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
+def test_via_points_survive_a_restart(tmp_path: Path) -> None:
     """After the daemon has ended, and after it was killed: its lock keeps nobody out either."""
     with serving(tmp_path, "--joints", "assumed") as daemon:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
@@ -139,16 +139,14 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         assert daemon.end() == 0
         assert "earlier run" not in daemon.log.read_text()
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        (log_line,) = (
-            line for line in daemon.log.read_text().splitlines() if "earlier run" in line
-        )
-        (file,) = (tmp_path / "state").rglob("places-*.json")
+        (said,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
+        (file,) = (tmp_path / "state").rglob("via-points-*.json")
         assert (
             f"via-points of an earlier run are in force (1): handover. They are saved in {file}; "
-            in log_line
+            in said
         )
-        assert "`thirdhand via-points remove NAME` removes one" in log_line
-        assert daemon.client.status().places == ("handover",)
+        assert "`thirdhand via-points remove NAME` removes one" in said
+        assert daemon.client.status().via_points == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [
             ("handover", 0.03, "left")
@@ -156,7 +154,7 @@ def test_taught_places_survive_a_restart(tmp_path: Path) -> None:
         daemon.client.ask("via_points", {"op": "clear"})
         daemon.process.kill()
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        assert daemon.client.status().places == ()
+        assert daemon.client.status().via_points == ()
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +186,7 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     assert "resume in force since tick" in told("resume", *connect).stdout
     reset = told("reset", *connect)
     assert (reset.returncode, "there was no fault: nothing was reset" in reset.stdout) == (0, True)
-    place = (
+    positions = (
         "--left",
         ".62",
         "-.28",
@@ -202,25 +200,25 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
         "-.28",
         ".3",
     )
-    added = succeeded("via-points", "add", "my place", *place, *connect)
-    assert "my place" in added.stdout
+    added = succeeded("via-points", "add", "my point", *positions, *connect)
+    assert "my point" in added.stdout
     assert "replaced" not in added.stdout
-    repeated = told("via-points", "add", "my place", *place, *connect)
+    again = told("via-points", "add", "my point", *positions, *connect)
     assert (
-        repeated.returncode,
-        repeated.stdout.endswith("replaced, because a via-point had the same name: my place\n"),
+        again.returncode,
+        again.stdout.endswith("replaced, because a via-point had the same name: my point\n"),
     ) == (
         0,
         True,
     )
     assert "1 via-point in force" in told("via-points", "list", *connect).stdout
-    assert_refused(1, "in force: my place", "via-points", "remove", "other", *connect)
+    assert_refused(1, "in force: my point", "via-points", "remove", "other", *connect)
     succeeded("via-points", "clear", *connect)
     carried = json.loads(told("status", "--json", *connect).stdout)
     assert {"mode", "reason", "tick", "rate_hz", "missed", "rejected"} <= carried.keys()
 
 
-def test_a_place_is_taught_from_where_hands_and_tool_are(
+def test_a_via_point_is_taught_from_where_hands_and_tool_are(
     shared_daemon: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     add = ["via-points", "add", "glass", "--here", "--connect", shared_daemon.endpoint]
@@ -228,10 +226,10 @@ def test_a_place_is_taught_from_where_hands_and_tool_are(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
-    error_text = capsys.readouterr().err
+    said = capsys.readouterr().err
     assert re.search(
         r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z",
-        error_text,
+        said,
     )
     shared_daemon.client.ask("hold")
     with Tracker(shared_daemon.session):

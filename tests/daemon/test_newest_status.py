@@ -34,10 +34,10 @@ def shown(status: dict[str, Any], request: str, reply: dict[str, Any]) -> bool:
         )
     if request == "segment":
         return bool(status["segment"]) and status["segment"][0] == "glass"
-    return status["places"] == [point["name"] for point in reply["points"]]
+    return status["via_points"] == [point["name"] for point in reply["points"]]
 
 
-PLACES = [
+VIA_POINTS = [
     {"name": p.name, "left": p.left, "right": p.right, "tool": p.tool, "std": 0.01}
     for p in Scene().via_points()
 ]
@@ -48,9 +48,9 @@ REQUESTS: list[tuple[str, dict[str, Any]]] = [
     ("reset", {}),
     ("resume", {}),
     ("segment", {"name": "glass"}),
-    ("via_points", {"op": "add", "points": PLACES[:1]}),
-    ("via_points", {"op": "remove", "names": [PLACES[0]["name"]]}),
-    ("via_points", {"op": "add", "points": PLACES[1:2]}),
+    ("via_points", {"op": "add", "points": VIA_POINTS[:1]}),
+    ("via_points", {"op": "remove", "names": [VIA_POINTS[0]["name"]]}),
+    ("via_points", {"op": "add", "points": VIA_POINTS[1:2]}),
     ("via_points", {"op": "clear"}),
     ("skill", {"name": "soldering"}),
 ]

@@ -19,9 +19,9 @@ from thirdhand.workbench.takes.demonstration_reader import write_demonstration
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import visits
 
-PLACES = Scene().via_points()
+VIA_POINTS = Scene().via_points()
 TURNED = msgspec.structs.replace(
-    PLACES[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03
+    VIA_POINTS[0], orientation=(0.0, 0.0, 0.0, 1.0), gripper="closed", radius=0.03
 )
 TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
 
@@ -29,8 +29,8 @@ TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
 def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[[], object]]]:
     """Every request to a daemon, one of them in a hold for hands in a segment of its task."""
     client = daemon.client
-    first = PLACES[0]
-    yield "add", lambda: client.add(PLACES)
+    first = VIA_POINTS[0]
+    yield "add", lambda: client.add(VIA_POINTS)
     hands.left = first.left
     hands.right = first.right
     yield "segment", lambda: client.set_segment(first.name)

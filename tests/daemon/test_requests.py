@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from support.request_cell import PLACES, Cell
+from support.request_cell import VIA_POINTS, Cell
 from thirdhand.client import RefusedError, endpoints
 from thirdhand.command_line import main
 from thirdhand.contract import requests
@@ -34,13 +34,13 @@ from thirdhand.skills.reach import beyond_m
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.skills.via_points import adapted
 
-HANDOVER = PLACES[0]
+HANDOVER = VIA_POINTS[0]
 ORDERS = ("hold", "resume", "reset")
 FAR_LEFT = Reach(centre=(0.0, 1.5, 0.346))
 
 
 def point(**change: Any) -> dict[str, Any]:
-    """A place as a client writes it; None leaves a field out."""
+    """A via-point as a client writes it; None leaves a field out."""
     whole = {
         "name": "a",
         "left": HANDOVER.left,
@@ -55,16 +55,23 @@ def add(*points: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 
 def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> None:
-    assert cell.client.places() == ()
-    points = cell.client.add(PLACES).points
+    assert cell.client.via_points() == ()
+    points = cell.client.add(VIA_POINTS).points
     assert points is not None
     assert [taught.name for taught in points] == ["handover", "glass", "soldering"]
     assert all(taught.missed_by_m < 0.003 for taught in points)
-    assert cell.client.places() == points
+    assert cell.client.via_points() == points
 
     moved = cell.client.ask(
         "via_points",
-        add(point(name="glass", left=PLACES[1].left, right=PLACES[1].right, tool=[0.5, 0.1, 0.3])),
+        add(
+            point(
+                name="glass",
+                left=VIA_POINTS[1].left,
+                right=VIA_POINTS[1].right,
+                tool=[0.5, 0.1, 0.3],
+            )
+        ),
     )
     assert {taught["name"]: taught["tool"] for taught in moved["points"]}["glass"] == [
         0.5,
@@ -79,49 +86,49 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     ]
     assert cell.client.clear().points == ()
     assert cell.kinds() == ["skill"] * 4
-    assert cell.taken[0].value.via_points == PLACES
+    assert cell.taken[0].value.via_points == VIA_POINTS
 
 
-def test_a_reply_warns_of_a_place_that_is_missed_and_only_then(cell: Cell) -> None:
-    assert cell.client.add(PLACES).warnings == ()
-    tool_m = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
-    reply = cell.client.ask("via_points", add(point(name="loose", tool=tool_m, std=0.2)))
+def test_a_reply_warns_of_a_via_point_that_is_missed_and_only_then(cell: Cell) -> None:
+    assert cell.client.add(VIA_POINTS).warnings == ()
+    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
     missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
     assert missed > 0.1
     assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
 
 
 def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: StoredSkill) -> None:
-    cell.client.add(PLACES, tolerance=0.04)
+    cell.client.add(VIA_POINTS, tolerance=0.04)
     (event,) = cell.taken
-    expected = adapted(skill, PLACES, tolerance=0.04)
-    assert event.payload == cell.kept[0] == expected.file
+    wanted = adapted(skill, VIA_POINTS, tolerance=0.04)
+    assert event.payload == cell.kept[0] == wanted.file
     assert type(event.value) is Skill  # without its file, which a recording has beside it
-    assert event.value.digest == expected.digest
+    assert event.value.digest == wanted.digest
 
 
 def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:
-    cell.client.add(PLACES)
+    cell.client.add(VIA_POINTS)
     saved = cell.folder / "state" / cell.settings.cell
-    assert stat.S_IMODE(next(saved.glob("places-*.json")).stat().st_mode) == 0o600
+    assert stat.S_IMODE(next(saved.glob("via-points-*.json")).stat().st_mode) == 0o600
     assert stat.S_IMODE(saved.stat().st_mode) == 0o700
 
 
-def test_places_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
+def test_via_points_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
     (cell.folder / "state").write_text("a file where a folder is needed")
     with pytest.raises(RefusedError, match="via-points"):
-        cell.client.add(PLACES)
+        cell.client.add(VIA_POINTS)
     assert cell.kinds() == []
     assert cell.names() == []
 
 
-def test_places_in_force_whose_file_cannot_be_replaced_are_reported(
+def test_via_points_in_force_whose_file_cannot_be_replaced_are_reported(
     cell: Cell, skill: Skill
 ) -> None:
     SavedViaPoints(cell.settings).path(skill).mkdir(parents=True)
-    (warning,) = cell.client.add(PLACES).warnings
+    (warning,) = cell.client.add(VIA_POINTS).warnings
     assert warning.startswith("the via-points end at a restart: they cannot be saved (")
-    assert cell.names() == [place.name for place in PLACES]
+    assert cell.names() == [point.name for point in VIA_POINTS]
 
 
 NOT_EMPTY: list[tuple[Any, str]] = [
@@ -224,18 +231,18 @@ def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) ->
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
-def test_a_skill_is_loaded_by_name_and_places_stay_with_what_they_were_taught_to(
+def test_a_skill_is_loaded_by_name_and_via_points_stay_with_what_they_were_taught_to(
     cell: Cell, skill: StoredSkill, name: str
 ) -> None:
-    cell.client.add(PLACES)
-    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    cell.client.add(VIA_POINTS)
+    assert len(cell.client.load_skill(name).points or ()) == len(VIA_POINTS)
     other = with_file(replace(skill, learned_from="other demonstrations"))
     (cell.folder / "other.npz").write_bytes(other.file)
     assert cell.client.ask("skill", {"name": "other"})["points"] == []
     assert cell.taken[-1].value.digest == other.digest
     assert cell.names() == []
-    cell.client.add(PLACES[:1])
-    assert len(cell.client.load_skill(name).points or ()) == len(PLACES)
+    cell.client.add(VIA_POINTS[:1])
+    assert len(cell.client.load_skill(name).points or ()) == len(VIA_POINTS)
     assert len(cell.client.load_skill("other").points or ()) == 1
 
 
@@ -252,13 +259,13 @@ def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
     monkeypatch.setattr("thirdhand.daemon.request_inbox.ADOPTION_TIMEOUT_S", 0.05)
     setattr(cell, state, state == "fails")
     with pytest.raises(RefusedError, match=message):
-        cell.client.add(PLACES)
+        cell.client.add(VIA_POINTS)
     monkeypatch.undo()
     setattr(cell, state, state == "running")
     cell.client.ask("hold")  # taken after whatever else waits
     assert cell.kinds() == ["hold"]
     assert cell.names() == []
-    assert [point.name for point in cell.client.add(PLACES[:1]).points or ()] == [HANDOVER.name]
+    assert [point.name for point in cell.client.add(VIA_POINTS[:1]).points or ()] == [HANDOVER.name]
 
 
 @pytest.mark.parametrize(
@@ -355,8 +362,8 @@ def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a
         folder.mkdir()
         number = int(np.count_nonzero(beyond_m(Settings(reach=reach), positions)))
         sentence = (
-            f"{number} of {len(positions)} places of the tool in skill 'soldering' are out of the "
-            "arm's reach, the"
+            f"{number} of {len(positions)} positions of the tool in skill 'soldering' are out of "
+            "the arm's reach, the"
         )
         with contextlib.closing(Cell(*sessions, skill, skill_worker, folder, reach)) as cell:
             if is_refused:
@@ -376,7 +383,7 @@ def test_a_skill_out_of_reach_is_not_served(
     settings = Settings(files=Files(state=str(tmp_path)), reach=reach)
     with pytest.raises(
         SkillError,
-        match=r"places of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: ",
+        match=r"positions of the tool .* out of the arm's reach, the farthest by \d\.\d+ m: ",
     ):
         load_skill(tmp_path / "soldering.npz", settings)
     served = load_skill(tmp_path / "soldering.npz", Settings(files=Files(state=str(tmp_path))))
@@ -416,7 +423,7 @@ def test_a_skill_with_a_residual_risk_is_served_only_if_somebody_accepted_it(
                 assert f"residual risk of skill 'soldering', {sentence}" in caplog.text
                 assert f"residual risk {sentence}" in cell.client.load_skill("soldering").warnings
                 assert served.for_loop().residual_risk == sentence
-                assert adapted(served, PLACES, tolerance=0.05).residual_risk == sentence
+                assert adapted(served, VIA_POINTS, tolerance=0.05).residual_risk == sentence
             else:
                 with pytest.raises(SkillError, match=refusal):
                     load_skill(folder / "risky.npz", settings)
@@ -438,14 +445,14 @@ class SlowWorkshop(SkillWorker):
     def adapt(
         self,
         skill: Skill,
-        places: Sequence[requests.ViaPoint],
+        via_points: Sequence[requests.ViaPoint],
         *,
         tolerance: float,
         timeout_s: float = 0.0,
     ) -> Skill:
         self.begun.set()
         assert self.let.wait(20)
-        return adapted(skill, places, tolerance=tolerance)
+        return adapted(skill, via_points, tolerance=tolerance)
 
 
 @pytest.fixture
@@ -480,7 +487,7 @@ def test_hold_is_answered_while_a_slow_request_runs(
 ) -> None:
     cell = opened(slow)
     with ThreadPoolExecutor(1) as pool:
-        teaching = pool.submit(cell.client.add, PLACES)
+        teaching = pool.submit(cell.client.add, VIA_POINTS)
         assert slow.begun.wait(10)
         held = cell.client.ask("hold")
         assert cell.kinds() == ["hold"]
@@ -496,7 +503,7 @@ def test_requests_that_wait_are_answered_before_the_end(
 ) -> None:
     cell = opened(slow)
     with ThreadPoolExecutor(2) as pool:
-        teaching = pool.submit(cell.client.add, PLACES)
+        teaching = pool.submit(cell.client.add, VIA_POINTS)
         assert slow.begun.wait(10)
         closing = pool.submit(cell.close)
         slow.let.set()

@@ -26,7 +26,7 @@ from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import adapted, in_force
 from thirdhand_sim.scene import Scene
 
-PLACES = Scene().via_points()
+VIA_POINTS = Scene().via_points()
 SOLDERING = RECORDINGS / "soldering.npz"
 
 
@@ -66,10 +66,10 @@ def bits(value: object) -> bytes:
 def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     skill_worker: SkillWorker, skill: Skill, count: int
 ) -> None:
-    remote = skill_worker.adapt(skill, PLACES[:count], tolerance=0.05)
-    assert_same_bits(remote, adapted(skill, PLACES[:count], tolerance=0.05))
-    assert remote.via_points == PLACES[:count]
-    assert in_force(remote) == in_force(adapted(skill, PLACES[:count], tolerance=0.05))
+    there = skill_worker.adapt(skill, VIA_POINTS[:count], tolerance=0.05)
+    assert_same_bits(there, adapted(skill, VIA_POINTS[:count], tolerance=0.05))
+    assert there.via_points == VIA_POINTS[:count]
+    assert in_force(there) == in_force(adapted(skill, VIA_POINTS[:count], tolerance=0.05))
 
 
 def test_errors_come_back_with_their_words_and_do_not_end_the_process(
@@ -78,7 +78,7 @@ def test_errors_come_back_with_their_words_and_do_not_end_the_process(
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     with pytest.raises(SkillError, match=r"tolerance is -1 m; 0 or more accepted"):
-        skill_worker.adapt(skill, PLACES[:1], tolerance=-1.0)
+        skill_worker.adapt(skill, VIA_POINTS[:1], tolerance=-1.0)
     with pytest.raises(SkillError, match=r"cannot read skill .*nowhere\.npz: No such file"):
         skill_worker.load(tmp_path / "nowhere.npz")
     with pytest.raises(SkillError, match=r"cannot read skill .*: Is a directory"):
@@ -106,14 +106,14 @@ def test_a_killed_process_is_replaced_at_the_next_request(
 def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Skill) -> None:
     skill_worker = SkillWorker()
     skill_worker.close()
-    remote = skill_worker.adapt(skill, PLACES, tolerance=0.05)
+    there = skill_worker.adapt(skill, VIA_POINTS, tolerance=0.05)
     started = process_of(skill_worker)
     skill_worker.close()
     skill_worker.close()
     assert not is_there(started)
-    assert_same_bits(remote, adapted(skill, PLACES, tolerance=0.05))
+    assert_same_bits(there, adapted(skill, VIA_POINTS, tolerance=0.05))
     with pytest.raises(ValueError, match="read-only"):
-        remote.model.primitive.inputs[0, 0] = 1.0
+        there.model.primitive.inputs[0, 0] = 1.0
 
 
 def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(

@@ -176,7 +176,7 @@ def test_a_daemon_that_was_paused_counts_what_it_missed_and_goes_on(tmp_path: Pa
 
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
     """Nor where Zenoh does not show it the first; a daemon of another cell does. That a cell is
-    free once its daemon has ended or was killed: test_taught_places_survive_a_restart.
+    free once its daemon has ended or was killed: test_via_points_survive_a_restart.
     """
     with serving(tmp_path, "--joints", "assumed") as daemon:
         arguments = (
@@ -259,9 +259,9 @@ def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     """The via-points in force once these are taught."""
-    place = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
+    others = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
     points = [
-        {"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **place} for i in range(count)
+        {"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **others} for i in range(count)
     ]
     points_in_force: list[dict[str, Any]] = daemon.client.ask(
         "via_points", {"op": "add", "points": points}

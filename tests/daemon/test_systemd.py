@@ -225,13 +225,13 @@ def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
                 RefusedError, match=r"cannot save via-points in .*: No space left on device"
             ):
                 Client(daemon.session).add(Scene().via_points())
-            assert Client(daemon.session).status().places == ()
+            assert Client(daemon.session).status().via_points == ()
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
             filled.unlink()
             Client(daemon.session).add(Scene().via_points())
             daemon.until(lambda now: now["scribe"]["state"] == "recording", 30)
             assert daemon.end() == 1  # the recording lacks ticks, which its last line counts
             assert daemon.log.read_text().endswith("ticks are not recorded\n")
-        assert len(list((disk / "state" / "thirdhand").glob("places-*.json"))) == 1
+        assert len(list((disk / "state" / "thirdhand").glob("via-points-*.json"))) == 1
     finally:
         subprocess.run(["umount", "--lazy", str(disk)], check=True)

@@ -80,10 +80,10 @@ FLOOD = """
 from thirdhand.contract.requests import Add, ViaPoint, encode_json
 import threading
 kind = arguments[0]
-place = ViaPoint("a", (0.62, -0.28, 0.30), (0.98, 0.32, 0.06), (0.62, -0.28, 0.30))
+POINT = ViaPoint("a", (0.62, -0.28, 0.30), (0.98, 0.32, 0.06), (0.62, -0.28, 0.30))
 key, payload = {
     "list": ("via_points", b'{"op": "list"}'),
-    "add": ("via_points", encode_json(Add((place,)))),
+    "add": ("via_points", encode_json(Add((POINT,)))),
     "status": ("status", b""),
     "resume": ("resume", b"{}"),
     "hold": ("hold", b"{}"),

@@ -1,4 +1,4 @@
-"""What a take tells of places that it never reached, of rests elsewhere, and of hands not seen."""
+"""What a take tells of via-points never reached, of rests elsewhere, and of hands not seen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thirdhand.contract.requests import ViaPoint
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.demonstration_files import Summary, summary, table
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
-from thirdhand.workbench.takes.dwells import dwells, remarks_on_places
+from thirdhand.workbench.takes.dwells import dwells, remarks_on_via_points
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import demonstrations
 
@@ -22,8 +22,10 @@ START = ViaPoint("start", SCENE.left_start, SCENE.right_start, SCENE.robot_start
 
 @pytest.fixture(scope="module")
 def taken() -> Demonstration:
-    """A demonstration of the scene, with its places named."""
-    return demonstrations(SCENE, count=1, seed=1)[0]._replace(places=(START, *SCENE.via_points()))
+    """A demonstration of the scene, with its via-points named."""
+    return demonstrations(SCENE, count=1, seed=1)[0]._replace(
+        via_points=(START, *SCENE.via_points())
+    )
 
 
 def listed(taken: Demonstration, path: Path) -> Summary:
@@ -32,23 +34,23 @@ def listed(taken: Demonstration, path: Path) -> Summary:
     return summary(path)
 
 
-def test_a_place_that_was_never_reached_is_named_with_how_near_the_tool_came(
+def test_a_via_point_that_was_never_reached_is_named_with_how_near_the_tool_came(
     taken: Demonstration, tmp_path: Path
 ) -> None:
     vise = msgspec.structs.replace(
-        taken.places[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
+        taken.via_points[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
     )
-    listing = listed(taken._replace(places=(*taken.places, vise)), tmp_path / "a.mcap")
+    found = listed(taken._replace(via_points=(*taken.via_points, vise)), tmp_path / "a.mcap")
     least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
-    (remark,) = listing.remarks
+    (remark,) = found.remarks
     assert remark == (
         f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} "
         "mm, 100 mm needed"
     )
-    assert remark in table(listing)
+    assert remark in table(found)
 
 
-def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstration) -> None:
+def test_a_rest_far_from_all_via_points_may_be_one_that_is_not_named(taken: Demonstration) -> None:
     # on the way to the glass, as fast as it goes
     middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))
     period_ns = round(1e9 * taken.period_s)
@@ -63,8 +65,8 @@ def test_a_rest_far_from_all_places_may_be_one_that_is_not_named(taken: Demonstr
     begin_s = middle * taken.period_s
     end_s = (middle + lasts) * taken.period_s
     assert any(abs(a - begin_s) < 0.2 and abs(b - end_s) < 0.2 for a, b in dwells(rested))
-    assert remarks_on_places(taken) == []
-    (remark,) = remarks_on_places(rested)
+    assert remarks_on_via_points(taken) == []
+    (remark,) = remarks_on_via_points(rested)
     assert remark.startswith("hands and tool rest from ")
     assert remark.endswith("is a via-point missing here?")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.paths import RECORDINGS
-from support.taught_scene import PLACES, demonstrated, quickly
+from support.taught_scene import VIA_POINTS, demonstrated, quickly
 from thirdhand.core.skill.skill import Skill
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import decoded
@@ -40,5 +40,5 @@ def coarse(taught: list[Demonstration]) -> Skill:
 
 @pytest.fixture(scope="session")
 def aimed(learned: Skill) -> Skill:
-    """The skill of three, taught the scene's places."""
-    return adapted(learned, PLACES, tolerance=0.05)
+    """The skill of three, taught the scene's via-points."""
+    return adapted(learned, VIA_POINTS, tolerance=0.05)

@@ -14,26 +14,26 @@ from thirdhand.workbench.learning.gate import FLOOR_M
 from thirdhand.workbench.learning.learn import learn
 
 NOISE_M = 0.002  # of a usual tracker
-PLACES = tuple(
+VIA_POINTS = tuple(
     ViaPoint(name, (x, 0.2, 0.2), (x, -0.2, 0.2), (x, 0.0, 0.4))
     for name, x in (("near", 0.4), ("far", 0.7))
 )
 
 
 def along_a_line(number: int) -> Demonstration:
-    """Hands that go exactly from place to place, each time at another speed, and the tool along."""
+    """Hands exactly through the via-points, each time at another speed, and the tool along."""
     t = np.arange(0.0, 6.0, 0.02)
     share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
     ways = (
-        np.array(ends) for ends in zip(*((p.left, p.right, p.tool) for p in PLACES), strict=True)
+        np.array(one) for one in zip(*((p.left, p.right, p.tool) for p in VIA_POINTS), strict=True)
     )
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     poses = [np.hstack([begin + share * (end - begin), turn]) for begin, end in ways]
-    return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, places=PLACES)
+    return Demonstration(np.round(1e9 * t).astype(np.int64), *poses, via_points=VIA_POINTS)
 
 
 def test_gate_is_above_noise() -> None:
-    """Between places the gate is no nearer than noise."""
+    """Between via-points the gate is no nearer than noise."""
     skill = learn([along_a_line(number) for number in range(3)])
     assert skill.threshold >= FLOOR_M
     random = np.random.default_rng(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from support.taught_scene import PLACES, demonstrated, deviations
+from support.taught_scene import VIA_POINTS, demonstrated, deviations
 from thirdhand.core.skill.skill import Skill
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import HIGHEST_GATE_M
@@ -40,14 +40,14 @@ def unrelated(one: Demonstration) -> Demonstration:
     return one._replace(left=parts[0], right=parts[1], tool=parts[2])
 
 
-@pytest.mark.parametrize("places", [(), PLACES], ids=["as learned", "places taught"])
+@pytest.mark.parametrize("via_points", [(), VIA_POINTS], ids=["as learned", "via-points taught"])
 def test_unseen_people_pass_and_nonsense_is_held(
-    skill_of_five: Skill, unseen: list[Demonstration], places: tuple
+    skill_of_five: Skill, unseen: list[Demonstration], via_points: tuple
 ) -> None:
-    """Swapped hands where they are apart: while they meet over the board, at a taught place, they
+    """Swapped hands where they are apart: while they meet over the board, at a via-point, they
     are 9 cm from where they would be, and nothing tells.
     """
-    skill = adapted(skill_of_five, places, tolerance=0.05)
+    skill = adapted(skill_of_five, via_points, tolerance=0.05)
     hands = np.concatenate([take.hands for take in unseen])
     assert (deviations(skill, hands) > skill.threshold).mean() <= 0.02
     swapped, shifted, _ = nonsense(hands[::2])

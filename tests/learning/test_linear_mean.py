@@ -113,7 +113,7 @@ def test_file_serves_what_was_learned(skill: StoredSkill) -> None:
         np.testing.assert_allclose(prediction.velocity, (ahead - behind) / (2 * step), atol=1e-4)
 
 
-def test_a_task_between_places_has_none() -> None:
+def test_a_task_between_via_points_has_none() -> None:
     shipped = decoded((RECORDINGS / "soldering.npz").read_bytes(), origin="shipped")
     primitive = shipped.model.primitive
     width = primitive.inputs.shape[1]

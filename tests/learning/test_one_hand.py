@@ -95,17 +95,17 @@ def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
     assert prediction.gate_m > skill.threshold
 
 
-def test_takes_with_places_of_one_hand() -> None:
-    """Takes of one hand that name their places are learned between these."""
-    takes = []
+def test_takes_with_via_points_of_one_hand() -> None:
+    """Takes of one hand that name their via-points are learned between these."""
+    shown = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
-        takes.append(take._replace(right=take.left, conducts="left"))
-    learnt = learn(takes)
+        shown.append(take._replace(right=take.left, conducts="left"))
+    learnt = learn(shown)
     assert isinstance(learnt.model, SegmentedKMP)
     assert learnt.conductor == 0
-    aimed = adapted(learnt, takes[0].places, tolerance=0.05)
-    for point in takes[0].places:
+    aimed = adapted(learnt, shown[0].via_points, tolerance=0.05)
+    for point in shown[0].via_points:
         for other in (point.right, (2.0, 2.0, 2.0)):
             hands = np.array([[*point.left, *other]])
             np.testing.assert_allclose(aimed.mean(hands, [point.name])[0], point.tool, atol=2e-3)

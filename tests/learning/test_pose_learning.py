@@ -1,4 +1,4 @@
-"""Orientation and gripper as they are learned, judged, taught with places and stored."""
+"""Orientation and gripper as they are learned, judged, taught with via-points and stored."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.skills import at_rest, figures_of
-from support.taught_scene import PLACES, SCENE, with_hands
+from support.taught_scene import SCENE, VIA_POINTS, with_hands
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
@@ -75,20 +75,20 @@ def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]
 def test_pose_comes_back_from_file(posed: Skill) -> None:
     """A skill with orientation and gripper comes back from its file."""
     back = decoded(posed.file, origin="x.npz")
-    original, other = (at_rest(skill, with_hands(PLACES[2])) for skill in (posed, back))
-    assert original.turn.orientation.tobytes() == other.turn.orientation.tobytes()
-    assert original.turn.covariance.tobytes() == other.turn.covariance.tobytes()
-    assert original.closure == other.closure
+    one, other = (at_rest(skill, with_hands(VIA_POINTS[2])) for skill in (posed, back))
+    assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
+    assert one.turn.covariance.tobytes() == other.turn.covariance.tobytes()
+    assert one.closure == other.closure
     assert back.digest == posed.digest
 
 
 def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) -> None:
     """Via-points store orientation and gripper, and return them."""
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
-    via_point = msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w), gripper="open")
-    hands = with_hands(via_point)
-    for base in (posed, skill, shipped_skill()):  # the last is between places
-        taught = adapted(base, (*PLACES[:2], via_point), tolerance=0.05)
+    told = msgspec.structs.replace(VIA_POINTS[2], orientation=(x, y, z, w), gripper="open")
+    hands = with_hands(told)
+    for base in (posed, skill, shipped_skill()):  # the last is between via-points
+        taught = adapted(base, (*VIA_POINTS[:2], told), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad
         assert missed is not None
@@ -103,22 +103,29 @@ def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) ->
 
 
 def test_contradicting_via_points_are_refused(skill: Skill) -> None:
-    """Places that contradict each other are refused."""
+    """Via-points that contradict each other are refused."""
     x, y, z, w = TOOL_ORIENTATION
     near = ViaPoint(
-        "near", PLACES[2].left, PLACES[2].right, PLACES[2].tool, std=0.01, orientation=(y, x, w, z)
+        "near",
+        VIA_POINTS[2].left,
+        VIA_POINTS[2].right,
+        VIA_POINTS[2].tool,
+        std=0.01,
+        orientation=(y, x, w, z),
     )
     with pytest.raises(
         SkillError, match=r"'soldering' and 'near' contradict each other: .* turned by 1\d\d°"
     ):
         adapted(
             skill,
-            (msgspec.structs.replace(PLACES[2], orientation=(x, y, z, w)), near),
+            (msgspec.structs.replace(VIA_POINTS[2], orientation=(x, y, z, w)), near),
             tolerance=0.05,
         )
     near = msgspec.structs.replace(near, orientation=None, gripper="open")
     with pytest.raises(SkillError, match="gripper open at one and closed"):
-        adapted(skill, (msgspec.structs.replace(PLACES[2], gripper="closed"), near), tolerance=0.05)
+        adapted(
+            skill, (msgspec.structs.replace(VIA_POINTS[2], gripper="closed"), near), tolerance=0.05
+        )
 
 
 def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:

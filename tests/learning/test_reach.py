@@ -94,8 +94,8 @@ def test_skill_out_of_reach_is_refused(
     assert bool(finding.text) is bool(number)
     if number:
         assert (
-            f"{number} of 4 places of the tool in skill {judged.name!r} are out of the arm's reach"
-            in finding.text
+            f"{number} of 4 positions of the tool in skill {judged.name!r} are out of the arm's "
+            "reach" in finding.text
         )
         assert f"the farthest by {max(distances):.3f} m" in finding.text
         assert ("Learn a skill" in finding.text) is is_refused

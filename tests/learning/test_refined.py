@@ -84,7 +84,7 @@ def test_earlier_takes_of_a_person_count() -> None:
         SkillError,
         match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the",
     ):
-        learn([take._replace(places=()) for take in mine[:2]], refined=skill)
+        learn([one._replace(via_points=()) for one in mine[:2]], refined=skill)
 
 
 def test_impossible_refinement_is_refused(others: StoredSkill) -> None:
@@ -122,7 +122,7 @@ def test_a_skill_holds_its_demonstrations(others: StoredSkill) -> None:
     step = max(1, int(1.0 / (KEPT_HZ * take.period_s) + 1e-6))
     expected = take.every(step)
     assert (first.name, second.name) == ("a", "b")
-    for name in ("frame", "places", "conducts", "person", "begins"):
+    for name in ("frame", "via_points", "conducts", "person", "begins"):
         assert getattr(first.demonstration, name) == getattr(expected, name), name
     assert np.array_equal(first.demonstration.stamps_ns, expected.stamps_ns)
     for name in ("left", "right", "tool", "gripper"):

@@ -1,5 +1,5 @@
 """Tasks between via-points: what demonstrations tell of one, that it holds wherever these are, that
-a place may be visited twice, and what its file may hold.
+a via-point may be visited twice, and what its file may hold.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ def between(shown: list[Demonstration]) -> Skill:
     return learn(shown, name="between")
 
 
-def hands_at(place: ViaPoint, off: float = 0.0) -> np.ndarray:
-    return np.array([[*place.left, *place.right]]) + off
+def hands_at(point: ViaPoint, off: float = 0.0) -> np.ndarray:
+    return np.array([[*point.left, *point.right]]) + off
 
 
 def moved(
-    places: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]]
+    via_points: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]]
 ) -> tuple[ViaPoint, ...]:
-    """The places with the tool elsewhere at some of them."""
+    """The via-points with the tool elsewhere at some of them."""
     return tuple(
         msgspec.structs.replace(p, tool=tuple(np.add(p.tool, by.get(p.name, (0, 0, 0))).tolist()))
-        for p in places
+        for p in via_points
     )
 
 
 @pytest.mark.thorough
-def test_common_places_of_a_hand_are_found(between: Skill) -> None:
-    """Equal places of a hand are recognised."""
+def test_common_positions_of_a_hand_are_found(between: Skill) -> None:
+    """Equal positions of a hand are recognised."""
     assert isinstance(between.model, SegmentedKMP)
     task = between.model.task
     assert task.names == ("start", "handover", "glass", "soldering")
@@ -66,41 +66,44 @@ def test_common_places_of_a_hand_are_found(between: Skill) -> None:
     assert task.follow.tolist() == [-1, 0, -1, -1]
 
 
-def test_tool_goes_to_told_places(between: Skill, shown: list[Demonstration]) -> None:
+def test_tool_goes_to_its_via_points(between: Skill, shown: list[Demonstration]) -> None:
     """The tool reaches its via-points, and moves with the hand that it follows."""
-    for places in (shown[1].places, moved(shown[3].places, {"glass": (0.0, 0.1, 0.05)})):
-        aimed = adapted(between, places, tolerance=0.05)
+    for via_points in (
+        shown[1].via_points,
+        moved(shown[3].via_points, {"glass": (0.0, 0.1, 0.05)}),
+    ):
+        aimed = adapted(between, via_points, tolerance=0.05)
         assert max(point.missed_by_m for point in in_force(aimed)) < 0.008
-        for place in places:
-            near = aimed.mean(hands_at(place, 0.02))[0] - (0.02 if place.follow == "left" else 0.0)
-            assert np.linalg.norm(near - place.tool) < 0.015
-        far, near = (
-            aimed.model.gates_m(hands_at(places[2], offset_m))[0] for offset_m in (0.3, 0.0)
-        )
+        for point in via_points:
+            near = aimed.mean(hands_at(point, 0.02))[0] - (0.02 if point.follow == "left" else 0.0)
+            assert np.linalg.norm(near - point.tool) < 0.015
+        far, near = (aimed.model.gates_m(hands_at(via_points[2], off))[0] for off in (0.3, 0.0))
         assert far > aimed.threshold > near
 
 
-def test_unusable_places_are_explained(shown: list[Demonstration]) -> None:
+def test_unusable_via_points_are_explained(shown: list[Demonstration]) -> None:
     """Takes that cannot be learned between via-points are refused with a reason."""
-    assert task_of([take._replace(places=()) for take in shown]) == (None, "")
-    fewer = [shown[0], shown[1]._replace(places=shown[1].places[:2])]
+    assert task_of([one._replace(via_points=()) for one in shown]) == (None, "")
+    fewer = [shown[0], shown[1]._replace(via_points=shown[1].via_points[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
     assert (
         "1 named via-points: 2 to 65"
-        in task_of([take._replace(places=take.places[:1]) for take in shown])[1]
+        in task_of([one._replace(via_points=one.via_points[:1]) for one in shown])[1]
     )
 
 
-def test_place_never_reached_is_named(shown: list[Demonstration]) -> None:
+def test_via_point_never_reached_is_named(shown: list[Demonstration]) -> None:
     """A via-point that the tool never came near is named."""
     names = [f"take-{i}" for i in range(len(shown))]
     task, _ = task_of(shown)
     assert task is not None
     assert via_points_never_reached(task, shown, names) == []
-    wrong = [take._replace(places=moved(take.places, {"glass": (0.0, 0.4, 0.3)})) for take in shown]
-    (message,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
+    wrong = [
+        one._replace(via_points=moved(one.via_points, {"glass": (0.0, 0.4, 0.3)})) for one in shown
+    ]
+    (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
     assert re.fullmatch(
-        r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", message
+        r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said
     )
     with pytest.raises(
         SkillError,
@@ -137,7 +140,7 @@ def rms_mm(kind: str, skill: Skill) -> float:
     count = 0
     for demonstration in made(kind, (6, 7)):
         take = left_out("", "", demonstration)
-        aimed = adapted(skill, demonstration.places, tolerance=0.05)
+        aimed = adapted(skill, demonstration.via_points, tolerance=0.05)
         score = judged(take, predicted(aimed, take))
         total = total + score.squares
         count = count + score.samples
@@ -149,17 +152,17 @@ def cyclic() -> Skill:
     return learn(made("cyclic", range(4)))
 
 
-def test_place_is_visited_twice(cyclic: Skill) -> None:
+def test_via_point_is_visited_twice(cyclic: Skill) -> None:
     """Once the hands left it, what was before tells which visit it is."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
     # a Gaussian process with 2 s of memory: 51, one without: 101
     assert rms_mm("cyclic", cyclic) < 50.0
-    places = {place.name: place for place in made("cyclic", [6], each=1)[0].places}
-    aimed = adapted(cyclic, tuple(places.values()), tolerance=0.05)
-    visit = places["left out"]
-    revisit = places["left out again"]
-    assert np.allclose(visit.left, revisit.left)
-    assert np.linalg.norm(np.subtract(visit.tool, revisit.tool)) > 0.1
+    via_points = {point.name: point for point in made("cyclic", [6], each=1)[0].via_points}
+    aimed = adapted(cyclic, tuple(via_points.values()), tolerance=0.05)
+    one = via_points["left out"]
+    again = via_points["left out again"]
+    assert np.allclose(one.left, again.left)
+    assert np.linalg.norm(np.subtract(one.tool, again.tool)) > 0.1
     assert max(point.missed_by_m for point in in_force(aimed)) < 0.005
 
 
@@ -184,7 +187,9 @@ def late_right(shown: Demonstration, by_s: float) -> Demonstration:
 def without_follow(shown: Demonstration) -> Demonstration:
     """A demonstration whose via-points do not state which hand the tool follows."""
     return shown._replace(
-        places=tuple(msgspec.structs.replace(place, follow="none") for place in shown.places)
+        via_points=tuple(
+            msgspec.structs.replace(point, follow="none") for point in shown.via_points
+        )
     )
 
 
@@ -215,10 +220,10 @@ def test_leading_hand(on_path: list[Demonstration]) -> None:
 
 def test_where_it_waits_it_waits_to_the_end() -> None:
     skill = learn(made("three", range(3)), name="three")
-    places = made("three", [0], each=1)[0].places
-    aimed = adapted(skill, places, tolerance=0.05)
-    left_alone = np.array([[*places[1].left, *places[0].right]])
-    assert np.linalg.norm(aimed.mean(left_alone)[0] - places[0].tool) < 0.03
+    via_points = made("three", [0], each=1)[0].via_points
+    there = adapted(skill, via_points, tolerance=0.05)
+    left_alone = np.array([[*via_points[1].left, *via_points[0].right]])
+    assert np.linalg.norm(there.mean(left_alone)[0] - via_points[0].tool) < 0.03
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +240,7 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
-    # without the orientation: 39; a Gaussian process told the places: 80
+    # without the orientation: 39; a Gaussian process told the via-points: 80
     assert rms_mm("heading", carried) < 22.0
     restored = decoded(carried.file, origin="a file")
     assert (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.skills import figures_of, file_with
-from support.taught_scene import PLACES
+from support.taught_scene import VIA_POINTS
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
@@ -27,12 +27,12 @@ def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:
     return skill.mean(hands), skill.model.covariances(hands), primitive.jacobian(hands[3])
 
 
-@pytest.mark.parametrize("places", [(), PLACES])
+@pytest.mark.parametrize("via_points", [(), VIA_POINTS])
 def test_file_returns_same_bits(
-    learned: Skill, places: tuple[ViaPoint, ...], taught: list[Demonstration]
+    learned: Skill, via_points: tuple[ViaPoint, ...], taught: list[Demonstration]
 ) -> None:
     """Saving and loading changes no bit."""
-    sent = adapted(learned, places, tolerance=0.04)
+    sent = adapted(learned, via_points, tolerance=0.04)
     back = with_file(replace(decoded(sent.file, origin="a file"), file=b""))
     assert back.file == sent.file
     assert back.digest == sent.digest
@@ -46,8 +46,8 @@ def test_file_returns_same_bits(
     for array, other in zip(*(predicted(skill, queries) for skill in (sent, back)), strict=True):
         assert array.tobytes() == other.tobytes()
     assert (
-        adapted(back, PLACES[:2], tolerance=0.05).file
-        == adapted(learned, PLACES[:2], tolerance=0.05).file
+        adapted(back, VIA_POINTS[:2], tolerance=0.05).file
+        == adapted(learned, VIA_POINTS[:2], tolerance=0.05).file
     )
 
 

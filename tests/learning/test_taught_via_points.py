@@ -10,21 +10,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from support.taught_scene import HANDOVER, PLACES, with_hands
+from support.taught_scene import HANDOVER, VIA_POINTS, with_hands
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill.skill import Skill
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import adapted, in_force, warnings_of
 
 
-def test_places_are_met(aimed: Skill) -> None:
+def test_via_points_are_met(aimed: Skill) -> None:
     assert [point.name for point in in_force(aimed)] == ["handover", "glass", "soldering"]
     assert all(point.missed_by_m < 0.003 for point in in_force(aimed))
 
 
 @pytest.mark.parametrize("step", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (-0.01, 0.01, 0.01)])
 def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float, ...]) -> None:
-    glass = PLACES[1]
+    glass = VIA_POINTS[1]
     followed = aimed.mean([with_hands(HANDOVER, left=step)])[0]
     np.testing.assert_allclose(followed, np.add(HANDOVER.tool, step), atol=0.006)
     np.testing.assert_allclose(
@@ -34,8 +34,8 @@ def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float
 
 def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
     """Via-points are inserted into the base primitive, not into an adapted one."""
-    anew = adapted(aimed, PLACES[1:], tolerance=0.05)
-    assert anew.file == adapted(learned, PLACES[1:], tolerance=0.05).file
+    anew = adapted(aimed, VIA_POINTS[1:], tolerance=0.05)
+    assert anew.file == adapted(learned, VIA_POINTS[1:], tolerance=0.05).file
     assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
 
 
@@ -57,7 +57,7 @@ EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
 
 @pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
 def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> None:
-    """Places that contradict each other are refused by name."""
+    """Via-points that contradict each other are refused by name."""
     steep = 4.0 * hands + 0.001 + 0.0006
     with pytest.raises(
         SkillError, match=r"'handover' and 'twin' contradict each other: their hands are"
@@ -74,7 +74,7 @@ def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> Non
 
 
 def test_loose_via_points_contradict_less(skill: Skill) -> None:
-    """Places that are not exact contradict less and neighbourhoods more."""
+    """Via-points that are not exact contradict less and neighbourhoods more."""
     adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
     twin = moved(EXACT, "twin", hands=0.05, tool=0.12)
     adapted(skill, (EXACT, twin), tolerance=0.05)
@@ -85,7 +85,7 @@ def test_loose_via_points_contradict_less(skill: Skill) -> None:
 def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
     """Via-points that are missed or moved are reported by name."""
     loose = moved(HANDOVER, "loose", hands=0.06, tool=0.2, radius=0.0, std=0.05)
-    after = adapted(aimed, (*PLACES, loose), tolerance=0.05)
+    after = adapted(aimed, (*VIA_POINTS, loose), tolerance=0.05)
     missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")
     assert missed > 0.005
     assert f"via-point 'loose' is missed by {1000 * missed:.0f} mm" in warnings_of(aimed, after)[0]

@@ -1,5 +1,5 @@
-"""What a recording tells: modes and reasons over the time, what led to holds and faults, places,
-limits, promptness; against sessions of which that is known.
+"""What a recording tells: modes and reasons over the time, what led to holds and faults,
+via-points, limits, promptness; against sessions of which that is known.
 """
 
 from __future__ import annotations
@@ -218,28 +218,30 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][is_hand_seen].min()
 
 
-def test_places_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(
+def test_via_points_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(
     session: Report,
 ) -> None:
-    by_name = [(place.name, place.start_s) for place in session.places]
+    by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
-    first, second = [place for place in session.places if place.name == "handover"]
+    first, again = [point for point in session.via_points if point.name == "handover"]
     assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
     assert (
         first.end_s
-        == pytest.approx(second.start_s, abs=1.5 * PERIOD_S)
+        == pytest.approx(again.start_s, abs=1.5 * PERIOD_S)
         == pytest.approx(RETEACH_S, abs=0.1)
     )
     assert first.best_m is not None
     assert first.best_m < 0.02
-    assert (second.visits, second.best_m) == ((), None)
-    assert second.hands_m > 0.03
+    assert (again.visits, again.best_m) == ((), None)
+    assert again.hands_m > 0.03
 
 
-def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_path: Path) -> None:
+def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(
+    skill: Skill, tmp_path: Path
+) -> None:
     """Hands that rest where it was taught, and a tool that goes there."""
     Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
-    [place] = reported(tmp_path / "a.mcap").places
+    [point] = reported(tmp_path / "a.mcap").via_points
     frames = np.array(
         [
             step.frame
@@ -247,14 +249,14 @@ def test_a_place_is_missed_by_as_far_as_the_tool_is_from_it(skill: Skill, tmp_pa
             if step.frame is not None
         ]
     )
-    [visit] = place.visits
+    [visit] = point.visits
     assert visit.nearest_m == pytest.approx(
         np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min()
     )
     assert visit.settled_m == pytest.approx(
         np.linalg.norm(frames[-1]["tool"] - HERE.tool), abs=1e-4
     )
-    assert place.hands_m < 1e-3
+    assert point.hands_m < 1e-3
 
 
 @pytest.mark.parametrize("statuses", [True, False])

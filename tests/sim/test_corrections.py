@@ -81,7 +81,7 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:
         assert answer.returncode == 0, answer.stderr
         assert answer.stdout.startswith("correction-1 in force since tick "), answer.stdout
         assert "in the segment start -> handover" in answer.stdout
-        (point,) = daemon.client.places()
+        (point,) = daemon.client.via_points()
         assert (point.name, point.segment, point.corrections) == ("correction-1", "start", 1)
         np.testing.assert_allclose(point.left, HALFWAY, atol=5e-3)
         np.testing.assert_allclose(point.tool, tool, atol=NEAR_M)
@@ -102,7 +102,7 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:
         assert undone is not None
         assert undone.undone
         assert undone.moved_m == pytest.approx(moved_m, abs=0.01)
-        assert daemon.client.places() == ()
+        assert daemon.client.via_points() == ()
         assert refusals(daemon, {"op": "undo"}) == "no correction is in force"
         daemon.client.resume()
         daemon.until(lambda s: has_arrived(s, before), 60)

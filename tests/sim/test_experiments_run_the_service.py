@@ -33,7 +33,7 @@ from thirdhand_sim.people import person
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 from thirdhand_sim.sessions import session
-from thirdhand_sim.teach import places_of
+from thirdhand_sim.teach import via_points_of
 
 pytestmark = pytest.mark.thorough
 
@@ -63,7 +63,7 @@ def shown() -> Seen:
 
 @pytest.fixture(scope="module")
 def taught(shown: Seen) -> Skill:
-    return adapted(shipped_skill(), places_of(shown.session.told), tolerance=TOLERANCE_M)
+    return adapted(shipped_skill(), via_points_of(shown.session.told), tolerance=TOLERANCE_M)
 
 
 @pytest.fixture(scope="module")

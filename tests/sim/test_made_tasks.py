@@ -23,7 +23,7 @@ def test_takes_follow_from_their_numbers() -> None:
                     getattr(a.demonstration, name).tobytes()
                     == getattr(b.demonstration, name).tobytes()
                 )
-            assert a.demonstration.places == b.demonstration.places
+            assert a.demonstration.via_points == b.demonstration.via_points
         first += takes(kind, people=(0,), each=1, seed=1)
         assert len({take.demonstration.left.tobytes() for take in first}) == 5
 
@@ -41,7 +41,10 @@ def test_hands_and_tool_move_as_people_do(kind: str) -> None:
         assert take.period_s == pytest.approx(1.0 / TAKE_HZ)
         assert np.abs(np.linalg.norm(np.stack(take[1:4])[..., 3:], axis=-1) - 1.0).max() < 1e-9
         for i in trial.order:
-            assert off_via_point(take, take.places[i], FOLLOW[take.places[i].follow]).min() < 0.02
+            assert (
+                off_via_point(take, take.via_points[i], FOLLOW[take.via_points[i].follow]).min()
+                < 0.02
+            )
         reach = Reach()
         away = np.linalg.norm(take.tool[:, :3] - reach.centre, axis=1)
         assert away.max() < reach.outer

@@ -117,7 +117,7 @@ def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
     out = []
     for take in takes_:
         d = take.demonstration
-        places = tuple(
+        via_points = tuple(
             msgspec.structs.replace(
                 p,
                 **{
@@ -128,7 +128,7 @@ def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
             for p in d.places
         )
         d = d._replace(
-            left=d.left + moved, right=d.right + moved, tool=d.tool + moved, places=places
+            left=d.left + moved, right=d.right + moved, tool=d.tool + moved, via_points=via_points
         )
         out.append(left_out(take.name, take.group, d))
     return out

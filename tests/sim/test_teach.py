@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from thirdhand.cli.usage import places_in
+from thirdhand.cli.usage import via_points_in
 from thirdhand.contract import cdr, messages
 from thirdhand.core.skill.segments import NONE
 from thirdhand.workbench.learning.division import off_via_point
@@ -79,15 +79,15 @@ def test_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
     """The tutorial's task visits the tray twice, and its via-points are stored."""
-    file = tmp_path / "places.json"
-    assert teach.main(["--visits", "--places", str(file)]) == 0
-    places = places_in(file)
-    assert [place.name for place in places] == ["start", "tray", "work", "tray again", "done"]
-    assert places[1].left == places[3].left
-    assert np.linalg.norm(np.subtract(places[1].tool, places[3].tool)) > 0.1
+    file = tmp_path / "via-points.json"
+    assert teach.main(["--visits", "--via-points", str(file)]) == 0
+    told = via_points_in(file)
+    assert [place.name for place in told] == ["start", "tray", "work", "tray again", "done"]
+    assert told[1].left == told[3].left
+    assert np.linalg.norm(np.subtract(told[1].tool, told[3].tool)) > 0.1
     first = teach.visits(1)
     other = teach.visits(2)
     for take in (first, other):
-        for place in places:
+        for place in told:
             assert off_via_point(take, place, NONE).min() < 0.02
     assert len(first.tool) != len(other.tool)

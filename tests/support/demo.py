@@ -62,7 +62,7 @@ class _Sample(NamedTuple):
 
 @functools.cache
 def taught() -> Skill:
-    """The shipped skill with the nominal scene's places."""
+    """The shipped skill with the nominal scene's via-points."""
     return adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
 
 

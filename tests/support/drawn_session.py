@@ -70,7 +70,7 @@ class Played(NamedTuple):
 
 @cache
 def skills() -> dict[str, Skill]:
-    """Skills by name: shipped, with via-points in several places, with random ones, without
+    """Skills by name: shipped, with via-points at several positions, with random ones, without
     segments, one of a made task, and two that are followed however far hands are from what was
     demonstrated.
     """

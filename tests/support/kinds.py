@@ -66,7 +66,7 @@ def named(count: int, *, timetable: bool) -> list[Demonstration]:
             | {"tool": take.tool[index, :3].tolist()}
             for name, index in (("start", 0), ("end", -1))
         ]
-        out.append(take._replace(places=msgspec.convert(rows, tuple[ViaPoint, ...])))
+        out.append(take._replace(via_points=msgspec.convert(rows, tuple[ViaPoint, ...])))
     return out
 
 
@@ -76,7 +76,7 @@ def learned(kind: str) -> tuple[Skill, Demonstration]:
         *demonstrations, asked = (
             take.demonstration for take in made(kind, people=[0, 1, 2], each=2)
         )
-        return taught(learn(demonstrations), asked.places), asked
+        return taught(learn(demonstrations), asked.via_points), asked
     demonstrations = (named if "between" in kind else takes)(7, timetable="clock" in kind)
     if kind == "mixture":
         return learn(demonstrations[:6], components=6), demonstrations[6]

@@ -22,7 +22,7 @@ from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.settings.config import Files, Reach, Settings
 from thirdhand_sim.scene import Scene
 
-PLACES = Scene().via_points()
+VIA_POINTS = Scene().via_points()
 CELLS = (f"tests/cell{n}" for n in itertools.count())
 
 
@@ -102,7 +102,7 @@ class Cell:
             "skill": "",
             "version": "",
         }
-        lists: dict[str, Any] = {"flags": (), "places": (), "endpoints": ()}
+        lists: dict[str, Any] = {"flags": (), "via_points": (), "endpoints": ()}
         return requests.Status(
             **words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none
         )  # type: ignore[arg-type]
@@ -133,10 +133,10 @@ class Cell:
 
     def refusal(self, suffix: str, request: Any) -> str:
         """The words in which a request is refused; bytes are sent as they are."""
-        before = len(self.taken), self.names(), self.place_bytes()
+        before = len(self.taken), self.names(), self.saved_bytes()
         reply = self.reply(suffix, request)
         assert reply.err is not None
-        assert (len(self.taken), self.names(), self.place_bytes()) == before
+        assert (len(self.taken), self.names(), self.saved_bytes()) == before
         return reply.err.payload.to_string()
 
     def reply(self, suffix: str, request: Any) -> zenoh.Reply:
@@ -148,12 +148,12 @@ class Cell:
         return reply
 
     def names(self) -> list[str]:
-        """The places in force."""
+        """The names of the via-points in force."""
         return [point["name"] for point in self.client.ask("via_points", {"op": "list"})["points"]]
 
-    def place_bytes(self) -> bytes:
+    def saved_bytes(self) -> bytes:
         folder = state_folder(self.settings)
-        return b"".join(file.read_bytes() for file in sorted(folder.glob("places-*.json")))
+        return b"".join(file.read_bytes() for file in sorted(folder.glob("via-points-*.json")))
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.taken]

@@ -14,7 +14,7 @@ from thirdhand.contract.messages import BASE, PoseStamped
 from thirdhand.contract.requests import ViaPoint, encode_json
 from thirdhand.recordings.mcap_file import McapFile
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.takes.pose_streams import PLACES_TOPIC
+from thirdhand.workbench.takes.pose_streams import VIA_POINTS_TOPIC
 
 KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 START_NS = 10**18
@@ -47,9 +47,9 @@ def write_streams(
     streams: Mapping[str, Stream],
     cell: str = "cell",
     *,
-    places: tuple[ViaPoint, ...] = (),
+    via_points: tuple[ViaPoint, ...] = (),
 ) -> Path:
-    """A file of these streams, in the order of recording, which names these places."""
+    """A file of these streams, in the order of recording, which names these via-points."""
     rows = sorted(
         (int(stream.logged_ns[i]), name, i)
         for name, stream in streams.items()
@@ -62,9 +62,11 @@ def write_streams(
                 int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:])
             )
             file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
-        if places:
-            text = encode_json(places).decode()
-            file.put(f"{cell}/{PLACES_TOPIC}", STRING.type, cdr.encode_string(text), rows[0][0], 0)
+        if via_points:
+            text = encode_json(via_points).decode()
+            file.put(
+                f"{cell}/{VIA_POINTS_TOPIC}", STRING.type, cdr.encode_string(text), rows[0][0], 0
+            )
     return path
 
 

@@ -1,4 +1,4 @@
-"""The soldering scene's demonstrations and places, for the tests of learning."""
+"""The soldering scene's demonstrations and via-points, for the tests of learning."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import demonstrations
 
 SCENE = Scene()
-PLACES = SCENE.via_points()
-HANDOVER = PLACES[0]
+VIA_POINTS = SCENE.via_points()
+HANDOVER = VIA_POINTS[0]
 
 
 def demonstrated(count: int, *, late: int = 0) -> list[Demonstration]:
@@ -51,6 +51,6 @@ def deviations(skill: Skill, hands: Vector) -> Vector:
     return np.array([at_rest(skill, row).gate_m for row in hands])
 
 
-def with_hands(place: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:
-    """Hands (6,) at a place, the left one off by some metres."""
-    return np.array([*(np.array(place.left) + left), *place.right])
+def with_hands(point: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:
+    """Hands (6,) at a via-point, the left one off by some metres."""
+    return np.array([*(np.array(point.left) + left), *point.right])

@@ -79,7 +79,7 @@ def until_arrived(
 
 
 @pytest.mark.thorough
-def test_hands_begin_at_the_skills_first_places_and_are_published_as_they_are_drawn(
+def test_hands_begin_at_the_skills_first_via_point_and_are_published_as_they_are_drawn(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
     received = Heard(daemon.session)
@@ -191,7 +191,7 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         assert math.dist(goal[:2], (x + 0.02, y + 0.06)) < 0.005
         tab.picture(tmp_path / "dragged.png")
         assert corrected(tab).startswith("correction-1 in force: it moves the tool by ")
-        (point,) = daemon.client.places()
+        (point,) = daemon.client.via_points()
         assert math.dist(point.tool, goal) < 1e-3
         assert math.dist(point.left, halfway) < 5e-3
         tab.ask("at('resume').click()")
@@ -204,7 +204,7 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         assert pressed(tab, "undo").startswith(
             "correction-1 undone: it no longer moves the tool by "
         )
-        assert daemon.client.places() == ()
+        assert daemon.client.via_points() == ()
         assert pressed(tab, "undo") == "correct was NOT carried out: no correction is in force"
         tab.ask("at('resume').click()")
         daemon.until(lambda status: status["mode"] == "follow")

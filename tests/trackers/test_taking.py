@@ -298,8 +298,8 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     teacher.start()
     folder = ["--folder", str(tmp_path / "takes")]
     ended = ["--until", "rest", "--rest", "0.5"]
-    (tmp_path / "places.json").write_bytes(encode_json(Add(Scene().via_points())))
-    ended += ["--places", str(tmp_path / "places.json"), "--person", "Ada"]
+    (tmp_path / "via-points.json").write_bytes(encode_json(Add(Scene().via_points())))
+    ended += ["--via-points", str(tmp_path / "via-points.json"), "--person", "Ada"]
     assert main(["record", "take-1", "--listen", endpoint, *ended, *folder]) == 0
     teacher.join(20)
     path = tmp_path / "takes" / "take-1.mcap"
@@ -316,7 +316,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     assert re.search(r"rest left out: \d\.\d s before the motion, \d\.\d s after it", captured.err)
     report = summary(path)
     assert captured.out.strip() == table(report)
-    assert "  by Ada\n  places handover, glass, soldering\n" in captured.out
+    assert "  by Ada\n  via-points handover, glass, soldering\n" in captured.out
     assert 1.0 < report.lasts_s < 2.5
     assert [stream.name for stream in report.streams] == ["left", "right", "tool"]
     assert all(stream.poses > 20 and stream.frame == "base" for stream in report.streams)
@@ -333,7 +333,7 @@ def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     )
     assert uncut(path).read_bytes() == whole
     assert demonstration_paths(path.parent) == [path]
-    assert summary(path).demonstration.places == Scene().via_points()
+    assert summary(path).demonstration.via_points == Scene().via_points()
     assert summary(path).demonstration.person == "Ada"
     assert PoseRecording(path).settings == Settings()
     capsys.readouterr()

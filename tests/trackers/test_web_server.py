@@ -198,7 +198,7 @@ STATUS: dict[str, Any] = {
     **dict.fromkeys(("cell", "mode", "reason", "skill", "version"), "x"),
     **dict.fromkeys(("tick", "rate_hz", "missed", "hand_distance_m", "hand_limit_m_s"), 1),
     **dict.fromkeys(("realtime", "memory_locked"), True),
-    **dict.fromkeys(("flags", "places", "endpoints"), ()),
+    **dict.fromkeys(("flags", "via_points", "endpoints"), ()),
     **{name: {} for name in ("rejected", "hand_age_ms", "scribe")},
     **{name: {"p50": 0, "p99": 0, "max": 0} for name in ("lateness_us", "work_us", "latency_ms")},
 }

@@ -166,14 +166,14 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
 def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
     tmp_path: Path, skill: Skill
 ) -> None:
-    place = ViaPoint(
+    point = ViaPoint(
         "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
     )
     view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
     entries = list(ticks(40))
     for tick, frame, timing in entries[:20]:
         view.add(frame, at_ns(tick.index), timing)
-    view.learn(with_file(replace(skill, via_points=(place,))).file)
+    view.learn(with_file(replace(skill, via_points=(point,))).file)
     for tick, frame, timing in entries[20:]:
         view.add(frame, at_ns(tick.index), timing)
     view.close()
@@ -182,12 +182,16 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     assert len(lines) >= 5
     assert all(len(line) > 50 for line in lines)
     before, after = (
-        rows["/skill/places/tool"][index].get("Points3D:labels") or [] for index in (0, -1)
+        rows["/skill/via_points/tool"][at].get("Points3D:labels") or [] for at in (0, -1)
     )
     assert "vise" not in before
     assert "vise" in after
     half = dict(
-        zip(after, values(rows["/skill/places/left"], "Ellipsoids3D:half_sizes")[-1], strict=True)
+        zip(
+            after,
+            values(rows["/skill/via_points/left"], "Ellipsoids3D:half_sizes")[-1],
+            strict=True,
+        )
     )
     assert half["vise"] == pytest.approx([0.03] * 3)
     assert "vise" in values(rows["/about/skill"], "TextDocument:text")[-1][0]

@@ -79,7 +79,9 @@ def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(
         zip(whole, np.ravel(values(rows["/timing/lateness"], "Scalars:scalars")), strict=True)
     )
     assert max(late, key=lambda tick: late[tick]) == 220  # the next whole frame
-    assert any("vise" in labels for labels in values(rows["/skill/places/tool"], "Points3D:labels"))
+    assert any(
+        "vise" in labels for labels in values(rows["/skill/via_points/tool"], "Points3D:labels")
+    )
 
 
 @pytest.mark.parametrize(

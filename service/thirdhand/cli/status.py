@@ -136,7 +136,7 @@ def rows(now: Status) -> dict[str, str]:
     granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
         ", memory locked" if now.memory_locked else ", memory not locked"
     )
-    texts = {
+    found = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
@@ -146,7 +146,7 @@ def rows(now: Status) -> dict[str, str]:
             for flag in now.flags
             if flag != STUCK
         },
-        "skill": f"{now.skill}; via-points: {', '.join(now.places) or 'none'}",
+        "skill": f"{now.skill}; via-points: {', '.join(now.via_points) or 'none'}",
         "residual risk": now.residual_risk,
         "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
         "scheduling": granted,
@@ -185,15 +185,15 @@ def rows(now: Status) -> dict[str, str]:
         label, unit = name.rsplit("_", 1)
         values = getattr(now, name)
         digits = 1 if unit == "us" else 2
-        texts[label] = (
+        found[label] = (
             f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max "
             f"{values.max:.{digits}f} " + unit.replace("us", "µs")
             if values.max
             else "none yet"
         )
     if clocks := differing_clocks(now):
-        texts["latency"] = f"unknown: {clocks}"
-    return {name: text for name, text in texts.items() if text}
+        found["latency"] = f"unknown: {clocks}"
+    return {name: text for name, text in found.items() if text}
 
 
 def hours_until_full(scribe: Mapping[str, Any]) -> float | None:

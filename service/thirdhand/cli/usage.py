@@ -284,7 +284,7 @@ def added_in(path: Path) -> Add:
     return request
 
 
-def places_in(path: Path) -> tuple[ViaPoint, ...]:
+def via_points_in(path: Path) -> tuple[ViaPoint, ...]:
     """The via-points in a file, see `added_in`. Raises RequestError with the name of the file."""
     return added_in(path).points
 

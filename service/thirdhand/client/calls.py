@@ -40,8 +40,8 @@ class Client:
     storage are ignored: only those of a live daemon are returned.
 
     A request waits up to 2 s for a connection that broke to return. If it breaks before the answer
-    arrives, `status`, `places` and `hold` are requested again. Other requests are not, and raise
-    UncertainError, a subclass of UnreachableError: they may have been carried out.
+    arrives, `status`, `via_points` and `hold` are requested again. Other requests are not, and
+    raise UncertainError, a subclass of UnreachableError: they may have been carried out.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Client:
         """The daemon's status."""
         return self._typed("status", None, Status)
 
-    def places(self) -> tuple[ViaPointInForce, ...]:
+    def via_points(self) -> tuple[ViaPointInForce, ...]:
         """The via-points in force, each with the distance [m] by which the skill misses it."""
         return self._typed("via_points", requests.List(), Reply).points or ()
 

@@ -308,7 +308,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     memory_locked: bool
     skill: str
     hands: Hands = "both"  # hands that the skill follows
-    places: tuple[str, ...]
+    via_points: tuple[str, ...]
     rejected: dict[str, int]
     received: dict[str, int] = {}  # messages that arrived, by channel of each input
     hand_age_ms: dict[str, float]
@@ -370,7 +370,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     threshold_m: float = 0.0  # limit of that deviation
     tool_limits: dict[
         str, ToolLimits
-    ] = {}  # of the demonstrated places, by ANY_DIRECTION and ALONG_TASK
+    ] = {}  # of the demonstrated positions, by ANY_DIRECTION and ALONG_TASK
     binding: str = ""  # the limit that holds the tool back now; empty: none
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none

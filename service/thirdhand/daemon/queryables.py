@@ -59,7 +59,7 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill
 from thirdhand.skills.via_points import in_force, points_made_of, warnings_of
 
 # limit of via-points that are not the task's, with the points of their neighbourhoods
-MAX_TAUGHT_POINTS = 400
+MAX_VIA_POINTS = 400
 MAX_WAITING_REQUESTS = 16
 MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
 MAX_LIST_BYTES = 100  # a longer request is not a `list`
@@ -476,16 +476,16 @@ class Queryables:
 
     def _check(self, added: Sequence[ViaPoint], at: str = "") -> None:
         """Raise RequestError for too many via-points, for those outside the skill's workspace, and
-        for segments that the skill does not have. `at` is the place of the tool in the request.
+        for segments that the skill does not have. `at` is the position of the tool in the request.
         """
         all_of_them = {point.name: point for point in (*self._skill.via_points, *added)}
         total = points_made_of(
             [all_of_them[name] for name in all_of_them.keys() - set(self._skill.model.names)]
         )
-        if total > MAX_TAUGHT_POINTS:
+        if total > MAX_VIA_POINTS:
             raise RequestError(
                 f"$.points: {total} via-points beside the task's, where one with a radius counts "
-                f"as 13; at most {MAX_TAUGHT_POINTS} accepted"
+                f"as 13; at most {MAX_VIA_POINTS} accepted"
             )
         low, high = self._skill.workspace
         distances_m = self._beyond_m(self._settings, np.array([point.tool for point in added]))

@@ -67,7 +67,7 @@ class SavedViaPoints:
         digest = hashlib.blake2b(
             (skill.learned_from + self._arm).encode(), digest_size=6
         ).hexdigest()
-        return self._folder / f"places-{digest}.json"
+        return self._folder / f"via-points-{digest}.json"
 
     def read(self, skill: Skill) -> tuple[tuple[ViaPoint, ...], float] | None:
         """The via-points and the tolerance taught to this skill of this arm; None if there are

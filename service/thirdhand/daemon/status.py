@@ -86,7 +86,7 @@ class CellStatus(NamedTuple):
             skill=skill.name,
             residual_risk=skill.residual_risk,
             hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
-            places=tuple(point.name for point in skill.via_points),
+            via_points=tuple(point.name for point in skill.via_points),
             rejected=_by_cause({**sources, **self.streams}),
             sources=sources,
             streams=dict(self.streams),

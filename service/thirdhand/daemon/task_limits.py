@@ -1,4 +1,4 @@
-"""Limits of the tool at the places of the skill in force, computed beside the loop."""
+"""Limits of the tool at the positions of the skill in force, computed beside the loop."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def correction_at(
     in a segment of the task (-1 for a skill without segments).
 
     It replaces earlier ones of the same segment at hands that are nearer than
-    PATH_END_M, which are at the same place.
+    PATH_END_M, which are at the same positions.
     """
     left = _point(hands[:3])
     right = _point(hands[3:])
@@ -112,9 +112,9 @@ def offer_of(skill: Skill) -> str:
     if not repeated:
         return ""
     times = max(point.corrections for point in repeated)
-    places = ", ".join(point.name for point in repeated)
+    names = ", ".join(point.name for point in repeated)
     return (
-        f"{places} {'was' if len(repeated) == 1 else 'were'} corrected up to {times} times at "
+        f"{names} {'was' if len(repeated) == 1 else 'were'} corrected up to {times} times at "
         "nearly the same hands: show the task once as it should be, by `thirdhand record NAME`, "
         "and learn the skill again with this take, by `thirdhand learn`"
     )

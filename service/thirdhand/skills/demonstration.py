@@ -41,7 +41,7 @@ class Demonstration(NamedTuple):
     right: Vector
     tool: Vector
     frame: str = BASE
-    places: tuple[ViaPoint, ...] = ()
+    via_points: tuple[ViaPoint, ...] = ()
     gripper: Vector | None = None
     conducts: Hands = "both"
     person: str = ""
@@ -110,11 +110,11 @@ def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
 def exchanged(demonstration: Demonstration) -> list[Demonstration]:
     """The demonstration with its hands exchanged, and also with those of its via-points, if any."""
     mirrored = demonstration._replace(left=demonstration.right, right=demonstration.left)
-    places = tuple(
-        msgspec.structs.replace(place, left=place.right, right=place.left)
-        for place in mirrored.places
+    via_points = tuple(
+        msgspec.structs.replace(point, left=point.right, right=point.left)
+        for point in mirrored.via_points
     )
-    return [mirrored, mirrored._replace(places=places)] if places else [mirrored]
+    return [mirrored, mirrored._replace(via_points=via_points)] if via_points else [mirrored]
 
 
 def persons(demonstrations: Sequence[Demonstration]) -> list[int]:

@@ -45,11 +45,11 @@ def out_of_reach(skill: StoredSkill, distances_m: Vector, settings: Settings) ->
         )
     else:
         remedy = "The tool stops at the edge of its reach there" + (
-            ": teach these places anew within reach (thirdhand via-points add)"
+            ": teach these via-points anew within reach (thirdhand via-points add)"
             * bool(skill.model.names)
         )
     return OutOfReach(
-        f"{number} of {total} places of the tool in skill {skill.name!r} are out of the arm's "
+        f"{number} of {total} positions of the tool in skill {skill.name!r} are out of the arm's "
         f"reach, the farthest by {distances_m.max():.3f} m: {accepted(settings)}. {remedy}",
         is_refused,
     )

@@ -92,7 +92,7 @@ OTHERS = (
     "units",
     "name",
     "learned_from",
-    "places",
+    "via_points",
     "figures",
     "conductor",
     "turned",
@@ -163,7 +163,7 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         threshold=np.array(skill.threshold),
         learned_from=np.array(skill.learned_from),
         components=np.array(skill.components),
-        places=np.array(msgspec.json.encode(skill.via_points).decode()),
+        via_points=np.array(msgspec.json.encode(skill.via_points).decode()),
         tolerance=np.array(skill.tolerance),
         **to_arrays(skill.model.primitive),
     )
@@ -223,7 +223,7 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
         for fault in _spoilt(arrays):
             raise SkillError(f"{origin}: {fault}")
         model = _model(arrays)
-        via_points = validated(msgspec.json.decode(str(arrays["places"])), tuple[ViaPoint, ...])
+        via_points = validated(msgspec.json.decode(str(arrays["via_points"])), tuple[ViaPoint, ...])
         turn = _part(arrays, TURN)
         gripper = _part(arrays, GRIPPER)
         skill = StoredSkill(

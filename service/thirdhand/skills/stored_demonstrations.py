@@ -36,7 +36,7 @@ class _About(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     samples: int
     frame: str
-    places: tuple[ViaPoint, ...]
+    via_points: tuple[ViaPoint, ...]
     conducts: Hands
     person: str
     begins: tuple[int, ...]
@@ -55,15 +55,15 @@ def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
     about = [
         _About(
             name=name,
-            samples=len(demo.stamps_ns),
-            frame=demo.frame,
-            places=demo.places,
-            conducts=demo.conducts,
-            person=demo.person,
-            begins=demo.begins,
-            has_gripper=demo.gripper is not None,
+            samples=len(one.stamps_ns),
+            frame=one.frame,
+            via_points=one.via_points,
+            conducts=one.conducts,
+            person=one.person,
+            begins=one.begins,
+            has_gripper=one.gripper is not None,
         )
-        for name, demo in thin
+        for name, one in thin
     ]
     out = io.BytesIO()
     np.savez_compressed(
@@ -124,7 +124,7 @@ def _demonstration(
             right,
             tool,
             about.frame,
-            about.places,
+            about.via_points,
             closures.astype(np.float64) if about.has_gripper else None,
             about.conducts,
             about.person,

@@ -67,7 +67,7 @@ def skill_contents(skill: bytes) -> SkillContents:
                 point.name, point.left, point.right, point.tool, point.radius, point.follow
             )
             for point in msgspec.json.decode(
-                str(arrays.get("places", "[]")), type=tuple[ViaPoint, ...]
+                str(arrays.get("via_points", "[]")), type=tuple[ViaPoint, ...]
             )
         }
         return SkillContents(
@@ -128,12 +128,12 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
     points = skill.via_points
     count = len(skill.via_points)
     style = {
-        "colors": [palette.PLACE] * count,
+        "colors": [palette.VIA_POINT] * count,
         "radii": [0.01] * count,
         "labels": [point.name for point in points],
     }
     yield at(
-        "/skill/places/tool",
+        "/skill/via_points/tool",
         *row(rr.Points3D, count, positions=[point.tool for point in points], **style),
     )
     for side, colour in (("left", palette.LEFT), ("right", palette.RIGHT)):
@@ -142,12 +142,12 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
         style = {"colors": [palette.faint(colour, 0.5)] * count, "line_radii": [0.0004] * count}
         style |= {"fill_mode": [rr.components.FillMode.MajorWireframe] * count}
         yield at(
-            f"/skill/places/{side}",
+            f"/skill/via_points/{side}",
             *row(rr.Ellipsoids3D, count, half_sizes=half, centers=centres, **style),
         )
     triples = [[point.left, point.tool, point.right] for point in points]
-    style = {"colors": [palette.faint(palette.PLACE, 0.25)] * count, "radii": [0.0006] * count}
-    yield at("/skill/places/belong", *row(rr.LineStrips3D, count, strips=triples, **style))
+    style = {"colors": [palette.faint(palette.VIA_POINT, 0.25)] * count, "radii": [0.0006] * count}
+    yield at("/skill/via_points/belong", *row(rr.LineStrips3D, count, strips=triples, **style))
     text = about(skill)
     yield at("/about/skill", *rr.TextDocument.columns(text=[text], media_type=["text/markdown"]))
 

@@ -163,7 +163,7 @@ def part(one: Part) -> Found:
     if one.out:
         training = [t for t in training if t.group != one.out]
         asked = [t for t in asked if t.group == one.out]
-    named = bool(training[0].demonstration.places)
+    named = bool(training[0].demonstration.via_points)
     result = Found({}, {})
     if one.task not in TASK_KINDS:
         into_reach = RigidMap.of(training, Settings().reach)
@@ -192,8 +192,8 @@ def as_command(
     try:
         skill = learn(
             [
-                take.demonstration if told else take.demonstration._replace(places=())
-                for take in shown
+                one.demonstration if told else one.demonstration._replace(via_points=())
+                for one in shown
             ],
             names=[take.name for take in shown],
             refined=refined,
@@ -228,9 +228,9 @@ def served(
     for take in asked:
         rounds: list[Judged] = []
         try:
-            placed_skill = taught(skill, take.demonstration.places) if told else skill
+            there = taught(skill, take.demonstration.via_points) if told else skill
             predictions = predicted_rounds(
-                placed_skill, take, reach=None if refusals else Settings().reach
+                there, take, reach=None if refusals else Settings().reach
             )
             rounds = [judged(take, prediction) for prediction in predictions]
         except SkillError as error:

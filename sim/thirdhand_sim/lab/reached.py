@@ -1,4 +1,4 @@
-"""Are taught places reached? One harness for all that asks it: the places of a scene are taught,
+"""Are via-points reached? One harness for all that asks it: the places of a scene are taught,
 and the three events are judged open loop, in closed loop (`rehearsal`) or live (`load.live`).
 """
 

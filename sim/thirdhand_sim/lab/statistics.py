@@ -1,4 +1,4 @@
-"""Success rate of the task with taught places: 100 random scenes in closed loop, our skill beside
+"""Success rate of the task with via-points: 100 random scenes in closed loop, our skill beside
 rivals, some of which need no demonstration.
 """
 
@@ -34,7 +34,7 @@ ELL = 5.0  # [1/m²] as the shipped skill
 OURS_HZ = 500
 RIVALS_HZ = 125
 METHODS: dict[str, tuple[str, Learn]] = {
-    "ours": ("KMP, taught places\n(the service)", lambda shown: LearnedByService(shipped_skill())),
+    "ours": ("KMP, via-points\n(the service)", lambda shown: LearnedByService(shipped_skill())),
     "none": ("the places and the start,\nno demonstrations", NoDemonstrations(ell=ELL).learn),
     "look_up": ("look-up of these,\nweighted by distance", LookUp().learn),
     "gaussian_process_5": ("Gaussian process,\nour ell, same places", SampleProcess(ell=ELL).learn),

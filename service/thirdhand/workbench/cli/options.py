@@ -248,12 +248,12 @@ def learn(add: AddCommand) -> None:
         "CELL",
         f"the cell, for the tracker's axes and unit and for the arm: {ARM_HELP}",
     )
-    places = (
+    via_points = (
         "the via-points of the task, as `via-points add --file` reads them, for demonstrations "
         "without via-points; the skill is then learned between these via-points and follows them "
         "when they move"
     )
-    option(c, "--places", "FILE", places)
+    option(c, "--via-points", "FILE", via_points)
     accept = (
         "accept the residual risk of the skill, if it has one, in the name of this person, who "
         "takes responsibility for it; skill, daemon and status name both"

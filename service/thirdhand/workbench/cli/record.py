@@ -11,7 +11,7 @@ from thirdhand.cli.usage import (
     UsageError,
     check_writable,
     inputs_session,
-    places_in,
+    via_points_in,
 )
 from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.process.progress import say
@@ -118,7 +118,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
-    places = places_in(args.places) if args.places else ()
+    via_points = via_points_in(args.via_points) if args.via_points else ()
     cell = args.cell or settings.cell
     ended = EnterPressed()
     with inputs_session(args, CONNECT_TIMEOUT_S, settings) as session:
@@ -140,7 +140,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    captured.write(path, places)
+    captured.write(path, via_points)
     for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
     for key, count in captured.of_others.items():

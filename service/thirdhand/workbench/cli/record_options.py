@@ -59,8 +59,10 @@ def add_options(c: argparse.ArgumentParser) -> None:
         "listen on this Zenoh endpoint, so that tracker and arm can connect while no daemon runs"
     )
     option(c, "--listen", "EP", listen)
-    places = "the via-points of the task in this take, as JSON that `via-points add --file` reads"
-    option(c, "--places", "FILE", places)
+    via_points = (
+        "the via-points of the task in this take, as JSON that `via-points add --file` reads"
+    )
+    option(c, "--via-points", "FILE", via_points)
     option(c, "--plot", "FILE", "draw the take to this .png file")
     instead = c.add_mutually_exclusive_group()
     flag(instead, "--list", "list the takes, and record none")

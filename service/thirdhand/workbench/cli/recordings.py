@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import msgspec
 
 from kmp import AffineMean
-from thirdhand.cli.usage import UsageError, check_writable, places_in, reached
+from thirdhand.cli.usage import UsageError, check_writable, reached, via_points_in
 from thirdhand.client import Client, Tracker
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.printable import printable, printable_lines
@@ -145,7 +145,7 @@ def learn(args: argparse.Namespace) -> int:
         stored_demonstrations(refined)  # raises its errors before the new ones are read
     settings = cell_of(str(args.config)) if args.config else None
     topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
-    places = places_in(args.places) if args.places else ()
+    via_points = via_points_in(args.via_points) if args.via_points else ()
     demonstrations = []
     for i, path in enumerate(args.demonstrations, start=1):
         demonstration = read_demonstration(path, topics=topics, settings=settings, say=say)
@@ -156,7 +156,9 @@ def learn(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         demonstrations.append(
-            demonstration if demonstration.places else demonstration._replace(places=places)
+            demonstration
+            if demonstration.via_points
+            else demonstration._replace(via_points=via_points)
         )
     evidence: list[Evidence] = []
     with steps("learning") as doing:

@@ -89,7 +89,7 @@ def refitted_errors(
     for block in blocks_of(persons_of(takes)):
         model = fitted([i for i in range(len(takes)) if i not in block])
         for i in block:
-            primitive = _through_places(model, takes[i].demonstration).primitive
+            primitive = _through_via_points(model, takes[i].demonstration).primitive
             covariance = primitive.predict(inputs[i][_rows(len(inputs[i]))]).covariance
             out[i] = _timed(takes[i], primitive.mean(inputs[i]), covariance)
     return [out[i] for i in range(len(takes))]
@@ -199,16 +199,16 @@ def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
     return TimedErrors((take.position - mean)[rows], covariance, velocity[rows])
 
 
-def _through_places(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:
+def _through_via_points(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:
     """The model adapted to the demonstration's via-points, unless they contradict each other."""
-    if not demonstration.places:
+    if not demonstration.via_points:
         return model
     try:
-        check_agreement(demonstration.places)
+        check_agreement(demonstration.via_points)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ViaPointMissed)  # the errors contain it
             weight = 1.0 / len(model.primitive.base.inputs)
-            return model.through(demonstration.places, tolerance=TOLERANCE_M, weight=weight)
+            return model.through(demonstration.via_points, tolerance=TOLERANCE_M, weight=weight)
     except (SkillError, ValueError):
         return model
 

@@ -115,12 +115,10 @@ def divided(
     if conductor is not None:
         demonstrations, before = (
             [
-                demonstration._replace(
-                    places=tuple(of_one(point, conductor) for point in demonstration.places)
-                )
-                for demonstration in group
+                one._replace(via_points=tuple(of_one(point, conductor) for point in one.via_points))
+                for one in some
             ]
-            for group in (demonstrations, before)
+            for some in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
     if options.delay_s is not None and not isinstance(method, Segmented):
@@ -155,16 +153,16 @@ def _check_alike(
     demonstrations: Sequence[Demonstration], names: Sequence[str], earlier: Sequence[Demonstration]
 ) -> None:
     """Raise SkillError if new demonstrations name other via-points than the refined skill's."""
-    needed = [point.name for point in earlier[0].places]
+    needed = [point.name for point in earlier[0].via_points]
     if not needed:
         return
     for name, demonstration in zip(names, demonstrations, strict=True):
-        point_names = [point.name for point in demonstration.places]
-        if set(point_names) != set(needed):
+        given = [point.name for point in demonstration.via_points]
+        if set(given) != set(needed):
             raise SkillError(
-                f"{name} has the via-points {', '.join(point_names) or '(none)'}: "
-                f"{', '.join(needed)} needed, as in the skill that is refined; take them with the "
-                "demonstration (record --places), or name them (--places)"
+                f"{name} has the via-points {', '.join(given) or '(none)'}: {', '.join(needed)} "
+                "needed, as in the skill that is refined; take them with the demonstration "
+                "(record --via-points), or name them (--via-points)"
             )
 
 

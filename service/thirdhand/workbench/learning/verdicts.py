@@ -82,7 +82,7 @@ class Subject(NamedTuple):
         )
 
 
-MORE = "; more demonstrations along the same paths, or named via-points (record --places), help"
+MORE = "; more demonstrations along the same paths, or named via-points (record --via-points), help"
 
 
 class Rule(NamedTuple):
@@ -163,8 +163,8 @@ RULES = (
         f"variance in held-out demonstrations, at least {EXPLAINED:.0f} % needed; the error is "
         "{s.all.error_mm:.0f} mm",
         severity=lambda s: "unsafe",
-        remedy=": name the via-points of the task (record --places, learn --places), let the hands "
-        "lead the tool in each demonstration, or record more that are alike",
+        remedy=": name the via-points of the task (record --via-points, learn --via-points), let "
+        "the hands lead the tool in each demonstration, or record more that are alike",
     ),
     Rule(
         lambda s: s.all.error_mm > NOTED_MM and not _is_unexplained(s),
@@ -177,7 +177,7 @@ RULES = (
         "a simpler prediction is better: the error of {s.part!r} is {s.value:.0f} mm, not "
         "{s.all.error_mm:.0f}",
         remedy=". The hands say less about the tool than it seems, or the demonstrations are too "
-        "few: name the via-points of the task (record --places), or record more",
+        "few: name the via-points of the task (record --via-points), or record more",
         of="baselines",
     ),
     Rule(
@@ -205,7 +205,7 @@ RULES = (
         f"{AMBIGUOUS_RESIDUAL:.0f} % accepted: {{s.contradiction}}",
         severity=_of_contradictions,
         remedy=". Leave out the demonstration that differs, or name the via-points between which "
-        "the hands come by the same position twice (record --places, learn --places)",
+        "the hands come by the same position twice (record --via-points, learn --via-points)",
     ),
     Rule(
         lambda s: s.figures.beyond_reach > 0,

@@ -21,7 +21,7 @@ from thirdhand.workbench.report.tables import Table, comparison, names_of, summa
 LEFT, RIGHT, TOOL, TARGET = map(
     palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET)
 )
-NEAREST, OFF, PLACE = map(palette.written, (palette.NEAREST, palette.OFF, palette.PLACE))
+NEAREST, OFF, VIA_POINT = map(palette.written, (palette.NEAREST, palette.OFF, palette.VIA_POINT))
 LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.BY_MODE.items()}
 LETTER_SHARE = 0.011  # width of a letter / width of a plot
@@ -202,7 +202,7 @@ def _over_time(report: Report) -> Figure:
 
 
 def _from_above(report: Report) -> Figure:
-    """Hands, tool and taught places seen from above, the arm at the left."""
+    """Hands, tool and via-points seen from above, the arm at the left."""
     frames = report.columns.frames
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
@@ -214,9 +214,9 @@ def _from_above(report: Report) -> Figure:
     points = {point for _, skill in report.columns.skills for point in skill.via_points}
     for point in sorted(points, key=lambda point: point.name):
         x, y, _ = point.tool
-        axes.plot(x, y, "D", color=PLACE, ms=5)
+        axes.plot(x, y, "D", color=VIA_POINT, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
-    axes.plot(0, 0, "s", color=PLACE, ms=10)
+    axes.plot(0, 0, "s", color=VIA_POINT, ms=10)
     axes.annotate(
         "arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4"
     )

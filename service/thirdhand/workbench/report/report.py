@@ -22,7 +22,7 @@ from thirdhand.skills.corrections import offer_of
 from thirdhand.workbench.report.causes import before, why
 from thirdhand.workbench.report.columns import Columns, read, runs
 from thirdhand.workbench.report.segments import segments
-from thirdhand.workbench.report.visits import places
+from thirdhand.workbench.report.visits import via_point_visits
 
 SHARES = (50, 99, 100)
 JUDGED_POSTURES = 200  # limits of the tool are computed at this many postures, at most
@@ -187,7 +187,7 @@ class Report:
         self.stop_mm, self.stop_excess_mm = map(
             Percentiles.of, np.array([*_stops_mm(columns)]).reshape(-1, 2).T
         )
-        self.places = tuple(places(columns))
+        self.via_points = tuple(via_point_visits(columns))
         self.segments = tuple(segments(columns))
         self.limits = tuple(_limits(columns))
         self.binding = tuple(_binding(columns))
@@ -213,7 +213,8 @@ class Report:
     def best_m(self, name: str) -> float | None:
         """The tool's least distance from a via-point of this name [m]; None without a visit."""
         return min(
-            (p.best_m for p in self.places if p.name == name and p.best_m is not None), default=None
+            (p.best_m for p in self.via_points if p.name == name and p.best_m is not None),
+            default=None,
         )
 
     def overview(self) -> Overview:
@@ -256,9 +257,11 @@ class Report:
         rejected = {rejection.cause: rejection.samples for rejection in self.rejections}
         for cause in Cause:
             yield Figure(f"rejected: {word(cause)}", rejected.get(word(cause), 0), "", 0)
-        for place in dict.fromkeys(place.name for place in self.places):
-            best = self.best_m(place)
-            yield Figure(f"place {place}: nearest", None if best is None else 1000 * best, "mm", 1)
+        for name in dict.fromkeys(point.name for point in self.via_points):
+            best = self.best_m(name)
+            yield Figure(
+                f"via-point {name}: nearest", None if best is None else 1000 * best, "mm", 1
+            )
 
 
 def overview(path: Path) -> Overview:
@@ -436,7 +439,7 @@ def flat(value: Any, path: str = "") -> dict[str, Any]:
     return {path: value}
 
 
-def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end_s: float) -> str:
+def why_missed(found: Report, name: str, *, begun_s: float, start_s: float, end_s: float) -> str:
     """A sentence on what kept the tool from a via-point between two times [s], which count from
     `begun_s` of the recording.
     """
@@ -456,14 +459,12 @@ def why_missed(found: Report, place: str, *, begun_s: float, start_s: float, end
             f"the arm {outcome} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: "
             f"{worst.why}"
         )
-    hands_m = [point.hands_m for point in found.places if point.name == place]
+    hands_m = [one.hands_m for one in found.via_points if one.name == name]
     if not hands_m:
-        return f"no place {place!r} was taught"
-    if best := found.best_m(place):
+        return f"no via-point {name!r} was taught"
+    if best := found.best_m(name):
         return (
-            f"with the hands where {place!r} was taught, the tool came no nearer than "
+            f"with the hands where {name!r} was taught, the tool came no nearer than "
             f"{1000 * best:.0f} mm"
         )
-    return (
-        f"the hands came no nearer than {100 * min(hands_m):.0f} cm to where {place!r} was taught"
-    )
+    return f"the hands came no nearer than {100 * min(hands_m):.0f} cm to where {name!r} was taught"

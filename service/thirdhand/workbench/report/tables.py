@@ -86,8 +86,8 @@ def _tables(report: Report) -> Iterator[Table]:
         numbers=0,
     )
     yield Table(
-        "places",
-        "Taught via-points",
+        "via_points",
+        "Via-points",
         (
             "via-point",
             "taught at [s]",
@@ -98,14 +98,14 @@ def _tables(report: Report) -> Iterator[Table]:
         ),
         tuple(
             (
-                place.name,
-                _s(place.start_s),
-                NONE if math.isinf(place.hands_m) else f"{100 * place.hands_m:.1f}",
-                str(len(place.visits)),
-                _mm(place.best_m),
-                ", ".join(_mm(visit.settled_m) for visit in place.visits) or NONE,
+                point.name,
+                _s(point.start_s),
+                NONE if math.isinf(point.hands_m) else f"{100 * point.hands_m:.1f}",
+                str(len(point.visits)),
+                _mm(point.best_m),
+                ", ".join(_mm(visit.settled_m) for visit in point.visits) or NONE,
             )
-            for place in report.places
+            for point in report.via_points
         ),
     )
     yield Table(

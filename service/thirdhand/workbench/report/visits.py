@@ -29,8 +29,8 @@ class Visit(NamedTuple):
     settled_m: float
 
 
-class Place(NamedTuple):
-    """A taught via-point: the time in which it was in force [s], the least distance of the hands
+class ViaPointVisits(NamedTuple):
+    """A via-point: the time in which it was in force [s], the least distance of the hands
     from where it was taught [m], and its visits. Of two hands, the farther one counts; the distance
     is infinite if none was seen.
     """
@@ -47,26 +47,23 @@ class Place(NamedTuple):
         return min((visit.nearest_m for visit in self.visits), default=None)
 
 
-def places(columns: Columns) -> list[Place]:
+def via_point_visits(columns: Columns) -> list[ViaPointVisits]:
     """Every via-point that was in force at some time, in the order of teaching."""
     ticks = columns.frames["tick"]
     times = columns.times
-    results: list[Place] = []
+    found: list[ViaPointVisits] = []
     for point, conductor, begin, end in _taught(columns):
         within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
         frames = columns.frames[within]
         if len(frames):
-            nearest, visits = _visits(point, conductor, frames, times[within], columns.period_s)
-            results.append(
-                Place(
-                    point.name,
-                    float(times[within][0]),
-                    float(times[within][-1]),
-                    nearest,
-                    tuple(visits),
+            in_force_s = times[within]
+            nearest, visits = _visits(point, conductor, frames, in_force_s, columns.period_s)
+            found.append(
+                ViaPointVisits(
+                    point.name, float(in_force_s[0]), float(in_force_s[-1]), nearest, tuple(visits)
                 )
             )
-    return results
+    return found
 
 
 def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:

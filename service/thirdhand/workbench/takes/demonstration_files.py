@@ -17,7 +17,7 @@ from thirdhand.settings import palette
 from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import LEAST_M, Demonstration
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
-from thirdhand.workbench.takes.dwells import remarks_on_places
+from thirdhand.workbench.takes.dwells import remarks_on_via_points
 from thirdhand.workbench.takes.hands_and_tool import chosen
 from thirdhand.workbench.takes.pose_streams import TRACK_NAMES, PoseRecording
 from thirdhand.workbench.takes.track import Track
@@ -114,7 +114,7 @@ def summary(path: Path, *, settings: Settings | None = None) -> Summary:
     remarks += [
         *_still(demonstration),
         *_in_motion(demonstration, sides),
-        *remarks_on_places(demonstration),
+        *remarks_on_via_points(demonstration),
     ]
     return Summary(path, demonstration, streams, tuple(remarks))
 
@@ -182,8 +182,10 @@ def table(found: Summary) -> str:
     ]
     if found.demonstration.person:
         lines.append(f"  by {found.demonstration.person}")
-    if found.demonstration.places:
-        lines.append(f"  places {', '.join(place.name for place in found.demonstration.places)}")
+    if found.demonstration.via_points:
+        lines.append(
+            f"  via-points {', '.join(point.name for point in found.demonstration.via_points)}"
+        )
     lines += [f"  {remark}" for remark in found.remarks]
     speeds = {stream.name: _speed(found.demonstration, stream.name) for stream in found.streams}
     lines += [

@@ -26,7 +26,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.hands_and_tool import chosen
 from thirdhand.workbench.takes.pose_streams import (
     GRIPPER_STATE,
-    PLACES_TOPIC,
+    VIA_POINTS_TOPIC,
     PoseRecording,
     PoseTopic,
     type_of,
@@ -90,10 +90,10 @@ def write_demonstration(
             if gripper is not None:
                 data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
                 file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
-        if demonstration.places:
-            text = encode_json(demonstration.places).decode()
+        if demonstration.via_points:
+            text = encode_json(demonstration.via_points).decode()
             file.put(
-                topic(cell, PLACES_TOPIC),
+                topic(cell, VIA_POINTS_TOPIC),
                 STRING.type,
                 cdr.encode_string(text),
                 int(stamps_ns[0]),
@@ -165,7 +165,7 @@ def read_demonstration(
         right,
         tool,
         BASE,
-        recorded.places,
+        recorded.via_points,
         closure,
         common.conducts,
         recorded.person,

@@ -45,7 +45,7 @@ Value = TypeVar("Value")
 TRACK_NAMES = ("left", "right", "tool")
 JOINT_STATES = "joints/state"
 GRIPPER_STATE = "gripper/state"
-PLACES_TOPIC = "places"
+VIA_POINTS_TOPIC = "via_points"
 STATE_PARTS_TIMEOUT_S = 0.1  # an arm's state may arrive in several messages within this time
 FROM_ARRAYS = "A few lines of Python make a take from arrays: docs/arrays.md"
 NOT_READ = {
@@ -129,7 +129,7 @@ class PoseRecording:
         self.urdf = ""
         self.is_ours = False  # True if settings are attached
         self.unused: list[str] = []  # remarks on content that cannot be used
-        self.places: tuple[ViaPoint, ...] = ()  # recorded via-points of the task
+        self.via_points: tuple[ViaPoint, ...] = ()  # recorded via-points of the task
         self.conducts: Hands = "both"  # the hands that lead the tool in a take
         self.person = ""  # the person who demonstrates in a take
         self._raw: dict[
@@ -171,8 +171,8 @@ class PoseRecording:
                 if channel.message_encoding == "ros1":
                     self._ros_1_topics.add(channel.topic)
                 self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
-            elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{PLACES_TOPIC}"):
-                self._read_places(message.data)
+            elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{VIA_POINTS_TOPIC}"):
+                self._read_via_points(message.data)
         self.faults = messages.faults
         about = messages.metadata.get("thirdhand", {})
         self.conducts = next(
@@ -191,15 +191,13 @@ class PoseRecording:
                 )
             self.urdf = messages.attachments.get("arm.urdf", b"").decode(errors="replace")
 
-    def _read_places(self, data: bytes) -> None:
+    def _read_via_points(self, data: bytes) -> None:
         try:
-            self.places = Add(
+            self.via_points = Add(
                 decode_request(cdr.decode_string(_whole(data)).encode(), tuple[ViaPoint, ...])
             ).points
         except (WireError, ValueError) as error:
-            self.unused.append(
-                f"the recorded {PLACES_TOPIC} are not readable and not used: {error}"
-            )
+            self.unused.append(f"the recorded via-points are not readable and not used: {error}")
 
     def _read_bag(self) -> None:
         # its import is slow, and most recordings are MCAP files

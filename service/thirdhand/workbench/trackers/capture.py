@@ -35,7 +35,7 @@ from thirdhand.workbench.takes.demonstration_reader import (
     unknown_frame,
 )
 from thirdhand.workbench.takes.dwells import REST_M
-from thirdhand.workbench.takes.pose_streams import GRIPPER_STATE, JOINT_STATES, PLACES_TOPIC
+from thirdhand.workbench.takes.pose_streams import GRIPPER_STATE, JOINT_STATES, VIA_POINTS_TOPIC
 from thirdhand.workbench.takes.tool_poses import tool_poses
 from thirdhand.workbench.takes.track import Track
 
@@ -275,7 +275,7 @@ class Capture:
             return 0, time.time_ns()
         return min(begins) - int(1e9 * RETAINED_REST_S), max(ends) + int(1e9 * RETAINED_REST_S)
 
-    def write(self, path: Path, places: Sequence[ViaPoint] = ()) -> None:
+    def write(self, path: Path, via_points: Sequence[ViaPoint] = ()) -> None:
         """Write the whole demonstration or nothing: the received messages and the task's
         via-points, with settings and URDF attached.
 
@@ -298,9 +298,9 @@ class Capture:
             for arrived_ns, stamp_ns, pose_row in rows:
                 pose = PoseStamped(stamp_ns, BASE, tuple(pose_row[:3]), tuple(pose_row[3:]))
                 messages.append((arrived_ns, TOOL_KEY, channels.POSE.encode(pose)))
-        if places:
-            text = cdr.encode_string(encode_json(tuple(places)).decode())
-            messages.append((min(messages)[0], PLACES_TOPIC, text))
+        if via_points:
+            text = cdr.encode_string(encode_json(tuple(via_points)).decode())
+            messages.append((min(messages)[0], VIA_POINTS_TOPIC, text))
         with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
             about = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
@@ -308,7 +308,7 @@ class Capture:
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
             file.attach("arm.urdf", self._urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
-                codec = channels.STRING if key == PLACES_TOPIC else channels.BY_KEY[key].codec
+                codec = channels.STRING if key == VIA_POINTS_TOPIC else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
 
     def tool_by(self, states: Sequence[Sample]) -> Track:

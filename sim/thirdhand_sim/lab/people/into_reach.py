@@ -95,7 +95,7 @@ class RigidMap(NamedTuple):
             )
 
         d: Demonstration = take.demonstration
-        places = tuple(
+        via_points = tuple(
             msgspec.structs.replace(
                 point,
                 **{
@@ -103,11 +103,11 @@ class RigidMap(NamedTuple):
                     for part in ("left", "right", "tool")
                 },
             )
-            for point in d.places
+            for point in d.via_points
         )
         return take._replace(
             demonstration=d._replace(
-                left=pose(d.left), right=pose(d.right), tool=pose(d.tool), places=places
+                left=pose(d.left), right=pose(d.right), tool=pose(d.tool), via_points=via_points
             ),
             hands=self.positions(take.hands.reshape(-1, 2, 3)).reshape(-1, 6),
             velocities=(take.velocities.reshape(-1, 2, 3) @ self.rotation.T).reshape(-1, 6),

@@ -43,7 +43,7 @@ SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a s
 BACK_S = 2.0  # the hands' way back to where the take begins
 FAR_M = 1e3  # the corner of a workspace that clamps nothing
 ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
-PLACE_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
+VIA_POINT_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
 
 
 class LeftOut(NamedTuple):
@@ -316,7 +316,7 @@ def read(path: Path, *, named: bool = False) -> Demonstration:
                 part: x[i].tolist()
                 for part, x in (("left", left), ("right", right), ("tool", tool))
             },
-            "std": PLACE_STD_M,
+            "std": VIA_POINT_STD_M,
             "radius": 0.03,
         }
         for name, i in (("start", 0), ("end", -1))
@@ -328,6 +328,6 @@ def read(path: Path, *, named: bool = False) -> Demonstration:
         of_left,
         of_right,
         of_tool,
-        places=msgspec.convert(rows, tuple[ViaPoint, ...]) if named else (),
+        via_points=msgspec.convert(rows, tuple[ViaPoint, ...]) if named else (),
         conducts=conducts,
     )

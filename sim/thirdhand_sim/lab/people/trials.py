@@ -28,7 +28,7 @@ from thirdhand_sim.lab.rivals.as_skill import Said, along_hands, rival
 from thirdhand_sim.lab.rivals.method import DependsOn, Mask, Observed, Placed, Predicted
 from thirdhand_sim.scene import TOOL_FROM_HAND
 from thirdhand_sim.sessions import Session
-from thirdhand_sim.teach import places_of
+from thirdhand_sim.teach import via_points_of
 
 RATE_HZ = 125
 # an event succeeds within 10 mm for 0.3 s below 5 cm/s
@@ -220,7 +220,7 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
     skill = rival(
         shipped_skill(),
         lambda *moving: Said(motion[now], covariance[now], held is not None and bool(held[now])),
-        via_points=places_of(one.session.told),
+        via_points=via_points_of(one.session.told),
     )
     return frames(skill, counted(), settings())
 

@@ -40,7 +40,7 @@ def carried(points: Array, here: Array, there: Array) -> Array:
 
 def scene_of(take: LeftOut) -> Array:
     """A take's places (3, K, 3) [m] of left hand, right hand and tool, by name."""
-    named = sorted(take.demonstration.places, key=lambda point: point.name)
+    named = sorted(take.demonstration.via_points, key=lambda point: point.name)
     return np.array([[p.left for p in named], [p.right for p in named], [p.tool for p in named]])
 
 

@@ -14,7 +14,7 @@ from thirdhand_sim.lab.rivals.gaussian_process import Kernel, PlacedProcess
 from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
-from thirdhand_sim.teach import places_of
+from thirdhand_sim.teach import via_points_of
 
 # d tool / d hands where the tool follows the left hand
 FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])
@@ -33,11 +33,9 @@ class NoDemonstrations:
 
     def place(self, places: Places) -> PlacedProcess:
         """The regression through these places."""
-        via_hands, via_tools, std = neighbourhoods(places_of(places))
+        at, wanted, std = neighbourhoods(via_points_of(places))
         kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
-        return PlacedProcess.of(
-            [kernel], [via_hands], [via_tools], [std**2], centre=via_tools.mean(axis=0)
-        )
+        return PlacedProcess.of([kernel], [at], [wanted], [std**2], centre=wanted.mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class LookUp:
 
     def place(self, places: Places) -> PlacedLookUp:
         """The table of these places."""
-        return PlacedLookUp(places_of(places), self)
+        return PlacedLookUp(via_points_of(places), self)
 
 
 @dataclass(frozen=True, eq=False)

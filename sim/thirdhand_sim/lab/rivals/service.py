@@ -16,7 +16,7 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.results import Array
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
-from thirdhand_sim.teach import places_of, recorded
+from thirdhand_sim.teach import recorded, via_points_of
 
 COMPONENTS = 10
 SEED = EXPERIMENTS["statistics"].seeds.method
@@ -66,7 +66,7 @@ class LearnedByService:
     def place(self, places: Places) -> Skill:
         """The skill adapted to the places."""
         return adapted(
-            self.skill, places_of(places)[0 if self.start else 1 :], tolerance=TOLERANCE_M
+            self.skill, via_points_of(places)[0 if self.start else 1 :], tolerance=TOLERANCE_M
         )
 
 

@@ -98,7 +98,7 @@ HOLD_SHARE = 0.005
 # the new takes get a delay of their own if it reduces their error to this share
 OWN_DELAY_SHARE = 0.75
 DELAYS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6)  # candidates for a teacher's delay
-WITHOUT_PLACES = "without places"  # name of this baseline in a skill's figures
+WITHOUT_VIA_POINTS = "without via-points"  # name of this baseline in a skill's figures
 PRIOR = np.array([0.5, 0.0, 0.0, 0.0])  # outputs far from all samples: half of the path, no offset
 
 
@@ -544,7 +544,7 @@ class Segmented:
             predictions |= best.without(block, primitive)
         errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
         unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
-        # the places of held-out takes are given
+        # the via-points of held-out takes are given
         known_places = unknown._replace(scatters=np.zeros_like(unknown.scatters))
         progress(f"learning from all {len(takes)}")
         model = SegmentedKMP(
@@ -584,7 +584,7 @@ class Segmented:
         ]
         reached = np.concatenate([result.gate_m for result in in_order])
         gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
-        baselines = {WITHOUT_PLACES: self._without_places(takes, progress)}
+        baselines = {WITHOUT_VIA_POINTS: self._without_via_points(takes, progress)}
         return Fitted(
             model,
             in_order,
@@ -701,17 +701,19 @@ class Segmented:
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
-        places = (list(ordered(take.demonstration.places, self.task.names)) for take in takes)
+        via_points = (
+            list(ordered(take.demonstration.via_points, self.task.names)) for take in takes
+        )
         return NamedViaPoints(
-            self.task.names, np.mean([NamedViaPoints.of(points).at for points in places], axis=0)
+            self.task.names, np.mean([NamedViaPoints.of(one).at for one in via_points], axis=0)
         )
 
-    def _without_places(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
+    def _without_via_points(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
         """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
         progress("learning without the via-points, for comparison")
         inputs = [take.hands for take in takes]
         fit = refit(POSITIONS, takes, inputs, self.options.points, None)
-        return [result.errors for result in held_out_takes(takes, inputs, fit, progress)]
+        return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
 
 
 def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
