@@ -352,11 +352,11 @@ class _Run:
             if now_s >= self._live.duration_s:
                 return
             self._longest_pause = max(self._longest_pause, index - self._index)
-            seen, commanded = self._led.step(index - self._index)
+            observation, commanded = self._led.step(index - self._index)
             self._index = index
-            self._bridge.publish_joints(seen)
+            self._bridge.publish_joints(observation)
             self._note_commands(commanded, now_s)
-            self._publish(seen)
+            self._publish(observation)
             if self._is_ended(commanded, now_s):
                 self._let_stop()
                 return

@@ -128,8 +128,8 @@ def via_points_of(places: Places) -> tuple[ViaPoint, ...]:
         {
             "name": name,
             **{
-                part: np.round(at, 6).tolist()
-                for part, at in zip(("left", "right", "tool"), ends, strict=True)
+                part: np.round(position, 6).tolist()
+                for part, position in zip(("left", "right", "tool"), ends, strict=True)
             },
             "std": std,
             "radius": RADIUS_M,

@@ -149,8 +149,8 @@ def test_via_points_are_asked_for_as_the_wire_says(
     answering("bench/via_points", take)
     client = Client(session, "bench")
     client.wait_until_ready()
-    there = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
-    assert client.add([there], tolerance=0.1) == requests.Reply(3)
+    point = ViaPoint("there", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
+    assert client.add([point], tolerance=0.1) == requests.Reply(3)
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]

@@ -113,7 +113,7 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     )
     # the segment of the hold, whatever the hand did that led
     assert held.kinds()[-2:] == ["skill", "segment"]
-    one = held.client.via_points()
+    points = held.client.via_points()
     held.state["measured"][0] += 0.1
     second = held.client.correct()
     assert second.correction is not None
@@ -123,7 +123,7 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
     undone = held.client.undo_correction().correction
     assert undone is not None
     assert (undone.name, undone.undone) == ("correction-2", True)
-    assert held.client.via_points() == one
+    assert held.client.via_points() == points
     held.client.undo_correction()
     assert [point.name for point in held.client.via_points()] == [
         point.name for point in VIA_POINTS

@@ -203,10 +203,10 @@ def test_the_commands_of_a_client(shared_daemon: Any) -> None:
     added = succeeded("via-points", "add", "my point", *positions, *connect)
     assert "my point" in added.stdout
     assert "replaced" not in added.stdout
-    again = told("via-points", "add", "my point", *positions, *connect)
+    repeated = told("via-points", "add", "my point", *positions, *connect)
     assert (
-        again.returncode,
-        again.stdout.endswith("replaced, because a via-point had the same name: my point\n"),
+        repeated.returncode,
+        repeated.stdout.endswith("replaced, because a via-point had the same name: my point\n"),
     ) == (
         0,
         True,
@@ -226,10 +226,10 @@ def test_a_via_point_is_taught_from_where_hands_and_tool_are(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("thirdhand.cli.here.HERE_TIMEOUT_S", 0.0)
         assert main(add) == 1
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert re.search(
         r"nothing was taught: the left hand (has not been seen yet|was last .* ago); --left X Y Z",
-        said,
+        message,
     )
     shared_daemon.client.ask("hold")
     with Tracker(shared_daemon.session):

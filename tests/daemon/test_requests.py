@@ -91,8 +91,8 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
 
 def test_a_reply_warns_of_a_via_point_that_is_missed_and_only_then(cell: Cell) -> None:
     assert cell.client.add(VIA_POINTS).warnings == ()
-    at = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
-    reply = cell.client.ask("via_points", add(point(name="loose", tool=at, std=0.2)))
+    tool = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
+    reply = cell.client.ask("via_points", add(point(name="loose", tool=tool, std=0.2)))
     missed = next(taught["missed_by_m"] for taught in reply["points"] if taught["name"] == "loose")
     assert missed > 0.1
     assert reply["warnings"][0].startswith(f"via-point 'loose' is missed by {1000 * missed:.0f} mm")
@@ -101,10 +101,10 @@ def test_a_reply_warns_of_a_via_point_that_is_missed_and_only_then(cell: Cell) -
 def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: StoredSkill) -> None:
     cell.client.add(VIA_POINTS, tolerance=0.04)
     (event,) = cell.taken
-    wanted = adapted(skill, VIA_POINTS, tolerance=0.04)
-    assert event.payload == cell.kept[0] == wanted.file
+    expected = adapted(skill, VIA_POINTS, tolerance=0.04)
+    assert event.payload == cell.kept[0] == expected.file
     assert type(event.value) is Skill  # without its file, which a recording has beside it
-    assert event.value.digest == wanted.digest
+    assert event.value.digest == expected.digest
 
 
 def test_what_is_taught_is_its_users_alone(cell: Cell) -> None:

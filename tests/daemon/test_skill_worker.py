@@ -66,10 +66,10 @@ def bits(value: object) -> bytes:
 def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
     skill_worker: SkillWorker, skill: Skill, count: int
 ) -> None:
-    there = skill_worker.adapt(skill, VIA_POINTS[:count], tolerance=0.05)
-    assert_same_bits(there, adapted(skill, VIA_POINTS[:count], tolerance=0.05))
-    assert there.via_points == VIA_POINTS[:count]
-    assert in_force(there) == in_force(adapted(skill, VIA_POINTS[:count], tolerance=0.05))
+    adapted_skill = skill_worker.adapt(skill, VIA_POINTS[:count], tolerance=0.05)
+    assert_same_bits(adapted_skill, adapted(skill, VIA_POINTS[:count], tolerance=0.05))
+    assert adapted_skill.via_points == VIA_POINTS[:count]
+    assert in_force(adapted_skill) == in_force(adapted(skill, VIA_POINTS[:count], tolerance=0.05))
 
 
 def test_errors_come_back_with_their_words_and_do_not_end_the_process(
@@ -106,14 +106,14 @@ def test_a_killed_process_is_replaced_at_the_next_request(
 def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Skill) -> None:
     skill_worker = SkillWorker()
     skill_worker.close()
-    there = skill_worker.adapt(skill, VIA_POINTS, tolerance=0.05)
+    adapted_skill = skill_worker.adapt(skill, VIA_POINTS, tolerance=0.05)
     started = process_of(skill_worker)
     skill_worker.close()
     skill_worker.close()
     assert not is_there(started)
-    assert_same_bits(there, adapted(skill, VIA_POINTS, tolerance=0.05))
+    assert_same_bits(adapted_skill, adapted(skill, VIA_POINTS, tolerance=0.05))
     with pytest.raises(ValueError, match="read-only"):
-        there.model.primitive.inputs[0, 0] = 1.0
+        adapted_skill.model.primitive.inputs[0, 0] = 1.0
 
 
 def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(

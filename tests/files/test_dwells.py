@@ -40,14 +40,14 @@ def test_a_via_point_that_was_never_reached_is_named_with_how_near_the_tool_came
     vise = msgspec.structs.replace(
         taken.via_points[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
     )
-    found = listed(taken._replace(via_points=(*taken.via_points, vise)), tmp_path / "a.mcap")
+    report = listed(taken._replace(via_points=(*taken.via_points, vise)), tmp_path / "a.mcap")
     least = np.linalg.norm(taken.tool[:, :3] - vise.tool, axis=1).min()
-    (remark,) = found.remarks
+    (remark,) = report.remarks
     assert remark == (
         f"via-point 'vise' was never reached: the tool's smallest distance was {1000 * least:.0f} "
         "mm, 100 mm needed"
     )
-    assert remark in table(found)
+    assert remark in table(report)
 
 
 def test_a_rest_far_from_all_via_points_may_be_one_that_is_not_named(taken: Demonstration) -> None:

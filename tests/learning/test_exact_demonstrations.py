@@ -25,7 +25,8 @@ def along_a_line(number: int) -> Demonstration:
     t = np.arange(0.0, 6.0, 0.02)
     share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
     ways = (
-        np.array(one) for one in zip(*((p.left, p.right, p.tool) for p in VIA_POINTS), strict=True)
+        np.array(point)
+        for point in zip(*((p.left, p.right, p.tool) for p in VIA_POINTS), strict=True)
     )
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     poses = [np.hstack([begin + share * (end - begin), turn]) for begin, end in ways]

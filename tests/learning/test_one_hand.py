@@ -97,15 +97,15 @@ def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
 
 def test_takes_with_via_points_of_one_hand() -> None:
     """Takes of one hand that name their via-points are learned between these."""
-    shown = []
+    takes = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
-        shown.append(take._replace(right=take.left, conducts="left"))
-    learnt = learn(shown)
+        takes.append(take._replace(right=take.left, conducts="left"))
+    learnt = learn(takes)
     assert isinstance(learnt.model, SegmentedKMP)
     assert learnt.conductor == 0
-    aimed = adapted(learnt, shown[0].via_points, tolerance=0.05)
-    for point in shown[0].via_points:
+    aimed = adapted(learnt, takes[0].via_points, tolerance=0.05)
+    for point in takes[0].via_points:
         for other in (point.right, (2.0, 2.0, 2.0)):
             hands = np.array([[*point.left, *other]])
             np.testing.assert_allclose(aimed.mean(hands, [point.name])[0], point.tool, atol=2e-3)

@@ -22,7 +22,7 @@ def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
 @pytest.mark.parametrize("named", [True, False])
 def test_order_of_files_makes_no_difference(named: bool) -> None:
     """The order of the files makes no difference."""
-    demonstrations = [one if named else one._replace(via_points=()) for one in shown()]
+    demonstrations = [take if named else take._replace(via_points=()) for take in shown()]
     names = [f"take {number}" for number in range(len(demonstrations))]
     first = learn(demonstrations, names=names)
     for seed in range(2):
@@ -63,4 +63,4 @@ def test_take_with_exchanged_hands_is_left_out() -> None:
 def test_a_delay_that_is_given_is_taken() -> None:
     assert figures_of(learn(shown(), delay_s=0.35)).delay_s == 0.35
     with pytest.raises(SkillError, match=r"a delay goes with via-points"):
-        learn([one._replace(via_points=()) for one in shown()], delay_s=0.1)
+        learn([take._replace(via_points=()) for take in shown()], delay_s=0.1)

@@ -75,20 +75,20 @@ def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]
 def test_pose_comes_back_from_file(posed: Skill) -> None:
     """A skill with orientation and gripper comes back from its file."""
     back = decoded(posed.file, origin="x.npz")
-    one, other = (at_rest(skill, with_hands(VIA_POINTS[2])) for skill in (posed, back))
-    assert one.turn.orientation.tobytes() == other.turn.orientation.tobytes()
-    assert one.turn.covariance.tobytes() == other.turn.covariance.tobytes()
-    assert one.closure == other.closure
+    pose, other = (at_rest(skill, with_hands(VIA_POINTS[2])) for skill in (posed, back))
+    assert pose.turn.orientation.tobytes() == other.turn.orientation.tobytes()
+    assert pose.turn.covariance.tobytes() == other.turn.covariance.tobytes()
+    assert pose.closure == other.closure
     assert back.digest == posed.digest
 
 
 def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) -> None:
     """Via-points store orientation and gripper, and return them."""
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
-    told = msgspec.structs.replace(VIA_POINTS[2], orientation=(x, y, z, w), gripper="open")
-    hands = with_hands(told)
+    point = msgspec.structs.replace(VIA_POINTS[2], orientation=(x, y, z, w), gripper="open")
+    hands = with_hands(point)
     for base in (posed, skill, shipped_skill()):  # the last is between via-points
-        taught = adapted(base, (*VIA_POINTS[:2], told), tolerance=0.05)
+        taught = adapted(base, (*VIA_POINTS[:2], point), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad
         assert missed is not None

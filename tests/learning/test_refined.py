@@ -84,7 +84,7 @@ def test_earlier_takes_of_a_person_count() -> None:
         SkillError,
         match=r"demonstration 1 has the via-points \(none\): segment 1, .* needed, as in the",
     ):
-        learn([one._replace(via_points=()) for one in mine[:2]], refined=skill)
+        learn([take._replace(via_points=()) for take in mine[:2]], refined=skill)
 
 
 def test_impossible_refinement_is_refused(others: StoredSkill) -> None:

@@ -77,18 +77,20 @@ def test_tool_goes_to_its_via_points(between: Skill, shown: list[Demonstration])
         for point in via_points:
             near = aimed.mean(hands_at(point, 0.02))[0] - (0.02 if point.follow == "left" else 0.0)
             assert np.linalg.norm(near - point.tool) < 0.015
-        far, near = (aimed.model.gates_m(hands_at(via_points[2], off))[0] for off in (0.3, 0.0))
+        far, near = (
+            aimed.model.gates_m(hands_at(via_points[2], offset_m))[0] for offset_m in (0.3, 0.0)
+        )
         assert far > aimed.threshold > near
 
 
 def test_unusable_via_points_are_explained(shown: list[Demonstration]) -> None:
     """Takes that cannot be learned between via-points are refused with a reason."""
-    assert task_of([one._replace(via_points=()) for one in shown]) == (None, "")
+    assert task_of([take._replace(via_points=()) for take in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(via_points=shown[1].via_points[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
     assert (
         "1 named via-points: 2 to 65"
-        in task_of([one._replace(via_points=one.via_points[:1]) for one in shown])[1]
+        in task_of([take._replace(via_points=take.via_points[:1]) for take in shown])[1]
     )
 
 
@@ -99,11 +101,12 @@ def test_via_point_never_reached_is_named(shown: list[Demonstration]) -> None:
     assert task is not None
     assert via_points_never_reached(task, shown, names) == []
     wrong = [
-        one._replace(via_points=moved(one.via_points, {"glass": (0.0, 0.4, 0.3)})) for one in shown
+        take._replace(via_points=moved(take.via_points, {"glass": (0.0, 0.4, 0.3)}))
+        for take in shown
     ]
-    (said,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
+    (remark,) = via_points_never_reached(task, [*shown[:-1], wrong[-1]], names)
     assert re.fullmatch(
-        r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", said
+        r"via-point 'glass': the tool never came near it in take-5 \(\d{3} mm\)", remark
     )
     with pytest.raises(
         SkillError,
@@ -159,10 +162,10 @@ def test_via_point_is_visited_twice(cyclic: Skill) -> None:
     assert rms_mm("cyclic", cyclic) < 50.0
     via_points = {point.name: point for point in made("cyclic", [6], each=1)[0].via_points}
     aimed = adapted(cyclic, tuple(via_points.values()), tolerance=0.05)
-    one = via_points["left out"]
-    again = via_points["left out again"]
-    assert np.allclose(one.left, again.left)
-    assert np.linalg.norm(np.subtract(one.tool, again.tool)) > 0.1
+    first_visit = via_points["left out"]
+    second_visit = via_points["left out again"]
+    assert np.allclose(first_visit.left, second_visit.left)
+    assert np.linalg.norm(np.subtract(first_visit.tool, second_visit.tool)) > 0.1
     assert max(point.missed_by_m for point in in_force(aimed)) < 0.005
 
 
@@ -221,9 +224,9 @@ def test_leading_hand(on_path: list[Demonstration]) -> None:
 def test_where_it_waits_it_waits_to_the_end() -> None:
     skill = learn(made("three", range(3)), name="three")
     via_points = made("three", [0], each=1)[0].via_points
-    there = adapted(skill, via_points, tolerance=0.05)
+    adapted_skill = adapted(skill, via_points, tolerance=0.05)
     left_alone = np.array([[*via_points[1].left, *via_points[0].right]])
-    assert np.linalg.norm(there.mean(left_alone)[0] - via_points[0].tool) < 0.03
+    assert np.linalg.norm(adapted_skill.mean(left_alone)[0] - via_points[0].tool) < 0.03
 
 
 @pytest.fixture(scope="module")

@@ -223,17 +223,17 @@ def test_via_points_are_met_while_the_hands_are_there_and_told_apart_by_when_the
 ) -> None:
     by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
-    first, again = [point for point in session.via_points if point.name == "handover"]
+    first, second = [point for point in session.via_points if point.name == "handover"]
     assert first.start_s == pytest.approx(TEACH_S, abs=0.1)
     assert (
         first.end_s
-        == pytest.approx(again.start_s, abs=1.5 * PERIOD_S)
+        == pytest.approx(second.start_s, abs=1.5 * PERIOD_S)
         == pytest.approx(RETEACH_S, abs=0.1)
     )
     assert first.best_m is not None
     assert first.best_m < 0.02
-    assert (again.visits, again.best_m) == ((), None)
-    assert again.hands_m > 0.03
+    assert (second.visits, second.best_m) == ((), None)
+    assert second.hands_m > 0.03
 
 
 def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(

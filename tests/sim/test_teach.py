@@ -81,13 +81,13 @@ def test_tutorial_task_visits_tray_twice(tmp_path: Path) -> None:
     """The tutorial's task visits the tray twice, and its via-points are stored."""
     file = tmp_path / "via-points.json"
     assert teach.main(["--visits", "--via-points", str(file)]) == 0
-    told = via_points_in(file)
-    assert [place.name for place in told] == ["start", "tray", "work", "tray again", "done"]
-    assert told[1].left == told[3].left
-    assert np.linalg.norm(np.subtract(told[1].tool, told[3].tool)) > 0.1
+    via_points = via_points_in(file)
+    assert [place.name for place in via_points] == ["start", "tray", "work", "tray again", "done"]
+    assert via_points[1].left == via_points[3].left
+    assert np.linalg.norm(np.subtract(via_points[1].tool, via_points[3].tool)) > 0.1
     first = teach.visits(1)
     other = teach.visits(2)
     for take in (first, other):
-        for place in told:
+        for place in via_points:
             assert off_via_point(take, place, NONE).min() < 0.02
     assert len(first.tool) != len(other.tool)

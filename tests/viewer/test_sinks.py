@@ -182,7 +182,7 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     assert len(lines) >= 5
     assert all(len(line) > 50 for line in lines)
     before, after = (
-        rows["/skill/via_points/tool"][at].get("Points3D:labels") or [] for at in (0, -1)
+        rows["/skill/via_points/tool"][index].get("Points3D:labels") or [] for index in (0, -1)
     )
     assert "vise" not in before
     assert "vise" in after

@@ -136,7 +136,7 @@ def rows(now: Status) -> dict[str, str]:
     granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
         ", memory locked" if now.memory_locked else ", memory not locked"
     )
-    found = {
+    rows_by_name = {
         "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
@@ -185,15 +185,15 @@ def rows(now: Status) -> dict[str, str]:
         label, unit = name.rsplit("_", 1)
         values = getattr(now, name)
         digits = 1 if unit == "us" else 2
-        found[label] = (
+        rows_by_name[label] = (
             f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max "
             f"{values.max:.{digits}f} " + unit.replace("us", "µs")
             if values.max
             else "none yet"
         )
     if clocks := differing_clocks(now):
-        found["latency"] = f"unknown: {clocks}"
-    return {name: text for name, text in found.items() if text}
+        rows_by_name["latency"] = f"unknown: {clocks}"
+    return {name: text for name, text in rows_by_name.items() if text}
 
 
 def hours_until_full(scribe: Mapping[str, Any]) -> float | None:

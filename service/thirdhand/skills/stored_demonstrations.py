@@ -55,15 +55,15 @@ def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
     about = [
         _About(
             name=name,
-            samples=len(one.stamps_ns),
-            frame=one.frame,
-            via_points=one.via_points,
-            conducts=one.conducts,
-            person=one.person,
-            begins=one.begins,
-            has_gripper=one.gripper is not None,
+            samples=len(demonstration.stamps_ns),
+            frame=demonstration.frame,
+            via_points=demonstration.via_points,
+            conducts=demonstration.conducts,
+            person=demonstration.person,
+            begins=demonstration.begins,
+            has_gripper=demonstration.gripper is not None,
         )
-        for name, one in thin
+        for name, demonstration in thin
     ]
     out = io.BytesIO()
     np.savez_compressed(

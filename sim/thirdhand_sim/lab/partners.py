@@ -192,8 +192,8 @@ def as_command(
     try:
         skill = learn(
             [
-                one.demonstration if told else one.demonstration._replace(via_points=())
-                for one in shown
+                take.demonstration if told else take.demonstration._replace(via_points=())
+                for take in shown
             ],
             names=[take.name for take in shown],
             refined=refined,
@@ -228,9 +228,9 @@ def served(
     for take in asked:
         rounds: list[Judged] = []
         try:
-            there = taught(skill, take.demonstration.via_points) if told else skill
+            taught_skill = taught(skill, take.demonstration.via_points) if told else skill
             predictions = predicted_rounds(
-                there, take, reach=None if refusals else Settings().reach
+                taught_skill, take, reach=None if refusals else Settings().reach
             )
             rounds = [judged(take, prediction) for prediction in predictions]
         except SkillError as error:
@@ -300,12 +300,12 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
     numbers: dict[str, Any] = {"folds": len(found), "methods": methods}
     if found[0].moved:
         numbers["moved"] = [part.moved for part in found]
-    own = [part.own for part in found if part.own]
-    if own:
-        numbers["own_takes"] = summary(_accepted(own)) | {
+    own_folds = [part.own for part in found if part.own]
+    if own_folds:
+        numbers["own_takes"] = summary(_accepted(own_folds)) | {
             "own": OWN,
-            "folds_refused": sum(bool(fold.refusals) for fold in own),
-            "weights": [fold.figures.weight for fold in own if fold.figures],
+            "folds_refused": sum(bool(fold.refusals) for fold in own_folds),
+            "weights": [fold.figures.weight for fold in own_folds if fold.figures],
         }
     return numbers
 
@@ -386,8 +386,8 @@ def summary(takes: Sequence[Judged]) -> dict[str, Any]:
 
 def _share(counts: Sequence[float | None], total: int) -> float | None:
     """The share that the known counts are of a total; None if none is known, or the total is 0."""
-    known = [count for count in counts if count is not None]
-    return sum(known) / total if known and total > 0 else None
+    known_counts = [count for count in counts if count is not None]
+    return sum(known_counts) / total if known_counts and total > 0 else None
 
 
 def _line(fold: Fold) -> str:

@@ -175,13 +175,13 @@ def joint_step(
     limits.
     """
     arm = arms[0]
-    here = heres[0]
+    posture = heres[0]
     goal = goals[0]
-    task_count, joints = here.tasks.shape
+    task_count, joints = posture.tasks.shape
 
     # The programme: what the tool shall do, what the joints can do, and what separation allows.
     wish = np.empty(task_count)
-    damping = here.damping + _wish(arms, heres, goals, wish)
+    damping = posture.damping + _wish(arms, heres, goals, wish)
     scaled = np.empty((task_count, joints))
     home = np.empty(joints)
     bounds = np.empty((2, joints))
@@ -241,13 +241,13 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
     goal.
     """
     arm = arms[0]
-    here = heres[0]
+    posture = heres[0]
     goal = goals[0]
     linear = np.empty(3)
     error = np.empty(3)
     for i in range(3):
         linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
-        error[i] = min(max(goal.position[i] - here.position[i], -MAX_ERROR_M), MAX_ERROR_M)
+        error[i] = min(max(goal.position[i] - posture.position[i], -MAX_ERROR_M), MAX_ERROR_M)
         error[i] -= arm.period_s * linear[i]
 
     # The rate is constant for small errors; large ones are closed at constant deceleration.
@@ -263,12 +263,12 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
 
     turn = np.empty(3)
     turn_rows = len(wish) - 3
-    _turn(arms, here.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
+    _turn(arms, posture.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
     wish[:3] = linear
     wish[3:] = 0.0
     for i in range(turn_rows):
         for k in range(3):
-            wish[3 + i] += arm.turn_lever * here.rotation[k, i] * turn[k]
+            wish[3 + i] += arm.turn_lever * posture.rotation[k, i] * turn[k]
     excess = max(rate * distance - arm.far_speed, 0.0)
     far_damping: float = arm.far_damping * excess * excess
     return far_damping
@@ -282,24 +282,24 @@ def _bound_joints(
     near its limit, else 0.
     """
     arm = arms[0]
-    here = heres[0]
+    posture = heres[0]
     flags = 0
     for j in range(len(home)):
-        below = here.joints[j] - arm.lower[j]
-        above = arm.upper[j] - here.joints[j]
+        below = posture.joints[j] - arm.lower[j]
+        above = arm.upper[j] - posture.joints[j]
         if min(below, above) < arm.near_limit_rad * arm.per_rad[j]:
             flags = NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(below, 0.0) / arm.scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(above, 0.0) / arm.scale[j]
 
         # Any number of turns away; 0 at half a turn, where no direction is shorter.
-        error = arm.posture[j] - here.joints[j]
+        error = arm.posture[j] - posture.joints[j]
         if arm.is_continuous[j]:
             error, _ = sin_cos(error)
         max_speed = arm.posture_speed * arm.per_rad[j]
         home[j] = min(max(arm.posture_gain * error, -max_speed), max_speed) / arm.scale[j]
         for i in range(len(scaled)):
-            scaled[i, j] = here.tasks[i, j] * arm.scale[j]
+            scaled[i, j] = posture.tasks[i, j] * arm.scale[j]
     return flags
 
 

@@ -118,7 +118,7 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
     states, heres, parameters, capsules, contacts, _ = scene
     state = states[0]
     config = parameters[0]
-    here = heres[0]
+    posture = heres[0]
 
     # What is known of the hand: its velocity, and how much faster and nearer it may be.
     is_known = _is_velocity_known(states, parameters, side)
@@ -127,14 +127,14 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
     faster_by, nearer_by = _while_unseen(states, parameters, side)
     moving = _swiftness(state.hands[side, 1], config.tremor_speed) if is_known else 0.0
 
-    later = np.empty(len(here.joints))
+    later = np.empty(len(posture.joints))
     forearm = np.empty((2, 3))
     velocity = np.empty(3)
     for k in range(len(config.lookahead_s) if moving > 0.0 else 1):
         ahead_s = moving * config.lookahead_s[k]
         if k > 0:
             for j in range(len(later)):
-                later[j] = here.joints[j] + ahead_s * state.joints[1, j]
+                later[j] = posture.joints[j] + ahead_s * state.joints[1, j]
             place(later, config.frames, config.axes, capsules, placed[1])
         _move_hand(states, parameters, side, ahead_s, forearm, velocity)
         braked = config.brake[PEOPLE] * max(ahead_s - config.brake_ramp_s, 0.0)

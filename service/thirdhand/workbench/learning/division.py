@@ -50,7 +50,9 @@ FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     """The task of demonstrations, and why there is none although they name via-points."""
-    named = [tuple(point.name for point in one.via_points) for one in demonstrations]
+    named = [
+        tuple(point.name for point in demonstration.via_points) for demonstration in demonstrations
+    ]
     if not any(named):
         return None, ""
     if len(set(map(frozenset, named))) > 1:
@@ -61,10 +63,15 @@ def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     names = Counter(named).most_common(1)[0][0]
     if not 2 <= len(names) <= MOST_SEGMENTS + 1:
         return None, f"{len(names)} named via-points: 2 to {MOST_SEGMENTS + 1} are learned between"
-    at = np.array(
-        [[[*p.left, *p.right] for p in ordered(one.via_points, names)] for one in demonstrations]
+    via_point_hands = np.array(
+        [
+            [[*p.left, *p.right] for p in ordered(demonstration.via_points, names)]
+            for demonstration in demonstrations
+        ]
     )
-    corners = np.stack([_corners(at[:, :, :3]), _corners(at[:, :, 3:])], axis=1)
+    corners = np.stack(
+        [_corners(via_point_hands[:, :, :3]), _corners(via_point_hands[:, :, 3:])], axis=1
+    )
     return Task(
         names,
         corners,
@@ -100,18 +107,26 @@ def via_points_never_reached(
     """
     warned = []
     for named, follow in zip(task.names, task.follow.tolist(), strict=True):
-        off = [
-            float(off_via_point(one, next(ordered(one.via_points, (named,))), follow).min())
-            for one in demonstrations
+        distances_m = [
+            float(
+                off_via_point(
+                    demonstration, next(ordered(demonstration.via_points, (named,))), follow
+                ).min()
+            )
+            for demonstration in demonstrations
         ]
-        if min(off) > FAR_M:
+        if min(distances_m) > FAR_M:
             raise SkillError(
-                f"via-point {named!r}: the tool never came nearer to it than {1000 * min(off):.0f} "
-                f"mm ({names[int(np.argmin(off))]}), {1000 * FAR_M:.0f} mm needed: is it given in "
+                f"via-point {named!r}: the tool never came nearer to it than "
+                f"{1000 * min(distances_m):.0f} "
+                f"mm ({names[int(np.argmin(distances_m))]}), {1000 * FAR_M:.0f} mm needed: is it "
+                "given in "
                 "metres, in frame base, where it was in these demonstrations?"
             )
         missed = [
-            f"{name} ({1000 * m:.0f} mm)" for name, m in zip(names, off, strict=True) if m > FAR_M
+            f"{name} ({1000 * m:.0f} mm)"
+            for name, m in zip(names, distances_m, strict=True)
+            if m > FAR_M
         ]
         if missed:
             warned.append(
@@ -157,11 +172,11 @@ class Divided:
             for x in (hands, smooth_tool)
         )
         moving = np.stack([hands, velocities, np.zeros_like(hands)], axis=1)
-        at = NamedViaPoints.of(demonstration.via_points)
-        segments = _segments(task, at)
+        via_points = NamedViaPoints.of(demonstration.via_points)
+        segments = _segments(task, via_points)
         labels = _divided(segments, moving, (smooth_tool, tool_velocities), period_s)
         return Divided(
-            demonstration, at, segments, moving, stillness_of(velocities, period_s), labels
+            demonstration, via_points, segments, moving, stillness_of(velocities, period_s), labels
         )
 
     @property

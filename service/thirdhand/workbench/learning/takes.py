@@ -115,8 +115,10 @@ def divided(
     if conductor is not None:
         demonstrations, before = (
             [
-                one._replace(via_points=tuple(of_one(point, conductor) for point in one.via_points))
-                for one in some
+                demonstration._replace(
+                    via_points=tuple(of_one(point, conductor) for point in demonstration.via_points)
+                )
+                for demonstration in some
             ]
             for some in (demonstrations, before)
         )

@@ -459,7 +459,7 @@ def why_missed(found: Report, name: str, *, begun_s: float, start_s: float, end_
             f"the arm {outcome} ({word(worst.reason)}) {since}, for {worst.lasts_s:.1f} s: "
             f"{worst.why}"
         )
-    hands_m = [one.hands_m for one in found.via_points if one.name == name]
+    hands_m = [point.hands_m for point in found.via_points if point.name == name]
     if not hands_m:
         return f"no via-point {name!r} was taught"
     if best := found.best_m(name):

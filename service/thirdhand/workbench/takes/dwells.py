@@ -19,17 +19,19 @@ def remarks_on_via_points(demonstration: Demonstration) -> list[str]:
     points = demonstration.via_points
     if not points:
         return []
-    off = np.array([off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points])
+    distances_m = np.array(
+        [off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points]
+    )
     remarks = [
         f"via-point {point.name!r} was never reached: the tool's smallest distance was "
         f"{1000 * least:.0f} mm, {1000 * FAR_M:.0f} mm needed"
-        for point, least in zip(points, off.min(axis=1).tolist(), strict=True)
+        for point, least in zip(points, distances_m.min(axis=1).tolist(), strict=True)
         if least > FAR_M
     ]
     seconds = (demonstration.stamps_ns - demonstration.stamps_ns[0]) / 1e9
     for begin_s, end_s in dwells(demonstration):
         during = (seconds >= begin_s) & (seconds <= end_s)
-        near = off[:, during].min(axis=1, initial=np.inf)
+        near = distances_m[:, during].min(axis=1, initial=np.inf)
         if near.min() > FAR_M:
             remarks.append(
                 f"hands and tool rest from {begin_s:.1f} to {end_s:.1f} s, {1000 * near.min():.0f} "

@@ -33,9 +33,11 @@ class NoDemonstrations:
 
     def place(self, places: Places) -> PlacedProcess:
         """The regression through these places."""
-        at, wanted, std = neighbourhoods(via_points_of(places))
+        inputs, outputs, std = neighbourhoods(via_points_of(places))
         kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
-        return PlacedProcess.of([kernel], [at], [wanted], [std**2], centre=wanted.mean(axis=0))
+        return PlacedProcess.of(
+            [kernel], [inputs], [outputs], [std**2], centre=outputs.mean(axis=0)
+        )
 
 
 @dataclass(frozen=True)

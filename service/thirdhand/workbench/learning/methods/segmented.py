@@ -705,7 +705,8 @@ class Segmented:
             list(ordered(take.demonstration.via_points, self.task.names)) for take in takes
         )
         return NamedViaPoints(
-            self.task.names, np.mean([NamedViaPoints.of(one).at for one in via_points], axis=0)
+            self.task.names,
+            np.mean([NamedViaPoints.of(points).at for points in via_points], axis=0),
         )
 
     def _without_via_points(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
@@ -713,7 +714,7 @@ class Segmented:
         progress("learning without the via-points, for comparison")
         inputs = [take.hands for take in takes]
         fit = refit(POSITIONS, takes, inputs, self.options.points, None)
-        return [one.errors for one in held_out_takes(takes, inputs, fit, progress)]
+        return [take.errors for take in held_out_takes(takes, inputs, fit, progress)]
 
 
 def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
