@@ -11,11 +11,12 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from thirdhand.cli.usage import UsageError, add_end_with, end_with, option
-from thirdhand.client import client_settings, endpoints, open_session
+from thirdhand.client import ClientSettings, client_settings, endpoints, open_session
 from thirdhand.contract import requests
 from thirdhand.contract.channels import ENDPOINT
 from thirdhand.contract.explain import in_words
@@ -23,9 +24,14 @@ from thirdhand.contract.printable import printable_lines
 from thirdhand.daemon.launch import ENGINES, LaunchError, engine_of
 from thirdhand.process import interrupt, output
 from thirdhand.recordings.shipped import ARMS, cell_of
+from thirdhand.settings.config import Settings
 from thirdhand.settings.file_content import SettingsError, UnreadableError
 from thirdhand_sim.scene import Scene, SceneError
 from thirdhand_sim.script import Clock, HandScript, ScriptPause
+
+if TYPE_CHECKING:
+    from thirdhand_sim.bench import BenchHands
+    from thirdhand_sim.network import RunReport
 
 SIM_EXAMPLE = """example:
   thirdhand serve &
@@ -157,12 +163,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the bench; exit code 0, 1 on failure, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
-    if not 30 <= args.hands_rate <= 500:
-        p.error(f"--hands-rate {args.hands_rate}: 30 to 500 accepted")
-    if not 0.05 <= args.speed <= 20:
-        p.error(f"--speed {args.speed}: 0.05 to 20 accepted")
-    if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
-        p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
+    _check(p, args)
     try:
         if args.end_with is not None:
             end_with(args.end_with)
@@ -179,30 +180,41 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except (SettingsError, UsageError) as error:
         p.error(str(error))
-    from thirdhand_sim.bench import Bench, BenchHands
-    from thirdhand_sim.engines import world_of
-    from thirdhand_sim.network import BenchError, Dropout, Live, RunReport, run
-    from thirdhand_sim.observed_world import ObservedWorld
-    from thirdhand_sim.parts import before_others
-    from thirdhand_sim.tracked_hands import TrackedHands
+    return _run(args, settings, scene, reach)
 
-    world = ObservedWorld if args.hands_only else world_of(args.engine)
-    stop = threading.Event()
-    came = list[int]()
 
-    def end(number: int, _: object) -> None:
-        came.append(number)
-        stop.set()
-
+def _check(p: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """End with bad usage if an option is out of its range."""
+    if not 30 <= args.hands_rate <= 500:
+        p.error(f"--hands-rate {args.hands_rate}: 30 to 500 accepted")
+    if not 0.05 <= args.speed <= 20:
+        p.error(f"--speed {args.speed}: 0.05 to 20 accepted")
+    if min(args.offset_mm, args.tremor_mm, args.noise_mm) < 0:
+        p.error("--offset-mm, --tremor-mm and --noise-mm cannot be negative")
     try:
         Clock(pauses=[ScriptPause(*pause) for pause in args.pause + args.turn])
     except ValueError as error:
         p.error(f"--pause, --turn: {error}")
-    dropout = (
-        Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand)
-        if args.dropout
-        else None
-    )
+
+
+def _run(args: argparse.Namespace, settings: Settings, scene: Scene, reach: ClientSettings) -> int:
+    """Run the bench in a cell, until a signal or its end; the exit code."""
+    from thirdhand_sim.bench import Bench
+    from thirdhand_sim.engines import world_of
+    from thirdhand_sim.network import BenchError, Dropout, Live, run
+    from thirdhand_sim.observed_world import ObservedWorld
+    from thirdhand_sim.parts import before_others
+
+    stop = threading.Event()
+    signals: list[int] = []
+
+    def end(number: int, _: object) -> None:
+        signals.append(number)
+        stop.set()
+
+    dropout = None
+    if args.dropout:
+        dropout = Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand)
     live = Live(
         cell=reach.cell,
         hands_hz=args.hands_rate,
@@ -211,61 +223,75 @@ def main(arguments: list[str] | None = None) -> int:
         wait_s=args.wait,
         dropout=dropout,
     )
-    target = args.output or ("-" if args.once else None)
-    runs = 0
-
-    def report(result: RunReport) -> None:
-        nonlocal runs
-        runs += 1
-        line = msgspec.json.encode(result).decode() + "\n"
-        if target == "-":
-            sys.stdout.write(line)
-            sys.stdout.flush()
-        elif target:
-            with Path(target).open("a", encoding="utf-8") as file:
-                file.write(line)
-
+    world = ObservedWorld if args.hands_only else world_of(args.engine)
     try:
-        script: BenchHands = HandScript(
-            scene,
-            seed=scene.seed if args.seed is None else args.seed,
-            speed=args.speed,
-            pauses=[
-                *(ScriptPause(start_s, lasts) for start_s, lasts in args.pause),
-                *(ScriptPause(start_s, lasts, depth=2.0) for start_s, lasts in args.turn),
-            ],
-            offset_std=args.offset_mm / 1000,
-            tremor_rms=args.tremor_mm / 1000,
-            noise_std=args.noise_mm / 1000,
-        )
-        if args.tracked_hands is not None:
-            script = TrackedHands(scene, settings, timeout_s=args.tracked_hands)
-        if target and target != "-":
-            # a file that cannot be written is reported before the run
-            Path(target).write_text("", encoding="utf-8")
+        reports = _Reports(args.output or ("-" if args.once else ""))
+        script = _script(args, settings, scene)
         before_others()
-        listener = (
-            open_session(connect=args.connect or (), listen=args.listen) if args.listen else None
-        )
-        session = listener or reach.session(timeout_s=None)
+        if args.listen:
+            session = open_session(connect=args.connect or (), listen=args.listen)
+        else:
+            session = reach.session(timeout_s=None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
         with session, Bench(script, settings=settings, world=world) as bench:
             if args.listen:
                 print(f"listening on {', '.join(endpoints(session))}", file=sys.stderr, flush=True)
-            run(bench, session, live, stop=stop, report=report)
+            run(bench, session, live, stop=stop, report=reports.write)
     except (BenchError, OSError) as error:
         print(f"thirdhand sim: {printable_lines(in_words(error))}", file=sys.stderr)
         return 1
     if not args.once:
-        report_note = (
-            f"their reports are in {target}" if target else "without --output no report was written"
-        )
-        print(
-            f"ended: the bench of cell {reach.cell}, after {runs} complete runs; {report_note}",
-            file=sys.stderr,
-        )
-    return interrupt.EXIT_CODE if signal.SIGINT in came else 0
+        ended = f"ended: the bench of cell {reach.cell}, after {reports.count} complete runs"
+        print(f"{ended}; {reports.note}", file=sys.stderr)
+    return interrupt.EXIT_CODE if signal.SIGINT in signals else 0
+
+
+def _script(args: argparse.Namespace, settings: Settings, scene: Scene) -> BenchHands:
+    """The hands: those of a script, or tracked ones."""
+    from thirdhand_sim.tracked_hands import TrackedHands
+
+    if args.tracked_hands is not None:
+        return TrackedHands(scene, settings, timeout_s=args.tracked_hands)
+    return HandScript(
+        scene,
+        seed=scene.seed if args.seed is None else args.seed,
+        speed=args.speed,
+        pauses=[
+            *(ScriptPause(start_s, lasts) for start_s, lasts in args.pause),
+            *(ScriptPause(start_s, lasts, depth=2.0) for start_s, lasts in args.turn),
+        ],
+        offset_std=args.offset_mm / 1000,
+        tremor_rms=args.tremor_mm / 1000,
+        noise_std=args.noise_mm / 1000,
+    )
+
+
+class _Reports:
+    """A writer of reports as JSON lines: to a file, to standard output (`-`), or nowhere (empty).
+
+    A file that cannot be written is reported before the run. Raises OSError.
+    """
+
+    def __init__(self, target: str) -> None:
+        self._target = target
+        self.count = 0
+        self.note = "without --output no report was written"
+        if target:
+            self.note = f"their reports are in {target}"
+        if target not in ("", "-"):
+            Path(target).write_text("", encoding="utf-8")
+
+    def write(self, report: RunReport) -> None:
+        """Write the report of a run."""
+        self.count += 1
+        line = msgspec.json.encode(report).decode() + "\n"
+        if self._target == "-":
+            sys.stdout.write(line)
+            sys.stdout.flush()
+        elif self._target:
+            with Path(self._target).open("a", encoding="utf-8") as file:
+                file.write(line)
 
 
 if __name__ == "__main__":
