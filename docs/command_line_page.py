@@ -70,7 +70,8 @@ def _command(name: str, parser: argparse.ArgumentParser, heading: str) -> Iterat
     """A command's heading, description, options and examples; then the commands below it."""
     about = " ".join((parser.description or "").split())
     yield f"\n{heading} {name}\n\n{textwrap.fill(_sentence(about), 100)}\n"
-    below, reach = _subparsers(parser), _group(parser, REACH)
+    below = _subparsers(parser)
+    reach = _group(parser, REACH)
     own = [
         action
         for action in parser._actions  # noqa: SLF001

@@ -28,9 +28,13 @@ from thirdhand_sim.scene import Scene
 
 PICTURE = Path(__file__).with_name("correct.png")
 DPI = 90
-SEGMENT, SHARE = 0, 0.5  # the correction is made halfway to the handover
+# the correction is made halfway to the handover
+SEGMENT = 0
+SHARE = 0.5
 LED_M = np.array([0.03, 0.0, 0.07])  # [m] displacement of the tool that is led
-REST_S, MOVE_S, SAMPLE_TICKS = 1.0, 2.5, 5
+REST_S = 1.0
+MOVE_S = 2.5
+SAMPLE_TICKS = 5
 
 
 def hands_at(skill: Skill, time_s: float) -> Vector:
@@ -46,7 +50,8 @@ def motion(skill: Skill, path: Skill, settings: Settings) -> tuple[Vector, Vecto
 
     def ticks() -> Iterator[Tick]:
         for k, time_s in enumerate(times):
-            hands, stamp_ns = hands_at(path, float(time_s)).reshape(2, 3), START_NS + k * 2_000_000
+            hands = hands_at(path, float(time_s)).reshape(2, 3)
+            stamp_ns = START_NS + k * 2_000_000
             both = [
                 hand_event(side, tuple(at), stamp_ns)
                 for side, at in zip(("left", "right"), hands.tolist(), strict=True)

@@ -78,7 +78,8 @@ def pages() -> dict[Path, str]:
     found = templates(results, tree())
     texts = {HERE / "experiments.md": wrapped(found.get_template("experiments.md.jinja").render())}
     for name, template in BLOCKS.items():
-        path, paragraph = HERE.parent / name, wrapped(found.from_string(template).render())
+        path = HERE.parent / name
+        paragraph = wrapped(found.from_string(template).render())
         texts[path] = BLOCK.sub(lambda _, text=paragraph: text, path.read_text(encoding="utf-8"))
     texts[HERE / "faults.md"] = with_figures(texts[HERE / "faults.md"], results["faults"]["faults"])
     return texts
@@ -183,7 +184,8 @@ def wrapped(text: str) -> str:
     lines as they are. A paragraph follows its picture at once.
     """
     parts = re.split(r"\n\s*\n|\n(?=[*|] |\|-|!\[|#|<!--)|(?<=\.png\))\n|(?<=\|)\n", text.strip())
-    out, before = [], ""
+    out = []
+    before = ""
     for part in filter(None, (" ".join(part.split()) for part in parts)):
         kind = next((kind for kind in ("|", "* ", "#", "![", "<!--") if part.startswith(kind)), "")
         close = (before, kind) in {("|", "|"), ("* ", "* "), ("![", "")}

@@ -32,7 +32,8 @@ HANDS = {
     "left hand": (0.78, -0.22, 0.10),
     "right hand": (0.78, 0.22, 0.10),
 }
-AXIS_M, ELBOW_M = 0.13, 0.18
+AXIS_M = 0.13
+ELBOW_M = 0.18
 COLOURS = ("tab:red", "tab:green", "tab:blue")  # x, y, z
 DPI = 90
 LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}

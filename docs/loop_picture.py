@@ -20,9 +20,14 @@ from thirdhand.contract.channels import BY_KEY
 from thirdhand.settings.config import Settings
 
 PICTURE = Path(__file__).with_name("loop.png")
-WIDTH, HEIGHT = 1.9, 0.8  # of a box
-CORE, CORE_LEFT, CORE_RIGHT = "core", 2.65, 13.55
-STAGE, OUTSIDE = "#d6e6f4", "#eeeeee"
+# of a box
+WIDTH = 1.9
+HEIGHT = 0.8
+CORE = "core"
+CORE_LEFT = 2.65
+CORE_RIGHT = 13.55
+STAGE = "#d6e6f4"
+OUTSIDE = "#eeeeee"
 DPI = 90
 LABEL = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 
@@ -99,7 +104,8 @@ def draw_box(axes: Axes, name: str, box: Box) -> None:
 
 def edge(begin: Box, end: Box) -> tuple[float, float]:
     """The point where the line to another box leaves this one."""
-    dx, dy = end.x - begin.x, end.y - begin.y
+    dx = end.x - begin.x
+    dy = end.y - begin.y
     share = min(
         (WIDTH / 2 + 0.12) / abs(dx) if dx else float("inf"),
         (HEIGHT / 2 + 0.12) / abs(dy) if dy else float("inf"),
@@ -111,7 +117,8 @@ def draw_arrow(axes: Axes, arrow: Arrow) -> None:
     """An arrow from edge to edge, and its text."""
     end = BOXES[arrow.end]
     begin = BOXES.get(arrow.begin, Box(CORE_RIGHT - WIDTH / 2, end.y, "", STAGE))
-    start, stop = edge(begin, end), edge(end, begin)
+    start = edge(begin, end)
+    stop = edge(end, begin)
     axes.annotate(
         "", stop, start, arrowprops={"arrowstyle": "-|>", "color": "0.2", "linewidth": 1.2}
     )

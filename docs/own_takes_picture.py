@@ -26,7 +26,10 @@ from thirdhand_sim.made_tasks import takes
 
 PICTURE = Path(__file__).with_name("own-takes.png")
 DPI = 90
-TASK, OTHERS, PERSON, OWN = "three", range(4), 32, 3
+TASK = "three"
+OTHERS = range(4)
+PERSON = 32
+OWN = 3
 REST_MPS = 0.03  # both hands rest below this speed
 PAUSE_S = 0.6  # a rest between the first and the last motion is a pause from this duration on
 

@@ -19,14 +19,17 @@ from thirdhand.core.skill.segments import SEGMENT, along_way, on_way
 
 PICTURE = Path(__file__).with_name("path.png")
 DPI = 90
-LONG_M, SHORT_M = 0.5, 0.2  # lengths of two paths
+# lengths of two paths
+LONG_M = 0.5
+SHORT_M = 0.2
 HAND = np.array([0.22, 0.09, 0.0])  # beside a path along the first axis
 
 
 def segment_of(length_m: float) -> np.record:
     """A segment in which the left hand moves straight along the first axis."""
     segment = structured(1, SEGMENT)
-    segment["way"][0, 0, 0], segment["square"][0, 0] = length_m, length_m**2
+    segment["way"][0, 0, 0] = length_m
+    segment["square"][0, 0] = length_m**2
     return segment[0]
 
 

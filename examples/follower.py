@@ -21,22 +21,22 @@ def main(arguments: list[str] | None = None) -> list[float]:
     parser.add_argument("--connect", action="append", help="of the daemon or a router")
     parser.add_argument("--seconds", type=float, default=math.inf, help="else until Ctrl-C")
     args = parser.parse_args(arguments)
-    client, names, joints = (
-        client_settings(connect=args.connect),
-        Settings().joints.names,
-        list(Settings().arm.posture),
-    )
+    client = client_settings(connect=args.connect)
+    names = Settings().joints.names
+    joints = list(Settings().arm.posture)
     with (
         client.session(timeout_s=None) as session,
         Follower(session, names, client.cell) as follower,
     ):
-        begin, braking = time.monotonic(), True
+        begin = time.monotonic()
+        braking = True
         while time.monotonic() - begin < args.seconds:
             command = follower.command()  # waits for one, 20 ms at most
             if command is None:
                 velocity = (0.0,) * len(joints)  # an arm of mass would brake
             else:
-                joints, velocity = list(command.position), command.velocity
+                joints = list(command.position)
+                velocity = command.velocity
             if braking != (command is None):
                 braking = not braking
                 print(

@@ -30,7 +30,8 @@ def poses(
     """
     for body in bodies:
         if body.id_num in keys and body.tracking_valid:
-            (x, y, z), (qx, qy, qz, qw) = body.pos, body.rot
+            x, y, z = body.pos
+            qx, qy, qz, qw = body.rot
             yield keys[body.id_num], PoseStamped(stamp_ns, FRAME, (x, y, z), (qx, qy, qz, qw))
 
 

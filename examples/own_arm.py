@@ -31,10 +31,8 @@ class FakeArm:
     def __init__(self, settings: Settings) -> None:
         # names, and what the drive can do: no less than what is commanded
         self.limits = settings.joints
-        self.position, self.velocity = (
-            np.array(settings.arm.posture),
-            np.zeros(len(settings.joints.names)),
-        )
+        self.position = np.array(settings.arm.posture)
+        self.velocity = np.zeros(len(settings.joints.names))
 
     def __enter__(self) -> "FakeArm":  # switch the drives on: the arm stands
         self._read_s = time.monotonic()
@@ -48,7 +46,8 @@ class FakeArm:
         return self.position
 
     def read(self) -> Measured:  # once the next period begins, as measured [rad, rad/s]
-        before, due = self._read_s, self._read_s + self.period_s
+        before = self._read_s
+        due = self._read_s + self.period_s
         time.sleep(max(due - time.monotonic(), 0.0))
         self._read_s = max(due, time.monotonic() - 0.05)
         return Measured(self.position, self.velocity, self._read_s - before)
@@ -64,7 +63,8 @@ class FakeArm:
     def move(
         self, position: np.ndarray, velocity: np.ndarray
     ) -> None:  # a servo is late; this one is not
-        self.position, self.velocity = position, velocity
+        self.position = position
+        self.velocity = velocity
 
 
 if __name__ == "__main__":
@@ -79,7 +79,8 @@ if __name__ == "__main__":
     parser.add_argument(
         "--connect", action="append", help="of the daemon, of `thirdhand record` or of a router"
     )
-    args, stop = parser.parse_args(), threading.Event()
+    args = parser.parse_args()
+    stop = threading.Event()
     settings = load(args.config) if args.config else Settings()
     where = args.connect or (settings.network.reached_at if args.config else None)
     client = client_settings(connect=where, cell=settings.cell if args.config else None)

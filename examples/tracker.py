@@ -13,7 +13,8 @@ from thirdhand import Tracker, client_settings
 
 RATE_HZ = 100
 # frame base [m]: x forward from the arm, y to its left, z up
-LEFT, RIGHT = ((0.98, -0.32, 0.06), (0.98, 0.32, 0.06))
+LEFT = (0.98, -0.32, 0.06)
+RIGHT = (0.98, 0.32, 0.06)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -26,9 +27,8 @@ def main(arguments: list[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     client = client_settings(connect=args.connect)
     with (
-        client.session(
-            timeout_s=None
-        ) as session,  # None: it waits for who listens, whoever is started first
+        # None: it waits for who listens, whoever is started first
+        client.session(timeout_s=None) as session,
         Tracker(session, client.cell, timeout_s=None) as tracker,
     ):
         begin = time.monotonic()

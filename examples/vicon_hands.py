@@ -24,7 +24,8 @@ from thirdhand.contract.messages import PoseStamped, Quaternion
 FRAME = "vicon"
 PORT = 51001
 # frame and number of items; kind and size of an item
-HEAD, ITEM = (struct.Struct("<IB"), struct.Struct("<BH"))
+HEAD = struct.Struct("<IB")
+ITEM = struct.Struct("<BH")
 OBJECT = struct.Struct("<24s6d")  # name, x y z [mm], rotations about the moving x, y and z [rad]
 
 
@@ -46,7 +47,8 @@ def poses(
     that Tracker does not see has zeros, and is left out. Raises ValueError for another packet.
     """
     try:
-        (_, count), at = HEAD.unpack_from(packet), HEAD.size
+        _, count = HEAD.unpack_from(packet)
+        at = HEAD.size
         for _ in range(count):
             kind, size = ITEM.unpack_from(packet, at)
             name, *numbers = OBJECT.unpack_from(packet, at + ITEM.size)

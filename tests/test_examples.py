@@ -70,7 +70,7 @@ def test_tracker_follower_teacher_and_watcher_work_together(
     assert "commands arrive, at tick " in output
     assert "were none of this arm's" not in output
     assert "example: missed by " in output
-    assert "refused: $.names[0]: no via-point 'no such place'" in output
+    assert "refused: $.names[0]: no via-point 'no such via-point'" in output
     assert np.abs(ended["follower"]).max() > 0.1
 
 

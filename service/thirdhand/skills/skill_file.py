@@ -297,17 +297,16 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
-    model_arrays = [
-        name for name in _model(arrays).ranges if name in arrays
-    ]  # one that is missing is found missing later
+    # An array that is missing is found missing later.
+    model_arrays = [name for name in _model(arrays).ranges if name in arrays]
     clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
     yield from _beyond(arrays, [*RANGES, *model_arrays], "")
     for prefix in (TURN, GRIPPER):
         if part := _part(arrays, prefix):
             yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
-            if len(part["base_inputs"]) > MOST_POINTS:
-                points = len(part["base_inputs"])
-            yield f"{points} points of {prefix}, at most {MOST_POINTS} accepted"
+            points = len(part["base_inputs"])
+            if points > MOST_POINTS:
+                yield f"{points} points of {prefix}, at most {MOST_POINTS} accepted"
     for prefix in ("", TURN, GRIPPER):
         if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (
             prefix or _model(arrays) is not HandsKMP
