@@ -17,6 +17,7 @@ os.environ["NUMBA_DISABLE_JIT"] = "1"  # before anything imports Numba
 from thirdhand.process import one_blas_thread  # noqa: F401
 
 # isort: split
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -28,7 +29,7 @@ from thirdhand.contract import cdr
 from thirdhand.contract.messages import BASE, Attachment, JointState, PoseStamped
 from thirdhand.contract.records import SIDES, SOURCES, Mode
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import Event, Frame, Tick, Vector
+from thirdhand.core.frame import Event, Frame, Tick
 from thirdhand.daemon import daemon
 from thirdhand.daemon.cell_streams import Arrivals, CellStreams
 from thirdhand.daemon.input_monitor import KEY_OF_SOURCE
@@ -99,19 +100,27 @@ def walk() -> Walk:
     controller = Controller(settings, skill, urdf=robot_description(settings))
     hands = skill.hands[0].reshape(2, 3)
     names = settings.joints.names
-    listening = open_session(listen=["tcp/127.0.0.1:0"])
     arrivals = {KEY_OF_SOURCE[source]: Arrivals() for source in SOURCES}
-    streams = CellStreams(listening, settings, arrivals=arrivals, failed=print)
-    with open_session(connect=list(endpoints(listening))) as session:
-        trackers = [Publisher(session, settings.cell, f"hands/{side}") for side in SIDES]
 
-        def sample(hand: Vector, index: int) -> bytes:
-            x, y, z = hand.tolist()
-            return cdr.encode_pose(
-                PoseStamped(
-                    1 + 2_000_000 * index, BASE, (x, y, z + 1e-4 * index), (0.0, 0.0, 0.0, 1.0)
-                )
-            )
+    def sample(side: str, index: int) -> PoseStamped:
+        x, y, z = hands[SIDES.index(side)].tolist()
+        return PoseStamped(
+            1 + 2_000_000 * index, BASE, (x, y, z + 1e-4 * index), (0.0, 0.0, 0.0, 1.0)
+        )
+
+    for index in range(PERIODS):
+        state = JointState(1 + 2_000_000 * index, names, settings.arm.posture, (0.0,) * len(names))
+        inbox = [Event(f"hands/{side}", b"", sample(side, index)) for side in SIDES]
+        frame = controller.step(Tick(index, (*inbox, Event("joints/state", b"", state))))
+    if frame["mode"] != Mode.FOLLOW:
+        raise SystemExit(f"the arm does not follow, but has mode {Mode(int(frame['mode'])).name}")
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as listening,
+        contextlib.closing(
+            CellStreams(listening, settings, arrivals=arrivals, failed=print)
+        ) as streams,
+        open_session(connect=list(endpoints(listening))) as session,
+    ):
 
         def publish(tick: Tick, frame: Frame) -> None:
             attachment = cdr.encode_attachment(
@@ -120,30 +129,9 @@ def walk() -> Walk:
             for key, payload in outgoing(frame, tick.index, names):
                 streams.publish(key, payload, attachment)
 
-        def arm(index: int) -> Event:
-            state = JointState(
-                1 + 2_000_000 * index, names, settings.arm.posture, (0.0,) * len(names)
-            )
-            return Event("joints/state", b"", state)
-
-        frames: list[Frame] = []
-        for index in range(PERIODS):
-            for tracker, hand in zip(trackers, hands, strict=True):
-                tracker.put(sample(hand, index))
-            until = time.monotonic() + 10.0
-            inbox: list[Event] = []
-            while len(inbox) < 2 and time.monotonic() < until:
-                inbox += streams.receive()
-            run(
-                controller,
-                [Tick(index, (*inbox, arm(index)))],
-                [lambda tick, frame: frames.append(frame)],
-            )
-        if frames[-1]["mode"] != Mode.FOLLOW:
-            raise SystemExit(
-                f"the arm does not follow, but has mode {Mode(int(frames[-1]['mode'])).name}"
-            )
-        trackers[0].put(sample(hands[0], PERIODS))
+        Publisher(session, settings.cell, "hands/left").put(
+            cdr.encode_pose(sample("left", PERIODS))
+        )
         newest: list[Event] = []
         until = time.monotonic() + 10.0
         while not newest and time.monotonic() < until:
@@ -153,8 +141,6 @@ def walk() -> Walk:
             newest = streams.receive()
         run(controller, [Tick(PERIODS, tuple(newest))], [publish])
         sys.setprofile(None)
-    streams.close()
-    listening.close()  # type: ignore[no-untyped-call]
     return trace
 
 

@@ -13,25 +13,11 @@ from pathlib import Path
 
 import pytest
 
-import kmp
 from support import tiers
+from support.cell_commands import python
 from support.paths import ROOT
 
 PACKAGES = {"kmp": "", "thirdhand": "service", "thirdhand_sim": "sim"}  # and the folder of each
-OUTSIDE = {
-    *(
-        "time",
-        "threading",
-        "os",
-        "socket",
-        "subprocess",
-        "datetime",
-        "random",
-        "asyncio",
-        "multiprocessing",
-    ),
-    *("signal", "logging", "sched", "queue", "zenoh", "mcap", "rerun", "pybullet", "mujoco"),
-}
 VAGUE = {
     "utils",
     "util",
@@ -48,11 +34,6 @@ VAGUE = {
 PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"
 MODULES = sorted(
     path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py")
-)
-PURE = sorted(
-    path
-    for room in ("core", "contract")
-    for path in (ROOT / "service" / "thirdhand" / room).rglob("*.py")
 )
 ENTRY_POINTS = [
     path
@@ -185,16 +166,11 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
         "import sys; from importlinter.cli import lint_imports_command; "
         "sys.exit(lint_imports_command())"
     )
-    return subprocess.run(
-        [sys.executable, "-c", code, "--no-cache"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        cwd=folder,
-        env=os.environ
-        | {"PYTHONPATH": f"{folder}:{folder / 'service'}:{folder / 'sim'}", "COLUMNS": "200"},
-    )
+    environment = os.environ | {
+        "PYTHONPATH": f"{folder}:{folder / 'service'}:{folder / 'sim'}",
+        "COLUMNS": "200",
+    }
+    return python(code, "--no-cache", timeout=120, cwd=folder, env=environment)
 
 
 def test_import_contracts_hold() -> None:
@@ -275,19 +251,10 @@ def test_lines_that_break_a_contract_are_found_and_named(
 def test_a_process_of_a_cell_imports_what_it_needs(
     process: str, most: int, without: tuple[str, ...]
 ) -> None:
-    code = f"import sys, {process}; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
-    modules = done.stdout.split()
+    modules = python(f"import sys, {process}; print(*sys.modules)").stdout.split()
+    assert process.split(",", maxsplit=1)[0] in modules
     assert [name for name in modules if name.startswith(without)] == []
     assert len([name for name in modules if name.split(".")[0] in PACKAGES]) <= most
-
-
-def test_core_and_contract_import_neither_a_clock_nor_the_outside() -> None:
-    assert {
-        named(path): imported(path) & OUTSIDE for path in PURE if imported(path) & OUTSIDE
-    } == {}
 
 
 @pytest.mark.parametrize("path", ENTRY_POINTS, ids=named)
@@ -399,12 +366,6 @@ def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
 def test_every_file_that_a_tier_names_exists() -> None:
     for file in (*tiers.REAL_STARTS, *tiers.LONGEST_FIRST):
         assert (ROOT / "tests" / file).exists(), file
-
-
-def test_everything_that_the_mathematics_offers_is_there_and_sorted() -> None:
-    assert [name for name in kmp.__all__ if not hasattr(kmp, name)] == []
-    assert {"KMP", "GaussianKernel", "GaussianMixture", "Gaussians"} <= set(kmp.__all__)
-    assert len(kmp.__all__) == len(set(kmp.__all__))
 
 
 def test_constraints_name_versions_and_no_places() -> None:

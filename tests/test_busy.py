@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from support.cell_commands import python
 from support.paths import ROOT
 
 TESTS = """
@@ -66,14 +67,7 @@ def test_a_failure_on_a_busy_processor_counts_only_if_it_comes_again(tmp_path: P
             f"sys.exit(pytest.main({options!r}))"
         )
         environment = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = python(code, cwd=tmp_path, env=environment)
     assert done.returncode == 1
     assert "1 failed, 1 busy in" in done.stdout
     assert "FAILED test_both.py::test_fails_always - AssertionError: wrong" in done.stdout

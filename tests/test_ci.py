@@ -41,6 +41,20 @@ def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
     return {"PATH": f"{folder / newer}:{os.environ['PATH']}", "PYENV_ROOT": str(folder / "pythons")}
 
 
+def checked(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """The script's run in a checkout."""
+    command = ["bash", ".ci/run"]
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
 @pytest.mark.parametrize(
     ("readme", "python", "failed"),
     [
@@ -55,16 +69,7 @@ def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
 def test_every_part_runs_and_the_end_names_those_that_failed(
     readme: str, python: str, failed: tuple[str, ...], tmp_path: Path
 ) -> None:
-    environment = checkout(tmp_path, readme=readme, python=python)
-    done = subprocess.run(
-        ["bash", ".ci/run"],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = checked(tmp_path, checkout(tmp_path, readme=readme, python=python))
     assert done.returncode == (1 if failed else 0), done.stderr
     for part in PARTS:
         assert f"== {part}\n" in done.stdout
@@ -82,14 +87,6 @@ def test_a_part_that_cannot_run_has_failed(tmp_path: Path) -> None:
     # a Python that cannot make environments
     environment = checkout(tmp_path, readme="true", python='[ "$1" != -c ]')
     (tmp_path / "README.md").write_text("# A\n", encoding="utf-8")
-    done = subprocess.run(
-        ["bash", ".ci/run"],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = checked(tmp_path, environment)
     assert done.returncode == 1
     assert "README.md has no test command" in done.stderr

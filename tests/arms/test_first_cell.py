@@ -6,12 +6,12 @@ import importlib.util
 import math
 import re
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from support.arms import published
 from support.paths import ROOT
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.separation.stage import Separation
@@ -27,18 +27,6 @@ from thirdhand_sim.script import HandScript
 
 SHIPPED = ROOT / "service" / "thirdhand" / "arms"
 SAWYER = Path(__file__).with_name("sawyer.urdf")
-
-
-def published(name: str) -> Path:
-    """A description of `example-robot-data`; who asks is skipped where that is not installed."""
-    try:
-        return next(
-            Path(str(file.locate()))
-            for file in files("example-robot-data") or ()
-            if file.name == name
-        )
-    except PackageNotFoundError:
-        pytest.skip("example-robot-data, whose descriptions these are, is not installed")
 
 
 def iiwa() -> Path:

@@ -55,8 +55,8 @@ class Following:
         assert self.process.stderr is not None
         self.said += iter(self.process.stderr.readline, "")
 
-    def until(self, line: str, times: int = 1, timeout_s: float = 60.0) -> None:
-        self.waits(lambda: sum(line in log_line for log_line in self.said) >= times, timeout_s)
+    def until(self, line: str, times: int = 1) -> None:
+        self.waits(lambda: sum(line in log_line for log_line in self.said) >= times)
 
     def waits(self, what: Callable[[], bool], timeout_s: float = 60.0) -> None:
         end = time.monotonic() + timeout_s

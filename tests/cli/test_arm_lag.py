@@ -32,13 +32,7 @@ def followed(commanded: np.ndarray, lag_s: float) -> np.ndarray:
 
 
 def simulated(
-    servo: str,
-    lag_s: float,
-    *,
-    state_hz: float = 500.0,
-    noise_rad: float = 0.0,
-    size: float = 0.3,
-    seed: int = 0,
+    servo: str, lag_s: float, *, state_hz: float = 500.0, noise_rad: float = 0.0, seed: int = 0
 ) -> Lag | None:
     """The lag that is measured in 3 s: joints on smooth paths, followed by a pure delay or by a
     servo.
@@ -47,7 +41,7 @@ def simulated(
     times = np.arange(0.0, 5.0, PERIOD_S)
     commanded = np.zeros((len(times), len(NAMES)))
     for frequency_hz in (0.2, 0.35, 0.6):
-        commanded += rng.uniform(-size, size, 3) * np.sin(
+        commanded += rng.uniform(-0.3, 0.3, 3) * np.sin(
             2 * np.pi * frequency_hz * times[:, None] + rng.uniform(0, 6, 3)
         )
     if servo == "delay":

@@ -123,10 +123,6 @@ def test_a_cell_with_ones_own_arm_and_tracker(
 
             tracker.left = NEAR_LEFT
             daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
-            assert main(["hold", "--connect", daemon.endpoint]) == 0
-            assert ": hold (operator)" in capsys.readouterr().out
-            assert main(["resume", "--connect", daemon.endpoint]) == 0
-            assert ": follow" in capsys.readouterr().out
             assert main(["resume", "--connect", daemon.endpoint]) == 0
             assert "there was no hold to end" in capsys.readouterr().out
 

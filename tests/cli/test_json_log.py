@@ -37,7 +37,7 @@ def test_each_line_of_a_json_log_is_an_object_also_the_last_before_a_failure(
         ), done.stderr
 
 
-def test_an_unexpected_failure_is_an_object_with_its_exception(tmp_path: Path) -> None:
+def test_an_unexpected_failure_is_an_object_with_its_exception() -> None:
     code = (
         "import sys\nfrom thirdhand.cli import serve\nfrom thirdhand.command_line import main\n"
         "serve.starting = None\nsys.exit(main(['serve', '--log', 'json']))"

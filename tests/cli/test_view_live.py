@@ -63,11 +63,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 
 @contextlib.contextmanager
-def served(daemon: Daemon, address: str = "127.0.0.1:0") -> Iterator[str]:
+def served(daemon: Daemon) -> Iterator[str]:
     """The URL of a page that `thirdhand view live --web` serves; it must end without a word on
     standard error.
     """
-    arguments = ("view", "live", "--web", address, "--connect", daemon.endpoint)
+    arguments = ("view", "live", "--web", "127.0.0.1:0", "--connect", daemon.endpoint)
     with started(*arguments, within_s=5 * TIMEOUT_S) as server:
         assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
         yield server.stdout.readline().strip()

@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from support.cell import until
+from support.statuses import holding
 from thirdhand.client import (
     Client,
     RefusedError,
@@ -69,27 +70,7 @@ def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
         queryable.undeclare()
 
 
-STATUS = requests.Status(
-    cell="bench",
-    mode="hold",
-    reason="no_hands",
-    skill="",
-    version="",
-    flags=(),
-    via_points=(),
-    endpoints=(),
-    rejected={},
-    hand_age_ms={},
-    scribe={},
-    tick=3,
-    rate_hz=500.0,
-    missed=0,
-    hand_distance_m=3.0,
-    hand_limit_m_s=1.5,
-    realtime=False,
-    memory_locked=False,
-    **dict.fromkeys(("lateness_us", "work_us", "latency_ms"), requests.Percentiles()),
-)  # type: ignore[arg-type]
+STATUS = holding("bench", 3)
 
 
 def ready(query: zenoh.Query) -> None:
@@ -108,17 +89,6 @@ def test_sessions_find_each_other_by_name_only(
         assert list(session.info.peers_zid()) == [daemon.zid()]
         assert list(stranger.info.peers_zid()) + list(stranger.info.routers_zid()) == []
         assert stranger.zid() not in list(daemon.info.peers_zid())
-
-
-def test_connecting_to_nobody_is_told_with_the_endpoint() -> None:
-    with pytest.raises(
-        UnreachableError,
-        match=(
-            r"nobody answers at tcp/127.0.0.1:1: is a daemon, `thirdhand record --listen` or a "
-            r"router listening"
-        ),
-    ):
-        open_session(connect=["tcp/127.0.0.1:1"], timeout_s=0.2)
 
 
 # --- requests ------------------------------------------------------------------------------------

@@ -152,6 +152,10 @@ def test_what_controllers_are_told_is_read_by_others() -> None:
             r"'/tf:left_hand' given, which this cell publishes its",
         ),
         (
+            "network.ros2_domain = 233",
+            r"ros2_domain: 233 given; a whole number from 0 to 232 accepted",
+        ),
+        (
             'ros2.joints = ["elbow"]',
             r"\[ros2\] joints: \['elbow'\] given; those of \[joints\] names needed, in any",
         ),
@@ -196,11 +200,3 @@ def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(
             SettingsError, match=r"cell\.toml: cell: .* given; with \[network\] ros2_domain names"
         ):
             parse(domain, origin="cell.toml")
-
-
-def test_a_domain_that_is_none_is_refused() -> None:
-    with pytest.raises(
-        SettingsError,
-        match=r"\[network\] ros2_domain: 233 given; a whole number from 0 to 232 accepted",
-    ):
-        parse("network.ros2_domain = 233", origin="cell.toml")

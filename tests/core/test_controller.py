@@ -76,16 +76,6 @@ def test_demonstrated_relation_with_little_tremor() -> None:
     assert speed.max() <= ASSUMED.tool.max_speed + 1e-6
 
 
-def test_state_continues_bit_for_bit(taught: Skill) -> None:
-    """A controller continues from its state bit for bit."""
-    ticks = list(ticks_of(HandScript(Scene(), seed=7)))[:2500]
-    whole = followed(taught, ticks)
-    first = Controller(ASSUMED, taught, urdf=URDF)
-    head = frames(first, ticks[:1234])
-    tail = frames(Controller(ASSUMED, taught, first.state, urdf=URDF), ticks[1234:])
-    assert np.concatenate([head, tail]).tobytes() == whole.tobytes()
-
-
 def test_first_setpoint_is_at_the_tool(taught: Skill) -> None:
     """The first setpoint is where the tool is."""
     trace = followed(taught, resting(0, 300, every=1))
@@ -183,12 +173,6 @@ def test_far_hands_are_held_with_hysteresis(taught: Skill) -> None:
         ("hold", "far_from_demonstrations"),
         ("follow", "none"),
     ]
-
-
-def test_an_operator_holds_and_resumes(taught: Skill) -> None:
-    orders = {300: "hold", 900: "resume"}
-    trace = followed(taught, resting(0, 1500, lambda k: (order(orders[k]),) if k in orders else ()))
-    assert modes(trace[1:]) == [("follow", "none"), ("hold", "operator"), ("follow", "none")]
 
 
 def test_nothing_is_commanded_before_arm_is_heard(taught: Skill) -> None:

@@ -48,10 +48,10 @@ def cell(
     return changed(base, rate_hz=rate_hz, tool={"engage_speed": engage_speed}, hands=hands)
 
 
-def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
+def resumed(script: HandScript) -> Iterator[Tick]:
     """Ticks of the script in which the arm is held until the hands are on their way."""
     orders = {0: order("hold"), RESUMED: order("resume")}
-    for tick in ticks_of(script, wait_s=0.0, tail_s=tail_s):
+    for tick in ticks_of(script, wait_s=0.0):
         yield Tick(
             tick.index, (*tick.inbox, *([orders[tick.index]] if tick.index in orders else []))
         )
@@ -59,11 +59,6 @@ def resumed(script: HandScript, *, tail_s: float = 0.5) -> Iterator[Tick]:
 
 def engages(seen: np.ndarray) -> np.ndarray:
     return (seen["flags"] & Flag.ENGAGING) > 0
-
-
-def tool_speeds(settings: Settings, seen: np.ndarray) -> Vector:
-    geometry = ArmGeometry(settings, robot_description(settings))
-    return geometry.tool_speeds(seen["joints"], seen["joint_velocities"])
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +90,8 @@ def test_tool_engages_slowly_after_a_hold(
     ticks = led(path, lambda k: (orders[k],) if k in orders else (), every=rate_hz // 100)
     frames = followed(taught, ticks, settings)
     slow = engages(frames)
-    speed = tool_speeds(settings, frames)
+    geometry = ArmGeometry(settings, robot_description(settings))
+    speed = geometry.tool_speeds(frames["joints"], frames["joint_velocities"])
     assert np.linalg.norm(frames["setpoint_velocity"][slow], axis=1).max() <= E
     assert speed[slow].max() <= E + TOOL_RISE_MPS
     for begin_s in (start_s, resume_s):
@@ -193,7 +189,7 @@ def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) 
 def test_engaging_setpoint_keeps_its_bounds(
     told: list[tuple[tuple[float, ...], ...]], ticks: int, speed: float, engage_speed: float
 ) -> None:
-    """From any speed, toward any target; `driven` asserts the bounds of the position."""
+    """From any speed, toward any target; `driven` asserts the bounds that hold at all times."""
     tool = ToolSettings(engage_speed=engage_speed)
     start = np.array([MIDDLE, (speed, 0.0, 0.0), (0.0, 0.0, 0.0)])
     targets = [np.array(target) for target in told for _ in range(ticks)] + [
@@ -206,11 +202,6 @@ def test_engaging_setpoint_keeps_its_bounds(
     )
     end = int(np.argmax(near)) if near.any() else len(near)
     assert (speeds[1 : end + 1] <= np.maximum(speeds[:end], engage_speed) + 1e-9).all()
-    assert speeds.max() <= tool.max_speed + 1e-9
-    assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
-    assert (
-        np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
-    )
 
 
 def test_turn_is_slowed_in_proportion(taught: Skill) -> None:

@@ -16,7 +16,6 @@ from support.wam import JOINT_NAMES
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.records import Cause
 from thirdhand.core.geometry import rotation
-from thirdhand.core.intake.far_away import too_far
 from thirdhand.core.intake.stage import z_reversed
 from thirdhand.settings.config import HandSettings, TrackerSettings
 
@@ -182,16 +181,6 @@ def test_bursts_extend_the_stale_time(stale_max_ms: float, most: int) -> None:
     assert (stale == 0) == (stale_max_ms > 0.0)
 
 
-def test_a_repeated_sample_does_not_keep_a_hand_fresh() -> None:
-    hands = Hands()
-    for _ in range(51):
-        hands.hand(1000)
-        hands.advance()
-    assert not hands.fresh()
-    hands.hand(1000)
-    assert not hands.fresh()
-
-
 def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
     hands = Hands()
     hands.hand(5_000_000_000)
@@ -313,14 +302,3 @@ def test_arm_is_silent_after_configured_time() -> None:
     assert not hands.heard()
     hands.arm(5)
     assert hands.heard()
-
-
-# --- positions that are too far away: the unit that was meant ---
-
-
-@pytest.mark.parametrize(
-    ("position", "unit"),
-    [((98.0, -32.0, 6.0), "cm"), ((980.0, -320.0, 60.0), "mm"), ((40.0, 30.0, 20.0), "cm")],
-)
-def test_the_unit_that_fits_best_is_named(position: tuple[float, ...], unit: str) -> None:
-    assert f"which looks like {unit};" in too_far(position, "m")

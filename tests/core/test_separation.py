@@ -35,7 +35,7 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Box, Obstacles, Settings, TableTop, robot_description
-from thirdhand_sim.lab.separation import nearest as measured
+from thirdhand_sim.lab.separation import nearest
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -222,19 +222,6 @@ def with_hands(
     return state
 
 
-def nearest(
-    seen: np.ndarray, hands: Vector, settings: Settings = ASSUMED
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Of each tick, hand and capsule the distance and the arm's speed toward it (T, 2, N); and how
-    near its links come to each other and to the table (T,).
-    """
-    joints = np.stack([seen["joints"], seen["joint_velocities"]], axis=1)
-    distance, speed, _, link_gap, table = measured(
-        settings, body_of(settings, robot_description(settings)), joints, hands
-    )
-    return distance, speed, link_gap, table
-
-
 def thrust(
     place: tuple[float, float, float], at_s: float, seconds: float = 3.5
 ) -> Iterator[tuple[Tick, Vector]]:
@@ -259,7 +246,10 @@ def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
     ticks, hands = zip(*thrust((0.53, -0.27, 0.37), 1.2), strict=True)
     frames = followed(taught, list(ticks), cell)
     assert (frames["flags"] & Flag.SEPARATION).any() or (frames["mode"] == Mode.HOLD).any()
-    distance, speed, _, _ = nearest(frames, np.array(hands), cell)
+    joints = np.stack([frames["joints"], frames["joint_velocities"]], axis=1)
+    distance, speed, *_ = nearest(
+        cell, body_of(cell, robot_description(cell)), joints, np.array(hands)
+    )
     assert distance.min() > 0
     late = slice(round((0.5 + 1.3 + 0.13) / 0.002), None)  # after a reaction time
     least_m = cell.people.clearance + cell.people.position_uncertainty

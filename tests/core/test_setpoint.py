@@ -36,18 +36,18 @@ moving = st.tuples(*(st.floats(-20.0, 20.0),) * 3)
 wild = st.tuples(*(st.floats(-1e4, 1e4),) * 3)
 
 
-def assert_bounds_hold(states: Vector, targets: list[Vector], tool: ToolSettings = TOOL) -> None:
+def assert_bounds_hold(states: Vector, targets: list[Vector]) -> None:
     """Speed, acceleration, jerk, workspace, and the box around the last targets."""
     assert np.isfinite(states).all()
-    assert np.linalg.norm(states[:, 1], axis=1).max() <= tool.max_speed + 1e-9
-    assert np.linalg.norm(states[:, 2], axis=1).max() <= tool.acceleration + 1e-9
+    assert np.linalg.norm(states[:, 1], axis=1).max() <= TOOL.max_speed + 1e-9
+    assert np.linalg.norm(states[:, 2], axis=1).max() <= TOOL.acceleration + 1e-9
     assert (
-        np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (tool.jerk + 1e-6) * PERIOD_S
+        np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (TOOL.jerk + 1e-6) * PERIOD_S
     )
     # of constant jerk: wrong by jerk period³ / 12
     trapezia = 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])
     np.testing.assert_allclose(
-        np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * tool.jerk * PERIOD_S**3 / 12
+        np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * TOOL.jerk * PERIOD_S**3 / 12
     )
     assert (states[:, 0] >= BOX[0] - 1e-9).all()
     assert (states[:, 0] <= BOX[1] + 1e-9).all()

@@ -12,7 +12,6 @@ from thirdhand.contract.requests import Source
 from thirdhand.daemon.machine import Machine
 
 FOLLOWS = (Mode.FOLLOW, Reason.NONE)
-SILENT = (Mode.FAULT, Reason.ARM_SILENT)
 
 
 class Watched:
@@ -33,7 +32,6 @@ class Watched:
         missed: int = 0,
         late_ms: float = 0.3,
         waiting: float = 0.2,
-        outcome: tuple[Mode, Reason] = FOLLOWS,
     ) -> None:
         for _ in range(round(10 * seconds)):
             self._now_s = self._now_s + 0.1
@@ -45,7 +43,7 @@ class Watched:
                 f"some avg10=1.00 avg60=0.00 avg300=0.00 total={waited_us}\nfull total=0\n"
             )
             self.machine.update(
-                self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=outcome
+                self._now_s, tick=self._tick, missed=self._missed, late_ms=late_ms, outcome=FOLLOWS
             )
 
 

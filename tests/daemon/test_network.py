@@ -204,7 +204,9 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
                 )
             )
     assert set(came) == {"cell/hands/left"}  # and not elsewhere
-    with pytest.raises(UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1"):
+    with pytest.raises(
+        UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1: is a daemon, `thirdhand rec"
+    ):
         open_session(otherwise=[lab.endpoint], zenoh_config=file, timeout_s=0.3)
     with open_session(
         listen=["tcp/127.0.0.1:0"], zenoh_config=file, more={"mode": "peer"}

@@ -167,11 +167,11 @@ def as_told(one: Any) -> Transform:
     )
 
 
-def placed(transforms: list[Transform], frame: str, root: str = "base") -> np.ndarray:
+def placed(transforms: list[Transform], frame: str) -> np.ndarray:
     """Where a frame is in frame `base`, as a 4 x 4 matrix, along the parents."""
     placement = pin.SE3.Identity()
     above = {transform.child: transform for transform in transforms}
-    while frame != root:
+    while frame != "base":
         transform = above[frame]
         placement = (
             pin.SE3(

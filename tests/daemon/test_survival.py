@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from support.cell import Daemon, Tracker, serving, thirdhand, until
+from support.cell import Daemon, Tracker, is_running, serving, thirdhand, until
 from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
 from thirdhand.client import Client, RefusedError, UnreachableError, open_session
@@ -32,13 +32,6 @@ def children(pid: int) -> list[int]:
         ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False
     )
     return [int(line) for line in done.stdout.split()]
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def until_gone(pids: list[int], within_s: float) -> None:

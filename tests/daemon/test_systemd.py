@@ -4,7 +4,6 @@ loop, restarts that do not follow by themselves, and the unit in examples/.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import signal
 import socket
@@ -17,6 +16,7 @@ import pytest
 
 from support.cell import LISTENING, Daemon, Tracker, serving, told
 from support.paths import ROOT
+from support.small_disk import fill, small_disk
 from thirdhand.client import Client, RefusedError
 from thirdhand.command_line import parser
 from thirdhand_sim.scene import Scene
@@ -196,18 +196,11 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
     manager: Manager, tmp_path: Path
 ) -> None:
-    disk = tmp_path / "disk"
-    filled = tmp_path / "disk" / "filled"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
-        pytest.skip("a small disk cannot be mounted here")
-    try:
+    with small_disk(tmp_path / "disk", "8m") as disk:
+        filled = disk / "filled"
         (disk / "state").mkdir()
         (tmp_path / "state").symlink_to(disk / "state")
-        with contextlib.suppress(OSError), filled.open("wb", buffering=0) as file:
-            while file.write(bytes(4096)):
-                pass
+        fill(filled)
         with serving(tmp_path, "--joints", "assumed", "--record", str(disk / "records")) as daemon:
             checked = told(
                 "serve",
@@ -233,5 +226,3 @@ def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
             assert daemon.end() == 1  # the recording lacks ticks, which its last line counts
             assert daemon.log.read_text().endswith("ticks are not recorded\n")
         assert len(list((disk / "state" / "thirdhand").glob("via-points-*.json"))) == 1
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)

@@ -183,9 +183,9 @@ def peak_mib(pid: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def is_welcome(daemon: Daemon, within_s: float = 30.0) -> bool:
+def is_welcome(daemon: Daemon) -> bool:
     """Whether a new client is served."""
-    end = time.monotonic() + within_s
+    end = time.monotonic() + 30.0
     while time.monotonic() < end:
         with (
             contextlib.suppress(UnreachableError),

@@ -19,9 +19,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration
 
 SEEDS = 3
-# a shorter stretch is bridged: positions may be off by this much then
-BRIDGED_S = 0.5
-OFF_M = 0.02
+OFF_M = 0.02  # of positions within a stretch of less than 0.5 s, which is bridged
 # [s] clean samples that may be lost with the bad ones
 SLOW_TO_SETTLE = {
     spoiled.two_sources: 2.2,

@@ -22,8 +22,8 @@ def letter(representation="dense"):
     return primitive.adapt([[1.0]], Gaussians.of([[1.4, -1.2]], deviation=1e-4), tolerance=0.02)
 
 
-def basis(count=5):
-    return Correlation.neutral(np.linspace(0, 2, count)[:, None], width=0.3, outputs=2)
+def basis():
+    return Correlation.neutral(np.linspace(0, 2, 5)[:, None], width=0.3, outputs=2)
 
 
 def roughness(path):

@@ -37,8 +37,8 @@ def tube(seed, count):
     return inputs, Gaussians(tool + 0.01 * random.normal(size=tool.shape), covariance)
 
 
-def both(seed, count=300, **options):
-    inputs, reference = tube(seed, count)
+def both(seed, **options):
+    inputs, reference = tube(seed, 300)
     options = {"kernel": kernel, "lambda_mean": 2.0, "prior_mean": [0.1, 0.2, 0.3]} | options
     return of_both(inputs, reference, **options)
 

@@ -279,13 +279,13 @@ def exact(primitive, queries):
     return mean, np.array(covariances) * n / wide(primitive.lambda_covariance)
 
 
-def hands(seed=0, count=70):
-    random = np.random.default_rng(seed)
-    t = np.linspace(0, 1, count)
+def hands():
+    random = np.random.default_rng(0)
+    t = np.linspace(0, 1, 70)
     path = np.stack(
         [0.4 * t, 0.2 * np.sin(5 * t), 0.1 * t, 0.3 * np.cos(3 * t), t**2, 0.1 - 0.1 * t], axis=1
     )
-    root = 0.02 * random.normal(size=(count, 3, 3))
+    root = 0.02 * random.normal(size=(70, 3, 3))
     tool = np.stack([np.sin(3 * t), np.cos(4 * t), t - t**2], axis=1) * 0.5
     inputs = path + 0.01 * random.normal(size=path.shape)
     inputs[10:14] = inputs[9]  # the hands rest

@@ -16,12 +16,10 @@ from kmp import (
 from support.shown_skills import off, two_hands
 
 
-def some(seed, count=6, outputs=2):
+def some(seed):
     random = np.random.default_rng(seed)
-    root = random.normal(size=(count, outputs, outputs))
-    return Gaussians(
-        random.normal(size=(count, outputs)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(outputs)
-    )
+    root = random.normal(size=(6, 2, 2))
+    return Gaussians(random.normal(size=(6, 2)), root @ root.swapaxes(1, 2) + 0.1 * np.eye(2))
 
 
 def test_superposition_is_a_product():

@@ -22,10 +22,10 @@ CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is f
 NOISE_M = 0.001
 
 
-def smooth(random: np.random.Generator, size: float, count: int = 3) -> np.ndarray:
-    """Slow ways (T, count)."""
-    rates = random.uniform(0.5, 1.2, (2, count))
-    phases = random.uniform(0.0, 6.0, (2, count))
+def smooth(random: np.random.Generator, size: float) -> np.ndarray:
+    """Slow ways (T, 3)."""
+    rates = random.uniform(0.5, 1.2, (2, 3))
+    phases = random.uniform(0.0, 6.0, (2, 3))
     return size * sum(
         np.sin(np.multiply.outer(TIMES, rate) + phase)
         for rate, phase in zip(rates, phases, strict=True)

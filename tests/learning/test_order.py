@@ -14,8 +14,8 @@ from thirdhand.workbench.learning.learn import learn
 
 
 @functools.cache
-def shown(kind: str = "three", people: int = 3) -> list[Demonstration]:
-    return made(kind, range(people))
+def shown() -> list[Demonstration]:
+    return made("three", range(3))
 
 
 @pytest.mark.thorough

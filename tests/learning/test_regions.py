@@ -22,7 +22,7 @@ from thirdhand.workbench.learning.records import TimedErrors
 from thirdhand.workbench.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
 
 
-def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) -> TimedErrors:
+def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
     """A demonstration by someone who errs as no normal says: by three times the covariance, with
     heavy tails, and early or late.
     """
@@ -31,7 +31,7 @@ def apart(rng: np.random.Generator, *, late_s: float = 0.2, times: float = 1.0) 
     covariance = np.tile(np.diag([4e-4, 1e-4, 2e-4]), (count, 1, 1))
     velocity = np.clip(rng.normal(size=(count, 3)), -1, 1) * (rng.random(count) < 0.5)[:, None]
     tails = rng.standard_t(4, size=(count, 3)) * np.sqrt(np.diagonal(covariance[0]))
-    errors = times * (3.0 * person * tails + late_s * rng.normal(size=(count, 1)) * velocity)
+    errors = times * (3.0 * person * tails + 0.2 * rng.normal(size=(count, 1)) * velocity)
     return TimedErrors(errors, covariance, velocity)
 
 

@@ -156,7 +156,7 @@ def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(
     assert unchanged < 40
 
 
-def test_large_archive_is_not_unpacked(skill: Skill) -> None:
+def test_large_archive_is_not_unpacked() -> None:
     """A file that would unpack to too many bytes is not unpacked."""
     out = io.BytesIO()
     with (

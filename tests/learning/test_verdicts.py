@@ -7,10 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from thirdhand.skills.residual_risk import ResidualRisk
 from thirdhand.workbench.learning.gate import Caught, Gate
 from thirdhand.workbench.learning.records import Figures, Row
-from thirdhand.workbench.learning.table import table
 from thirdhand.workbench.learning.verdicts import Subject, verdicts
 
 GOOD = Row(
@@ -101,22 +99,3 @@ def test_verdict_of_each_figure(change: dict[str, Any], severity: str, says: str
         else found(**change)
     )
     assert list(texts.values()) == [severity] * bool(says)
-
-
-def test_residual_risk_needs_acceptance() -> None:
-    """A residual risk is refused until somebody accepts it."""
-    risky = msgspec.structs.replace(FIGURES, residual=("the gate holds 3 %",))
-    assert "residual risk: the gate holds 3 %" in table(risky)
-    for accepted_by, refused, accepted in (
-        ("", "nobody has accepted its residual risk: the gate holds 3 %. Who takes", ""),
-        ("Ada", "", "accepted by Ada: the gate holds 3 %"),
-    ):
-        figures = msgspec.json.encode(
-            msgspec.structs.replace(risky, accepted_by=accepted_by)
-        ).decode()
-        risk = ResidualRisk.of(figures)
-        assert risk.refusal.startswith(refused)
-        assert bool(risk.refusal) == bool(refused)
-        assert risk.accepted == accepted
-    for harmless in ("", msgspec.json.encode(FIGURES).decode()):
-        assert ResidualRisk.of(harmless) == ResidualRisk()

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from support.cell_commands import python
 from support.paths import RECORDINGS, ROOT
 
 SAID = "thirdhand: interrupted"
@@ -142,18 +143,6 @@ def test_an_interrupt_ends_a_command_with_one_line(
 
 
 @pytest.mark.thorough
-def test_an_interrupt_while_it_learns_leaves_no_skill(tmp_path: Path) -> None:
-    output = tmp_path / "said"
-    skill = tmp_path / "skill.npz"
-    process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
-    wait_for(lambda: "choosing parameters" in output.read_text())
-    process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 130
-    assert output.read_text().splitlines()[-1] == SAID
-    assert not skill.exists()
-
-
-@pytest.mark.thorough
 def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
     output = tmp_path / "said"
     skill = tmp_path / "skill.npz"
@@ -230,10 +219,7 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
 
 
 def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:
-    command = [sys.executable, "-c", INTERRUPTED_JUST_BEFORE]
-    done = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, timeout=30, check=False
-    )
+    done = python(INTERRUPTED_JUST_BEFORE)
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 
 
@@ -244,12 +230,5 @@ def test_an_interrupt_that_is_ignored_stays_so() -> None:
         "import interrupt\n"
         "interrupt.watch()\nsignal.raise_signal(signal.SIGINT)\nprint('goes on')"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=30,
-        check=True,
-    )
-    assert done.stdout == "goes on\n"
+    done = python(code)
+    assert (done.returncode, done.stdout) == (0, "goes on\n")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
-from support.paths import ROOT
+from support.cell_commands import python
 
 PROGRAM = """
 import re
@@ -29,9 +26,7 @@ print(used_mb, left_mb)
 
 
 def test_code_that_only_the_start_used_is_released_and_runs_again() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT, check=False
-    )
+    done = python(PROGRAM)
     assert done.returncode == 0, done.stderr
     used_mb, left_mb = map(float, done.stdout.split())
     assert used_mb > 60

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from pyarrow import parquet
 
 from support.in_process import ASSUMED, resting
 from support.pictures import grey
+from support.small_disk import small_disk
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
@@ -253,47 +251,25 @@ def recorded(
     skill: StoredSkill,
     inputs: list[Tick],
     urdf: str = URDF,
-    images: Sequence[tuple[int, str, bytes]] = (),
 ) -> Path:
-    """A recording of an arm that tells nothing of its joints; `images` by tick and key."""
+    """A recording of an arm that tells nothing of its joints."""
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(
         path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
     ) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
-            time_ns = tick.index * 2_000_000
-            recorder.write(tick, frame, time_ns=time_ns)
-            for index, key, file in images:
-                if index == tick.index:
-                    recorder.image(
-                        key, encode_image(CompressedImage(time_ns, "lens", "png", file)), time_ns
-                    )
+            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
 
         run(controller, inputs, [keep])
     return path
 
 
-def png(mode: str = "RGB", size: tuple[int, int] = (64, 48)) -> bytes:
-    """The file of a picture of level 77, or 77 of 255 with 16 bits."""
-    out = io.BytesIO()
-    level = {"RGB": (77, 77, 77), "RGBA": (77, 77, 77, 9), "L": 77, "I;16": 77 * 257}[mode]
-    Image.new(mode, size, level).save(out, "PNG")
-    return out.getvalue()
-
-
 def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    disk = tmp_path / "disk"
     path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
-    disk.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", disk], capture_output=True, check=False
-    )
-    if done.returncode != 0:
-        pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
-    try:
+    with small_disk(tmp_path / "disk", "24k") as disk:
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1
         assert (
             f"{disk}/data: No space left on device; room on that disk needed"
@@ -302,8 +278,6 @@ def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
         assert list(disk.iterdir()) == []
         subprocess.run(["mount", "-o", "remount,size=4m", disk], check=True)
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
-    finally:
-        subprocess.run(["umount", "--lazy", disk], check=True, timeout=10)
 
 
 def test_there_are_no_data_sets_of_two_arms_or_of_nothing(

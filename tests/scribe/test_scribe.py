@@ -13,13 +13,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from support.cell import is_running, until
 from support.pictures import grey
 from support.recorded import SKILL, at_ns, state_after, tell, ticks
 from thirdhand.contract.images import CompressedImage, encode_image
@@ -45,13 +46,6 @@ def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
         yield writer
     finally:
         writer.close(10)
-
-
-def until(done: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
-    """Returns once `done` holds."""
-    deadline = time.monotonic() + timeout_s
-    while not done():
-        assert time.monotonic() < deadline, "waited too long"
 
 
 @pytest.mark.parametrize(
@@ -304,23 +298,15 @@ def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(
         command, stdout=subprocess.PIPE, text=True, timeout=60, check=False, env=environment
     )
     assert done.returncode == -signal.SIGKILL
-    until(lambda: not Path(f"/proc/{int(done.stdout)}").exists() or _is_dead(int(done.stdout)))
+    until(lambda: not is_running(int(done.stdout)))
     (path,) = tmp_path.glob("*.mcap")
     recording = Recording.open(path)
     assert len(list(recording.steps())) == 301
     assert not recording.truncated
 
 
-def _is_dead(pid: int) -> bool:
-    with suppress(FileNotFoundError):
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(") ", 1)[1][0] == "Z"
-    return True
-
-
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
-def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(
-    tmp_path: Path, place: str
-) -> None:
+def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(place: str) -> None:
     with scribe(recording=Path(place), live_port=0) as writer:
         tell(writer, 100)
         until(lambda: writer.supervise() or writer.status()["live"])

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ import pytest
 
 from support.in_process import ASSUMED, ticks_of
 from support.recorded import SKILL, state_after, ticks, write
+from support.small_disk import fill, small_disk
 from support.wam import URDF
 from thirdhand.command_line import main
 from thirdhand.core.controller import Controller, run
@@ -174,8 +173,8 @@ def test_a_clock_that_was_set_makes_no_recording_much_older(
 class Session:
     """A scribe that is told ticks at 50 Hz or so, and supervised as the daemon does it."""
 
-    def __init__(self, settings: Settings, **where: Any) -> None:
-        self.scribe = Scribe(settings, restart_s=0.1, **where)
+    def __init__(self, **where: Any) -> None:
+        self.scribe = Scribe(CELL, restart_s=0.1, **where)
         self.told = 0
         self._ticks = list(ticks(40))
         self.missing = ""
@@ -194,11 +193,9 @@ class Session:
             self.told += 1
         self.scribe.supervise()
 
-    def until(
-        self, what: Callable[[dict[str, Any]], bool], *, timeout_s: float = 20.0
-    ) -> dict[str, Any]:
+    def until(self, what: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Tells ticks until something is true of the status."""
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + 20.0
         while not what(status := self.scribe.status()):
             assert time.monotonic() < deadline, status
             self.tell(5)
@@ -207,14 +204,14 @@ class Session:
 
 
 @contextlib.contextmanager
-def session(settings: Settings = CELL, **where: Any) -> Iterator[Session]:
-    sender = Session(settings, **where)
+def session(**where: Any) -> Iterator[Session]:
+    one = Session(**where)
     try:
-        sender.scribe.start(skill=SKILL, state=state_after(-1))
-        assert sender.scribe.ready(60)
-        yield sender
+        one.scribe.start(skill=SKILL, state=state_after(-1))
+        assert one.scribe.ready(60)
+        yield one
     finally:
-        sender.missing = sender.scribe.close(10)
+        one.missing = one.scribe.close(10)
 
 
 def test_growth_is_told_once_there_is_enough_of_it(
@@ -259,67 +256,37 @@ def accounted(paths: list[Path], told: int) -> tuple[int, int]:
     return len(steps), sum(step.lost for step in steps)
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 6 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], capture_output=True, check=False
-    )
-    if done.returncode != 0:
-        pytest.skip(f"mounting is not allowed here: {done.stderr.decode()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", folder], check=True, timeout=10)
-
-
 @pytest.mark.thorough
-def test_after_a_full_disk_the_recording_goes_on_by_itself(small_disk: Path) -> None:
-    ballast = small_disk / "ballast"
-    with session(folder=small_disk) as sender:
-        sender.until(lambda status: status["sent"] > 200)
-        with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
-            while file.write(bytes(4096)):
-                pass
-        status = sender.until(
-            lambda status: status["state"] == "interrupted" and status["lost"] > 200
-        )
-        assert status["recording"] is None
-        assert sender.scribe.newest_recording == str(*small_disk.glob("*.mcap"))
-        full = [error for error in status["errors"] if error.startswith("recording to ")]
-        assert len(full) == 1
-        assert "No space left on device" in full[0]
-        ballast.unlink()
-        sender.until(lambda status: status["state"] == "recording")
-        sent = sender.told
-        status = sender.until(
-            lambda status: status["sent"] > sent + 200 and "continues in" in status["errors"][-1]
-        )
-        assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
-    recordings = sorted(small_disk.glob("*.mcap"))
-    recorded, lost = accounted(recordings, sender.told)
-    assert recorded + lost == sender.told
-    assert sender.missing == f"{lost} of {sender.told} ticks are not recorded"
-    result = [Recording.open(path) for path in recordings]
-    assert [len(list(r.steps())) > 50 for r in result] == [True, True]
-    assert [r.truncated for r in result] == [True, False]
-
-
-@pytest.mark.timed
-def test_a_limit_on_files_interrupts_a_recording_until_it_is_lifted(tmp_path: Path) -> None:
-    with session(folder=tmp_path) as sender:
-        sender.until(lambda status: status["sent"] > 200)
-        pid = sender.scribe.status()["pid"]
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
-        sender.until(lambda status: status["state"] == "interrupted" and status["lost"] > 200)
-        resource.prlimit(
-            pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
-        )
-        sender.until(lambda status: status["state"] == "recording")
-    recorded, lost = accounted(sorted(tmp_path.glob("*.mcap")), sender.told)
-    assert recorded + lost == sender.told
+def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "6m") as disk:
+        ballast = disk / "ballast"
+        with session(folder=disk) as one:
+            one.until(lambda status: status["sent"] > 200)
+            fill(ballast)
+            status = one.until(
+                lambda status: status["state"] == "interrupted" and status["lost"] > 200
+            )
+            assert status["recording"] is None
+            assert one.scribe.newest_recording == str(*disk.glob("*.mcap"))
+            full = [error for error in status["errors"] if error.startswith("recording to ")]
+            assert len(full) == 1
+            assert "No space left on device" in full[0]
+            ballast.unlink()
+            one.until(lambda status: status["state"] == "recording")
+            sent = one.told
+            status = one.until(
+                lambda status: (
+                    status["sent"] > sent + 200 and "continues in" in status["errors"][-1]
+                )
+            )
+            assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
+        recordings = sorted(disk.glob("*.mcap"))
+        recorded, lost = accounted(recordings, one.told)
+        assert recorded + lost == one.told
+        assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+        result = [Recording.open(path) for path in recordings]
+        assert [len(list(r.steps())) > 50 for r in result] == [True, True]
+        assert [r.truncated for r in result] == [True, False]
 
 
 def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(

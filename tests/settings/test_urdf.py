@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from support.arms import MODELS, cell_of, toml_of, urdf_of
+from support.arms import MODELS, cell_of, published, toml_of
 from support.turning import continuous_urdf, sliding_urdf
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.core.arm.stage import Arm
@@ -206,8 +206,8 @@ def test_settings_that_do_not_fit_the_description_are_refused(
 
 
 def test_a_description_is_looked_for_beside_the_settings(tmp_path: Path) -> None:
-    meshes = f'packages = ["{urdf_of(MODELS["ur5"]).parents[4]}"]'
-    (tmp_path / "arm.urdf").write_bytes(urdf_of(MODELS["ur5"]).read_bytes())
+    meshes = f'packages = ["{published(MODELS["ur5"].file).parents[4]}"]'
+    (tmp_path / "arm.urdf").write_bytes(published(MODELS["ur5"].file).read_bytes())
     (tmp_path / "cell.toml").write_text(
         toml_of(MODELS["ur5"], urdf=f'[arm]\nurdf = "arm.urdf"\n{meshes}')
     )

@@ -5,8 +5,6 @@ others publish, and an arm that is elsewhere is scored by its joint states.
 from __future__ import annotations
 
 import struct
-from importlib.metadata import PackageNotFoundError, files
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -14,6 +12,8 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
+from support.arms import published
+from support.franka_cell import allowed
 from thirdhand.contract.records import Mode
 from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
@@ -28,22 +28,6 @@ from thirdhand_sim.scene import Scene, SceneError
 from thirdhand_sim.script import HandScript
 
 SCENE = Scene()
-# The maker's limits of an FR3's joint velocity at a position q [rad/s]: the least of `flat` and
-# sqrt(slope (end - q)) - off toward its upper end, likewise toward the lower one.
-FLAT = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
-SLOPE = np.array([12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0])
-OFF = np.array([0.3, 0.2, 0.2, 0.3, 0.35, 0.35, 0.35])
-LOWEST = np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196])
-HIGHEST = np.array([2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196])
-
-
-def fr3_velocities(
-    q: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The lowest and highest velocity at positions (..., 7) that an FR3 accepts."""
-    high = np.minimum(FLAT, np.sqrt(np.maximum(SLOPE * (HIGHEST - q), 0.0)) - OFF)
-    low = np.maximum(-FLAT, OFF - np.sqrt(np.maximum(SLOPE * (q - LOWEST), 0.0)))
-    return low, high
 
 
 @pytest.mark.parametrize("arm", ["franka", "ur5"])
@@ -84,7 +68,7 @@ def test_shipped_arm_does_the_task(arm: str) -> None:
     assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
     assert min(near) > 0.01
     if arm == "franka":
-        low, high = fr3_velocities(frames["joints"])
+        low, high = allowed(frames["joints"])
         assert (frames["joint_velocities"] >= low).all()
         assert (frames["joint_velocities"] <= high).all()
 
@@ -101,7 +85,7 @@ def test_franka_keeps_makers_velocity_limits() -> None:
         q = lower + share * (upper - lower)
         fastest = np.minimum(limits.velocity, np.sqrt(2 * acceleration * (upper - q)))
         slowest = -np.minimum(limits.velocity, np.sqrt(2 * acceleration * (q - lower)))
-        low, high = fr3_velocities(q)
+        low, high = allowed(q)
         assert (fastest <= high).all(), (q, fastest, high)
         assert (slowest >= low).all(), (q, slowest, low)
 
@@ -124,20 +108,6 @@ def test_ur5_needs_half_of_its_torque() -> None:
 
 
 # --- descriptions ---------------------------------------------------------------------------------
-
-
-def published(name: str) -> Path:
-    """A file of `example-robot-data`; who asks is skipped where that is not installed."""
-    try:
-        return next(
-            Path(str(file.locate()))
-            for file in files("example-robot-data") or ()
-            if str(file).endswith(name)
-        )
-    except PackageNotFoundError:
-        pytest.skip(
-            "example-robot-data, whose descriptions ours are compared with, is not installed"
-        )
 
 
 def tips(
@@ -274,6 +244,3 @@ def test_scene_beyond_reach_is_refused(reach: Reach, words: str) -> None:
     assert words in str(refused.value)
     for way_out in ("--scene", "a larger arm", "thirdhand arm URDF --at", "docs/tutorial.md"):
         assert way_out in str(refused.value)
-
-
-# --- an arm that is elsewhere ---------------------------------------------------------------------

@@ -5,10 +5,7 @@ be, and its channels on the network.
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +17,9 @@ import pinocchio as pin
 import pytest
 import zenoh
 
+from support.cell import thirdhand
+from support.cell_commands import started
+from support.demo import SCENE, Bytes, Sample
 from support.wam import JOINT_NAMES
 from thirdhand.client import endpoints, open_session
 from thirdhand.contract import cdr, channels, messages
@@ -31,11 +31,9 @@ from thirdhand_sim.bench import Bench, Observation
 from thirdhand_sim.lab.rehearsal import rehearse
 from thirdhand_sim.network import BenchError, Commands, Dropout, Live, RunReport, run
 from thirdhand_sim.observed_world import ObservedWorld
-from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import GRIP_S, HandScript, Teacher
 from thirdhand_sim.teach import demonstrations
 
-SCENE = Scene()
 STILL = (0.0,) * 7
 
 
@@ -304,7 +302,7 @@ def test_run_on_network_reports_latency(
 
 def test_missing_commands_are_reported(network: tuple[zenoh.Session, str]) -> None:
     """The bench says so when no command comes."""
-    result = sim("--connect", network[1], "--once", "--wait", "0.2")
+    result = thirdhand("sim", "--connect", network[1], "--once", "--wait", "0.2")
     assert result.returncode == 1
     assert "no command on thirdhand/joints/command within 0.2 s" in result.stderr
     assert "Traceback" not in result.stderr
@@ -369,10 +367,8 @@ def test_process_ends_on_signal_with_report(
     """A process plays until it is asked to stop and leaves its reports."""
     service = Service(network[0], "thirdhand")
     target = tmp_path / "report.json"
-    command = [
-        sys.executable,
-        "-m",
-        "thirdhand_sim",
+    arguments = (
+        "sim",
         "--connect",
         network[1],
         "--output",
@@ -381,15 +377,8 @@ def test_process_ends_on_signal_with_report(
         "20",
         "--seed",
         "5",
-    ]
-    with subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).parents[1],
-    ) as process:
-        assert process.stderr is not None
+    )
+    with started(*arguments) as process:
         for line in process.stderr:
             if "the hands move back" in line:
                 process.send_signal(signal.SIGTERM)
@@ -408,39 +397,13 @@ def test_process_ends_on_signal_with_report(
 def test_exit_codes(tmp_path: Path) -> None:
     """Bad usage and bad scenes have their exit codes."""
     (tmp_path / "scene.toml").write_text("glass = [0.5, 0.38, 0.5]")
-    usage = sim("--once", "--hands-rate", "7")
+    usage = thirdhand("sim", "--once", "--hands-rate", "7")
     assert usage.returncode == 2
     assert "30 to 500 accepted" in usage.stderr
-    bad = sim("--connect", "tcp/127.0.0.1:1", "--scene", str(tmp_path / "scene.toml"))
+    bad = thirdhand("sim", "--connect", "tcp/127.0.0.1:1", "--scene", str(tmp_path / "scene.toml"))
     assert bad.returncode == 1
     assert "lies 0.34 m from" in bad.stderr
-    assert "example:" in sim("--help").stdout
-
-
-def sim(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-m", "thirdhand_sim", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-        cwd=Path(__file__).parents[1],
-        env={**os.environ},
-    )
-
-
-class _Bytes:
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-
-    def to_bytes(self) -> bytes:
-        return self._data
-
-
-class _Sample:
-    def __init__(self, payload: bytes, attachment: bytes | None = None) -> None:
-        self.payload = _Bytes(payload)
-        self.attachment = None if attachment is None else _Bytes(attachment)
+    assert "example:" in thirdhand("sim", "--help").stdout
 
 
 @pytest.mark.parametrize(
@@ -455,7 +418,7 @@ class _Sample:
 def test_invalid_command_is_never_followed(payload: bytes) -> None:
     """Bytes that are no command are counted and never followed."""
     commands = Commands(JOINT_NAMES)
-    commands.receive(_Sample(payload))  # type: ignore[arg-type]
+    commands.receive(Sample(Bytes(payload)))  # type: ignore[arg-type]
     assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))
     assert commands.last_error
 
@@ -467,7 +430,8 @@ def test_first_answer_counts_for_latency() -> None:
     now = time.time_ns()
     # the first is older than the counting
     for stamp in (now - 10**10, now, now, now + 1, now, now + 1):
-        commands.receive(_Sample(payload, cdr.encode_attachment(messages.Attachment(1, 0, stamp))))  # type: ignore[arg-type]
+        attachment = Bytes(cdr.encode_attachment(messages.Attachment(1, 0, stamp)))
+        commands.receive(Sample(Bytes(payload), attachment))  # type: ignore[arg-type]
     assert commands.count == 6
     assert len(commands.latencies_ms) == 2
     assert commands.take() == (STILL, STILL)

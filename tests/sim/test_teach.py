@@ -16,18 +16,6 @@ from thirdhand_sim import teach
 from thirdhand_sim.scene import Scene
 
 
-def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        assert teach.main(["--output", str(tmp_path / name), "--count", "2", "--seed", "3"]) == 0
-    first, two = (
-        [path.read_bytes() for path in sorted((tmp_path / name).iterdir())]
-        for name in ("one", "two")
-    )
-    assert len(first) == 2
-    assert first == two
-    assert first[0] != first[1]
-
-
 def test_file_of_a_demonstration(tmp_path: Path) -> None:
     """A file holds hands and tool at a hundred hertz in frame base."""
     assert (

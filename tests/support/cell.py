@@ -64,6 +64,14 @@ def until(
     return value
 
 
+def is_running(pid: int) -> bool:
+    """True if a process is there and has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 class Daemon:
     """A running `thirdhand serve` and a client's session to it."""
 
@@ -111,13 +119,14 @@ def serving(
 
 class Tracker:
     """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not
-    seen. Its clock is `ahead_ns` ahead.
+    seen. They are in a `frame`; its clock is `ahead_ns` ahead.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.left: tuple[float, float, float] | None = LEFT
         self.right: tuple[float, float, float] | None = RIGHT
         self.ahead_ns = 0
+        self.frame = messages.BASE
         self._publishers = {
             side: session.declare_publisher(f"thirdhand/hands/{side}") for side in ("left", "right")
         }
@@ -131,7 +140,7 @@ class Tracker:
             for side, position in (("left", self.left), ("right", self.right)):
                 if position is not None:
                     pose = messages.PoseStamped(
-                        stamp_ns, messages.BASE, position, (0.0, 0.0, 0.0, 1.0)
+                        stamp_ns, self.frame, position, (0.0, 0.0, 0.0, 1.0)
                     )
                     self._publishers[side].put(cdr.encode_pose(pose))
 

@@ -80,11 +80,6 @@ class Tab:
             time.sleep(0.1)
         return value
 
-    def hold_as_phone(self, width: int, height: int) -> None:
-        """Shows the page as on a phone with a screen of this size."""
-        screen = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
-        self._call("Emulation.setDeviceMetricsOverride", screen, self._session)
-
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`.
 

@@ -19,11 +19,9 @@ GOES = np.array(
 """By how much the tool goes with the hands."""
 
 
-def circling(
-    seed: int, *, apart_m: float = 0.1, noise_m: float = 0.001, lift_m: float = 0.01
-) -> Demonstration:
+def circling(seed: int, *, apart_m: float = 0.1, noise_m: float = 0.001) -> Demonstration:
     """A take by a person of this seed: both hands circle about a place that is elsewhere by some
-    `apart_m` in each take, and the tool between them, lifted twice a round by `lift_m`. The tracker
+    `apart_m` in each take, and the tool between them, lifted twice a round by 1 cm. The tracker
     of hands and tool has white noise of `noise_m`, a standard deviation on each axis.
     """
     random = np.random.default_rng(seed)
@@ -39,7 +37,7 @@ def circling(
         sway = np.stack([np.sin(0.7 * t + phase) for phase in random.uniform(0, 6, 3)], axis=1)
         hands.append(centre + [0.0, side, 0.0] + circle + 0.01 * sway)
     tool = np.hstack(hands) @ GOES.T + [0.0, 0.0, 0.1] + 0.005 * random.normal(size=3)
-    tool[:, 2] += lift_m * np.sin(2 * angle)
+    tool[:, 2] += 0.01 * np.sin(2 * angle)
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     poses = [
         np.hstack([positions + noise_m * random.normal(size=positions.shape), turn])

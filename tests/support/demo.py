@@ -45,7 +45,7 @@ class Played(NamedTuple):
     followed: bool
 
 
-class _Bytes:
+class Bytes:
     """Bytes as Zenoh hands them over."""
 
     def __init__(self, data: bytes) -> None:
@@ -55,9 +55,11 @@ class _Bytes:
         return self._data
 
 
-class _Sample(NamedTuple):
-    payload: _Bytes
-    attachment: _Bytes
+class Sample(NamedTuple):
+    """A sample as Zenoh hands it over."""
+
+    payload: Bytes
+    attachment: Bytes | None = None
 
 
 @functools.cache
@@ -101,8 +103,8 @@ def played(settings: Settings, engine: str | None = None, *, bench_hz: int | Non
             tick_ns = START_NS + round(index * period_s * 1e9)
             for key, payload in outgoing(frame, tick_ns, names):
                 if key == "joints/command":
-                    attachment = _Bytes(encode_attachment(Attachment(index, tick_ns, 0)))
-                    commands.receive(_Sample(_Bytes(payload), attachment))  # type: ignore[arg-type]
+                    attachment = Bytes(encode_attachment(Attachment(index, tick_ns, 0)))
+                    commands.receive(Sample(Bytes(payload), attachment))  # type: ignore[arg-type]
                     error_rad = max(
                         error_rad, float(np.abs(frame["joints"] - observation.joints).max())
                     )

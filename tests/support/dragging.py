@@ -64,15 +64,9 @@ class Person:
             time.sleep(max(0.0, begun_s + i * STEP_S - time.monotonic()))
         mouse("Released", *end)
 
-    def arrive(
-        self,
-        side: str,
-        to: tuple[float, float, float],
-        within_m: float = 0.01,
-        within_s: float = ARRIVE_S,
-    ) -> None:
+    def arrive(self, side: str, to: tuple[float, float, float], within_m: float = 0.01) -> None:
         """Wait until a hand has arrived at a point."""
-        end = time.monotonic() + within_s
+        end = time.monotonic() + ARRIVE_S
         while math.dist(self.hand(side), to) > within_m:
             assert time.monotonic() < end, f"{side} hand: {self.hand(side)}, {to} wanted"
             time.sleep(0.05)

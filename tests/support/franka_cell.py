@@ -41,7 +41,7 @@ def fr3() -> JointSettings:
 
 
 def allowed(joints: Vector) -> tuple[Vector, Vector]:
-    """Least and greatest velocities at joints (N, 7), as published for the Franka Research 3."""
+    """Least and greatest velocities at joints (..., 7), as published for the Franka Research 3."""
     most = []
     for q, sign in ((joints, 1.0), (-joints, -1.0)):
         ends = np.array(
@@ -53,7 +53,7 @@ def allowed(joints: Vector) -> tuple[Vector, Vector]:
         offset = np.array((0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35))
         falls = np.array((12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0))
         fast = np.array((2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26))
-        most.append(np.clip(np.sqrt(falls * np.maximum(ends - q, 0.0)) - offset, 0.0, fast))
+        most.append(np.minimum(np.sqrt(falls * np.maximum(ends - q, 0.0)) - offset, fast))
     return -most[1], most[0]
 
 

@@ -115,11 +115,11 @@ def emulation(*, without: tuple[str, ...] = (), stereo: bool = False) -> str:
 
 
 @contextlib.contextmanager
-def worn(
-    url: str, folder: Path, *, size: tuple[int, int] = (320, 240), **more: Any
-) -> Iterator[chromium.Tab]:
+def worn(url: str, folder: Path, **more: Any) -> Iterator[chromium.Tab]:
     """The page in the browser of a headset, with its session started."""
-    with chromium.opened(url, folder, size=size, timeout_s=250, before=emulation(**more)) as tab:
+    with chromium.opened(
+        url, folder, size=(320, 240), timeout_s=250, before=emulation(**more)
+    ) as tab:
         tab.until("document.getElementById('start')?.disabled === false")
         tab.ask("document.getElementById('start').click()")
         tab.until("session !== null")
@@ -152,7 +152,7 @@ class Served:
 
 
 @contextlib.contextmanager
-def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> Iterator[Served]:
+def serving_hands(endpoint: str, home: Path, *arguments: str) -> Iterator[Served]:
     """The command, connected to a Zenoh endpoint, with its token under a home folder."""
     command = [
         sys.executable,
@@ -165,7 +165,7 @@ def serving_hands(endpoint: str, home: Path, *arguments: str, port: int = 0) -> 
         *arguments,
     ]
     if "--listen" not in arguments:
-        command += ["--listen", f"127.0.0.1:{port}"]
+        command += ["--listen", "127.0.0.1:0"]
     environment = os.environ | {"HOME": str(home)}
     with subprocess.Popen(
         command,

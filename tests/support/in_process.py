@@ -79,17 +79,10 @@ def led(
         yield Tick(k, (*(seen(positions, k) if k % every == 0 else ()), *extra(k)))
 
 
-def ticks_of(
-    script: HandScript,
-    *,
-    wait_s: float = 1.5,
-    tail_s: float = 0.5,
-    period_s: float = 0.002,
-    every: int = 5,
-) -> Iterator[Tick]:
+def ticks_of(script: HandScript, *, wait_s: float = 1.5, tail_s: float = 0.5) -> Iterator[Tick]:
     """Ticks with the script's hands, which first rest at their start for a while."""
-    times = np.arange(round((wait_s + script.duration_s + tail_s) / period_s)) * period_s
-    return led((np.array(script.sample(max(0.0, t - wait_s)))[:, :3] for t in times), every=every)
+    hands_at = script_hands(script, wait_s=wait_s)
+    return led(hands_at(k) for k in range(round((wait_s + script.duration_s + tail_s) / 0.002)))
 
 
 def resting(

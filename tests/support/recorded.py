@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from thirdhand.core.frame import TIMING, Event, Record, Tick, blank
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks as ticks_in
 from thirdhand.scribe.scribe import Scribe
-from thirdhand.settings.config import Settings
+from thirdhand.settings.config import WAM, Settings
+from thirdhand.viewer.stream import Viewer
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 2_000_000
@@ -138,6 +139,23 @@ def drawn(path: Path) -> dict[str, list[dict[str, Any]]]:
     for chunk in rr.chunk.RrdReader(path).stream():
         rows.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
     return rows
+
+
+def viewed(
+    path: Path,
+    count: int,
+    change: Callable[[Viewer, int, Record], Any] = lambda *_: (),
+    *,
+    skill: bytes | None = None,
+) -> dict[str, list[dict[str, Any]]]:
+    """The rows of a drawing of the shipped arm in so many ticks. `change` is called before each is
+    drawn, with viewer, tick and frame, and returns events that arrived in it, or None.
+    """
+    one = Viewer(urdf=WAM, settings=Settings(), rrd=path, skill=skill)
+    for tick, frame, timing in ticks(count):
+        one.add(frame, at_ns(tick.index), timing, change(one, tick.index, frame) or ())
+    one.close()
+    return drawn(path)
 
 
 def drawn_ticks(path: Path, curve: str) -> list[int]:

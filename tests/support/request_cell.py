@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from support.statuses import holding
 from thirdhand.client import Client
 from thirdhand.contract import channels, requests
 from thirdhand.contract.records import Mode, Reason
@@ -53,7 +54,11 @@ class Cell:
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
-        tell = {"status": lambda *, published: requests.encode_json(self.status())}
+        tell = {
+            "status": lambda *, published: requests.encode_json(
+                holding(self.settings.cell, self._tick)
+            )
+        }
         tell |= {"moment": lambda: (self.frame(), self.state)}
         tell |= {
             "note": self.notes.append,
@@ -80,32 +85,6 @@ class Cell:
     @mode.setter
     def mode(self, mode: Mode) -> None:
         self.state["mode"] = mode
-
-    def status(self) -> requests.Status:
-        none = requests.Percentiles()
-        numbers = {
-            "tick": self._tick,
-            "rate_hz": 500.0,
-            "missed": 0,
-            "realtime": False,
-            "memory_locked": False,
-            "rejected": {},
-            "hand_age_ms": {},
-            "hand_distance_m": 3.0,
-            "hand_limit_m_s": 1.5,
-            "scribe": {},
-        }
-        words = {
-            "cell": self.settings.cell,
-            "mode": "hold",
-            "reason": "no_hands",
-            "skill": "",
-            "version": "",
-        }
-        lists: dict[str, Any] = {"flags": (), "via_points": (), "endpoints": ()}
-        return requests.Status(
-            **words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none
-        )  # type: ignore[arg-type]
 
     def frame(self) -> dict[str, Any]:
         unseen = {

@@ -28,7 +28,6 @@ def driven(
     start: Vector | None = None,
     tool: ToolSettings = TOOL,
     costs: Vector = FREE,
-    slow: float = 1.0,
     rate_hz: int = 500,
 ) -> tuple[Vector, Vector]:
     """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
@@ -43,7 +42,7 @@ def driven(
     for target in targets:
         before = state["setpoint"].copy()
         generator.engage(state, target[0])
-        results.append(generator.step(state, Target(*target, clamped=False), BOX, costs, slow))
+        results.append(generator.step(state, Target(*target, clamped=False), BOX, costs, 1.0))
         assert generator.name_of_broken_bound(state, before, BOX) == ""
         out.append(state["setpoint"].copy())
     return np.array(out), np.array(results)

@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from thirdhand.contract import cdr
-from thirdhand.contract.channels import POSE, STRING
+from thirdhand.contract.channels import POSE
 from thirdhand.contract.messages import BASE, PoseStamped
-from thirdhand.contract.requests import ViaPoint, encode_json
 from thirdhand.recordings.mcap_file import McapFile
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.takes.pose_streams import VIA_POINTS_TOPIC
 
 KEYS = {"left": "hands/left", "right": "hands/right", "tool": "tool/pose"}
 START_NS = 10**18
@@ -33,23 +31,17 @@ Spoil = Callable[[Streams, str, np.ndarray, np.random.Generator], None]
 """Spoils the stream of this name in place in the samples of a mask (N,)."""
 
 
-def streams_of(take: Demonstration, *, delay_s: float = 0.004) -> Streams:
+def streams_of(take: Demonstration) -> Streams:
     """The streams of a take, each sample recorded a moment after its stamp."""
     stamps = START_NS + take.stamps_ns - take.stamps_ns[0]
-    logged = stamps + round(1e9 * delay_s)
+    logged = stamps + 4_000_000
     return {
         name: Stream(stamps.copy(), logged.copy(), np.array(getattr(take, name))) for name in KEYS
     }
 
 
-def write_streams(
-    path: Path,
-    streams: Mapping[str, Stream],
-    cell: str = "cell",
-    *,
-    via_points: tuple[ViaPoint, ...] = (),
-) -> Path:
-    """A file of these streams, in the order of recording, which names these via-points."""
+def write_streams(path: Path, streams: Mapping[str, Stream]) -> Path:
+    """A file of these streams, in the order of recording."""
     rows = sorted(
         (int(stream.logged_ns[i]), name, i)
         for name, stream in streams.items()
@@ -61,12 +53,7 @@ def write_streams(
             pose = PoseStamped(
                 int(streams[name].stamps_ns[i]), BASE, tuple(row[:3]), tuple(row[3:])
             )
-            file.put(f"{cell}/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
-        if via_points:
-            text = encode_json(via_points).decode()
-            file.put(
-                f"{cell}/{VIA_POINTS_TOPIC}", STRING.type, cdr.encode_string(text), rows[0][0], 0
-            )
+            file.put(f"cell/{KEYS[name]}", POSE.type, cdr.encode_pose(pose), logged_ns, i)
     return path
 
 

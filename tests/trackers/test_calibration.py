@@ -9,7 +9,6 @@ import functools
 import os
 import re
 import subprocess
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,10 +20,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.cell import serving, told
+from support.cell import LISTENING, Tracker, serving, told
 from support.cell_commands import assert_refused, started, succeeded
 from support.paths import ROOT
-from thirdhand.client import open_session
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.daemon.launch import free_port
@@ -52,19 +50,18 @@ from thirdhand.workbench.trackers.calibration.solver import (
 )
 from thirdhand_sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
 
-SECONDS = 40.0
 SEEDS = range(8)
 CORNERS = bench_corners(Settings())
 
 
 @functools.cache
-def path_of(arm: str, seed: int, seconds: float = SECONDS) -> LedArm:
+def path_of(arm: str, seed: int) -> LedArm:
     """The arm of a shipped cell as it is led."""
-    return led(cell_of(arm), seconds, np.random.default_rng(seed))
+    return led(cell_of(arm), 40.0, np.random.default_rng(seed))
 
 
-def held_by(kind: str, *, arm: str = "wam", seed: int = 0, rate_hz: float = 50) -> HeldTool:
-    return held(path_of(arm, seed), KINDS[kind], np.random.default_rng([seed, 1]), rate_hz=rate_hz)
+def held_by(kind: str, *, arm: str = "wam", seed: int = 0) -> HeldTool:
+    return held(path_of(arm, seed), KINDS[kind], np.random.default_rng([seed, 1]))
 
 
 # --- accuracy -------------------------------------------------------------------------------------
@@ -244,8 +241,6 @@ def test_points_that_show_nothing_are_refused() -> None:
         match=r"extend over \d+ x \d+ x 0 cm; 5 cm or more needed .* along \(0\.0, 0\.0, 1",
     ):
         solve_points(hand, base * [1, 1, 0], CORNERS)
-    with pytest.raises(CalibrationError, match="mirrored"):
-        solve_points(hand * [-1, 1, 1], base, CORNERS)
 
 
 @pytest.mark.parametrize("missed_m", [0.0, 0.05, 0.3])
@@ -464,16 +459,6 @@ def test_the_settings_are_changed_and_nothing_else(
         assert after.hands.frame == "webxr"
         restored = msgspec.structs.replace(restored, frame=before.hands.frame)
         assert msgspec.structs.replace(after, hands=restored) == before
-        assert [
-            line
-            for line in text.splitlines()
-            if "#" in line
-            and "hands" not in line
-            and "frame" not in line
-            and "position" not in line
-            and "eye" not in line
-            and line not in changed
-        ] == []
     assert [word for word in words if word not in changed] == []
     assert backup.read_text() == text
     assert path.stat().st_mode & 0o777 == 0o640
@@ -572,6 +557,9 @@ def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
 # --- the command ----------------------------------------------------------------------------------
 
 
+CHECKED = "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"
+
+
 def recording(
     path: Path, held: HeldTool, joints: np.ndarray, settings: Settings, frame: str = "mocap"
 ) -> None:
@@ -634,11 +622,8 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     assert after.hands.frame == "mocap"
     true = (*ORIGIN, *TURN.as_quat())
     np.testing.assert_allclose(after.hands.base_from_tracker, true, atol=0.002)
-    done = told(*cell, "--check")
-    assert (done.returncode, done.stdout) == (
-        0,
-        "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n",
-    ), done.stderr
+    done = succeeded(*cell, "--check")
+    assert done.stdout == CHECKED
     moved = text.replace(
         "[joints]",
         "[hands]\nframe = 'mocap'\nbase_from_tracker = "
@@ -696,11 +681,8 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(
     )
     assert load(cell).hands == HandSettings(frame="webxr")
     assert record_path(cell, "mocap").exists()
-    done = told(*command, "--check")
-    assert (done.returncode, done.stdout) == (
-        0,
-        "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n",
-    ), done.stderr
+    done = succeeded(*command, "--check")
+    assert done.stdout == CHECKED
     assert_refused(
         1, "cell.calibration.json does not exist", *command, "--check", "--hand", "right"
     )
@@ -709,46 +691,6 @@ def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(
         1, "hands/left is in frame 'mocap', which has no table", *command, "--hand", "left"
     )
     assert load(cell).hands == HandSettings(frame="webxr")
-
-
-class LedCell:
-    """An arm that is led in real time and a hand that holds its tool, published until closed.
-
-    While `touched` is a position in frame `base` [m], the right hand rests there instead.
-    """
-
-    def __init__(self, endpoint: str, settings: Settings, arm: LedArm) -> None:
-        self.touched: tuple[float, float, float] | None = None
-        self._session = open_session(connect=[endpoint], timeout_s=30)
-        self._settings = settings
-        self._arm = arm
-        self._hands = arm.tool + Rotation.from_quat(arm.turn).apply(GRIP)
-        self._end, self._thread = threading.Event(), threading.Thread(target=self._publish)
-        self._thread.start()
-
-    def _publish(self) -> None:
-        random = np.random.default_rng(0)
-        begun_ns = time.time_ns()
-        names = self._settings.joints.names
-        while not self._end.wait(0.01):
-            now_ns = time.time_ns()
-            k = int((now_ns - begun_ns) / 1e7) % len(self._arm.times_s)
-            state = JointState(now_ns, names, tuple(self._arm.joints[k].tolist()), ())
-            self._session.put("thirdhand/joints/state", cdr.encode_joints(state))
-            position = self._hands[k] if self.touched is None else np.array(self.touched)
-            tracked = TURN.inv().apply(position - ORIGIN) + 0.001 * random.normal(size=3)
-            pose = PoseStamped(
-                now_ns + 35_000_000, "webxr", tuple(tracked.tolist()), (0.0, 0.0, 0.0, 1.0)
-            )
-            self._session.put("thirdhand/hands/right", cdr.encode_pose(pose))
-
-    def __enter__(self) -> LedCell:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(10)
-        self._session.close()
 
 
 def line_with(process: subprocess.Popen[str], words: str) -> str:
@@ -761,12 +703,6 @@ def line_with(process: subprocess.Popen[str], words: str) -> str:
     raise AssertionError("".join(output))
 
 
-def press_enter(process: subprocess.Popen[str]) -> None:
-    process.stdin.write("\n")
-    process.stdin.flush()
-
-
-LIVE = '# my cell\n[network]\nlisten = ["tcp/127.0.0.1:0"]\n[arm]\nsource = "assumed"\n'
 POINTS = (
     (0.5, -0.3, 0.05),
     (0.5, 0.3, 0.05),
@@ -781,27 +717,28 @@ POINTS = (
 @pytest.mark.thorough
 def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
     cell = tmp_path / "my.toml"
-    cell.write_text(LIVE + f'[files]\nstate = "{tmp_path / "state"}"\n')
-    arm = path_of("wam", 1)
-    true = (*ORIGIN, *TURN.as_quat())
-    with (
-        serving(tmp_path, "--config", str(cell)) as daemon,
-        LedCell(daemon.endpoint, Settings(), arm) as hand,
-    ):
+    cell.write_text(LISTENING + f'[files]\nstate = "{tmp_path / "state"}"\n')
+    serve = ("--config", str(cell), "--joints", "assumed")
+    with serving(tmp_path, *serve) as daemon, Tracker(daemon.session) as tracker:
+        tracker.frame = "webxr"
+        tracker.left = None
         points = ["--config", str(cell), "--connect", daemon.endpoint]
         for point in POINTS:
             points += ["--at", *map(str, point)]
         with started("calibrate", *points) as process:
             for number, point in enumerate(POINTS, 1):
-                hand.touched = point
+                tracker.right = tuple(TURN.inv().apply(point - ORIGIN).tolist())
                 line_with(process, f"{number}: touch ({point[0]:g}, ")
                 time.sleep(0.8)
-                press_enter(process)
+                process.stdin.write("\n")
+                process.stdin.flush()
             out, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert out.startswith("right hand     points, ")
     assert ", 6 points, 0 outliers" in out
-    np.testing.assert_allclose(load(cell).hands.base_from_tracker, true, atol=0.005)
+    np.testing.assert_allclose(
+        load(cell).hands.base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.005
+    )
     assert len(list(tmp_path.glob("my.toml.before-*"))) == 1
 
 

@@ -5,15 +5,15 @@ that serves the page, a running daemon, and the demo that is played on it.
 from __future__ import annotations
 
 import contextlib
-import http.client
 import json
 import math
 import re
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -58,13 +58,9 @@ def url(daemon: Daemon) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def person_at(
-    url: str, folder: Path, *, phone: bool = False, timeout_s: float = TIMEOUT_S, **more: Any
-) -> Iterator[Person]:
+def person_at(url: str, folder: Path, *, timeout_s: float = TIMEOUT_S) -> Iterator[Person]:
     """A person at the page, once it shows the hands."""
-    with chromium.opened(url, folder, size=(1200, 800), timeout_s=timeout_s, **more) as tab:
-        if phone:
-            tab.hold_as_phone(390, 844)
+    with chromium.opened(url, folder, size=(1200, 800), timeout_s=timeout_s) as tab:
         tab.until("typeof hands !== 'undefined' && !!hands.left")
         yield Person(tab)
 
@@ -232,13 +228,9 @@ def test_a_hidden_page_sends_nothing_and_its_hands_wait_where_they_were(
 
 
 def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None:
-    parts = urlsplit(url)
     for query in ("", "?token=guessed"):
-        connection = http.client.HTTPConnection(parts.netloc, timeout=TIMEOUT_S)
-        connection.request("GET", f"/{query}")
-        answer = connection.getresponse()
-        assert (answer.status, answer.read().decode()) == (403, NO_TOKEN)
-        connection.close()
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(url.partition("?")[0] + query, timeout=TIMEOUT_S)
     # a page that was open when another token was made: its socket is refused, and it says why
     stale = "history.replaceState(null, '', '?token=guessed')"
     with chromium.opened(url, tmp_path, size=(1200, 800), timeout_s=TIMEOUT_S) as tab:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 import html
-import json
 import os
 import re
 import threading
@@ -192,24 +191,3 @@ def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyP
         page_of_hands(pinches=Pinches(session, "thirdhand", clutch="left")) as (page, _),
     ):
         asyncio.run(scenario())
-
-
-STATUS: dict[str, Any] = {
-    **dict.fromkeys(("cell", "mode", "reason", "skill", "version"), "x"),
-    **dict.fromkeys(("tick", "rate_hz", "missed", "hand_distance_m", "hand_limit_m_s"), 1),
-    **dict.fromkeys(("realtime", "memory_locked"), True),
-    **dict.fromkeys(("flags", "via_points", "endpoints"), ()),
-    **{name: {} for name in ("rejected", "hand_age_ms", "scribe")},
-    **{name: {"p50": 0, "p99": 0, "max": 0} for name in ("lateness_us", "work_us", "latency_ms")},
-}
-STRANGE: dict[str, bytes] = {  # anybody may publish a status in an open network
-    "no JSON": b"\xff" * 100,
-    "another type": b"[" * 10_000,
-    "an address without end": json.dumps(
-        STATUS | {"scribe": {"live": "rerun+http://[x/"}}
-    ).encode(),
-    "a port that is none": json.dumps(
-        STATUS | {"scribe": {"live": "rerun+http://x:999999"}}
-    ).encode(),
-    "a long text": json.dumps(STATUS | {"because": "x" * 1_000_000}).encode(),
-}

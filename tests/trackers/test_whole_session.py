@@ -1,6 +1,6 @@
 """One session from a headset to a finished task: an emulated headset is calibrated at an arm that
-is led, its hands play the scene of the demo with the left one's pinch as the clutch, and it is
-recentred. What was recorded replays exactly.
+is led, and its hands play the scene of the demo with the left one's pinch as the clutch. What was
+recorded replays exactly.
 """
 
 from __future__ import annotations
@@ -205,12 +205,6 @@ def test_a_headset_is_calibrated_and_its_hands_do_the_task(tmp_path: Path) -> No
             assert bench.stdout is not None
             report = json.loads(bench.stdout.read())
         assert report["success"], report
-        tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")
-        daemon.until(
-            lambda now: now["rejected"].get("wrong_frame", 0) > 0 and now["mode"] != "follow",
-            TIMEOUT_S,
-        )
-        assert tab.ask("document.getElementById('frame').textContent") == "webxr1, not calibrated"
         assert daemon.end() == 0
 
     recordings = sorted(records.glob("*.mcap"))

@@ -6,28 +6,23 @@ import os
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from support.recorded import TEXT, at_ns, drawn, ticks, values
+from support.recorded import TEXT, at_ns, drawn, ticks, values, viewed
 from support.wicked import WICKED, wicked_skill
 from thirdhand.command_line import main
 from thirdhand.contract.messages import SceneObject
 from thirdhand.contract.printable import as_markdown, printable
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.contract.requests import encode_json
+from thirdhand.core.frame import Record
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.config import WAM, Settings
 from thirdhand.viewer.stream import Viewer
 from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
-
-
-def viewer(**where: Any) -> Viewer:
-    """A viewer of the shipped arm."""
-    return Viewer(urdf=WAM, settings=Settings(), **where)
 
 
 @pytest.mark.usefixtures("drawing")
@@ -35,13 +30,12 @@ def viewer(**where: Any) -> Viewer:
 def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(
     tmp_path: Path,
 ) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(600):
-        if tick.index >= 400:
+    def change(_: Viewer, k: int, frame: Record) -> None:
+        if k >= 400:
             frame["mode"] = Mode.FAULT
             frame["reason"] = Reason.ARM_SILENT
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
+
+    viewed(tmp_path / "a.rrd", 600, change)
     assert last_followed(tmp_path / "a.rrd", 599 * 2_000_000) == 400 * 2_000_000 - 1
     screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
     screenshot(tmp_path / "a.rrd", tmp_path / "b.png", time=0.5)
@@ -122,17 +116,14 @@ def test_names_and_notes_are_drawn_without_effects(tmp_path: Path) -> None:
     thing = SceneObject(
         WICKED, "box", "base", (0.5, 0.4, 0.2), (0, 0, 0, 1), (0.1, 0.1, 0.1), (1, 1, 1, 1)
     )
-    view = viewer(rrd=tmp_path / "a.rrd", skill=wicked_skill())
-    for tick, frame, timing in ticks(30):
-        view.add(frame, at_ns(tick.index), timing)
-        if tick.index == 10:
-            view.note("objects", encode_json((thing,)).decode(), at_ns(tick.index))
-            view.note("log", f"rejected: {WICKED}", at_ns(tick.index))
-            view.note(
-                "requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(tick.index)
-            )
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+
+    def change(one: Viewer, k: int, _: Record) -> None:
+        if k == 10:
+            one.note("objects", encode_json((thing,)).decode(), at_ns(k))
+            one.note("log", f"rejected: {WICKED}", at_ns(k))
+            one.note("requests", f"skill {encode_json({'name': WICKED}).decode()}", at_ns(k))
+
+    rows = viewed(tmp_path / "a.rrd", 30, change, skill=wicked_skill())
     (named,) = (path for path in rows if re.fullmatch(r"/scene/things/.*/name", path))
     assert values(rows[named], "Points3D:labels")[-1] == [printable(WICKED)]
     log = [text for (text,) in values(rows["/log"], "TextLog:text")]

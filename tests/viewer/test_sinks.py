@@ -9,18 +9,18 @@ import socket
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.recorded import TEXT, at_ns, drawn, ticks, values, write
+from support.recorded import TEXT, at_ns, drawn, ticks, values, viewed, write
 from support.wam import JOINT_NAMES
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, SceneObject
 from thirdhand.contract.requests import ViaPoint, encode_json
+from thirdhand.core.frame import Record
 from thirdhand.core.skill.model import REGION_95
 from thirdhand.core.skill.pose import CLOSED
 from thirdhand.core.skill.skill import Skill
@@ -31,9 +31,11 @@ from thirdhand.viewer.stream import Viewer, ViewerError
 from thirdhand.workbench.cli.view import convert
 
 
-def viewer(**where: Any) -> Viewer:
-    """A viewer of the shipped arm."""
-    return Viewer(urdf=WAM, settings=Settings(), **where)
+def measured(tick: int, joints: Record) -> tuple[str, bytes]:
+    """The event of joints (7,) [rad] that are measured in a tick."""
+    return "joints/state", cdr.encode_joints(
+        JointState(at_ns(tick), JOINT_NAMES, tuple(joints), ())
+    )
 
 
 def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: Path) -> None:
@@ -55,13 +57,13 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
 
 
 def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
     entries = list(ticks(600))
-    for tick, frame, timing in entries:
-        view.add(frame, at_ns(tick.index), timing)
-    view.log("handover taught", "INFO", at_ns(300))
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+
+    def change(one: Viewer, k: int, _: Record) -> None:
+        if k == 300:
+            one.log("handover taught", "INFO", at_ns(k))
+
+    rows = viewed(tmp_path / "a.rrd", 600, change)
     by_path = {
         path: [row["tick"] for row in table if row.get("tick") is not None]
         for path, table in rows.items()
@@ -95,37 +97,25 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
     assert not [path for path in rows if "collision" in path]
 
 
-def test_time_is_told_in_seconds_from_the_start_and_every_curve_names_its_unit(
-    tmp_path: Path,
-) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(300):
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
-    seconds = [moment.total_seconds() for moment in values(rows["/joints/position"], "seconds")]
-    assert seconds == pytest.approx(np.arange(300) / 500)
-    names = {path: values(table, "SeriesLines:names") for path, table in rows.items()}
-    labels = [name for groups in names.values() for several in groups for name in several]
-    assert len(labels) > 30
-    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
+def test_every_curve_names_its_unit(tmp_path: Path) -> None:
+    rows = viewed(tmp_path / "a.rrd", 300)
+    names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
+    told = [name for found in names.values() for several in found for name in several]
+    assert len(told) > 30
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(
     tmp_path: Path,
 ) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(900):
-        if 300 <= tick.index < 600:  # away, and then back elsewhere
-            frame["hand_ages"][0] = tick.index - 300
-        if tick.index >= 600:
+    def change(_: Viewer, k: int, frame: Record) -> None:
+        if 300 <= k < 600:  # away, and then back elsewhere
+            frame["hand_ages"][0] = k - 300
+        if k >= 600:
             frame["hands"][0] += 0.5
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    strips = [
-        batch[0]
-        for batch in values(drawn(tmp_path / "a.rrd")["/scene/left_trail"], "LineStrips3D:strips")
-    ]
+
+    rows = viewed(tmp_path / "a.rrd", 900, change)
+    strips = [found[0] for found in values(rows["/scene/left_trail"], "LineStrips3D:strips")]
     corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
     assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
     steps = [
@@ -136,18 +126,11 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
 
 
 def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(100):
+    def change(_: Viewer, k: int, frame: Record) -> list[tuple[str, bytes]]:
         frame["commanded"] = 1
-        measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"] + 0.02), ())
-        view.add(
-            frame,
-            at_ns(tick.index),
-            timing,
-            [("joints/state", cdr.encode_joints(measured)), ("hold", b"")],
-        )
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+        return [measured(k, frame["joints"] + 0.02), ("hold", b"")]
+
+    rows = viewed(tmp_path / "a.rrd", 100, change)
     assert (
         len(values(rows["/measured/joints/3"], "tick"))
         == len(values(rows["/arm/joints/3"], "tick"))
@@ -169,15 +152,13 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     point = ViaPoint(
         "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
     )
-    view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
-    entries = list(ticks(40))
-    for tick, frame, timing in entries[:20]:
-        view.add(frame, at_ns(tick.index), timing)
-    view.learn(with_file(replace(skill, via_points=(point,))).file)
-    for tick, frame, timing in entries[20:]:
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+    taught = with_file(replace(skill, via_points=(point,))).file
+    rows = viewed(
+        tmp_path / "a.rrd",
+        40,
+        lambda view, k, frame: view.learn(taught) if k == 20 else None,
+        skill=skill.file,
+    )
     lines = values(rows["/skill/demonstrations/tool"], "LineStrips3D:strips")[-1]
     assert len(lines) >= 5
     assert all(len(line) > 50 for line in lines)
@@ -202,20 +183,18 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
 def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(
     tmp_path: Path, skill: Skill
 ) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd", skill=skill.file)
     turned = Rotation.from_euler("x", 3, degrees=True)
-    for tick, original, timing in ticks(200):
-        frame = original.copy()
-        if tick.index >= 100:
+
+    def change(_: Viewer, k: int, frame: Record) -> None:
+        if k >= 100:
             frame["closure"] = 0.7
             frame["gripper"] = CLOSED
             frame["orientation_covariance"] = np.radians(2.0) ** 2 * np.eye(3)
             frame["tool_orientation"] = (
                 Rotation.from_quat(frame["orientation"]) * turned
             ).as_quat()
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+
+    rows = viewed(tmp_path / "a.rrd", 200, change, skill=skill.file)
     curves = {
         path: np.ravel(values(rows[path], "Scalars:scalars"))
         for path in rows
@@ -230,11 +209,7 @@ def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(
 def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(
     tmp_path: Path,
 ) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd", skill=b"nonsense")
-    for tick, frame, timing in ticks(30):
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+    rows = viewed(tmp_path / "a.rrd", 30, skill=b"nonsense")
     assert len(values(rows["/joints/position"], "tick")) == 30
     assert any(
         text.startswith("a skill that cannot be drawn") for (text,) in values(rows["/log"], TEXT)
@@ -260,15 +235,15 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
         (0.1, 0.1, 0.006),
         (0.7, 0.7, 0.7, 1),
     )
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(60):
-        view.add(frame, at_ns(tick.index), timing)
-        if tick.index in (10, 40):
-            objects = (board, glass)[: 1 if tick.index == 40 else 2]
-            view.note("objects", encode_json(objects).decode(), at_ns(tick.index))
-    view.note("requests", 'via_points {"op": "clear"}', at_ns(50))
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+
+    def change(one: Viewer, k: int, _: Record) -> None:
+        if k in (10, 40):
+            found = (board, glass)[: 1 if k == 40 else 2]
+            one.note("objects", encode_json(found).decode(), at_ns(k))
+        if k == 50:
+            one.note("requests", 'via_points {"op": "clear"}', at_ns(k))
+
+    rows = viewed(tmp_path / "a.rrd", 60, change)
     assert set(np.ravel(values(rows["/scene/things/board"], "CoordinateFrame:frame"))) == {
         "tool_plate"
     }
@@ -311,11 +286,11 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
 
 
 def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
-    view = viewer(live_port=0)
-    assert view.url is not None
-    port = int(view.url.rsplit(":", 1)[1].split("/")[0])
+    one = Viewer(urdf=WAM, settings=Settings(), live_port=0)
+    assert one.url is not None
+    port = int(one.url.rsplit(":", 1)[1].split("/")[0])
     for tick, frame, timing in ticks(300):
-        view.add(frame, at_ns(tick.index), timing)
+        one.add(frame, at_ns(tick.index), timing)
     with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         assert connection.getpeername()[0] == "127.0.0.1"
     with (
@@ -323,7 +298,7 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
         socket.create_connection(("127.0.0.2", port), timeout=5),
     ):
         pass
-    view.close()
+    one.close()
 
 
 @pytest.mark.parametrize(
@@ -363,17 +338,10 @@ def test_what_cannot_be_shown_is_said_in_words(
 def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(
     tmp_path: Path,
 ) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(100):
-        measured = JointState(at_ns(tick.index), JOINT_NAMES, tuple(frame["joints"]), ())
-        view.add(
-            frame,
-            at_ns(tick.index),
-            timing,
-            [("joints/state", cdr.encode_joints(measured))] if tick.index > 50 else [],
-        )
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+    def change(_: Viewer, k: int, frame: Record) -> list[tuple[str, bytes]]:
+        return [measured(k, frame["joints"])] if k > 50 else []
+
+    rows = viewed(tmp_path / "a.rrd", 100, change)
     for number in range(len(JOINT_NAMES)):
         first, *later = sorted(rows[f"/measured/joints/{number}"], key=lambda row: row["seconds"])
         assert (first["seconds"].total_seconds(), len(later)) == (0.0, 9)
@@ -381,18 +349,13 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
         assert not any(row.get("Transform3D:scale") for row in later)
 
 
-@pytest.mark.parametrize("conducts", [1])
-def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(
-    tmp_path: Path, conducts: int
-) -> None:
-    view = viewer(rrd=tmp_path / "a.rrd")
-    for tick, frame, timing in ticks(200):
-        frame["hand_ages"][1 - conducts] = -1
-        frame["covariance"][:] *= tick.index >= 10  # nothing is predicted before
+def test_what_the_right_hand_conducts_is_drawn_before_the_left_is_seen(tmp_path: Path) -> None:
+    def change(_: Viewer, k: int, frame: Record) -> None:
+        frame["hand_ages"][0] = -1
+        frame["covariance"][:] *= k >= 10  # nothing is predicted before
         frame["tool"] += [0.02, 0.0, 0.0]
-        view.add(frame, at_ns(tick.index), timing)
-    view.close()
-    rows = drawn(tmp_path / "a.rrd")
+
+    rows = viewed(tmp_path / "a.rrd", 200, change)
     followed = list(range(10, 200))
     assert values(rows["/scene/target"], "tick") == followed[::5]
     for path, expected in (("/error/target", 20.0), ("/deviation/target", 1e3 * np.sqrt(7e-4 / 3))):
@@ -401,5 +364,5 @@ def test_what_one_hand_conducts_is_drawn_before_the_other_is_seen(
             np.full(190, expected)
         ), path
     ages = np.array(values(rows["/age"], "Scalars:scalars"))
-    assert (len(ages), ages[:, conducts].min()) == (190, 0.0)
-    assert np.isnan(ages[:, 1 - conducts]).all()  # a curve that is not there
+    assert (len(ages), ages[:, 1].min()) == (190, 0.0)
+    assert np.isnan(ages[:, 0]).all()  # a curve that is not there
