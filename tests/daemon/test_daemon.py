@@ -139,13 +139,13 @@ def test_via_points_survive_a_restart(tmp_path: Path) -> None:
         assert daemon.end() == 0
         assert "earlier run" not in daemon.log.read_text()
     with serving(tmp_path, "--joints", "assumed") as daemon:
-        (said,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
+        (notice,) = (line for line in daemon.log.read_text().splitlines() if "earlier run" in line)
         (file,) = (tmp_path / "state").rglob("via-points-*.json")
         assert (
             f"via-points of an earlier run are in force (1): handover. They are saved in {file}; "
-            in said
+            in notice
         )
-        assert "`thirdhand via-points remove NAME` removes one" in said
+        assert "`thirdhand via-points remove NAME` removes one" in notice
         assert daemon.client.status().via_points == ("handover",)
         listed = daemon.client.ask("via_points", {"op": "list"})["points"]
         assert [(point["name"], point["radius"], point["follow"]) for point in listed] == [

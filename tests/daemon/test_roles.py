@@ -178,7 +178,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
 def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Path) -> None:
     """Sessions of two trackers and two operators; of each the second was revoked."""
     daemon = Guarded(secrets, revoked=("tracker-2", "operator-2"))
-    said: set[bytes] = set()
+    revoked: set[bytes] = set()
     with contextlib.ExitStack() as closing:
         closing.callback(daemon.close)
         sessions = {
@@ -196,7 +196,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
             for key in ("**", *(channels.key(CELL, key) for key in OUTPUTS)):
                 closing.callback(session.declare_subscriber(key, hear).undeclare)
         taken = daemon.session.declare_subscriber(
-            f"{CELL}/**", lambda sample: said.add(bytes(sample.payload))
+            f"{CELL}/**", lambda sample: revoked.add(bytes(sample.payload))
         )
         closing.callback(taken.undeclare)
         until(lambda: Client(sessions["operator"], CELL, timeout_s=1.0).ask("status") == {})
@@ -215,7 +215,7 @@ def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Pa
         assert not any(reply.ok for replies in asked for reply in replies)
         assert daemon.asked == set()
         assert Client(sessions["operator"], CELL).ask("hold") == {}
-    assert said == {b"out", b"tracker"}
+    assert revoked == {b"out", b"tracker"}
     assert b"out" in got["operator"]
     # but its own words
     assert [got[name] - {name.encode()} for name in ("tracker-2", "operator-2")] == [set(), set()]

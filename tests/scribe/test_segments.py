@@ -205,13 +205,13 @@ class Session:
 
 @contextlib.contextmanager
 def session(**where: Any) -> Iterator[Session]:
-    one = Session(**where)
+    writer = Session(**where)
     try:
-        one.scribe.start(skill=SKILL, state=state_after(-1))
-        assert one.scribe.ready(60)
-        yield one
+        writer.scribe.start(skill=SKILL, state=state_after(-1))
+        assert writer.scribe.ready(60)
+        yield writer
     finally:
-        one.missing = one.scribe.close(10)
+        writer.missing = writer.scribe.close(10)
 
 
 def test_growth_is_told_once_there_is_enough_of_it(
@@ -260,30 +260,30 @@ def accounted(paths: list[Path], told: int) -> tuple[int, int]:
 def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", "6m") as disk:
         ballast = disk / "ballast"
-        with session(folder=disk) as one:
-            one.until(lambda status: status["sent"] > 200)
+        with session(folder=disk) as writer:
+            writer.until(lambda status: status["sent"] > 200)
             fill(ballast)
-            status = one.until(
+            status = writer.until(
                 lambda status: status["state"] == "interrupted" and status["lost"] > 200
             )
             assert status["recording"] is None
-            assert one.scribe.newest_recording == str(*disk.glob("*.mcap"))
+            assert writer.scribe.newest_recording == str(*disk.glob("*.mcap"))
             full = [error for error in status["errors"] if error.startswith("recording to ")]
             assert len(full) == 1
             assert "No space left on device" in full[0]
             ballast.unlink()
-            one.until(lambda status: status["state"] == "recording")
-            sent = one.told
-            status = one.until(
+            writer.until(lambda status: status["state"] == "recording")
+            sent = writer.told
+            status = writer.until(
                 lambda status: (
                     status["sent"] > sent + 200 and "continues in" in status["errors"][-1]
                 )
             )
             assert status["errors"][-1].endswith(f"{status['lost']} ticks are lost in all")
         recordings = sorted(disk.glob("*.mcap"))
-        recorded, lost = accounted(recordings, one.told)
-        assert recorded + lost == one.told
-        assert one.missing == f"{lost} of {one.told} ticks are not recorded"
+        recorded, lost = accounted(recordings, writer.told)
+        assert recorded + lost == writer.told
+        assert writer.missing == f"{lost} of {writer.told} ticks are not recorded"
         result = [Recording.open(path) for path in recordings]
         assert [len(list(r.steps())) > 50 for r in result] == [True, True]
         assert [r.truncated for r in result] == [True, False]

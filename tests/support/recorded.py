@@ -151,10 +151,10 @@ def viewed(
     """The rows of a drawing of the shipped arm in so many ticks. `change` is called before each is
     drawn, with viewer, tick and frame, and returns events that arrived in it, or None.
     """
-    one = Viewer(urdf=WAM, settings=Settings(), rrd=path, skill=skill)
+    viewer = Viewer(urdf=WAM, settings=Settings(), rrd=path, skill=skill)
     for tick, frame, timing in ticks(count):
-        one.add(frame, at_ns(tick.index), timing, change(one, tick.index, frame) or ())
-    one.close()
+        viewer.add(frame, at_ns(tick.index), timing, change(viewer, tick.index, frame) or ())
+    viewer.close()
     return drawn(path)
 
 

@@ -23,7 +23,7 @@ def holding(cell: str, tick: int) -> Status:
         realtime=False,
         memory_locked=False,
         **numbers,
-        **dict.fromkeys(("flags", "places", "endpoints"), ()),
+        **dict.fromkeys(("flags", "via_points", "endpoints"), ()),
         **{name: {} for name in ("rejected", "hand_age_ms", "scribe")},
         **dict.fromkeys(("lateness_us", "work_us", "latency_ms"), Percentiles()),
     )  # type: ignore[arg-type]

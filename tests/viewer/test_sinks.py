@@ -99,10 +99,10 @@ def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_p
 
 def test_every_curve_names_its_unit(tmp_path: Path) -> None:
     rows = viewed(tmp_path / "a.rrd", 300)
-    names = {path: values(found, "SeriesLines:names") for path, found in rows.items()}
-    told = [name for found in names.values() for several in found for name in several]
-    assert len(told) > 30
-    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in told)
+    names = {path: values(entity_rows, "SeriesLines:names") for path, entity_rows in rows.items()}
+    labels = [name for entity_rows in names.values() for several in entity_rows for name in several]
+    assert len(labels) > 30
+    assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
 
 
 def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(
@@ -115,7 +115,7 @@ def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_
             frame["hands"][0] += 0.5
 
     rows = viewed(tmp_path / "a.rrd", 900, change)
-    strips = [found[0] for found in values(rows["/scene/left_trail"], "LineStrips3D:strips")]
+    strips = [strips[0] for strips in values(rows["/scene/left_trail"], "LineStrips3D:strips")]
     corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
     assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
     steps = [
@@ -238,8 +238,8 @@ def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path:
 
     def change(one: Viewer, k: int, _: Record) -> None:
         if k in (10, 40):
-            found = (board, glass)[: 1 if k == 40 else 2]
-            one.note("objects", encode_json(found).decode(), at_ns(k))
+            objects = (board, glass)[: 1 if k == 40 else 2]
+            one.note("objects", encode_json(objects).decode(), at_ns(k))
         if k == 50:
             one.note("requests", 'via_points {"op": "clear"}', at_ns(k))
 
@@ -286,11 +286,11 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
 
 
 def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
-    one = Viewer(urdf=WAM, settings=Settings(), live_port=0)
-    assert one.url is not None
-    port = int(one.url.rsplit(":", 1)[1].split("/")[0])
+    viewer = Viewer(urdf=WAM, settings=Settings(), live_port=0)
+    assert viewer.url is not None
+    port = int(viewer.url.rsplit(":", 1)[1].split("/")[0])
     for tick, frame, timing in ticks(300):
-        one.add(frame, at_ns(tick.index), timing)
+        viewer.add(frame, at_ns(tick.index), timing)
     with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         assert connection.getpeername()[0] == "127.0.0.1"
     with (
@@ -298,7 +298,7 @@ def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed()
         socket.create_connection(("127.0.0.2", port), timeout=5),
     ):
         pass
-    one.close()
+    viewer.close()
 
 
 @pytest.mark.parametrize(

@@ -118,9 +118,9 @@ def divided(
                 demonstration._replace(
                     via_points=tuple(of_one(point, conductor) for point in demonstration.via_points)
                 )
-                for demonstration in some
+                for demonstration in subset
             ]
-            for some in (demonstrations, before)
+            for subset in (demonstrations, before)
         )
     method = method_of([*demonstrations, *before], options)
     if options.delay_s is not None and not isinstance(method, Segmented):
@@ -159,10 +159,10 @@ def _check_alike(
     if not needed:
         return
     for name, demonstration in zip(names, demonstrations, strict=True):
-        given = [point.name for point in demonstration.via_points]
-        if set(given) != set(needed):
+        own_names = [point.name for point in demonstration.via_points]
+        if set(own_names) != set(needed):
             raise SkillError(
-                f"{name} has the via-points {', '.join(given) or '(none)'}: {', '.join(needed)} "
+                f"{name} has the via-points {', '.join(own_names) or '(none)'}: {', '.join(needed)} "
                 "needed, as in the skill that is refined; take them with the demonstration "
                 "(record --via-points), or name them (--via-points)"
             )

@@ -51,19 +51,19 @@ def via_point_visits(columns: Columns) -> list[ViaPointVisits]:
     """Every via-point that was in force at some time, in the order of teaching."""
     ticks = columns.frames["tick"]
     times = columns.times
-    found: list[ViaPointVisits] = []
+    point_visits: list[ViaPointVisits] = []
     for point, conductor, begin, end in _taught(columns):
         within = slice(*np.searchsorted(ticks, (begin, end)).tolist())
         frames = columns.frames[within]
         if len(frames):
             in_force_s = times[within]
             nearest, visits = _visits(point, conductor, frames, in_force_s, columns.period_s)
-            found.append(
+            point_visits.append(
                 ViaPointVisits(
                     point.name, float(in_force_s[0]), float(in_force_s[-1]), nearest, tuple(visits)
                 )
             )
-    return found
+    return point_visits
 
 
 def _taught(columns: Columns) -> list[tuple[ViaPoint, int | None, int, float]]:

@@ -226,10 +226,12 @@ class LearnedProcess:
 
     def place(self, places: Places | None) -> PlacedProcess:
         """The process in a scene with these places, or in an unknown scene."""
-        at, wanted, std = neighbourhoods(() if places is None else via_points_of(places)[1:])
+        via_hands, via_tools, std = neighbourhoods(
+            () if places is None else via_points_of(places)[1:]
+        )
         groups = [self.owner == number for number in np.unique(self.owner)]
-        inputs = [self.inputs[group] for group in groups] + [at]
-        outputs = [self.outputs[group] for group in groups] + [wanted]
+        inputs = [self.inputs[group] for group in groups] + [via_hands]
+        outputs = [self.outputs[group] for group in groups] + [via_tools]
         noise = [np.full(int(group.sum()), self.noise**2) for group in groups] + [std**2]
         return PlacedProcess.of(
             [self.shared, self.own],
@@ -290,12 +292,12 @@ class LearnedSamples:
 
     def place(self, places: Places) -> PlacedProcess:
         """The process in a scene with these places."""
-        at, wanted, _ = neighbourhoods(via_points_of(places)[1:])
-        is_far = cdist(self.inputs, at).min(axis=1) >= TOLERANCE_M
-        inputs = np.concatenate([self.inputs[is_far], at])
-        outputs = np.concatenate([self.outputs[is_far], wanted])
+        via_hands, via_tools, _ = neighbourhoods(via_points_of(places)[1:])
+        is_far = cdist(self.inputs, via_hands).min(axis=1) >= TOLERANCE_M
+        inputs = np.concatenate([self.inputs[is_far], via_hands])
+        outputs = np.concatenate([self.outputs[is_far], via_tools])
         noise = np.concatenate(
-            [np.full(int(is_far.sum()), self.noise), np.full(len(at), VIA_STD_M**2)]
+            [np.full(int(is_far.sum()), self.noise), np.full(len(via_hands), VIA_STD_M**2)]
         )
         # Closed loops amplify rounding: another triangle moves the events of a scene by 0.8 mm.
         covariance = self.kernel(inputs, inputs) + np.diag(noise)
