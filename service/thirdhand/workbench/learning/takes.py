@@ -161,10 +161,11 @@ def _check_alike(
     for name, demonstration in zip(names, demonstrations, strict=True):
         own_names = [point.name for point in demonstration.via_points]
         if set(own_names) != set(needed):
+            present = ", ".join(own_names) or "(none)"
             raise SkillError(
-                f"{name} has the via-points {', '.join(own_names) or '(none)'}: {', '.join(needed)} "
-                "needed, as in the skill that is refined; take them with the demonstration "
-                "(record --via-points), or name them (--via-points)"
+                f"{name} has the via-points {present}: {', '.join(needed)} needed, as in the skill "
+                "that is refined; take them with the demonstration (record --via-points), or name "
+                "them (--via-points)"
             )
 
 
