@@ -116,30 +116,42 @@ def _why_hold(
         return TWO_SOURCES
     if conditions & ARM_GUIDED and not parameters[0].is_assumed:
         return GUIDED
-    if state.arm_ready != READY and not (
-        state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED
-    ):
+    returns_later = state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED
+    if state.arm_ready != READY and not returns_later:
         return NOT_READY
     if state.operator_hold:
         return OPERATOR
     if conditions & CLUTCH_RELEASED:
         return CLUTCH
-    if math.isnan(gate_m):
-        unseen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0 and not conditions & ONE_HAND
-        return NO_HANDS if unseen else STALE_HAND
-    if conditions & sum(UNSEEN) and (conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW):
-        return STALE_HAND
-    if gate_m > threshold:
+    reason = _unseen_reason(states, conditions, gate_m)
+    if reason == NONE and _is_far(states, parameters, gate_m, threshold):
         return FAR
-    if state.reason == FAR:
-        jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
-        is_jumpy = (
-            jump_tick > 0
-            and (state.tick - jump_tick) * parameters[0].period_s < parameters[0].jumpy_s
-        )
-        if is_jumpy or gate_m > parameters[0].end_share * threshold:
-            return FAR
-    return AMBIGUOUS if conditions & SEGMENT_AMBIGUOUS else NONE
+    if reason == NONE and conditions & SEGMENT_AMBIGUOUS:
+        return AMBIGUOUS
+    return reason
+
+
+@compiled
+def _unseen_reason(states: Records, conditions: int, gate_m: float) -> int:
+    """NO_HANDS or STALE_HAND of `_why_hold`, or NONE."""
+    state = states[0]
+    if math.isnan(gate_m):
+        is_never_seen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0
+        return NO_HANDS if is_never_seen and not conditions & ONE_HAND else STALE_HAND
+    is_needed = conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW
+    return STALE_HAND if conditions & sum(UNSEEN) and is_needed else NONE
+
+
+@compiled
+def _is_far(states: Records, parameters: Records, gate_m: float, threshold: float) -> bool:
+    """True if the hands are too far from the demonstrations, see FAR in `_why_hold`."""
+    state = states[0]
+    config = parameters[0]
+    if state.reason != FAR:
+        return bool(gate_m > threshold)
+    jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
+    is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * config.period_s < config.jumpy_s
+    return bool(is_jumpy or gate_m > config.end_share * threshold)
 
 
 @compiled
@@ -164,52 +176,77 @@ def _arm(
     """
     state = states[0]
     config = parameters[0]
-    heard = conditions & ARM_HEARD
-    inside = conditions & ARM_INSIDE
     if config.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
         return starts, NONE, -1.0, -1.0
-    moving = False
-    for joint in range(state.joints.shape[1]):
-        moving = moving or state.joints[1, joint] != 0.0 or state.joints[2, joint] != 0.0
+    is_moving = _is_commanded_to_move(state.joints)
     if conditions & ARM_GUIDED:
         state.operator_hold = 1
         state.arm_ready = 0
         state.leaves = 0
         state.guided_tick = state.tick
         state.stuck = state.way_count = 0
-        return 0 if moving else STARTS_MEASURED, NONE, -1.0, -1.0
+        return 0 if is_moving else STARTS_MEASURED, NONE, -1.0, -1.0
     if not state.arm_ready:
-        state.stuck = state.way_count = 0
-        if not conditions & ARM_STILL:
-            state.leaves = 0
-        # Commanded joints that move come to rest first; the reported posture must be constant.
-        if not conditions & ARM_STILL or moving or (inside and not state.leaves):
-            return 0, NONE, -1.0, -1.0
-        state.arm_ready = RETURNING if inside or _is_outside(state.measured, parameters) else READY
-        state.slow_tick = state.stuck_tick = state.tick
-        return STARTS_MEASURED, NONE, -1.0, -1.0
-    if not heard:
-        if state.mode == FOLLOW or moving:
+        return _start(states, parameters, conditions, is_moving), NONE, -1.0, -1.0
+    if not conditions & ARM_HEARD:
+        if state.mode == FOLLOW or is_moving:
             return 0, ARM_SILENT, -1.0, -1.0
         state.arm_ready = 0
         return 0, NONE, -1.0, -1.0
-    if state.arm_ready == RETURNING and not _is_outside(state.joints[0], parameters):
-        if moving:
-            state.stuck_tick = state.tick
-        if not inside or (state.tick - state.stuck_tick) * config.period_s > config.stuck_s:
-            state.arm_ready = READY
-            state.leaves = 0
+    if state.arm_ready == RETURNING:
+        _return(states, parameters, conditions, is_moving)
+
     error, speed = measured_error(states, heres, parameters)
     if error > config.max_error_rad:
         return 0, ARM_ERROR, error, speed
     if speed <= config.fault_speed:
         state.slow_tick = state.tick
-    fault = (
-        TOOL_SPEED if (state.tick - state.slow_tick) * config.period_s > config.too_fast_s else NONE
-    )
-    return 0, fault, error, speed
+    fast_s = (state.tick - state.slow_tick) * config.period_s
+    return 0, TOOL_SPEED if fast_s > config.too_fast_s else NONE, error, speed
+
+
+@compiled
+def _is_commanded_to_move(joints: Vector) -> bool:
+    """True if a commanded joint (3, J) has a velocity or an acceleration."""
+    for joint in range(joints.shape[1]):
+        if joints[1, joint] != 0.0 or joints[2, joint] != 0.0:
+            return True
+    return False
+
+
+@compiled
+def _start(states: Records, parameters: Records, conditions: int, is_moving: bool) -> int:
+    """STARTS_MEASURED if an arm that is not ready starts, else 0; see `_arm`."""
+    state = states[0]
+    is_inside = conditions & ARM_INSIDE
+    is_still = conditions & ARM_STILL
+    state.stuck = state.way_count = 0
+    if not is_still:
+        state.leaves = 0
+    # Commanded joints that move come to rest first; the reported posture must be constant.
+    if not is_still or is_moving or (is_inside and not state.leaves):
+        return 0
+    is_returning = is_inside or _is_outside(state.measured, parameters)
+    state.arm_ready = RETURNING if is_returning else READY
+    state.slow_tick = state.stuck_tick = state.tick
+    return STARTS_MEASURED
+
+
+@compiled
+def _return(states: Records, parameters: Records, conditions: int, is_moving: bool) -> None:
+    """Let a RETURNING arm become READY, see `_arm`."""
+    state = states[0]
+    config = parameters[0]
+    if _is_outside(state.joints[0], parameters):
+        return
+    if is_moving:
+        state.stuck_tick = state.tick
+    still_s = (state.tick - state.stuck_tick) * config.period_s
+    if not conditions & ARM_INSIDE or still_s > config.stuck_s:
+        state.arm_ready = READY
+        state.leaves = 0
 
 
 @compiled

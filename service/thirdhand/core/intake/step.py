@@ -140,28 +140,14 @@ def take_arm(
     state = states[0]
     config = parameters[0]
     passed = state.tick - state.arm_tick
-    passed_s = passed * config.period_s
-    silent_s = config.silent_ticks * config.period_s
     fresh = state.arm_tick >= 0 and passed < config.silent_ticks
-    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-        state.rejected[NOT_FINITE] += 1
-        return NOT_FINITE
-    # Before it is ready, and after a silence, an arm is in the turn that it reports, because it may
-    # have restarted. While it is commanded, its turns are counted on.
-    if fresh or (state.arm_ready and state.mode != FAULT):
-        unwrap(states, parameters, position)
-    near, deviation, moved = compared(states, parameters, position, velocity)
-    cause = -1 if near else OUT_OF_RANGE
-    if near:
-        cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
-    if near and cause != REPEATED:
-        jumped = fresh and deviation > config.joint_jump_rad + config.joint_jump_speed * passed_s
-        note_arm(states, parameters, jumped)
-        if jumped and cause < 0:
-            cause = JUMPED
-    if near and (moved > config.arm_still_rad or not fresh):
-        state.arm_still_posture[:] = position
-        state.arm_still_tick = state.tick
+    cause = NOT_FINITE
+    if np.isfinite(position).all() and np.isfinite(velocity).all():
+        # Before it is ready, and after a silence, an arm is in the turn that it reports, because it
+        # may have restarted. While it is commanded, its turns are counted on.
+        if fresh or (state.arm_ready and state.mode != FAULT):
+            unwrap(states, parameters, position)
+        cause = _judge_arm(states, parameters, stamp_ns, position, velocity, fresh)
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
@@ -170,6 +156,37 @@ def take_arm(
     state.arm_stamp_ns = stamp_ns
     state.arm_tick = state.tick
     return -1
+
+
+@compiled
+def _judge_arm(
+    states: Records,
+    parameters: Records,
+    stamp_ns: int,
+    position: Vector,
+    velocity: Vector,
+    fresh: bool,
+) -> int:
+    """Cause for which a finite sample of the arm is rejected, or -1. Notes whether it contradicts
+    the others, and whether the arm is still.
+    """
+    state = states[0]
+    config = parameters[0]
+    near, deviation, moved = compared(states, parameters, position, velocity)
+    if not near:
+        return OUT_OF_RANGE
+    passed_s = (state.tick - state.arm_tick) * config.period_s
+    silent_s = config.silent_ticks * config.period_s
+    cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
+    if cause != REPEATED:
+        jumped = fresh and deviation > config.joint_jump_rad + config.joint_jump_speed * passed_s
+        note_arm(states, parameters, jumped)
+        if jumped and cause < 0:
+            cause = JUMPED
+    if moved > config.arm_still_rad or not fresh:
+        state.arm_still_posture[:] = position
+        state.arm_still_tick = state.tick
+    return cause
 
 
 @compiled
@@ -376,7 +393,6 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     """
     frame = frames[0]
     state = states[0]
-    config = parameters[0]
     left = state.hand_ticks[0]
     right = state.hand_ticks[1]
     if left == right:
@@ -391,15 +407,30 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
         frame.hand_velocities[side] = state.hands[side, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
+    return _hand_conditions(frames, parameters) | _arm_conditions(states, parameters)
+
+
+@compiled
+def _hand_conditions(frames: Records, parameters: Records) -> int:
+    """HANDS, LEFT_UNSEEN and RIGHT_UNSEEN, as they hold for the ages in the frame."""
+    ages = frames[0].hand_ages
+    stale = frames[0].stale_ticks
+    is_any_seen = ages[0] < stale[0] or ages[1] < stale[1]
+    if ages.min() < 0 or ages.max() >= parameters[0].unseen_ticks or not is_any_seen:
+        return 0
+    conditions = HANDS_KNOWN
+    for side in range(2):
+        if ages[side] >= stale[side]:
+            conditions |= UNSEEN[side]
+    return conditions
+
+
+@compiled
+def _arm_conditions(states: Records, parameters: Records) -> int:
+    """ARM_HEARD, ARM_STILL, ARM_GUIDED, CONTESTED and CLUTCH_RELEASED, as they hold now."""
+    state = states[0]
+    config = parameters[0]
     conditions = 0
-    ages = frame.hand_ages
-    stale = frame.stale_ticks
-    is_seen = ages[0] < stale[0], ages[1] < stale[1]
-    if ages.min() >= 0 and ages.max() < config.unseen_ticks and (is_seen[0] or is_seen[1]):
-        conditions = HANDS_KNOWN
-        for side in range(2):
-            if not is_seen[side]:
-                conditions |= UNSEEN[side]
     if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
         conditions |= ARM_HEARD
         if state.tick - state.arm_still_tick >= config.still_ticks:
