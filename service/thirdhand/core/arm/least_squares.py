@@ -82,58 +82,82 @@ def least_squares(
     released if the cost falls toward the inside.
     """
     joints = len(posture)
-    count = len(wanted)
     free = np.ones(joints)
     best = np.empty(joints)
     _solve(tasks, wanted, posture, damping, free, posture, result)
-    inside = True
+    is_inside = True
     for j in range(joints):
         if not bounds[0, j] <= result[j] <= bounds[1, j]:
-            inside = False
+            is_inside = False
             free[j] = 0.0
             result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
-    if inside:
+    if is_inside:
         return
-    residual = np.empty(count)
     for _ in range(BOUND_ROUNDS):
         _solve(tasks, wanted, posture, damping, free, result, best)
-        blocked = -1
-        least = 1.0
-        for j in range(joints):
-            step = best[j] - result[j]
-            if step != 0.0:
-                fraction = ((bounds[1, j] if step > 0.0 else bounds[0, j]) - result[j]) / step
-                if fraction < least:
-                    blocked = j
-                    least = fraction
-        for j in range(joints):
-            result[j] += least * (best[j] - result[j])
+        blocked = _move_within(bounds, best, result)
         if blocked >= 0:
-            for j in range(joints):
-                result[j] = min(max(result[j], bounds[0, j]), bounds[1, j])
             free[blocked] = 0.0
             continue
-        result[:] = best
-        for i in range(count):
-            residual[i] = -wanted[i]
-            for j in range(joints):
-                residual[i] += tasks[i, j] * result[j]
-        # the bound with the steepest descent to its inside
-        leaving = -1
-        most = ROUNDING
-        for j in range(joints):
-            if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
-                continue
-            slope = damping * (result[j] - posture[j])
-            for i in range(count):
-                slope += tasks[i, j] * residual[i]
-            gained = slope if result[j] >= bounds[1, j] else -slope
-            if gained > most:
-                leaving = j
-                most = gained
-        if leaving < 0:
+        released = _steepest(tasks, wanted, posture, damping, bounds, free, result)
+        if released < 0:
             return
-        free[leaving] = 1.0
+        free[released] = 1.0
+
+
+@compiled
+def _move_within(bounds: Vector, best: Vector, result: Vector) -> int:
+    """Move `result` (J,) toward `best` (J,), as far as the bounds (2, J) allow. Returns the joint
+    that meets its bound first, or -1 if `best` is reached.
+    """
+    blocked = -1
+    share = 1.0
+    for j in range(len(result)):
+        step = best[j] - result[j]
+        if step != 0.0:
+            fraction = ((bounds[1, j] if step > 0.0 else bounds[0, j]) - result[j]) / step
+            if fraction < share:
+                blocked = j
+                share = fraction
+    if blocked < 0:
+        result[:] = best
+        return blocked
+    for j in range(len(result)):
+        moved = result[j] + share * (best[j] - result[j])
+        result[j] = min(max(moved, bounds[0, j]), bounds[1, j])
+    return blocked
+
+
+@compiled
+def _steepest(
+    tasks: Vector,
+    wanted: Vector,
+    posture: Vector,
+    damping: float,
+    bounds: Vector,
+    free: Vector,
+    result: Vector,
+) -> int:
+    """The held joint from whose bound the cost falls most steeply inward; -1 if none does."""
+    count = len(wanted)
+    residual = np.empty(count)
+    for i in range(count):
+        residual[i] = -wanted[i]
+        for j in range(len(result)):
+            residual[i] += tasks[i, j] * result[j]
+    steepest = -1
+    descent = ROUNDING
+    for j in range(len(result)):
+        if free[j] > 0.0 or bounds[1, j] <= bounds[0, j]:
+            continue
+        slope = damping * (result[j] - posture[j])
+        for i in range(count):
+            slope += tasks[i, j] * residual[i]
+        gained = slope if result[j] >= bounds[1, j] else -slope
+        if gained > descent:
+            steepest = j
+            descent = gained
+    return steepest
 
 
 @compiled

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,58 +56,80 @@ def body_of(settings: Settings, description: str, tuning: Tuning = TUNING) -> Bo
     names = settings.joints.names
     chain = [joint for joint in urdf.chain(settings.arm.plate) if joint.name in names]
     frames = np.array([_in_joint(urdf, names, joint.parent, _origin(joint))[1] for joint in chain])
-    parts: list[tuple[int, Vector, float]] = []
+    parts = sorted(_parts(settings, urdf, chain, frames), key=lambda part: part.link)
+    capsules = structured(len(parts), CAPSULE)
+    capsules[:] = [(*part, _max_speed(settings, frames, part.link, part.ends)) for part in parts]
+    axes = np.array([[*joint.axis, float(joint.kind == "prismatic")] for joint in chain])
+    body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
+    has_meshes = any(shape.kind == "mesh" for shape in urdf.shapes)
+    pairs = _pairs(settings, body, has_meshes, tuning)
+    return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
+
+
+class _Part(NamedTuple):
+    """A capsule: the number of joints that move it, its ends (2, 3) [m], and its radius [m]."""
+
+    link: int
+    ends: Vector
+    radius: float
+
+
+def _parts(
+    settings: Settings, urdf: Urdf, chain: Sequence[UrdfJoint], frames: Vector
+) -> list[_Part]:
+    """The capsules of shapes, of links without a shape, and of the tool."""
+    names = settings.joints.names
+    parts: list[_Part] = []
     for shape in urdf.shapes:
         if shape.size:
             ends, radius = _capsule(shape)
             link, placed = _in_joint(urdf, names, shape.link, np.eye(3, 4))
-            parts.append((link, ends @ placed[:, :3].T + placed[:, 3], radius))
-    link, plate = _in_joint(urdf, names, settings.arm.plate, np.eye(3, 4))
-    covered = {number for number, _, _ in parts}
-    for number in range(len(chain) + 1):
-        if number not in covered:
-            end = frames[number][:, 3] if number < len(chain) else plate[:, 3]
-            parts.append((number, np.array([np.zeros(3), end]), settings.arm.link_radius))
-            # the guide of the next link
-            if number < len(chain) and chain[number].kind == "prismatic":
-                travel = np.outer(
-                    [chain[number].lower, chain[number].upper],
-                    frames[number][:, :3] @ chain[number].axis,
-                )
-                parts.append((number, end + travel, settings.arm.link_radius))
+            parts.append(_Part(link, ends @ placed[:, :3].T + placed[:, 3], radius))
+
+    radius = settings.arm.link_radius
+    plate_link, plate = _in_joint(urdf, names, settings.arm.plate, np.eye(3, 4))
+    covered = {part.link for part in parts}
+    for link in range(len(chain) + 1):
+        if link in covered:
+            continue
+        end = frames[link][:, 3] if link < len(chain) else plate[:, 3]
+        parts.append(_Part(link, np.array([np.zeros(3), end]), radius))
+        if link < len(chain) and chain[link].kind == "prismatic":  # the guide of the next link
+            joint = chain[link]
+            travel = np.outer([joint.lower, joint.upper], frames[link][:, :3] @ joint.axis)
+            parts.append(_Part(link, end + travel, radius))
+
     tool = np.array(settings.tool.plate_from_tool[:3])
     if math.hypot(*tool) > TOLERANCE:
-        parts.append(
-            (link, np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]]), settings.tool.radius)
-        )
-    parts.sort(key=lambda one: one[0])
-    capsules = structured(len(parts), CAPSULE)
-    capsules[:] = [
-        (number, ends, radius, _max_speed(settings, frames, number, ends))
-        for number, ends, radius in parts
-    ]
-    axes = np.array([[*joint.axis, float(joint.kind == "prismatic")] for joint in chain])
-    body = Body(np.ascontiguousarray(frames), axes, capsules, np.empty((0, 2), np.int64))
+        ends = np.array([plate[:, 3], plate[:, :3] @ tool + plate[:, 3]])
+        parts.append(_Part(plate_link, ends, settings.tool.radius))
+    return parts
+
+
+def _pairs(
+    settings: Settings, body: Body, has_meshes: bool, tuning: Tuning
+) -> list[tuple[int, int]]:
+    """The pairs of capsules that are kept apart, see `body_of`."""
     postures = np.array([settings.arm.posture, *_ends_of_motion(settings)])
-    placed = np.empty((len(postures), len(capsules), 2, 3))
+    placed = np.empty((len(postures), len(body.capsules), 2, 3))
     near = np.empty(9)
     for q, ends in zip(postures, placed, strict=True):
-        place(q, body.frames, body.axes, capsules, ends)
+        place(q, body.frames, body.axes, body.capsules, ends)
+
+    links = body.capsules["link"]
+    radii = body.capsules["radius"]
+    clearance_m = own_clearance(settings, tuning)
     pairs = []
-    meshes = any(shape.kind == "mesh" for shape in urdf.shapes)
-    links = capsules["link"]
-    radii = capsules["radius"]
     for i, j in itertools.combinations(range(len(links)), 2):
-        if links[j] - links[i] > 1:
-            gaps_m = [
-                between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed
-            ]
-            over = (
-                tuning.separation.planned_margin_m if meshes and links[j] - links[i] == 2 else 0.0
-            )
-            if gaps_m[0] > own_clearance(settings, tuning) + over and np.ptp(gaps_m) > TOLERANCE:
-                pairs.append((i, j))
-    return body._replace(pairs=np.array(pairs, np.int64).reshape(-1, 2))
+        between = links[j] - links[i]
+        if between <= 1:
+            continue
+        gaps_m = [between_segments(ends[i], ends[j], near) - radii[i] - radii[j] for ends in placed]
+        is_coarse = has_meshes and between == 2  # capsules exceed meshes
+        least_m = clearance_m + (tuning.separation.planned_margin_m if is_coarse else 0.0)
+        if gaps_m[0] > least_m and np.ptp(gaps_m) > TOLERANCE:
+            pairs.append((i, j))
+    return pairs
 
 
 def _max_speed(settings: Settings, frames: Vector, link: int, ends: Vector) -> float:
