@@ -1,5 +1,5 @@
-"""How the code reads, by folder: `python -m tests.support.air` prints shares of parallel assignments, of
-local names that say nothing, and of functions with many branches.
+"""How the code reads, by folder: `python -m tests.support.air` prints shares of parallel
+assignments, of local names that say nothing, and of functions with many branches.
 """
 
 from __future__ import annotations
