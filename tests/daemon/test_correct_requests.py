@@ -97,7 +97,7 @@ def test_a_correction_is_made_in_its_own_hold_alone(
     held: Cell, monkeypatch: pytest.MonkeyPatch, field: str, value: int
 ) -> None:
     """The hold ends while the correction is computed, and another one may have begun."""
-    monkeypatch.setattr(held.requests, "_keep", lambda file: held.state.__setitem__(field, value))
+    monkeypatch.setattr(held, "keep", lambda file: held.state.__setitem__(field, value))
     assert held.refusal("correct", ADD).startswith(
         "the hold ended while this was computed; nothing was changed"
     )

@@ -22,7 +22,7 @@ import pytest
 from support.cell import Daemon, serving
 from support.paths import ROOT
 from thirdhand.client import Client, UnreachableError, open_session
-from thirdhand.daemon.daemon import MAX_NOTES_PER_S
+from thirdhand.daemon.cell_state import MAX_NOTES_PER_S
 from thirdhand.daemon.single_instance import MAX_SESSIONS
 from thirdhand.process.priority import AHEAD_NICE
 

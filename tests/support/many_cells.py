@@ -12,11 +12,11 @@ import os
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from thirdhand.core.warm_up import warm_up
+from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.daemon import Daemon
 from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.daemon.start import starting
@@ -45,8 +45,8 @@ def main(folder: Path, endpoint: str, *cells: str) -> None:
             files=Files(state=str(folder)),
         )
         start = held.enter_context(starting(settings))
-        more: Any = {"skill_worker": skill_worker, "scribe": Scribe(settings), "start": start}
-        daemons.append(Daemon(settings, skill, skills=recordings(), **more))
+        state = CellState(settings, skill, Scribe(settings), start)
+        daemons.append(Daemon(state, skill_worker, recordings()))
     for daemon, cell in zip(daemons, cells, strict=True):
         say = threading.Thread(
             target=daemon.serve, args=(lambda _, cell=cell: os.write(1, f"{cell}\n".encode()),)

@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from support.statuses import holding
 from thirdhand.client import Client
 from thirdhand.contract import channels, requests
 from thirdhand.contract.records import Mode, Reason
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import Event
 from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.answers import Answers
+from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.queryables import Queryables
+from thirdhand.daemon.request_inbox import RequestInbox
 from thirdhand.daemon.single_instance import state_folder
 from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.settings.config import Files, Reach, Settings
@@ -27,7 +29,7 @@ VIA_POINTS = Scene().via_points()
 CELLS = (f"tests/cell{n}" for n in itertools.count())
 
 
-class Cell:
+class Cell(CellState):
     """Requests of one cell, a thread in the loop's place that drains their inbox, and a client."""
 
     def __init__(
@@ -44,6 +46,9 @@ class Cell:
         self.settings = Settings(
             cell=next(CELLS), files=Files(state=str(folder / "state")), reach=reach
         )
+        self.inbox = RequestInbox()
+        self.adoptable = {skill.digest: skill}
+        self.scribe = self.newest_status = self
         self.taken: list[Event] = []
         self.notes: list[str] = []
         self.kept: list[bytes] = []
@@ -54,20 +59,10 @@ class Cell:
         self._tick = 0
         self._end = threading.Event()
         self.failures: list[str] = []
-        tell = {
-            "status": lambda *, published: requests.encode_json(
-                holding(self.settings.cell, self._tick)
-            )
-        }
-        tell |= {"moment": lambda: (self.frame(), self.state)}
-        tell |= {
-            "note": self.notes.append,
-            "keep": self.kept.append,
-            "failed": self.failures.append,
-        }  # type: ignore[dict-item]
-        self.requests = Queryables(
-            self.settings, skill, skill_worker=skill_worker, skills=folder, **tell
-        )  # type: ignore[arg-type]
+        self.note = self.notes.append
+        self.keep = self.kept.append
+        self.fail = self.failures.append
+        self.requests = Queryables(self, Answers(self, skill_worker, folder))
         self._loop = threading.Thread(target=self._drain)
         self._loop.start()
         self.requests.open(near)
@@ -86,6 +81,38 @@ class Cell:
     def mode(self, mode: Mode) -> None:
         self.state["mode"] = mode
 
+    def moment(self) -> tuple[Any, Any]:
+        return self.frame(), self.state
+
+    def requested(self, *, published: bool) -> bytes:
+        return requests.encode_json(self.status())
+
+    def status(self) -> requests.Status:
+        none = requests.Percentiles()
+        numbers = {
+            "tick": self._tick,
+            "rate_hz": 500.0,
+            "missed": 0,
+            "realtime": False,
+            "memory_locked": False,
+            "rejected": {},
+            "hand_age_ms": {},
+            "hand_distance_m": 3.0,
+            "hand_limit_m_s": 1.5,
+            "scribe": {},
+        }
+        words = {
+            "cell": self.settings.cell,
+            "mode": "hold",
+            "reason": "no_hands",
+            "skill": "",
+            "version": "",
+        }
+        lists: dict[str, Any] = {"flags": (), "via_points": (), "endpoints": ()}
+        return requests.Status(
+            **words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none
+        )  # type: ignore[arg-type]
+
     def frame(self) -> dict[str, Any]:
         unseen = {
             "hand_ages": np.array((-1, -1)),
@@ -97,10 +124,10 @@ class Cell:
     def _drain(self) -> None:
         while not self._end.wait(0.0005):
             self._tick += 1
-            if self.running and self.requests.inbox:
-                events = self.requests.inbox.take(self.state)
+            if self.running and self.inbox:
+                events = self.inbox.take(self.state)
                 if self.fails:
-                    self.requests.inbox.answer(None)
+                    self.inbox.answer(None)
                     continue
                 for event in events:
                     self.taken.append(event)
@@ -108,7 +135,7 @@ class Cell:
                         self.state["skill"] = np.frombuffer(event.value.digest, np.uint8)
                     elif event.kind in ("hold", "resume"):
                         self.state["operator_hold"] = event.kind == "hold"
-                self.requests.inbox.answer(self.frame())  # type: ignore[arg-type]
+                self.inbox.answer(self.frame())  # type: ignore[arg-type]
 
     def refusal(self, suffix: str, request: Any) -> str:
         """The words in which a request is refused; bytes are sent as they are."""

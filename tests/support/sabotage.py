@@ -8,8 +8,7 @@ from pathlib import Path
 SABOTAGE = """
 import pathlib
 from thirdhand.core import controller
-from thirdhand.daemon import daemon
-from thirdhand.daemon import queryables
+from thirdhand.daemon import cell_state, daemon, queryables, status
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
     honest = getattr(owner, name)
@@ -21,11 +20,11 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
         return honest(*arguments, **more)
     setattr(owner, name, method)
 
-sabotaged(daemon.CellStatus, "status")
+sabotaged(status.CellStatus, "status")
 sabotaged(controller.Controller, "step")
 sabotaged(daemon, "outgoing")
 sabotaged(queryables.RequestQueue, "enqueue")
-sabotaged(daemon.Daemon, "note")
+sabotaged(cell_state.CellState, "note")
 """
 
 

@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,9 @@ def _run(args: argparse.Namespace) -> int:
 
         gc.freeze()  # no later collection visits what was imported
 
-        def announce(running: daemon.Daemon) -> None:
+        def announce(endpoints: Sequence[str]) -> None:
             where = (
-                ", ".join(running.endpoints)
+                ", ".join(endpoints)
                 or f"nothing, connected to {', '.join(settings.network.connect)}"
             )
             line = f"listening on {where} as cell {settings.cell}"

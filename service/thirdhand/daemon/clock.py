@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thirdhand.contract.requests import Percentiles
-from thirdhand.core.frame import Vector
+from thirdhand.core.frame import STAGES, Frame, Record, Vector, timed
 
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
 PREPARING_NS = 430_000  # the next tick is prepared within this time, which is that of a tick
@@ -31,6 +31,7 @@ CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is b
 _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
 FIFO_PRIORITY = 80  # priority of the loop
 BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
+MAX_LATENCY_MS = 1000.0  # a longer latency shows that the clocks differ
 
 
 class Deadlines:
@@ -153,7 +154,7 @@ class Granted(NamedTuple):
     """The requests of the loop that the operating system granted."""
 
     realtime: bool  # real-time scheduling of the thread
-    locked: bool  # memory pages of the process remain in memory once they are used
+    memory_locked: bool  # memory pages of the process remain in memory once they are used
 
 
 def ask_for_real_time() -> Granted:
@@ -218,4 +219,57 @@ class Window:
             return Percentiles()
         return Percentiles(
             *np.percentile(self._values[: self._count], (50, 99, 100)).round(3).tolist()
+        )
+
+
+class TickTimes:
+    """Lateness and work of the ticks of the last 10 s, the latency of the hands in them, and the
+    times at which the stages of the present tick ended. `begin`, `lap` and `end` are for the loop.
+    """
+
+    def __init__(self, rate_hz: int) -> None:
+        self.windows = {
+            name: Window(10 * rate_hz) for name in ("lateness_us", "work_us", "latency_ms")
+        }
+        self._late_ns = self._began_ns = 0
+        self._laps: list[tuple[str, int]] = []
+
+    def begin(self, late_ns: int) -> None:
+        """Note that a tick begins, this late [ns]."""
+        self._late_ns = late_ns
+        self._began_ns = time.perf_counter_ns()
+        self._laps = []
+
+    def lap(self, stage: str) -> None:
+        """Note that a stage of the tick ends."""
+        self._laps.append((stage, time.perf_counter_ns()))
+
+    def end(self, frame: Frame, clock: Deadlines) -> Record:
+        """The timing of the tick that decided this frame, as it is recorded."""
+        stages_us = dict.fromkeys(STAGES, 0.0)
+        before_ns = self._began_ns
+        for stage, at_ns in self._laps:
+            stages_us[stage] = (at_ns - before_ns) / 1e3
+            before_ns = at_ns
+
+        latency_ms = 0.0
+        if 0 in frame["hand_ages"].tolist():
+            since_stamp_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
+            if 0 <= since_stamp_ms < MAX_LATENCY_MS:
+                latency_ms = since_stamp_ms
+                self.windows["latency_ms"].add(latency_ms)
+
+        late_us = self._late_ns / 1e3
+        work_us = (time.perf_counter_ns() - self._began_ns) / 1e3
+        self.windows["lateness_us"].add(late_us)
+        self.windows["work_us"].add(work_us)
+        tick = int(frame["tick"])
+        return timed(
+            tick,
+            clock.stamp_ns,
+            clock.missed,
+            late_us,
+            work_us,
+            1e3 * latency_ms,
+            [*stages_us.values()],
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,14 +11,13 @@ from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import FAULT, HELD_SEEN, HOLD
 from thirdhand.core.frame import Frame, Record, Vector
 from thirdhand.core.geometry import quaternion_of
-from thirdhand.core.skill.skill import Skill
+from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.status import MAX_MEASURED_AGE_S
-from thirdhand.settings.config import Settings, robot_description
+from thirdhand.settings.config import robot_description
 
 MAX_LED_RADPS = 0.05  # an arm that moves faster than this is still being led
 NOT_HELD = "the arm does not hold for an operator; `thirdhand hold` first, or guide it by hand"
 HOLD_ENDED = "the hold ended while this was computed; nothing was changed. Hold again"
-Moment = tuple[Frame, Record]
 
 
 def held_since(state: Record) -> int:
@@ -32,11 +30,12 @@ def held_since(state: Record) -> int:
     return int(state["held_tick"])
 
 
-def check_same_hold(held_tick: int, state: Record) -> None:
-    """Raise RequestError unless the operator's hold that began at this tick lasts. The tool then
-    approaches a corrected target at the engaging speed.
+def check_same_hold(held_tick: int | None, state: Record) -> None:
+    """Raise RequestError unless the operator's hold that began at this tick lasts; None: never. The
+    tool then approaches a corrected target at the engaging speed.
     """
-    if state["mode"] != HOLD or not state["operator_hold"] or state["held_tick"] != held_tick:
+    is_held = state["mode"] == HOLD and state["operator_hold"] and state["held_tick"] == held_tick
+    if held_tick is not None and not is_held:
         raise RequestError(HOLD_ENDED)
 
 
@@ -58,22 +57,20 @@ class Corrections:
     correction replaced.
     """
 
-    def __init__(self, settings: Settings, moment: Callable[[], Moment]) -> None:
-        """`moment` gives the newest frame, and the state after it."""
-        self._settings = settings
-        self._moment = moment
+    def __init__(self, cell: CellState) -> None:
+        self._cell = cell
         self._arm: Arm | None = None
         self.replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
 
-    def led(self, request: Correct, skill: Skill) -> LedTool:
+    def led(self, request: Correct) -> LedTool:
         """The hands and the tool of a correction that is requested now. Raises RequestError."""
-        frame, state = self._moment()
+        frame, state = self._cell.moment()
         held_tick = held_since(state)
-        hands, segment = self._hands(request, skill, frame, state)
+        hands, segment = self._hands(request, frame, state)
         joints = np.array(state["joints"][0])
         if request.tool is not None:
             return LedTool(held_tick, hands, segment, np.array(request.tool), None, joints)
-        settings = self._settings
+        settings = self._cell.settings
         if settings.arm.source == "assumed":
             raise RequestError(
                 "$.tool: none given; needed, as this daemon does not measure where the arm is"
@@ -108,10 +105,9 @@ class Corrections:
             np.array(state["measured"]),
         )
 
-    def _hands(
-        self, request: Correct, skill: Skill, frame: Frame, state: Record
-    ) -> tuple[Vector, int]:
+    def _hands(self, request: Correct, frame: Frame, state: Record) -> tuple[Vector, int]:
         """The hands (6,) [m] and the segment of a correction. Raises RequestError."""
+        skill = self._cell.skill
         sides = (0, 1) if skill.conductor is None else (skill.conductor,)
         if request.hands == "held":
             if state["held"] != HELD_SEEN:

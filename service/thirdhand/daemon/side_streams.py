@@ -74,11 +74,16 @@ def side_streams(
     objects = SideStream(
         session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY]
     )
-    images = {key: functools.partial(record_image, key) for key in settings.recording.also}
     return [
         objects,
         *(
-            SideStream(session, key, take, arrivals[key], waiting=WAITING_IMAGES)
-            for key, take in images.items()
+            SideStream(
+                session,
+                key,
+                functools.partial(record_image, key),
+                arrivals[key],
+                waiting=WAITING_IMAGES,
+            )
+            for key in settings.recording.also
         ),
     ]

@@ -57,8 +57,7 @@ class CellStatus(NamedTuple):
         sources = self.sources
         settings = self.settings
         begun = int(frame["tick"]) >= 0
-        is_seen = frame["hand_ages"] >= 0
-        aimed = bool(frame["covariance"].any())
+        seen = frame["hand_ages"] >= 0
         skill = self.controller.skill
         mode, reason = outcome(frame)
         flags = Flag(int(frame["flags"]))
@@ -99,11 +98,11 @@ class CellStatus(NamedTuple):
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
-            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if is_seen[i]},
+            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
             below_table_m={
                 side: depth_m
                 for i, side in enumerate(SIDES)
-                if is_seen[i] and (depth_m := self._below_table_m(i))
+                if seen[i] and (depth_m := self._below_table_m(i))
             },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i]))
@@ -115,12 +114,8 @@ class CellStatus(NamedTuple):
             },
             tool_m=_point(frame["tool"]) if begun else None,
             setpoint_m=_point(frame["setpoint"]) if begun else None,
-            target_m=_point(frame["target"]) if aimed else None,
-            std_m=_std(frame["covariance"]) if aimed else None,
-            turn_off_rad=self._turned() if aimed else None,
-            turn_std_rad=(_std(frame["orientation_covariance"]) or None) if aimed else None,
+            **(self._prediction() if frame["covariance"].any() else {}),
             gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
-            closure=round(float(frame["closure"]), 3) if aimed and frame["closure"] >= 0 else None,
             segment=skill.model.names[frame["segment"] : frame["segment"] + 2]
             if frame["segment_belief"]
             else (),
@@ -128,8 +123,6 @@ class CellStatus(NamedTuple):
             task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
             if skill.model.clock and skill.model.clock.weight
             else None,
-            error_probability=round(float(frame["error_probability"]), 4) if aimed else None,
-            deviation_m=round(float(frame["gate_m"]), 5) if aimed else None,
             threshold_m=round(skill.threshold, 5),
             guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
             offer=offer_of(skill),
@@ -145,16 +138,23 @@ class CellStatus(NamedTuple):
         half_x, half_y = self.settings.table.half_size
         return round(max(0.0, -z), 4) if abs(x) < half_x and abs(y) < half_y else 0.0
 
-    def _turned(self) -> float:
-        """Angle between the tool and its target, or between their directions [rad]."""
-        tool = self.frame["tool_orientation"]
-        target = self.frame["orientation"]
-        return round(
-            float(
-                off_target(tool, target, direction=self.settings.tool.orientation == "direction")
-            ),
-            5,
+    def _prediction(self) -> dict[str, Any]:
+        """The fields of the status on the target and its uncertainty."""
+        frame = self.frame
+        tool = frame["tool_orientation"]
+        target = frame["orientation"]
+        turn_off_rad = off_target(
+            tool, target, direction=self.settings.tool.orientation == "direction"
         )
+        return {
+            "target_m": _point(frame["target"]),
+            "std_m": _std(frame["covariance"]),
+            "turn_off_rad": round(float(turn_off_rad), 5),
+            "turn_std_rad": _std(frame["orientation_covariance"]) or None,
+            "closure": round(float(frame["closure"]), 3) if frame["closure"] >= 0 else None,
+            "error_probability": round(float(frame["error_probability"]), 4),
+            "deviation_m": round(float(frame["gate_m"]), 5),
+        }
 
     def evidence(self) -> Evidence:
         """The figures of the incidents that may be explained."""
