@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from support.statuses import holding
 from thirdhand.client import Client
 from thirdhand.contract import channels, requests
 from thirdhand.contract.records import Mode, Reason
@@ -85,33 +86,7 @@ class Cell(CellState):
         return self.frame(), self.state
 
     def requested(self, *, published: bool) -> bytes:
-        return requests.encode_json(self.status())
-
-    def status(self) -> requests.Status:
-        none = requests.Percentiles()
-        numbers = {
-            "tick": self._tick,
-            "rate_hz": 500.0,
-            "missed": 0,
-            "realtime": False,
-            "memory_locked": False,
-            "rejected": {},
-            "hand_age_ms": {},
-            "hand_distance_m": 3.0,
-            "hand_limit_m_s": 1.5,
-            "scribe": {},
-        }
-        words = {
-            "cell": self.settings.cell,
-            "mode": "hold",
-            "reason": "no_hands",
-            "skill": "",
-            "version": "",
-        }
-        lists: dict[str, Any] = {"flags": (), "via_points": (), "endpoints": ()}
-        return requests.Status(
-            **words, **numbers, **lists, lateness_us=none, work_us=none, latency_ms=none
-        )  # type: ignore[arg-type]
+        return requests.encode_json(holding(self.settings.cell, self._tick))
 
     def frame(self) -> dict[str, Any]:
         unseen = {

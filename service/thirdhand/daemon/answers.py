@@ -123,9 +123,9 @@ class Answers:
     def _set_segment(self, request: SegmentRequest) -> Reply:
         names = self._cell.skill.model.names
         if request.name not in names:
-            known = ", ".join(names) or "none, as the skill was not learned between via-points"
+            listing = ", ".join(names) or "none, as the skill was not learned between via-points"
             raise RequestError(
-                f"$.name: no via-point {request.name!r} of the task. There are: {known}"
+                f"$.name: no via-point {request.name!r} of the task. There are: {listing}"
             )
         return _in_force_since(self._cell.inbox.send(order("segment", request.name)).wait())
 
@@ -146,8 +146,8 @@ class Answers:
             if name in request.names[:i]:
                 raise RequestError(f"$.names[{i}]: {name!r} given twice; each name once needed")
             if name not in points:
-                known = ", ".join(points) or "none"
-                raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {known}")
+                listing = ", ".join(points) or "none"
+                raise RequestError(f"$.names[{i}]: no via-point {name!r}; in force: {listing}")
         return self._teach(point for point in points.values() if point.name not in request.names)
 
     def _clear(self, _: Clear) -> Reply:
@@ -220,7 +220,7 @@ class Answers:
         skill = self._cell.skill
         if (point := newest_correction(skill.via_points)) is None:
             raise RequestError("no correction is in force")
-        others = (one for one in skill.via_points if one != point)
+        others = (via_point for via_point in skill.via_points if via_point != point)
         points = (*others, *self._corrections.replaced.get(point, ()))
         return self._adopt_at(point, points, held_tick, undone=True)
 
@@ -260,21 +260,23 @@ class Answers:
         settings = self._cell.settings
         distances_m = self._beyond_m(settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
-            given = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
+            position = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
             if point.segment not in (None, *(begins := skill.model.names[:-1])):
-                known = ", ".join(begins) or "none"
+                listing = ", ".join(begins) or "none"
                 raise RequestError(
                     f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments "
-                    f"begin at: {known}"
+                    f"begin at: {listing}"
                 )
             if not ((low <= point.tool) & (point.tool <= high)).all():
                 corners = " to ".join(
                     f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high)
                 )
-                raise RequestError(f"{given} outside the skill's workspace, {corners} m accepted")
+                raise RequestError(
+                    f"{position} outside the skill's workspace, {corners} m accepted"
+                )
             if distance_m > 0.0:
                 raise RequestError(
-                    f"{given} out of the arm's reach by {distance_m:.3f} m: {accepted(settings)}"
+                    f"{position} out of the arm's reach by {distance_m:.3f} m: {accepted(settings)}"
                 )
 
     def _adopt(
@@ -292,9 +294,9 @@ class Answers:
         """
         cell = self._cell
         distances_m = self._beyond_m(cell.settings, skill.tool_positions)
-        found = out_of_reach(skill, distances_m, cell.settings)
-        if is_loaded and found.is_refused:
-            raise RequestError(found.text)
+        finding = out_of_reach(skill, distances_m, cell.settings)
+        if is_loaded and finding.is_refused:
+            raise RequestError(finding.text)
         cell.scribe.keep(skill.file)
         before = cell.skill
         points = self._in_force(skill)
@@ -306,9 +308,10 @@ class Answers:
             with self._saved.replacing(skill):
                 frame = cell.inbox.send(adoption, *events, check=check).wait()
         except OSError as error:  # the skill is in force already
-            remark = f"{remark} the via-points end at a restart: they cannot be saved ({in_words(error)})".strip()
+            unsaved = f"the via-points end at a restart: they cannot be saved ({in_words(error)})"
+            remark = f"{remark} {unsaved}".strip()
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
-        remarks = filter(None, (remark, risk, found.text))
+        remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
 
 

@@ -57,7 +57,7 @@ class CellStatus(NamedTuple):
         sources = self.sources
         settings = self.settings
         begun = int(frame["tick"]) >= 0
-        seen = frame["hand_ages"] >= 0
+        is_seen = frame["hand_ages"] >= 0
         skill = self.controller.skill
         mode, reason = outcome(frame)
         flags = Flag(int(frame["flags"]))
@@ -98,11 +98,11 @@ class CellStatus(NamedTuple):
             hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
             hand_distance_m=round(float(frame["hand_distance"]), 4),
             hand_limit_m_s=round(float(frame["hand_limit"]), 4),
-            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if seen[i]},
+            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if is_seen[i]},
             below_table_m={
                 side: depth_m
                 for i, side in enumerate(SIDES)
-                if seen[i] and (depth_m := self._below_table_m(i))
+                if is_seen[i] and (depth_m := self._below_table_m(i))
             },
             demonstrated_m={
                 side: (_point(low[i]), _point(high[i]))
