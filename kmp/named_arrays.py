@@ -35,9 +35,19 @@ from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _NAMES = (
-    *("base_inputs", "base_mean", "base_covariance", "base_weights"),
-    *("via_inputs", "via_mean", "via_covariance", "replaced", "weights"),
-    *("ell", "lambda_mean", "lambda_covariance", "prior_mean"),
+    "base_inputs",
+    "base_mean",
+    "base_covariance",
+    "base_weights",
+    "via_inputs",
+    "via_mean",
+    "via_covariance",
+    "replaced",
+    "weights",
+    "ell",
+    "lambda_mean",
+    "lambda_covariance",
+    "prior_mean",
 )
 _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
@@ -45,9 +55,23 @@ KIND = "kind"
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
-        *(KMP, OrientationKMP, LocalKMP, CoordinateFrame, LinearConstraints, AffineMean),
-        *(Gaussians, GaussianMixture, GaussianKernel, VelocityKernel, PeriodicKernel),
-        *(Correlation, Improvement, Learned, Score, Uncertainty, MotionPrediction),
+        KMP,
+        OrientationKMP,
+        LocalKMP,
+        CoordinateFrame,
+        LinearConstraints,
+        AffineMean,
+        Gaussians,
+        GaussianMixture,
+        GaussianKernel,
+        VelocityKernel,
+        PeriodicKernel,
+        Correlation,
+        Improvement,
+        Learned,
+        Score,
+        Uncertainty,
+        MotionPrediction,
     )
 }
 

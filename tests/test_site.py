@@ -59,22 +59,19 @@ UNITS += (
     "_SPEEDS",
 )
 DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a primitive's inputs
-    *(
-        "MODE_PRIOR",
-        "TREMOR_DAMPING",
-        "MAX_INNOVATION",
-        "SEGMENT_DISTANCE",
-        "SEGMENT_DISTANCE_BESIDE",
-        "REST_SHARPNESS",
-    ),
-    *(
-        "ERROR_WIDTH",
-        "GRIPPER_OPEN_BELOW",
-        "STOP_SECANTS",
-        "PLANNED_BRAKE_LIMITS",
-        "MAX_SQUARED_DEVIATION",
-    ),
-    *("SUPPORT_MASS", "SUPPORT_SHARPNESS"),
+    "MODE_PRIOR",
+    "TREMOR_DAMPING",
+    "MAX_INNOVATION",
+    "SEGMENT_DISTANCE",
+    "SEGMENT_DISTANCE_BESIDE",
+    "REST_SHARPNESS",
+    "ERROR_WIDTH",
+    "GRIPPER_OPEN_BELOW",
+    "STOP_SECANTS",
+    "PLANNED_BRAKE_LIMITS",
+    "MAX_SQUARED_DEVIATION",
+    "SUPPORT_MASS",
+    "SUPPORT_SHARPNESS",
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 # of `thirdhand.client`, for the service's own programs

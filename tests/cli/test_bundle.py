@@ -83,15 +83,13 @@ def test_an_archive_holds_what_it_says_and_no_secret(
     files = unpacked(output)
     (recording,) = (name for name in files if name.startswith("recordings/"))
     assert set(files) == {
-        *(
-            "README.txt",
-            "status.json",
-            "doctor.txt",
-            "versions.txt",
-            "log.txt",
-            "settings.json",
-            recording,
-        ),
+        "README.txt",
+        "status.json",
+        "doctor.txt",
+        "versions.txt",
+        "log.txt",
+        "settings.json",
+        recording,
     }
     listed = [line.split(": ")[0] for line in printed.splitlines()[1:]]
     assert set(listed) == set(files) - {"README.txt"}

@@ -65,17 +65,15 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
 def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_path: Path) -> None:
     checks = lines(tmp_path, code=0)
     assert list(checks) == [
-        *(
-            "ok configuration",
-            "ok imports",
-            "ok arm",
-            "ok skill",
-            "ok state",
-            "ok descriptors",
-            "ok recordings",
-            "ok disk",
-            "ok port",
-        ),
+        "ok configuration",
+        "ok imports",
+        "ok arm",
+        "ok skill",
+        "ok state",
+        "ok descriptors",
+        "ok recordings",
+        "ok disk",
+        "ok port",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
 

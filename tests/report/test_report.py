@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from support.in_process import LEFT, RIGHT, arm, hand
+from support.recorded import thin
 from support.wam import URDF
 from support.wicked import wicked_skill
 from thirdhand.command_line import main
@@ -434,3 +435,19 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_s == pytest.approx(far_ticks * columns.period_s)
     assert report.lag_mm is not None
     assert report.lag_mm.largest < 200.0
+
+
+@pytest.mark.thorough
+def test_ages_of_hands_advance_between_recorded_frames(golden: Path, tmp_path: Path) -> None:
+    """At most by what passed since the last frame; seen and unseen hands are the same."""
+    whole = read(Recording.open(golden))
+    columns = read(Recording.open(thin(golden, tmp_path / "thin.mcap")))
+    assert np.array_equal(columns.frames["tick"], whole.frames["tick"])
+    ages = columns.frames["hand_ages"]
+    true_ages = whole.frames["hand_ages"]
+    assert np.array_equal(ages < 0, true_ages < 0)
+    off = ages - true_ages
+    assert off.min() >= 0
+    assert off.max() < 20  # a frame is recorded every 20 ticks
+    stale = whole.frames["stale_ticks"]
+    assert np.array_equal(ages < stale, true_ages < stale)

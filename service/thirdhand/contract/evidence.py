@@ -84,7 +84,8 @@ class Evidence(NamedTuple):
     sources: Mapping[str, Source] = MappingProxyType({})
     contested: float = 0.0  # accepted share of the arm's states that contradict the rest
     settings: Any = None  # of the cell
-    gate_m: Exceeded | None = None  # deviation from what the skill knows
+    # deviation from what the skill knows, and below which the hold ends
+    gate_m: Exceeded | None = None
     measure: str = ""  # the skill's name for that deviation
     outside: Outside | None = None
     inside: Inside | None = None
@@ -154,7 +155,7 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
             )
             closer = unit_advice(unit)
         case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
-            finding = "{} is {:.1f} cm, {:.1f} accepted".format(
+            finding = "{} is {:.1f} cm; the hold ends below {:.1f}".format(
                 seen.measure, *(100 * value for value in seen.gate_m)
             )
             if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:

@@ -10,7 +10,7 @@ from thirdhand.contract.records import Mode, Reason
 class Condition(enum.IntFlag):
     """Conditions of hands, arm and task that hold at a tick."""
 
-    HANDS = 1  # both hands are seen
+    HANDS_KNOWN = 1  # both hands have been seen, at least one of them just now
     ARM_HEARD = 2  # the arm has reported its joints recently
     ARM_STILL = 4  # the arm has reported the same posture for a while
     CONTESTED = 8  # two sources report the arm
@@ -81,7 +81,7 @@ class ClockTrust(enum.IntEnum):
 
 # The same codes as plain integers: compiled functions need them, and in Python each access to a
 # member of an enumeration takes a microsecond.
-HANDS_KNOWN = int(Condition.HANDS)
+HANDS_KNOWN = int(Condition.HANDS_KNOWN)
 ARM_HEARD = int(Condition.ARM_HEARD)
 ARM_STILL = int(Condition.ARM_STILL)
 CONTESTED = int(Condition.CONTESTED)

@@ -31,19 +31,23 @@ CLOSED_WITHIN_S = 2.0
 HEARTBEAT_S = 0.5
 DIAGNOSTIC_LEVELS = {"follow": 0, "hold": 1, "fault": 2}  # OK, WARN and ERROR of diagnostic_msgs
 DIAGNOSED = (
-    *(
-        "mode",
-        "reason",
-        "flags",
-        "tick",
-        "rate_hz",
-        "missed",
-        "realtime",
-        "lateness_us",
-        "work_us",
-        "latency_ms",
-    ),
-    *("hand_age_ms", "hand_distance_m", "rejected", "received", "skill", "segment", "version"),
+    "mode",
+    "reason",
+    "flags",
+    "tick",
+    "rate_hz",
+    "missed",
+    "realtime",
+    "lateness_us",
+    "work_us",
+    "latency_ms",
+    "hand_age_ms",
+    "hand_distance_m",
+    "rejected",
+    "received",
+    "skill",
+    "segment",
+    "version",
 )
 
 

@@ -172,7 +172,7 @@ class CellStatus(NamedTuple):
             },
             settings=settings,
             contested=TUNING.intake.contested_off_share,
-            gate_m=(float(self.frame["gate_m"]), skill.threshold),
+            gate_m=(float(self.frame["gate_m"]), TUNING.intake.end_share * skill.threshold),
             measure=skill.model.measure,
             outside=self._outside(),
             inside=self.inside,

@@ -388,7 +388,7 @@ def _note_correction(
 @compiled
 def report(states: Records, frames: Records, parameters: Records) -> int:
     """Copy the hands' estimates and ages into the frame. Returns the flags of `codes.Condition`
-    that the intake determines: HANDS, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL,
+    that the intake determines: HANDS_KNOWN, LEFT_UNSEEN or RIGHT_UNSEEN, ARM_HEARD, ARM_STILL,
     ARM_GUIDED, CONTESTED, CLUTCH_RELEASED.
     """
     frame = frames[0]
@@ -412,7 +412,7 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
 
 @compiled
 def _hand_conditions(frames: Records, parameters: Records) -> int:
-    """HANDS, LEFT_UNSEEN and RIGHT_UNSEEN, as they hold for the ages in the frame."""
+    """HANDS_KNOWN, LEFT_UNSEEN and RIGHT_UNSEEN, as they hold for the ages in the frame."""
     ages = frames[0].hand_ages
     stale = frames[0].stale_ticks
     is_any_seen = ages[0] < stale[0] or ages[1] < stale[1]

@@ -210,7 +210,10 @@ def _played_on_page(
             invite(url, address, browser=browser)
             report: dict[str, Any] = json.loads(
                 play(
-                    *("--tracked-hands", str(PLAY_S), "--wait", str(PAGE_WAIT_S)),
+                    "--tracked-hands",
+                    str(PLAY_S),
+                    "--wait",
+                    str(PAGE_WAIT_S),
                     say=heard,
                     begun=running.append,
                     timeout_s=PLAY_TIMEOUT_S,

@@ -12,6 +12,7 @@ from thirdhand.contract.evidence import Evidence, Explanation, explained
 from thirdhand.contract.incidents import ORDERS, input_name, word
 from thirdhand.contract.records import SIDES, Cause, Flag, Mode, Reason
 from thirdhand.contract.requests import Source
+from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.report.columns import Columns
 
 BEFORE_S = 1.0  # what happened in this time before a fault is listed
@@ -46,10 +47,11 @@ def _by_frame(columns: Columns, row: int) -> Explanation:
         for side, age_ms, limit_ms in zip(SIDES, ages_ms, stale_ms, strict=True)
     }
     skill = next((change.skill for change in reversed(columns.skills) if change.tick <= tick), None)
+    ends_m = 0.0 if skill is None else TUNING.intake.end_share * skill.threshold
     evidence = Evidence(
         sources=sources,
         settings=settings,
-        gate_m=None if skill is None else (float(frame["gate_m"]), skill.threshold),
+        gate_m=None if skill is None else (float(frame["gate_m"]), ends_m),
         measure="" if skill is None else skill.model.measure,
         failure=next(
             (

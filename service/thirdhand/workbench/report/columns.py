@@ -28,37 +28,31 @@ from thirdhand.recordings.steps import Gap, Step
 from thirdhand.skills.skill_file import SkillError, decoded
 
 KEPT = (
-    *(
-        "tick",
-        "hands",
-        "hand_velocities",
-        "target",
-        "gate_m",
-        "setpoint",
-        "setpoint_velocity",
-        "setpoint_acceleration",
-    ),
-    *(
-        "tool",
-        "joints",
-        "joint_velocities",
-        "joint_accelerations",
-        "hand_distance",
-        "hand_limit",
-        "hand_ages",
-    ),
+    "tick",
+    "hands",
+    "hand_velocities",
+    "target",
+    "gate_m",
+    "setpoint",
+    "setpoint_velocity",
+    "setpoint_acceleration",
+    "tool",
+    "joints",
+    "joint_velocities",
+    "joint_accelerations",
+    "hand_distance",
+    "hand_limit",
+    "hand_ages",
     "stale_ticks",
-    *(
-        "rejected",
-        "mode",
-        "reason",
-        "flags",
-        "commanded",
-        "segment",
-        "segment_belief",
-        "error_probability",
-        "closure",
-    ),
+    "rejected",
+    "mode",
+    "reason",
+    "flags",
+    "commanded",
+    "segment",
+    "segment_belief",
+    "error_probability",
+    "closure",
 )
 MOTION = (
     "setpoint",
@@ -216,7 +210,8 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
     """Give `frames` a row for each of the ticks, whose frames may be left out of the recording.
 
     Such a row has the newest frame's decisions, as frames that change a decision are recorded. The
-    arm's motion is interpolated up to the next frame, and other numbers if that decides the same.
+    arm's motion is interpolated up to the next frame, and other numbers if that decides the same;
+    the hands' ages advance.
     """
     frames = found.frames
     parts = np.zeros(len(ticks), np.int64)
@@ -245,7 +240,24 @@ def _fill(found: Columns, ticks: NDArray[np.int64]) -> None:
             to = frames[name][after]
             share = motion if name in MOTION else motion * alike
             found.frames[name] += share.reshape(-1, *(1,) * (values.ndim - 1)) * (to - values)
+    found.frames["hand_ages"] = _ages_between(
+        frames["hand_ages"][row],
+        np.where(part_of[row] == part_of[after], end - ticks, 0)[:, None],
+        frames["hand_ages"][after],
+        (ticks - begin)[:, None],
+    )
     found.frames["tick"] = ticks
+
+
+def _ages_between(ages: Any, until: Any, later_ages: Any, elapsed: Any) -> Any:
+    """Ages (T, 2) [ticks] of the hands' newest samples, `elapsed` ticks after a frame with `ages`
+    and `until` ticks before one with `later_ages`; -1: none yet.
+
+    Of the samples between the two frames, only the last one is known.
+    """
+    by_later = later_ages - until
+    by_earlier = np.where(ages < 0, -1, ages + elapsed)
+    return np.where((later_ages >= 0) & (until > 0) & (by_later >= 0), by_later, by_earlier)
 
 
 def _take_events(found: Columns, step: Step, followed: int) -> None:

@@ -19,18 +19,18 @@ from thirdhand.contract.requests import Reply, Status
 MAX_STATUS_BYTES = 262_144  # a daemon's has 3 to 10 kB, and more with many via-points
 _COMMAND = re.compile(rf"(by |before )?thirdhand ({'|'.join(ORDERS)})")
 SHOWN_FIELDS = (
-    *(
-        "mode",
-        "reason",
-        "because",
-        "hands_m",
-        "tool_m",
-        "target_m",
-        "std_m",
-        "segment",
-        "segment_belief",
-    ),
-    *("demonstrated_m", "hands_at_m", "trackers"),
+    "mode",
+    "reason",
+    "because",
+    "hands_m",
+    "tool_m",
+    "target_m",
+    "std_m",
+    "segment",
+    "segment_belief",
+    "demonstrated_m",
+    "hands_at_m",
+    "trackers",
 )
 
 

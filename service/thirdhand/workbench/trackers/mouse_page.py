@@ -69,7 +69,9 @@ class MousePage(HandsPage):
             return answer(200, "The task ends.")
 
         super().__init__(
-            *(tracker, client, latest),
+            tracker,
+            client,
+            latest,
             **served,
             more=[web.get("/task", show), web.post("/end", end)] if task else (),
             colours=json.dumps(PAGE_COLOURS),
