@@ -188,7 +188,7 @@ def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session
         "thirdhand resume",
     )
     far = re.fullmatch(
-        r"the distance of a hand from its paths is (.*) cm, 11.0 accepted",
+        r"the distance of a hand from its paths is (.*) cm; the hold ends below 8.8",
         held[Reason.FAR_FROM_DEMONSTRATIONS].why,
     )
     assert far is not None
