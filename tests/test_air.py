@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+
 import pytest
 
-from support.air import FOLDERS, air_of
+from support.air import FOLDERS, ROOT, air_of
 
 MAX_PARALLEL = 0.5  # [%]
 MAX_VAGUE = 0.5  # [%]
@@ -18,3 +20,15 @@ def test_code_has_air(folder: str) -> None:
     assert parallel <= MAX_PARALLEL, air.parallel
     assert vague <= MAX_VAGUE, air.vague
     assert branchy <= MAX_BRANCHY[folder], air.branchy
+
+
+def test_names_of_tests_have_60_characters_at_most() -> None:
+    """The docstring says the rest."""
+    names = [
+        node.name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    ]
+    assert len(names) > 1000
+    assert [name for name in names if len(name) > 60] == []

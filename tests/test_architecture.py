@@ -256,9 +256,10 @@ def test_a_process_of_a_cell_imports_what_it_needs(
 
 
 @pytest.mark.parametrize("path", ENTRY_POINTS, ids=named)
-def test_an_entry_point_asks_for_one_blas_thread_before_all_but_the_standard_library(
+def test_entry_points_ask_for_one_blas_thread_first(
     path: Path,
 ) -> None:
+    """An entry point asks for one blas thread before all but the standard library."""
     imports = (
         node
         for node in ast.parse(path.read_text(encoding="utf-8")).body
@@ -333,7 +334,8 @@ def test_a_class_or_constant_has_a_name_of_its_own() -> None:
     assert {name: places for name, places in modules.items() if len(places) > 1} == {}
 
 
-def test_tests_share_what_stands_in_support_and_never_import_each_other() -> None:
+def test_tests_share_support_and_never_import_each_other() -> None:
+    """Tests share what stands in support and never import each other."""
     tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
     theirs = {
         path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")

@@ -50,7 +50,8 @@ def busy_processor() -> Iterator[int]:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processes cannot be pinned here")
-def test_a_failure_on_a_busy_processor_counts_only_if_it_comes_again(tmp_path: Path) -> None:
+def test_failure_on_a_busy_processor_must_repeat(tmp_path: Path) -> None:
+    """A failure on a busy processor counts only if it comes again."""
     (tmp_path / "test_both.py").write_text(TESTS)
     with busy_processor() as processor:
         options = [

@@ -31,9 +31,8 @@ def instruction(name: str) -> list[str]:
     return list(json.loads(re.findall(rf"^{name} .*?(\[.*\])$", IMAGE, re.MULTILINE)[-1]))
 
 
-def test_the_image_installs_this_distribution_as_tested_and_runs_its_commands_without_rights() -> (
-    None
-):
+def test_image_installs_this_distribution_and_runs() -> None:
+    """The image installs this distribution as tested and runs its commands without rights."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = re.findall(r'"/source\[(.*?)\]"', IMAGE)[0].split(",")
     assert set(extras) <= set(project["optional-dependencies"])
@@ -64,7 +63,8 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
         assert sorted(wheel.namelist()) == sorted(whole.namelist())
 
 
-def test_the_services_are_commands_of_this_version_and_reach_each_other() -> None:
+def test_services_reach_each_other() -> None:
+    """The services are commands of this version and reach each other."""
     services = COMPOSE["services"]
     configs = COMPOSE["configs"]
     cell, metrics = (parser().parse_args(services[name]["command"]) for name in ("cell", "metrics"))

@@ -114,9 +114,8 @@ def cells_below(text: str, head: str) -> list[list[str]]:
     ("page", "head", "least"),
     [("faults.md", "fault", len(MEASURED) + 10), ("bounds.md", "bound", 10)],
 )
-def test_each_promise_has_its_tests_in_the_appendix_and_they_exist(
-    page: str, head: str, least: int
-) -> None:
+def test_promises_of_the_appendix_have_tests(page: str, head: str, least: int) -> None:
+    """Each promise has its tests in the appendix and they exist."""
     promises = [
         row[0] for row in cells_below((ROOT / "docs" / page).read_text(encoding="utf-8"), head)
     ]
@@ -174,7 +173,8 @@ def test_the_table_of_topics_is_that_of_the_ros2_node() -> None:
     ]
 
 
-def test_the_layout_for_foxglove_shows_topics_and_fields_that_a_recording_has() -> None:
+def test_foxglove_layout_shows_existing_topics() -> None:
+    """The layout for foxglove shows topics and fields that a recording has."""
     layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text(encoding="utf-8"))
     fields = {
         topic("thirdhand", name): {field.name for field in fields}
@@ -239,7 +239,8 @@ TABLES = {
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_options_settings_and_files_that_a_page_names_exist(page: Path) -> None:
+def test_names_on_a_page_exist(page: Path) -> None:
+    """Commands options settings and files that a page names exist."""
     text = page.read_text(encoding="utf-8")
     code = re.findall(r"```(?:sh|console)\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL)
     for name, arguments in re.findall(

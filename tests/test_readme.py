@@ -23,9 +23,10 @@ def program() -> str:
     return str(programs[0])
 
 
-def test_the_program_runs_as_it_stands_by_the_client_alone_and_the_service_follows_its_hands(
+def test_program_runs_as_it_stands_by_the_client_alone(
     tmp_path: Path,
 ) -> None:
+    """The program runs as it stands by the client alone and the service follows its hands."""
     assert len([line for line in program().splitlines() if line]) <= 10
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
     with serving(tmp_path, "--joints", "assumed") as daemon:
@@ -68,7 +69,8 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
     assert math.dist(before, after) > 0.1
 
 
-def test_the_environment_is_activated_before_the_first_bare_command() -> None:
+def test_environment_is_activated_before_a_bare_command() -> None:
+    """The environment is activated before the first bare command."""
     lines = [
         line
         for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL)

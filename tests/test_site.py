@@ -105,7 +105,8 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
     )
 
 
-def test_each_tuned_number_has_a_unit_a_meaning_and_a_range_around_its_value() -> None:
+def test_tuned_numbers_have_unit_meaning_and_range() -> None:
+    """Each tuned number has a unit a meaning and a range around its value."""
     page = program("tuning_page")
     numbers = [number for segment in page.STAGES for number in page.numbers_of(segment)]
     assert len(numbers) > 70
@@ -126,7 +127,8 @@ def test_the_page_lists_each_tuned_number_that_is_data() -> None:
     assert set(sensitivity.numbers()) <= listed
 
 
-def test_the_page_on_the_command_line_has_every_command_and_option() -> None:
+def test_page_on_the_command_line_is_complete() -> None:
+    """The page on the command line has every command and option."""
     written = written_by("command_line_page")
     commands = {name for names in GROUPS.values() for name in names}
     assert set(re.findall(r"^## thirdhand ([\w-]+)$", written, re.MULTILINE)) == commands
@@ -139,7 +141,8 @@ def test_the_page_on_the_command_line_has_every_command_and_option() -> None:
         assert text in written
 
 
-def test_the_pages_on_python_are_those_of_the_docstrings_and_have_every_name() -> None:
+def test_pages_on_python_are_those_of_the_docstrings() -> None:
+    """The pages on python are those of the docstrings and have every name."""
     for page, written in program("library_page").pages().items():
         assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
         module = {"library": kmp, "client": client}[page.stem]
@@ -192,7 +195,8 @@ def test_the_figures_of_the_experiments_are_those_of_the_results() -> None:
         assert page.read_text(encoding="utf-8") == text, "run `python docs/experiments_page.py`"
 
 
-def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() -> None:
+def test_figure_without_a_result_is_an_error() -> None:
+    """A figure without a result is an error and a stale result is marked."""
     page = program("experiments_page")
     options = {"share": 1.0, "arm": "wam", "set": "test"}
     results: dict[str, dict[str, Any]] = {
@@ -228,7 +232,8 @@ def test_a_figure_without_a_result_is_an_error_and_a_stale_result_is_marked() ->
         written("{{ separation.tremor }}")
 
 
-def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them() -> None:
+def test_errors_with_and_without_jumps_are_shown() -> None:
+    """Errors against a truth without jumps are shown beside those with them."""
     page = program("experiments_page")
     results: dict[str, dict[str, Any]] = {
         name: page.result_of(page.RESULTS, name) for name in EXPERIMENTS
@@ -261,7 +266,8 @@ def test_errors_against_a_truth_without_jumps_are_shown_beside_those_with_them()
     assert "the gain is at most 1.25, and 1.12 at the tool" in " ".join(text.split())
 
 
-def test_names_and_programs_for_users_of_other_libraries_exist_and_run() -> None:
+def test_programs_for_users_of_other_libraries_run() -> None:
+    """Names and programs for users of other libraries exist and run."""
     text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
     cells = [line.strip("| ").split("|")[-1] for line in text.splitlines() if line.startswith("| ")]
     names = {name for cell in cells for name in re.findall(r"`([A-Za-z]\w*(?:\.\w+)*)[`(]", cell)}
@@ -275,7 +281,8 @@ def test_names_and_programs_for_users_of_other_libraries_exist_and_run() -> None
         exec(block, {})
 
 
-def test_each_setting_has_words_or_a_unit_beside_it_in_the_source() -> None:
+def test_each_setting_has_words_or_a_unit() -> None:
+    """Each setting has words or a unit beside it in the source."""
     rows = [line for line in written_by("settings_page").splitlines() if line.startswith("| `")]
     assert len(rows) > 40
     assert [row for row in rows if row.endswith("|  |")] == []

@@ -44,7 +44,8 @@ def test_it_holds_service_bench_and_recordings_and_nothing_else(wheel: Path) -> 
     assert [name for name in held if name.endswith(("golden.mcap", ".png", ".webp", ".svg"))] == []
 
 
-def test_how_to_cite_it_is_told_with_its_version_and_the_papers_it_follows(wheel: Path) -> None:
+def test_citation_names_version_and_papers(wheel: Path) -> None:
+    """How to cite it is told with its version and the papers it follows."""
     citation = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text(encoding="utf-8"))
     assert f"-{citation['version']}-" in wheel.name
     paper, article = citation["preferred-citation"], *citation["references"]
@@ -74,9 +75,10 @@ def test_nothing_in_it_needs_the_lab(wheel: Path) -> None:
     assert [name for name, text in texts.items() if lab.search(text)] == []
 
 
-def test_its_page_has_the_readmes_text_without_pictures_and_links_of_the_repository(
+def test_page_of_the_package_has_the_readmes_text(
     wheel: Path,
 ) -> None:
+    """Its page has the readmes text without pictures and links of the repository."""
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(
             next(name for name in archive.namelist() if name.endswith("/METADATA"))

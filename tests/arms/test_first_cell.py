@@ -60,9 +60,8 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.one_case
-def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(
-    name: str, tmp_path: Path
-) -> None:
+def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
+    """A first cell meets the demos places with a posture over the table."""
     where, plate = ARMS[name]
     path = where()
     proposal = proposed(path, plate=plate)
@@ -92,9 +91,10 @@ def test_a_first_cell_meets_the_demos_places_with_a_posture_over_the_table(
     assert max(run.errors_mm) < 15.0, run.errors_mm
 
 
-def test_accelerations_follow_from_velocities_and_less_where_efforts_are_small(
+def test_accelerations_follow_from_velocities_and_efforts(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
+    """Accelerations follow from velocities and less where efforts are small."""
     text = (SHIPPED / "ur5.urdf").read_text()
     moving = Urdf(text).movable("tool0")
     acceleration, jerk, by_effort = rates(text, moving)

@@ -149,14 +149,16 @@ fault_error_rad = 0.5
 
 
 @pytest.mark.thorough
-def test_a_daemon_killed_in_motion_leaves_an_arm_at_rest_that_follows_the_next(
+def test_arm_rests_when_its_daemon_is_killed(
     tmp_path: Path,
 ) -> None:
+    """A daemon killed in motion leaves an arm at rest that follows the next."""
     killed_and_started_again(tmp_path, "simulated", PATIENT)
 
 
 @simulated
-def test_a_franka_keeps_its_limits_while_daemons_are_killed_and_started(tmp_path: Path) -> None:
+def test_franka_keeps_its_limits_while_daemons_are_killed(tmp_path: Path) -> None:
+    """A franka keeps its limits while daemons are killed and started."""
     network = franka_toml().replace("[arm]\n", "[arm]\nsilent_ms = 1000\nfault_error_rad = 0.5\n")
     with robot(tmp_path) as device:
         killed_and_started_again(
@@ -217,9 +219,8 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("program", ["follow", "sim"])
 @pytest.mark.one_case
-def test_a_rate_that_leaves_no_room_to_brake_is_refused_in_one_sentence(
-    program: str, tmp_path: Path
-) -> None:
+def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> None:
+    """A rate that leaves no room to brake is refused in one sentence."""
     with serving(tmp_path, "--rate", "50") as daemon, Tracker(daemon.session):
         done = thirdhand(
             program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint

@@ -156,7 +156,7 @@ restarts = st.tuples(
     st.none() | restarts,
 )
 @pytest.mark.one_case
-def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
+def test_limits_hold_whatever_network_and_clocks_do(
     limits: JointSettings,
     period: float,
     wishes: list[tuple[tuple[float, ...], int]],
@@ -165,6 +165,7 @@ def test_every_limit_holds_whatever_network_daemons_and_clocks_do(
     hostile: list[tuple[float, Command]],
     restart: tuple[int, int, float, float] | None,
 ) -> None:
+    """Every limit holds whatever network daemons and clocks do."""
     wishes_radps = np.array([value for value, count in wishes for _ in range(count)])
     commands = motion(wishes_radps)
     arriving = [*sent(commands, late), *(Sent(*pair) for pair in hostile)]
@@ -194,7 +195,8 @@ def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, whic
     assert "finite" in playback.reason or "limit" in playback.reason
 
 
-def test_a_jump_within_the_limits_is_refused_and_the_motion_goes_on() -> None:
+def test_jump_within_the_limits_is_refused() -> None:
+    """A jump within the limits is refused and the motion goes on."""
     commands = motion(sway(1.0))
     jumping = [
         Sent(message.at_s, message.command._replace(position=tuple(AT)))
@@ -218,7 +220,8 @@ def test_another_number_of_joints_is_refused_and_named() -> None:
 # --- silence -------------------------------------------------------------------------------------
 
 
-def test_without_commands_it_brakes_after_20_ms_and_as_fast_as_the_limits_allow() -> None:
+def test_it_brakes_20_ms_after_the_last_command() -> None:
+    """Without commands it brakes after 20 ms and as fast as the limits allow."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     commands = motion(np.full((400, 7), 0.5))
     written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
@@ -246,9 +249,10 @@ def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
     [(0.0, 0.0, True), (0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.1, False)],
 )
 @pytest.mark.parametrize("at_start", [True, False])
-def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
+def test_after_silence_only_what_begins_at_the_arm_is_followed(
     off: float, speed: float, followed: bool, at_start: bool
 ) -> None:
+    """After silence it follows only what begins where the arm stands."""
     assert REJOIN_RAD == 0.05
     playback = Playback(COMMANDED, AT, period_s=0.001)
     arm = AT
@@ -264,7 +268,7 @@ def test_after_silence_it_follows_only_what_begins_where_the_arm_stands(
     assert followed or "begin where the arm stands" in playback.reason
 
 
-def test_what_a_network_held_back_does_not_move_an_arm_that_stopped() -> None:
+def test_late_commands_do_not_move_a_stopped_arm() -> None:
     """Half a second of motion comes at once, half a second late."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     commands = motion(sway(1.5))
@@ -355,7 +359,8 @@ def test_a_clock_that_is_set_does_not_change_the_pace(
     assert farthest_rad(written, arriving, 0.001) < 0.003
 
 
-def test_a_daemon_of_another_rate_that_takes_over_is_followed_at_its_own() -> None:
+def test_daemon_of_another_rate_is_followed() -> None:
+    """A daemon of another rate that takes over is followed at its own."""
     playback = Playback(STRONG, AT, period_s=0.001)
     first = at_rate(250, 1.0)
     stands = play(playback, first, 1.5, 0.001).position[-1]
@@ -365,7 +370,8 @@ def test_a_daemon_of_another_rate_that_takes_over_is_followed_at_its_own() -> No
 
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 66])
-def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_hz: int) -> None:
+def test_commands_without_room_to_brake_are_refused(rate_hz: int) -> None:
+    """Commands that leave no room to brake are refused and move nothing."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     assert (play(playback, at_rate(rate_hz, 2.0), 2.0, 0.001).position == AT).all()
     period = f"{1000 / rate_hz:.0f} ms"
@@ -376,7 +382,8 @@ def test_commands_that_leave_no_room_to_brake_are_refused_and_move_nothing(rate_
     )
 
 
-def test_commands_whose_stamps_tell_no_length_of_a_tick_are_refused() -> None:
+def test_commands_without_a_tick_length_are_refused() -> None:
+    """Commands whose stamps tell no length of a tick are refused."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     unstamped = [
         message._replace(command=message.command._replace(stamp_ns=0))
@@ -417,9 +424,10 @@ def behind(written: Written, commands: Sequence[Command], period: float) -> tupl
         (0.006, 0.1, 0.016, 6e-3, 2.0),
     ],
 )
-def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as_commanded(
+def test_delay_error_and_smoothness_under_jitter(
     period: float, jitter_s: float, lost: float, delay_s: float, off_rad: float, share: float
 ) -> None:
+    """It is late by what jitter needs hardly off beside that and as smooth as commanded."""
     rng = np.random.default_rng(3)
     commands = motion(sway(6.0))
     late_s = np.where(
@@ -437,7 +445,7 @@ def test_it_is_late_by_what_jitter_needs_hardly_off_beside_that_and_as_smooth_as
 
 
 @pytest.mark.parametrize("share", [0.97, 1.03])
-def test_a_loop_that_is_slow_or_fast_keeps_pace_by_the_time_between_its_steps(share: float) -> None:
+def test_slow_and_fast_loops_keep_pace(share: float) -> None:
     """A step is taken each 0.97 or 1.03 ms, by a drive whose period is 1 ms."""
     commands = motion(sway(6.0))
     playback = Playback(STRONG, AT, period_s=0.001)
@@ -487,7 +495,8 @@ def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.03
 
 
-def test_the_delay_grows_at_once_with_jitter_and_shrinks_again_without() -> None:
+def test_delay_grows_with_jitter_and_shrinks_again() -> None:
+    """The delay grows at once with jitter and shrinks again without."""
     rng = np.random.default_rng(5)
     commands = motion(sway(6.0))
     late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))

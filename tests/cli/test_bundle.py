@@ -142,7 +142,8 @@ def test_only_what_may_be_secret_is_left_out_of_a_text(text: str, left: str) -> 
     assert without_keys(text) == left
 
 
-def test_without_a_daemon_the_archive_says_so_and_has_the_newest_recording(tmp_path: Path) -> None:
+def test_bundle_without_a_daemon_says_so(tmp_path: Path) -> None:
+    """Without a daemon the archive says so and has the newest recording."""
     config = tmp_path / "bench.toml"
     output = tmp_path / "bundle.tar.gz"
     config.write_text(CELL.format(folder=tmp_path, secret=SECRET))

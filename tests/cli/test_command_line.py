@@ -53,9 +53,8 @@ def test_one_thing_has_one_word_and_an_example(command: str) -> None:
 @pytest.mark.parametrize(
     "command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")]
 )
-def test_an_endpoint_without_all_its_parts_is_told_with_what_was_meant(
-    given: str, meant: str, command: tuple[str, ...]
-) -> None:
+def test_incomplete_endpoint_is_explained(given: str, meant: str, command: tuple[str, ...]) -> None:
+    """An endpoint without all its parts is told with what was meant."""
     done = told(*command, given)
     assert (done.returncode, done.stderr.rstrip().endswith(f": {meant} ?")) == (2, True), (
         done.stderr
@@ -65,9 +64,10 @@ def test_an_endpoint_without_all_its_parts_is_told_with_what_was_meant(
 # --- exit codes, as docs/incidents.md promises them -----------------------------------------------
 
 
-def test_a_configuration_that_cannot_be_meant_is_2_and_one_that_cannot_be_read_is_1(
+def test_exit_codes_of_bad_configurations(
     tmp_path: Path,
 ) -> None:
+    """A configuration that cannot be meant is 2 and one that cannot be read is 1."""
     config = tmp_path / "cell.toml"
     takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
     config.write_text("rate_hz = 3\n")
@@ -185,9 +185,10 @@ def folder(
 
 
 @pytest.mark.parametrize(("code", "words", "command"), REFUSED)
-def test_what_cannot_be_done_is_refused_with_the_promised_exit_code_and_writes_nothing(
+def test_refusals_have_their_exit_code_and_write_nothing(
     code: int, words: str, command: str, folder: Path
 ) -> None:
+    """What cannot be done is refused with the promised exit code and writes nothing."""
     before = sorted(folder.rglob("*"))
     done = assert_refused(code, words.format_map(PATHS), *shlex.split(command.format_map(PATHS)))
     assert "Traceback" not in done.stderr
@@ -196,9 +197,10 @@ def test_what_cannot_be_done_is_refused_with_the_promised_exit_code_and_writes_n
     assert sorted(folder.rglob("*")) == before
 
 
-def test_a_view_without_a_screen_is_refused_before_anything_is_drawn(
+def test_view_without_a_screen_is_refused_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """A view without a screen is refused before anything is drawn."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     done = told("view", str(RECORDINGS / "golden.mcap"))
@@ -239,7 +241,8 @@ def test_so_are_those_of_a_process(
 
 
 @pytest.mark.thorough
-def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
+def test_silence_is_reported_and_waited_for() -> None:
+    """That nobody listens is said and who is silent is waited for."""
     done = thirdhand("status", "--connect", "tcp/bench.invalid:1")
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(
@@ -252,9 +255,10 @@ def test_that_nobody_listens_is_said_and_who_is_silent_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
-def test_what_publishes_waits_for_a_daemon_until_it_is_interrupted(
+def test_publishers_wait_for_a_daemon(
     command: tuple[str, ...],
 ) -> None:
+    """What publishes waits for a daemon until it is interrupted."""
     with started(*command, *NOBODY) as process:
         assert process.stderr.readline().startswith(
             "waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1"

@@ -59,9 +59,10 @@ def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
 
 @timed
 @pytest.mark.timeout(330)
-def test_the_task_succeeds_in_new_places_and_its_recording_replays_identically(
+def test_task_succeeds_in_new_places_and_replays(
     tmp_path: Path,
 ) -> None:
+    """The task succeeds in new places and its recording replays identically."""
     (tmp_path / "scene.toml").write_text(SCENE)
     report = demonstrated(
         "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")
@@ -107,9 +108,10 @@ open(sys.argv[2], "a").write(f"{web.urlopen(viewer).status} {status}\\n")
 @timed
 @pytest.mark.thorough
 @pytest.mark.timeout(330)
-def test_the_live_view_of_a_demo_is_open_in_the_browser_before_the_arm_moves(
+def test_live_view_of_a_demo_is_open_before_the_arm_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The live view of a demo is open in the browser before the arm moves."""
     (tmp_path / "browser.py").write_text(BROWSER)
     monkeypatch.setenv(
         "BROWSER", f"{sys.executable} {tmp_path / 'browser.py'} %s {tmp_path / 'opened'}"
@@ -202,9 +204,10 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
         ("the arm held", "1 of 9000 ticks are not recorded", 1),
     ],
 )
-def test_a_demo_fails_by_a_missed_event_and_by_missing_ticks_alone(
+def test_demo_fails_by_a_missed_event_or_missing_ticks(
     why: str | None, missing: str, code: int
 ) -> None:
+    """A demo fails by a missed event and by missing ticks alone."""
     report = report_of(None, None, why, missing=missing)
     assert exit_code(report) == code
     printed = text(report)

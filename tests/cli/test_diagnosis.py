@@ -75,7 +75,8 @@ def source(name: str, **changed: Any) -> dict[str, Source]:
     return HEALTHY.sources | {name: msgspec.structs.replace(HEALTHY.sources[name], **changed)}
 
 
-def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
+def test_healthy_cell_has_no_findings() -> None:
+    """Of a healthy cell nothing is wrong and everything is told."""
     diagnosis = diagnosed()
     assert {finding.level for finding in diagnosis} == {"ok"}
     subjects = {finding.what for finding in diagnosis}
@@ -92,7 +93,7 @@ def test_of_a_healthy_cell_nothing_is_wrong_and_everything_is_told() -> None:
     }
 
 
-def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
+def test_hand_below_the_table_shows_a_wrong_calibration() -> None:
     """Only if it is there all the time, and deeper than a hand's noise."""
     below = {"right": 0.05, "left": 0.01}
     (text,) = wrongs(diagnosed(msgspec.structs.replace(HEALTHY, below_table_m=below)))
@@ -224,9 +225,10 @@ def test_a_hand_below_the_table_shows_that_the_calibration_is_off() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_named_with_what_is_wanted_and_what_to_do(
+def test_findings_name_what_is_wrong_and_what_to_do(
     changed: dict[str, Any], what: str, words: tuple[str, ...]
 ) -> None:
+    """What is wrong is named with what is wanted and what to do."""
     lines = [
         finding.text()
         for finding in diagnosed(**changed)
@@ -249,7 +251,8 @@ def test_what_need_not_be_mended_is_a_note() -> None:
     assert "wrong" not in levels.values()
 
 
-def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_near() -> None:
+def test_hidden_latency_is_unknown_and_lost_hands_are_not_near() -> None:
+    """A latency that clocks hide is unknown and hands that are gone are not near."""
     ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
     assert (
         rows(ahead)["latency"]
@@ -263,7 +266,8 @@ def test_a_latency_that_clocks_hide_is_unknown_and_hands_that_are_gone_are_not_n
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
 
 
-def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() -> None:
+def test_causes_come_before_their_effects() -> None:
+    """What is wrong comes first and causes before what follows from them."""
     silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
     diagnosis = diagnosed(
         mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False
@@ -278,9 +282,8 @@ def test_what_is_wrong_comes_first_and_causes_before_what_follows_from_them() ->
     assert [level for level, _ in ranked] == sorted((level for level, _ in ranked), reverse=True)
 
 
-def test_a_joint_that_does_not_go_where_it_is_told_is_named_before_the_fault_that_it_makes() -> (
-    None
-):
+def test_stuck_joint_is_named_before_its_fault() -> None:
+    """A joint that does not go where it is told is named before the fault that it makes."""
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
     lines = wrongs(
         diagnosed(
@@ -341,9 +344,10 @@ def test_the_lag_of_the_arm_is_reported_with_what_to_do(
     ],
     ids=["silent", "error", "nothing comes", "clock", "ahead"],
 )
-def test_a_machine_that_is_too_busy_is_named_before_arm_network_and_clock(
+def test_busy_machine_is_named_before_arm_and_network(
     changed: dict[str, Any],
 ) -> None:
+    """A machine that is too busy is named before arm network and clock."""
     words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
     first, *others = wrongs(diagnosed(busy=words, **changed))
     assert first.startswith(f"wrong  machine            too busy: {words}")
@@ -374,7 +378,8 @@ def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
     assert np.allclose(turned, [0, 0, 1], atol=1e-4)
 
 
-def test_hands_that_slide_over_the_table_are_of_no_tracker_whose_y_points_up() -> None:
+def test_hands_on_the_table_do_not_mean_that_y_points_up() -> None:
+    """Hands that slide over the table are of no tracker whose y points up."""
     inside = [((0.8, -0.3 + shift_m, 0.1), (0.9, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
     outside = [((1.4, -0.3 + shift_m, 0.1), (1.4, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
     assert not any(

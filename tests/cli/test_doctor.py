@@ -165,9 +165,10 @@ def test_a_cell_with_ones_own_arm_and_tracker(
         assert "nothing listens on 127.0.0.1 port" in capsys.readouterr().out
 
 
-def test_a_port_that_is_no_daemons_is_told_from_one_that_is_closed(
+def test_foreign_port_is_distinguished_from_a_closed_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """A port that is no daemons is told from one that is closed."""
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -187,9 +188,10 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
     assert "give the name of the cell by --cell" in output
 
 
-def test_a_daemon_that_is_there_but_does_not_answer_is_told_from_none(
+def test_silent_daemon_is_distinguished_from_none(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """A daemon that is there but does not answer is told from none."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = occupy(near, "lab")
         reach = ["--connect", endpoints(near)[0], "--cell", "lab"]

@@ -80,8 +80,7 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
         ("$XDG_CONFIG_HOME/x and ${y} cost 3 $.", "$XDG_CONFIG_HOME/x and ${y} cost 3 $."),
     ],
 )
-def test_a_path_in_json_is_named_as_in_a_file_except_in_what_was_given(
-    text: str, words: str
-) -> None:
+def test_path_in_json_is_named_as_in_a_file(text: str, words: str) -> None:
+    """A path in json is named as in a file except in what was given."""
     assert in_file(text) == words
     assert in_file(words) == words

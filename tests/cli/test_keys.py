@@ -20,7 +20,8 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("given", INPUTS)
-def test_enter_is_heard_where_there_is_an_input_and_never_awaited(given: str) -> None:
+def test_enter_is_heard_only_where_there_is_an_input(given: str) -> None:
+    """Enter is heard where there is an input and never awaited."""
     closes = (lambda: os.close(0)) if given == "closed" else None
     done = python(WAITS, input="\n" if given == "a line" else "", preexec_fn=closes)
     assert (done.stdout.strip(), done.stderr) == (INPUTS[given], "")

@@ -54,7 +54,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     assert not out.exists()
 
 
-def test_a_skill_with_a_residual_risk_is_written_and_names_who_accepts_it(tmp_path: Path) -> None:
+def test_skill_with_a_residual_risk_names_who_accepts_it(tmp_path: Path) -> None:
     """Fine motion of one hand, which a noisy tracker hardly tells."""
     takes = [tmp_path / f"fine-{seed}.mcap" for seed in range(4)]
     for seed, path in enumerate(takes):

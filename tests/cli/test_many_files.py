@@ -59,9 +59,10 @@ def named_failures(errors: str) -> list[str]:
     "command", [("replay", "--each", "--exact"), ("report",)], ids=["replay", "report"]
 )
 @pytest.mark.one_case
-def test_two_workers_print_what_one_process_prints_and_a_broken_file_stops_neither(
+def test_two_workers_print_what_one_process_prints(
     command: tuple[str, ...], files: list[str]
 ) -> None:
+    """Two workers print what one process prints and a broken file stops neither."""
     alone = told(*command, *files)
     assert alone.returncode == 1
     assert [

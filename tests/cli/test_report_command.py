@@ -20,9 +20,10 @@ def rows(path: Path) -> list[list[str]]:
 
 
 @pytest.mark.thorough
-def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
+def test_two_recordings_are_compared_on_a_page(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Two recordings are told of side by side on a page and in files."""
     page = tmp_path / "report.html"
     folder = tmp_path / "tables"
     assert (
@@ -82,9 +83,10 @@ def test_two_recordings_are_told_of_side_by_side_on_a_page_and_in_files(
     assert float(row["tool[2]"]) == pytest.approx(float(frames[5000]["tool"][2]), rel=1e-6)
 
 
-def test_many_recordings_have_a_row_each_and_totals_by_cell_and_week(
+def test_many_recordings_have_a_row_each_and_totals(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Many recordings have a row each and totals by cell and week."""
     files = [tmp_path / f"thirdhand-20261128-1200{number:02}.mcap" for number in range(12)]
     for file in files:
         file.symlink_to(golden)

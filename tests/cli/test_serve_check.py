@@ -62,7 +62,8 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
     return checks
 
 
-def test_a_cell_that_can_start_is_ok_in_each_line_and_nothing_is_written(tmp_path: Path) -> None:
+def test_check_of_a_good_cell_writes_nothing(tmp_path: Path) -> None:
+    """A cell that can start is ok in each line and nothing is written."""
     checks = lines(tmp_path, code=0)
     assert list(checks) == [
         "ok configuration",
@@ -213,9 +214,10 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
     assert done.stdout.count(f"{tmp_path} cannot be written by user") == 2, done.stdout
 
 
-def test_beside_the_running_daemon_its_own_port_is_fine_and_a_fault_has_an_exit_code(
+def test_check_beside_the_running_daemon(
     tmp_path: Path,
 ) -> None:
+    """Beside the running daemon its own port is fine and a fault has an exit code."""
     listen = f"tcp/127.0.0.1:{free_port()}"
     network = f"[network]\nlisten = ['{listen}']\n"
     sabotage = SABOTAGE.format(folder=str(tmp_path))

@@ -121,9 +121,8 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
 @pytest.mark.skipif(
     chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium"
 )
-def test_a_browser_shows_mode_and_reason_and_its_buttons_hold_and_resume(
-    page: Page, tmp_path: Path
-) -> None:
+def test_browser_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
+    """A browser shows mode and reason and its buttons hold and resume."""
     with chromium.opened(page.url, tmp_path, size=(1200, 600), timeout_s=TIMEOUT_S) as tab:
 
         def click(name: str, *, until: str) -> Any:

@@ -137,12 +137,13 @@ def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["hold", "status"])
-def test_a_query_that_is_lost_is_asked_again_if_nothing_is_done_twice(
+def test_lost_query_is_repeated_if_that_is_safe(
     daemon: zenoh.Session,
     session: zenoh.Session,
     answering: Callable[[str, Answer], None],
     suffix: str,
 ) -> None:
+    """A query that is lost is asked again if nothing is done twice."""
     lost: list[zenoh.Query] = []
     client = Client(session, "bench", timeout_s=2.0)
     with daemon.declare_queryable("bench/resume", lost.append):
@@ -193,9 +194,10 @@ def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[]
         relay.__exit__()
 
 
-def test_status_via_points_and_hold_survive_a_connection_that_breaks_before_the_answer(
+def test_requests_survive_a_broken_connection(
     breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
 ) -> None:
+    """Status via points and hold survive a connection that breaks before the answer."""
     session, cut = breaking
     asked: list[str] = []
 
@@ -219,9 +221,10 @@ def test_status_via_points_and_hold_survive_a_connection_that_breaks_before_the_
     assert asked == ["bench/status"] * 2 + ["bench/hold"] * 2 + ["bench/via_points"] * 3
 
 
-def test_an_order_whose_answer_is_lost_may_have_been_carried_out_and_is_not_repeated(
+def test_order_with_a_lost_answer_is_not_repeated(
     breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
 ) -> None:
+    """An order whose answer is lost may have been carried out and is not repeated."""
     session, cut = breaking
     resumed: list[str] = []
 
@@ -244,9 +247,7 @@ def test_an_order_whose_answer_is_lost_may_have_been_carried_out_and_is_not_repe
     assert len(resumed) == 3
 
 
-def test_an_answer_of_a_daemon_once_known_needs_no_further_question(
-    daemon: zenoh.Session, session: zenoh.Session
-) -> None:
+def test_known_daemon_is_not_asked_again(daemon: zenoh.Session, session: zenoh.Session) -> None:
     """Its token may be out of sight at the moment of the answer, which is no less true."""
     with daemon.declare_queryable(
         "bench/status", lambda query: query.reply(query.key_expr, encoded)

@@ -24,9 +24,10 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "thirdhand" / "client.toml"
 
 
-def test_an_option_goes_before_the_environment_the_file_and_the_default(
+def test_option_goes_before_environment_file_and_default(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """An option goes before the environment the file and the default."""
     assert (client_settings().cell, client_settings().connect) == ("thirdhand", ())
     file.write_text(
         'connect = "tcp/127.0.0.1:1"\ncell = "filed"\ncertificate = "secrets/operator"\n'
@@ -46,9 +47,10 @@ def test_an_option_goes_before_the_environment_the_file_and_the_default(
     )
 
 
-def test_the_certificate_of_a_client_is_not_that_of_a_daemon_without_one(
+def test_certificate_of_a_client_is_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The certificate of a client is not that of a daemon without one."""
     monkeypatch.setenv("THIRDHAND_CERTIFICATE", str(tmp_path / "secrets"))
     open_session(listen=["tcp/127.0.0.1:0"], certificate=Settings().network.certificate).close()
     with pytest.raises(UnreachableError, match=r"cannot read .*secrets/certificate\.pem"):

@@ -71,7 +71,8 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(
     assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [warning]
 
 
-def test_a_slow_loop_knows_what_its_queue_dropped_and_message_numbers_may_wrap_around() -> None:
+def test_slow_loop_counts_what_its_queue_dropped() -> None:
+    """A slow loop knows what its queue dropped and message numbers may wrap around."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         publisher = session.declare_publisher("thirdhand/clutch")
         true = channels.BY_KEY["clutch"].codec.encode(True)

@@ -345,9 +345,10 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
                 call()
 
 
-def test_a_watch_yields_in_order_none_in_silence_and_skips_what_is_not_readable(
+def test_watch_yields_in_order_and_none_in_silence(
     cell: Connection, listener: zenoh.Session
 ) -> None:
+    """A watch yields in order none in silence and skips what is not readable."""
     encode = channels.BY_KEY["tool/setpoint"].codec.encode
     poses = [PoseStamped(n, "base", (0.0, 0.0, float(n)), (0.0, 0.0, 0.0, 1.0)) for n in range(3)]
     with cell.watch("tool/setpoint", timeout_s=0.2) as watch:

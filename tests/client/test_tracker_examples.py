@@ -51,7 +51,8 @@ Head pose:, 0, 0, 0, 0, 0, 0, 1
 KEYS = {"left": "hands/left", "right": "hands/right"}
 
 
-def test_an_object_of_vicon_is_a_hand_in_metres_and_one_that_is_not_seen_is_none() -> None:
+def test_object_of_vicon_is_a_hand_in_metres() -> None:
+    """An object of vicon is a hand in metres and one that is not seen is none."""
     ((key, pose),) = example("vicon_hands").poses(VICON, KEYS, 9)
     assert (key, pose[:3]) == ("hands/left", (9, "vicon", (0.1, -0.2, 0.3)))
     np.testing.assert_allclose(
@@ -67,7 +68,7 @@ def test_other_bytes_are_no_packet_of_vicon(packet: bytes) -> None:
         list(example("vicon_hands").poses(packet, KEYS, 9))
 
 
-def test_a_wrist_of_the_streamer_is_a_hand_whose_axes_are_right_handed() -> None:
+def test_wrist_of_the_streamer_is_right_handed() -> None:
     """A mirrored rotation turns mirrored points to where the mirrored turned points are."""
     ((key, pose),) = example("hts_hands").poses(HTS, 9)
     assert (key, pose[:3]) == ("hands/left", (9, "hts", (0.1, 1.2, -0.5)))
@@ -88,9 +89,8 @@ def test_a_wrist_without_seven_numbers_is_refused(values: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "frame"), [("vicon_hands", "vicon"), ("hts_hands", "hts")])
-def test_the_program_publishes_what_it_receives_and_goes_on_after_nonsense(
-    name: str, frame: str
-) -> None:
+def test_example_publishes_what_it_receives(name: str, frame: str) -> None:
+    """The program publishes what it receives and goes on after nonsense."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -65,9 +65,10 @@ def test_poses_are_the_bytes_of_another_implementation(
 @given(
     stamps, st.sampled_from(FRAMES) | texts, three, four, st.lists(finite, min_size=36, max_size=36)
 )
-def test_poses_with_covariance_are_the_bytes_of_another_implementation(
+def test_poses_with_covariance_have_the_bytes_of_rosbags(
     stamp_ns: int, frame: str, position: Any, orientation: Any, covariance: list[float]
 ) -> None:
+    """Poses with covariance are the bytes of another implementation."""
     message = messages.PoseWithCovarianceStamped(
         stamp_ns, frame, position, orientation, tuple(covariance)
     )
@@ -225,7 +226,8 @@ def test_transforms_are_the_bytes_of_another_implementation(
         ]
 
 
-def test_the_frames_of_a_message_are_read_each_with_its_own_stamp_and_parent() -> None:
+def test_each_frame_of_a_message_has_its_stamp_and_parent() -> None:
+    """The frames of a message are read each with its own stamp and parent."""
     stamped = ROS.types["geometry_msgs/msg/TransformStamped"]
     transform = ROS.types["geometry_msgs/msg/Transform"]
     vector = ROS.types["geometry_msgs/msg/Vector3"]

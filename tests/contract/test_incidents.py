@@ -79,9 +79,10 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (0.02, "jumped", "states of the arm were rejected as jumped: elbow from 1 to 2 rad"),
     ],
 )
-def test_an_arm_error_amid_states_that_contradict_each_other_is_explained_by_two_drivers(
+def test_contradicting_states_are_explained_by_two_drivers(
     busy: str, share: float, cause: str, told: str
 ) -> None:
+    """An arm error amid states that contradict each other is explained by two drivers."""
     arm = Source(
         rate_hz=500.0, fresh=True, contested=share, cause=cause, refused="elbow from 1 to 2 rad"
     )

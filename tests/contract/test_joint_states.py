@@ -31,9 +31,8 @@ STATE = JointState(1, NAMES, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
         ),
     ],
 )
-def test_a_velocity_that_is_not_measured_is_zero_and_all_else_is_as_given(
-    message: JointState, velocity: tuple[float, ...]
-) -> None:
+def test_unmeasured_velocity_is_zero(message: JointState, velocity: tuple[float, ...]) -> None:
+    """A velocity that is not measured is zero and all else is as given."""
     assert measured(message, NAMES) == ((1.0, 2.0, 3.0), velocity)
 
 
@@ -49,7 +48,8 @@ def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
     return JointState(stamp_ns, tuple(names), (value,) * len(names), (NAN,) * len(names))
 
 
-def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_comes() -> None:
+def test_messages_without_joints_of_the_arm_are_ignored() -> None:
+    """Messages without joints of the arm are ignored and named once no state comes."""
     states = JointStates(NAMES, 0.1)
     fingers = part("xy", 1)
     for k in range(300):
@@ -65,7 +65,8 @@ def test_messages_without_joints_of_the_arm_are_ignored_and_named_once_no_state_
 
 
 @pytest.mark.parametrize("split", ["a bc", "c ba", "a b c", "ab bc ca", "ax by cz"])
-def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(split: str) -> None:
+def test_partial_publishers_give_states_at_the_slowest_rate(split: str) -> None:
+    """Publishers of some joints each give states at the slowest one s rate."""
     states = JointStates(NAMES, 0.1)
     samples = []
     parts = split.split()
@@ -88,7 +89,8 @@ def test_publishers_of_some_joints_each_give_states_at_the_slowest_one_s_rate(sp
     assert len(set(stamps)) == len(stamps) or split == "ab bc ca"
 
 
-def test_a_publisher_that_ends_ends_the_states_and_its_joints_are_named() -> None:
+def test_joints_of_a_publisher_that_ended_are_named() -> None:
+    """A publisher that ends ends the states and its joints are named."""
     states = JointStates(NAMES, 0.1)
     for k in range(400):
         at_s = k / 1000
@@ -121,7 +123,8 @@ def test_a_stamp_that_does_not_advance_shows_in_the_state() -> None:
     assert stamps == {7}
 
 
-def test_a_joint_without_a_measured_position_is_taken_from_who_measures_it() -> None:
+def test_joint_without_a_position_comes_from_its_publisher() -> None:
+    """A joint without a measured position is taken from who measures it."""
     states = JointStates(NAMES, 0.1)
     assert states.take(part("ab", 1, value=NAN), 0.0) is None
     assert states.take(part("bc", 1), 0.0) is None

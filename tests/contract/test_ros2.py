@@ -50,7 +50,8 @@ def test_the_hashes_of_the_types_are_those_of_ros2(store: Stores) -> None:
     }
 
 
-def test_every_stream_has_a_topic_with_a_key_and_a_token_as_others_make_them() -> None:
+def test_every_stream_has_the_key_and_token_of_rmw_zenoh() -> None:
+    """Every stream has a topic with a key and a token as others make them."""
     topics = [ros2.of_channel(CELL, channel) for channel in (*ros2.HEARD, *ros2.SAID)]
     topics += ros2.of_settings(NAMED)
     tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
@@ -185,9 +186,8 @@ def test_what_rides_with_a_message_is_read_by_others() -> None:
         ("a/", False),
     ],
 )
-def test_a_cell_that_ros2_cannot_name_is_refused_with_a_domain_and_only_then(
-    cell: str, ok: bool
-) -> None:
+def test_cell_name_is_checked_only_with_a_ros2_domain(cell: str, ok: bool) -> None:
+    """A cell that ros2 cannot name is refused with a domain and only then."""
     assert ros2.is_name(cell) == ok
     if cell.endswith("/"):
         return

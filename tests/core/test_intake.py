@@ -181,7 +181,8 @@ def test_bursts_extend_the_stale_time(stale_max_ms: float, most: int) -> None:
     assert (stale == 0) == (stale_max_ms > 0.0)
 
 
-def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
+def test_clock_set_back_locks_a_hand_out_until_stale_only() -> None:
+    """A clock set back locks a hand out until it is stale only."""
     hands = Hands()
     hands.hand(5_000_000_000)
     for stamp in range(49):
@@ -196,7 +197,8 @@ def test_a_clock_set_back_locks_a_hand_out_until_it_is_stale_only() -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [110_000_000, 10**9, 3600 * 10**9, 2**62, 2**63 - 1])
-def test_a_stamp_from_the_future_is_refused_and_locks_no_source_out(ahead_ns: int) -> None:
+def test_stamp_from_the_future_locks_no_source_out(ahead_ns: int) -> None:
+    """A stamp from the future is refused and locks no source out."""
     hands = Hands()
     hands.hand(0, side=RIGHT)  # repeated: the same as none
     for tick in range(1, 60):

@@ -40,7 +40,8 @@ def run_in(root: Path, command: str) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_cell_is_restored_from_its_backup_by_the_commands_of_the_page(tmp_path: Path) -> None:
+def test_cell_is_restored_by_the_commands_of_the_page(tmp_path: Path) -> None:
+    """A cell is restored from its backup by the commands of the page."""
     backup = commands("Back up")
     restore = commands("Restore")
     assert len(backup) + len(restore) <= 4

@@ -105,7 +105,8 @@ def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
     return stamps_ns
 
 
-def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None:
+def test_stamps_grow_by_the_time_between_deadlines() -> None:
+    """Stamps grow by what lies between deadlines whatever is missed."""
     clock = FakeClock(oversleep_ns=300_000)
     deadlines = clock.deadlines()
     assert set(np.diff(stamps(clock, deadlines, 10))) == {PERIOD_NS}
@@ -117,7 +118,8 @@ def test_stamps_grow_by_what_lies_between_deadlines_whatever_is_missed() -> None
     assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000
 
 
-def test_stamps_grow_while_a_system_clock_that_was_set_back_catches_up() -> None:
+def test_stamps_grow_while_a_set_back_clock_catches_up() -> None:
+    """Stamps grow while a system clock that was set back catches up."""
     clock = FakeClock()
     deadlines = clock.deadlines()
     before = stamps(clock, deadlines, 5)[-1]
@@ -129,7 +131,8 @@ def test_stamps_grow_while_a_system_clock_that_was_set_back_catches_up() -> None
     assert abs(after[-1] - clock.wall_ns()) < STEP_NS
 
 
-def test_stamps_are_drawn_to_a_system_clock_that_drifts_without_a_jump() -> None:
+def test_stamps_follow_a_drifting_clock_without_a_jump() -> None:
+    """Stamps are drawn to a system clock that drifts without a jump."""
     clock = FakeClock()
     deadlines = clock.deadlines()
     stamps(clock, deadlines, 5)
@@ -141,7 +144,7 @@ def test_stamps_are_drawn_to_a_system_clock_that_drifts_without_a_jump() -> None
     assert abs(deadlines.stamp_ns - clock.wall_ns()) < 1_000_000
 
 
-def test_a_machine_that_was_suspended_has_missed_nothing_and_its_stamps_follow_at_once() -> None:
+def test_suspended_machine_has_missed_nothing() -> None:
     """The monotonic clock stands still meanwhile, and the system clock does not."""
     clock = FakeClock()
     deadlines = clock.deadlines()
@@ -173,7 +176,8 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
     assert [(k, text) for k, text in enumerate(reports) if text] == [(50, words)]
 
 
-def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -> None:
+def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
+    """The next tick is prepared where there is time and the deadline kept."""
     clock = FakeClock()
     prepared = []
     start = clock.now
@@ -194,9 +198,10 @@ def test_the_next_tick_is_prepared_where_there_is_time_and_the_deadline_kept() -
     assert len(prepared) == 1
 
 
-def test_work_beside_the_loop_is_done_while_the_loop_sleeps_for_long_enough(
+def test_work_beside_the_loop_is_done_while_it_sleeps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Work beside the loop is done while the loop sleeps for long enough."""
     monkeypatch.setattr(clock_module, "NO_TICK_S", 60.0)
     clock = FakeClock()
     deadlines = clock.deadlines()

@@ -95,7 +95,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     assert any("handover" in note for note in notes)
 
 
-def test_all_samples_that_arrive_within_a_tick_are_taken_up_to_four(tmp_path: Path) -> None:
+def test_at_most_four_samples_a_tick_are_taken(tmp_path: Path) -> None:
     """They are recorded in their order, and replayed identically."""
     records = tmp_path / "records"
     period_ns = 20_000_000
@@ -164,9 +164,10 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
         assert daemon.end() == 0
 
 
-def test_a_request_to_many_keys_at_once_is_refused_by_all_but_the_status(
+def test_request_to_many_keys_is_refused(
     shared_daemon: Any,
 ) -> None:
+    """A request to many keys at once is refused by all but the status."""
     shared_daemon.client.ask("hold")
     replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
     assert sum(reply.ok is not None for reply in replies) == 1
@@ -250,7 +251,8 @@ def test_a_via_point_is_taught_from_where_hands_and_tool_are(
     shared_daemon.client.ask("resume")
 
 
-def test_where_the_tool_is_is_told_by_the_joints_while_the_arm_tells_them(skill: Skill) -> None:
+def test_position_of_the_tool_comes_from_the_joints(skill: Skill) -> None:
+    """Where the tool is is told by the joints while the arm tells them."""
     settings = Settings()
     urdf = robot_description(Settings())
     controller = Controller(settings, skill, urdf=urdf)

@@ -35,9 +35,8 @@ def measured(seconds: float, rate_hz: float, at: tuple[float, ...] = LEFT, seed:
 
 @pytest.mark.parametrize("unit_m", [1.0, 1e-3])
 @pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
-def test_each_loss_of_a_tracked_hand_is_noticed_after_half_a_second(
-    rate_hz: float, unit_m: float
-) -> None:
+def test_loss_of_a_tracked_hand_is_noticed(rate_hz: float, unit_m: float) -> None:
+    """Each loss of a tracked hand is noticed after half a second."""
     lost = round(2.0 * rate_hz)
     # the last pose again and again, or one of the tracker's own
     for default in (None, (0.25, -0.25, 0.1)):

@@ -59,7 +59,8 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
     assert watched.machine.now == ""
 
 
-def test_it_is_the_cause_of_what_time_decides_and_of_nothing_else() -> None:
+def test_busy_machine_is_the_cause_of_timing_incidents_only() -> None:
+    """It is the cause of what time decides and of nothing else."""
     evidence = Evidence(busy="the loop was up to 45 ms late")
     for reason in Reason:
         blamed = explained(reason, evidence).why.startswith(

@@ -22,7 +22,8 @@ SOURCES = {"hands/left": "left hand", "hands/right": "right hand", "joints/state
 
 @pytest.mark.timeout(120)
 @pytest.mark.thorough
-def test_malformed_messages_of_every_stream_are_counted_and_named(tmp_path: Path) -> None:
+def test_malformed_messages_are_counted_by_stream(tmp_path: Path) -> None:
+    """Malformed messages of every stream are counted and named."""
     keys = {key: channels.key("thirdhand", key) for key in HEARD} | {"camera": "camera"}
     with serving(tmp_path, "--joints", "state", network=EVERY_INPUT) as daemon:
         before = daemon.client.status()

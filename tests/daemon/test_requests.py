@@ -89,7 +89,8 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
     assert cell.taken[0].value.via_points == VIA_POINTS
 
 
-def test_a_reply_warns_of_a_via_point_that_is_missed_and_only_then(cell: Cell) -> None:
+def test_reply_warns_of_a_missed_via_point(cell: Cell) -> None:
+    """A reply warns of a via point that is missed and only then."""
     assert cell.client.add(VIA_POINTS).warnings == ()
     tool = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
     reply = cell.client.ask("via_points", add(point(name="loose", tool=tool, std=0.2)))
@@ -122,9 +123,8 @@ def test_via_points_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
     assert cell.names() == []
 
 
-def test_via_points_in_force_whose_file_cannot_be_replaced_are_reported(
-    cell: Cell, skill: Skill
-) -> None:
+def test_unsaved_via_points_are_reported(cell: Cell, skill: Skill) -> None:
+    """Via points in force whose file cannot be replaced are reported."""
     SavedViaPoints(cell.settings).path(skill).mkdir(parents=True)
     (warning,) = cell.client.add(VIA_POINTS).warnings
     assert warning.startswith("the via-points end at a restart: they cannot be saved (")
@@ -231,9 +231,10 @@ def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) ->
 
 
 @pytest.mark.parametrize("name", ["soldering", "soldering.npz"])
-def test_a_skill_is_loaded_by_name_and_via_points_stay_with_what_they_were_taught_to(
+def test_skill_is_loaded_by_name_and_keeps_its_via_points(
     cell: Cell, skill: StoredSkill, name: str
 ) -> None:
+    """A skill is loaded by name and via points stay with what they were taught to."""
     cell.client.add(VIA_POINTS)
     assert len(cell.client.load_skill(name).points or ()) == len(VIA_POINTS)
     other = with_file(replace(skill, learned_from="other demonstrations"))
@@ -345,12 +346,13 @@ def test_the_segment_of_the_task_is_told_by_client_and_command(
     assert cell.kinds()[-3:] == ["segment"] * 3
 
 
-def test_a_skill_out_of_reach_is_refused_and_one_of_which_a_part_is_comes_with_a_warning(
+def test_skill_out_of_reach_is_refused(
     sessions: tuple[zenoh.Session, zenoh.Session],
     skill: StoredSkill,
     skill_worker: SkillWorker,
     tmp_path: Path,
 ) -> None:
+    """A skill out of reach is refused and one of which a part is comes with a warning."""
     positions = skill.tool_positions
     half = Reach(min_x=float(np.quantile(positions[:, 0], 0.4)))  # 40 % are nearer to the base
     for reach, is_refused in ((FAR_LEFT, True), (half, False)):
@@ -394,13 +396,14 @@ def with_residual_risk(skill: StoredSkill, accepted_by: str) -> StoredSkill:
     return decoded(with_file(replace(skill, figures=figures)).file, origin="skill")
 
 
-def test_a_skill_with_a_residual_risk_is_served_only_if_somebody_accepted_it(
+def test_residual_risk_must_be_accepted(
     sessions: tuple[zenoh.Session, zenoh.Session],
     skill: StoredSkill,
     skill_worker: SkillWorker,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """A skill with a residual risk is served only if somebody accepted it."""
     refusal = (
         "not served: nobody has accepted its residual risk: the gate holds 3.0 % of hands swapped. "
         "Who takes"
@@ -466,7 +469,8 @@ def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suff
     assert cell.kinds() == [suffix, suffix]
 
 
-def test_who_holds_by_a_name_ends_that_hold_and_no_hold_of_others(cell: Cell) -> None:
+def test_named_hold_is_ended_by_its_name_only(cell: Cell) -> None:
+    """Who holds by a name ends that hold and no hold of others."""
     mine = {"by": "me"}
     for name in ("me", "you"):
         cell.client.hold(name)

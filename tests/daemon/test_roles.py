@@ -175,7 +175,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
 
 
-def test_a_certificate_is_revoked_by_its_name_and_its_sibling_is_not(secrets: Path) -> None:
+def test_certificate_is_revoked_by_its_name(secrets: Path) -> None:
     """Sessions of two trackers and two operators; of each the second was revoked."""
     daemon = Guarded(secrets, revoked=("tracker-2", "operator-2"))
     revoked: set[bytes] = set()
@@ -232,7 +232,7 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
 
 
 @pytest.mark.thorough
-def test_each_refusal_names_the_certificate_and_what_is_wrong_with_it(tmp_path: Path) -> None:
+def test_refusals_name_the_certificate_and_its_fault(tmp_path: Path) -> None:
     """Some have expired, and one is of another authority."""
     certificates = make_certificates(tmp_path, expired="daemon-8 operator-8")
     other = make_certificates(tmp_path / "other")

@@ -118,9 +118,8 @@ MALFORMED = (
 
 
 @pytest.mark.thorough
-def test_frames_are_hands_amid_many_others_and_bad_ones_are_refused(
-    tmp_path: Path, router: zenoh.Session
-) -> None:
+def test_hands_are_found_among_many_frames(tmp_path: Path, router: zenoh.Session) -> None:
+    """Frames are hands amid many others and bad ones are refused."""
     (endpoint,) = endpoints(router)
     (tmp_path / "tf.toml").write_text(CELL.format(router=endpoint, state=tmp_path))
     serve = ("--config", str(tmp_path / "tf.toml"), "--record", str(tmp_path / "records"))

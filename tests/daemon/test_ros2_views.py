@@ -194,7 +194,7 @@ def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
     return np.array((data.oMf[model.getFrameId(settings.arm.plate)] * tool).homogeneous)
 
 
-def test_who_may_hear_is_told_what_is_latched_behind_certificates_too(tmp_path: Path) -> None:
+def test_latched_topics_are_delivered_with_certificates(tmp_path: Path) -> None:
     """An observer, and not a tracker."""
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
     topics = list(ros2.of_settings(settings.ros2))

@@ -48,13 +48,14 @@ def files_in(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
+def test_failed_save_leaves_the_old_files(
     saved: SavedViaPoints,
     settings: Settings,
     skill: Skill,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """What cannot be saved leaves the old files and nothing else."""
     monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
     taught = adapted(skill, POINTS, tolerance=0.03)
     keep(saved, taught)
@@ -77,9 +78,11 @@ def test_what_cannot_be_saved_leaves_the_old_files_and_nothing_else(
     assert files_in(tmp_path) == before
 
 
-def test_via_points_that_this_skill_cannot_go_through_are_set_aside(
+def test_unsuitable_saved_via_points_are_set_aside(
     saved: SavedViaPoints, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Via points that this skill cannot go through are set aside."""
+
     def refuse(*_: object) -> str:
         raise SkillError("they would bend it too much")
 
@@ -138,7 +141,7 @@ def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
     assert saved.read(skill) is None
 
 
-def test_via_points_that_a_changed_arm_does_not_reach_are_set_aside_and_can_be_taught_again(
+def test_unreachable_saved_via_points_are_set_aside(
     saved: SavedViaPoints, skill: Skill, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Whatever the change leaves in reach is in force; and all once the arm is as it was."""
@@ -230,9 +233,10 @@ REASONS: dict[str | bytes, tuple[str, ...]] = {
 
 
 @pytest.mark.parametrize("how", [*REASONS, *CONTENTS], ids=lambda how: str(how)[:20])
-def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
+def test_wrong_thing_in_place_of_a_saved_file_is_set_aside(
     how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Whatever is in the place of a saved file is set aside and reported."""
     folder = state_folder(settings)
     saved_points = SavedViaPoints(settings)
     segment = folder / "segment.json"
@@ -253,9 +257,8 @@ def test_whatever_is_in_the_place_of_a_saved_file_is_set_aside_and_reported(
     assert SavedSegment(settings).read(skill) == "handover"
 
 
-def test_a_daemon_starts_beside_a_damaged_state_and_keeps_its_own_again(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_daemon_starts_with_a_damaged_state(tmp_path: Path, skill: Skill) -> None:
+    """A daemon starts beside a damaged state and keeps its own again."""
     settings = Settings(files=Files(state=str(tmp_path / "state")))
     folder = state_folder(settings)
     points = SavedViaPoints(settings).path(skill)

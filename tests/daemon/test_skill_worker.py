@@ -63,18 +63,20 @@ def bits(value: object) -> bytes:
 
 
 @pytest.mark.parametrize("count", [3, 1, 0])
-def test_a_skill_adapted_there_predicts_the_same_bits_as_one_adapted_here(
+def test_adaptation_there_gives_the_same_bits(
     skill_worker: SkillWorker, skill: Skill, count: int
 ) -> None:
+    """A skill adapted there predicts the same bits as one adapted here."""
     adapted_skill = skill_worker.adapt(skill, VIA_POINTS[:count], tolerance=0.05)
     assert_same_bits(adapted_skill, adapted(skill, VIA_POINTS[:count], tolerance=0.05))
     assert adapted_skill.via_points == VIA_POINTS[:count]
     assert in_force(adapted_skill) == in_force(adapted(skill, VIA_POINTS[:count], tolerance=0.05))
 
 
-def test_errors_come_back_with_their_words_and_do_not_end_the_process(
+def test_errors_come_back_and_do_not_end_the_process(
     skill_worker: SkillWorker, skill: Skill, tmp_path: Path
 ) -> None:
+    """Errors come back with their words and do not end the process."""
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     with pytest.raises(SkillError, match=r"tolerance is -1 m; 0 or more accepted"):
@@ -103,7 +105,8 @@ def test_a_killed_process_is_replaced_at_the_next_request(
     assert not is_there(started)
 
 
-def test_closing_leaves_no_process_and_its_skills_and_may_be_repeated(skill: Skill) -> None:
+def test_closing_leaves_no_process(skill: Skill) -> None:
+    """Closing leaves no process and its skills and may be repeated."""
     skill_worker = SkillWorker()
     skill_worker.close()
     adapted_skill = skill_worker.adapt(skill, VIA_POINTS, tolerance=0.05)
@@ -138,9 +141,10 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(
         worker.close()
 
 
-def test_the_time_of_a_request_counts_from_its_arrival_and_not_from_its_turn(
+def test_time_of_a_request_counts_from_its_arrival(
     skill_worker: SkillWorker,
 ) -> None:
+    """The time of a request counts from its arrival and not from its turn."""
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 
         def late(left_s: float) -> None:

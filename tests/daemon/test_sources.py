@@ -197,9 +197,7 @@ def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: in
 
 
 @pytest.mark.parametrize("named_twice", JOINT_NAMES)
-def test_a_joint_that_one_state_names_twice_is_refused_by_its_name(
-    skill: Skill, named_twice: str
-) -> None:
+def test_joint_named_twice_is_refused(skill: Skill, named_twice: str) -> None:
     """With two positions it is nowhere: the arm would seem to have left its command."""
     cell = Cell(skill)
     for k in range(1, 100):
@@ -232,9 +230,8 @@ class Clock:
 
 
 @pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # of the publisher's clock from the daemon's
-def test_samples_that_were_held_up_are_told_from_a_clock_that_stepped(
-    skill: Skill, apart_s: int
-) -> None:
+def test_delayed_samples_are_distinguished_from_a_clock_step(skill: Skill, apart_s: int) -> None:
+    """Samples that were held up are told from a clock that stepped."""
     held = Clock(skill)
     stepped = Clock(skill)
     for clock in (held, stepped):
@@ -286,7 +283,8 @@ def test_a_clock_that_was_set_back_is_told_from_a_second_source(
     assert set_back.cell.status(2.1).sources["right"].fresh
 
 
-def test_the_first_of_each_kind_is_logged_at_once_and_the_others_are_counted(skill: Skill) -> None:
+def test_first_rejection_is_logged_and_others_are_counted(skill: Skill) -> None:
+    """The first of each kind is logged at once and the others are counted."""
     cell = Cell(skill)
     for k in range(30):
         cell.tell(("left", pose(k + 1, frame="camera")))
@@ -322,7 +320,8 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
     assert status.rejected == {"out_of_range": 1}
 
 
-def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill) -> None:
+def test_hold_names_the_missing_sample_and_the_remedy(skill: Skill) -> None:
+    """A hold names whose sample it lacks and why and what to do."""
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
     for k in range(200):
@@ -356,9 +355,8 @@ def test_a_hold_names_whose_sample_it_lacks_and_why_and_what_to_do(skill: Skill)
 @pytest.mark.parametrize(
     ("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")]
 )
-def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
-    skill: Skill, unit: str, reported: str
-) -> None:
+def test_wrong_unit_explains_the_hold(skill: Skill, unit: str, reported: str) -> None:
+    """Hands in another unit are explained by the unit while the arm holds."""
     settings = Settings(hands=HandSettings(unit=unit))  # type: ignore[arg-type]
     cell = Cell(skill, settings)
     for k in range(100):
@@ -378,9 +376,8 @@ def test_hands_in_another_unit_are_explained_by_the_unit_while_the_arm_holds(
 
 
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
-def test_hands_that_arrive_in_batches_are_told_the_setting_for_that(
-    skill: Skill, batch_ticks: int
-) -> None:
+def test_batches_of_samples_get_their_setting(skill: Skill, batch_ticks: int) -> None:
+    """Hands that arrive in batches are told the setting for that."""
     cell = Cell(skill)
     period_ns = S // 500
     waiting: list[tuple[str, PoseStamped]] = []

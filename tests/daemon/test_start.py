@@ -33,9 +33,10 @@ def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
         yield start, endpoints(start.session)[0]
 
 
-def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
+def test_starting_daemon_answers_with_its_progress(
     started: tuple[Startup, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Every request to a daemon that starts is answered with how far it is."""
     start, endpoint = started
     with open_session(connect=[endpoint]) as session:
         client = Client(session, "lab/bench")
@@ -61,9 +62,10 @@ def test_every_request_to_a_daemon_that_starts_is_answered_with_how_far_it_is(
         assert not isinstance(ended.value, StartingError)
 
 
-def test_a_start_that_gets_further_is_waited_for_longer_than_one_that_does_not(
+def test_start_with_progress_is_waited_for_longer(
     started: tuple[Startup, str],
 ) -> None:
+    """A start that gets further is waited for longer than one that does not."""
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:
         client = Client(session, "lab/bench")
@@ -109,7 +111,8 @@ def test_a_service_that_gets_no_further_is_not_waited_for(
     "command",
     ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"],
 )
-def test_that_nobody_listens_is_told_before_anything_heavy_is_imported(command: str) -> None:
+def test_missing_listener_is_reported_before_heavy_imports(command: str) -> None:
+    """That nobody listens is told before anything heavy is imported."""
     arguments = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = (
         f"import sys\nfrom thirdhand.command_line import main\ncode = main({arguments})\nassert "

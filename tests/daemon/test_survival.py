@@ -38,7 +38,8 @@ def until_gone(pids: list[int], within_s: float) -> None:
     until(lambda: not any(map(is_running, pids)), "processes are left", within_s=within_s)
 
 
-def test_a_part_that_fails_is_a_fault_that_is_said_and_all_goes_on(tmp_path: Path) -> None:
+def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
+    """A part that fails is a fault that is said and all goes on."""
     records = tmp_path / "records"
 
     def is_at_fault(status: dict[str, Any]) -> bool:
@@ -154,7 +155,8 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
     assert result.exact, result.text()
 
 
-def test_a_daemon_that_was_paused_counts_what_it_missed_and_goes_on(tmp_path: Path) -> None:
+def test_paused_daemon_counts_what_it_missed(tmp_path: Path) -> None:
+    """A daemon that was paused counts what it missed and goes on."""
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session):
         before = daemon.until(lambda now: now["mode"] == "follow")
         daemon.process.send_signal(signal.SIGSTOP)
@@ -203,9 +205,10 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
-def test_a_killed_workshop_changes_nothing_and_a_killed_daemon_leaves_no_child(
+def test_killed_skill_worker_changes_nothing(
     tmp_path: Path,
 ) -> None:
+    """A killed workshop changes nothing and a killed daemon leaves no child."""
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
 
@@ -266,9 +269,8 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
     "streams", ["> /dev/full", "2> /dev/full", "> >(true)", ">&-", "2>&-", "<&- >&- 2>&-"]
 )
 @pytest.mark.one_case
-def test_an_arm_that_works_does_not_depend_on_who_reads_standard_output(
-    tmp_path: Path, streams: str
-) -> None:
+def test_arm_does_not_depend_on_readers_of_the_output(tmp_path: Path, streams: str) -> None:
+    """An arm that works does not depend on who reads standard output."""
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = (

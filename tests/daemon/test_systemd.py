@@ -67,9 +67,8 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 
 
 @pytest.mark.thorough
-def test_pings_follow_the_loop_and_a_restart_follows_no_hand_before_resume(
-    manager: Manager, tmp_path: Path
-) -> None:
+def test_pings_follow_the_loop(manager: Manager, tmp_path: Path) -> None:
+    """Pings follow the loop and a restart follows no hand before resume."""
     mark = tmp_path / "mark"
     arguments = ("--joints", "assumed")
     before = STANDS_STILL.format(mark=str(mark))
@@ -116,9 +115,8 @@ own_answers.DEAF_AFTER_S, own_answers.ASK_EVERY_S = 1.5, 0.3
 
 
 @pytest.mark.thorough
-def test_a_daemon_that_answers_nobody_pings_no_longer_and_the_log_reports_it(
-    manager: Manager, tmp_path: Path
-) -> None:
+def test_unresponsive_daemon_stops_its_pings(manager: Manager, tmp_path: Path) -> None:
+    """A daemon that answers nobody pings no longer and the log reports it."""
     mark = tmp_path / "mark"
     with serving(tmp_path, "--joints", "assumed", before=DEAF.format(mark=str(mark))) as daemon:
         for _ in range(10):  # more than two of its own requests
@@ -193,9 +191,8 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
         assert bool(done.returncode or done.stderr) == bool(spoilt), done.stderr
 
 
-def test_a_full_disk_ends_no_daemon_and_is_said_by_the_check_and_by_who_teaches(
-    manager: Manager, tmp_path: Path
-) -> None:
+def test_full_disk_ends_no_daemon(manager: Manager, tmp_path: Path) -> None:
+    """A full disk ends no daemon and is said by the check and by who teaches."""
     with small_disk(tmp_path / "disk", "8m") as disk:
         filled = disk / "filled"
         (disk / "state").mkdir()

@@ -236,7 +236,8 @@ def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kin
     assert noted < (MAX_NOTES_PER_S + 5) * (time.monotonic() - begin + 2)
 
 
-def test_hold_does_not_wait_for_a_client_that_asks_on_and_reads_no_answer(daemon: Daemon) -> None:
+def test_hold_does_not_wait_for_a_slow_client(daemon: Daemon) -> None:
+    """Hold does not wait for a client that asks on and reads no answer."""
     with attack(NOTHING_READ, daemon) as report:
         assert report == "begun"
         took = holds_s(daemon, 4.0)
@@ -260,7 +261,7 @@ def network_threads(pid: int) -> dict[int, int]:
     return niceness
 
 
-def test_hold_does_not_wait_for_a_machine_with_more_to_do_than_cores(daemon: Daemon) -> None:
+def test_hold_does_not_wait_for_a_busy_machine(daemon: Daemon) -> None:
     """What answers took longest for: Zenoh's threads, behind other processes. The same daemon with
     these threads as they are and made ordinary, in turn, beside processes that only compute; the
     client is put before them, so that it does not wait itself.

@@ -62,9 +62,10 @@ def named(said: list[str]) -> list[tuple[str, float, float]]:
 
 @pytest.mark.parametrize("spoil", SPOILS, ids=lambda spoil: str(spoil.__name__))
 @pytest.mark.one_case
-def test_a_stretch_that_is_wrong_is_named_and_left_out_and_the_rest_is_as_it_was(
+def test_wrong_stretch_is_named_and_left_out(
     spoil: spoiled.Spoil, clean: list[Demonstration], tmp_path: Path
 ) -> None:
+    """A stretch that is wrong is named and left out and the rest is as it was."""
     for number, take in enumerate(clean):
         for seed in range(SEEDS):
             random = np.random.default_rng([number, seed])
@@ -112,9 +113,8 @@ def test_a_take_without_enough_of_the_rest_is_refused(
         read_back(tmp_path / "a.mcap", streams)
 
 
-def test_a_short_stretch_is_bridged_and_a_longer_one_than_unseen_ms_is_not(
-    clean: list[Demonstration], tmp_path: Path
-) -> None:
+def test_short_stretch_is_bridged(clean: list[Demonstration], tmp_path: Path) -> None:
+    """A short stretch is bridged and a longer one than unseen ms is not."""
     take = clean[1]
     for lasts_s, begins in ((0.4, ()), (0.6, (300,))):
         streams = streams_of(take)

@@ -174,9 +174,8 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut"])
-def test_a_drawing_says_what_replay_says_is_missing_and_shows_the_rest(
-    tmp_path: Path, whole: bytes, kind: str
-) -> None:
+def test_drawing_names_what_is_missing(tmp_path: Path, whole: bytes, kind: str) -> None:
+    """A drawing says what replay says is missing and shows the rest."""
     path = tmp_path / "a.mcap"
     remarks = list[str]()
     start, end = chunks(whole)[5]

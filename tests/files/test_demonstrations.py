@@ -32,7 +32,8 @@ def _swaying(count: int) -> np.ndarray:
     )
 
 
-def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_demonstration_is_written_and_read_unchanged(tmp_path: Path) -> None:
+    """A demonstration comes back as it was and gives the same bytes."""
     stamps = START_NS + np.arange(200) * 10_000_000
     poses = _swaying(200)
     write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses), cell="north/3")
@@ -45,7 +46,7 @@ def test_a_demonstration_comes_back_as_it_was_and_gives_the_same_bytes(tmp_path:
         assert not a.flags.writeable
 
 
-def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Path) -> None:
+def test_streams_are_mapped_by_the_tracker_of_their_frame(tmp_path: Path) -> None:
     """Hands of a tracker in millimetres that is turned by 90 degrees, beside a tool in `base`."""
     stamps = START_NS + np.arange(50) * 10_000_000
     path = tmp_path / "a.mcap"
@@ -87,7 +88,8 @@ def test_each_stream_is_mapped_by_the_tracker_that_its_frame_names(tmp_path: Pat
         read_demonstration(path, settings=far)
 
 
-def test_a_gripper_comes_back_with_its_demonstration_at_the_tools_stamps(tmp_path: Path) -> None:
+def test_gripper_comes_back_at_the_tools_stamps(tmp_path: Path) -> None:
+    """A gripper comes back with its demonstration at the tools stamps."""
     stamps = START_NS + np.arange(50) * 10_000_000
     poses = _swaying(50)
     closure = np.linspace(0.0, 1.0, 50)
@@ -133,7 +135,8 @@ def _line(stamps: np.ndarray, slope: float) -> np.ndarray:
     return poses
 
 
-def test_streams_with_stamps_of_their_own_are_brought_to_those_of_the_tool(tmp_path: Path) -> None:
+def test_streams_are_brought_to_the_stamps_of_the_tool(tmp_path: Path) -> None:
+    """Streams with stamps of their own are brought to those of the tool."""
     left = np.arange(0, 1000, 7) * 1_000_000
     right = np.arange(30, 900, 11) * 1_000_000
     tool = np.arange(0, 1000, 5) * 1_000_000

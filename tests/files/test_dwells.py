@@ -34,9 +34,8 @@ def listed(taken: Demonstration, path: Path) -> Summary:
     return summary(path)
 
 
-def test_a_via_point_that_was_never_reached_is_named_with_how_near_the_tool_came(
-    taken: Demonstration, tmp_path: Path
-) -> None:
+def test_missed_via_point_is_named_with_its_distance(taken: Demonstration, tmp_path: Path) -> None:
+    """A via point that was never reached is named with how near the tool came."""
     vise = msgspec.structs.replace(
         taken.via_points[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
     )
@@ -50,7 +49,8 @@ def test_a_via_point_that_was_never_reached_is_named_with_how_near_the_tool_came
     assert remark in table(report)
 
 
-def test_a_rest_far_from_all_via_points_may_be_one_that_is_not_named(taken: Demonstration) -> None:
+def test_rest_far_from_all_via_points_is_noted(taken: Demonstration) -> None:
+    """A rest far from all via points may be one that is not named."""
     # on the way to the glass, as fast as it goes
     middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))
     period_ns = round(1e9 * taken.period_s)

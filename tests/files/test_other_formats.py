@@ -72,13 +72,14 @@ def compressed(stamp_ns: int, row: list[float]) -> bytes:
     ("encoding", "kind", "encoded"),
     [("ros1", "geometry_msgs/PoseStamped", of_ros_1), ("cdr", POSE.type, compressed)],
 )
-def test_messages_of_ros_1_and_compressed_ones_are_read_from_mcap(
+def test_ros_1_and_compressed_messages_are_read(
     encoding: str,
     kind: str,
     encoded: Callable[[int, list[float]], bytes],
     take: Demonstration,
     tmp_path: Path,
 ) -> None:
+    """Messages of ros 1 and compressed ones are read from mcap."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -138,9 +139,8 @@ def motive(
     return path
 
 
-def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(
-    take: Demonstration, tmp_path: Path
-) -> None:
+def test_bodies_and_gaps_of_motive_are_read(take: Demonstration, tmp_path: Path) -> None:
+    """Bodies of motive are read and gaps are those of the file."""
     path = motive(tmp_path / "a.csv", take)
     remarks = list[str]()
     got = read_demonstration(path, settings=CAPTURE, say=remarks.append)
@@ -180,12 +180,13 @@ def test_bodies_of_motive_are_read_and_gaps_are_those_of_the_file(
         ),
     ],
 )
-def test_frames_of_motive_that_are_none_are_refused_with_what_to_do(
+def test_wrong_frames_of_motive_are_refused(
     spoil: Callable[[list[list[str]]], list[list[str]]],
     words: str,
     take: Demonstration,
     tmp_path: Path,
 ) -> None:
+    """Frames of motive that are none are refused with what to do."""
     path = motive(tmp_path / "a.csv", take)
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
     head = next(i for i, row in enumerate(rows) if row[0] == "Frame") + 1
@@ -217,9 +218,8 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
     assert one_handed.conducts == "right"
 
 
-def test_a_c3d_file_that_is_cut_or_names_two_markers_alike_is_refused(
-    take: Demonstration, tmp_path: Path
-) -> None:
+def test_damaged_c3d_file_is_refused(take: Demonstration, tmp_path: Path) -> None:
+    """A c3d file that is cut or names two markers alike is refused."""
     for labels, words in (
         (list(NAMES.values()), "was cut: it holds .* of .* frames"),
         (["RightHand"] * 3, "RightHand 2"),

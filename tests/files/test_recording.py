@@ -47,9 +47,10 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
     ]
 
 
-def test_after_a_gap_the_next_step_says_how_many_are_missing_and_brings_state_and_skill(
+def test_step_after_a_gap_brings_state_and_skill(
     tmp_path: Path,
 ) -> None:
+    """After a gap the next step says how many are missing and brings state and skill."""
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):
             recorder.write(tick, frame, time_ns=at_ns(tick.index))
@@ -124,7 +125,8 @@ def test_a_note_may_not_pose_as_what_a_replay_needs(tmp_path: Path) -> None:
         recorder.note("frame", "x", 0)
 
 
-def test_an_event_of_a_kind_that_nobody_knows_is_refused_with_its_tick(tmp_path: Path) -> None:
+def test_event_of_unknown_kind_is_refused(tmp_path: Path) -> None:
+    """An event of a kind that nobody knows is refused with its tick."""
     file = McapFile(tmp_path / "a.mcap", joints=7)
     with Recorder(tmp_path / "b.mcap", settings=CELL, skill=SKILL) as recorder:
         recorder.close()

@@ -107,9 +107,8 @@ def moving(make: Any, *arguments: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
-def test_hands_in_an_array_and_a_tool_in_a_tree_are_read_from_bags(
-    tmp_path: Path, plugin: StoragePlugin
-) -> None:
+def test_arrays_and_trees_are_read_from_bags(tmp_path: Path, plugin: StoragePlugin) -> None:
+    """Hands in an array and a tool in a tree are read from bags."""
     hands = moving(lambda stamp, way: array(stamp, "base", (way, 0.3, 0.0), (way, -0.3, 0.0)))
     frames = moving(
         lambda stamp, way: tree(stamp, "base", elbow=(0.0, 0.0, 1.0), glass=(0.5, way, 0.2))
@@ -185,9 +184,10 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
         (POSE.type, "json"),
     ],
 )
-def test_hands_of_a_type_that_is_not_read_are_refused_with_it_and_with_the_types_accepted(
+def test_unread_type_is_refused_with_accepted_types(
     kind: str, encoding: str, read: Callable[[Path], object], tmp_path: Path
 ) -> None:
+    """Hands of a type that is not read are refused with it and with the types accepted."""
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = McapWriter(stream)
         writer.start()
@@ -212,7 +212,7 @@ def test_odometry_of_a_tracker_is_read_as_poses(tmp_path: Path) -> None:
     )
 
 
-def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_path: Path) -> None:
+def test_streams_are_found_by_name_and_brought_to_base(tmp_path: Path) -> None:
     """Of a motion capture in millimetres, y up, the arm's base 1 m before its origin."""
     y_up = Rotation.from_euler("x", 90, degrees=True)
     frames = moving(
@@ -244,9 +244,10 @@ def test_what_can_be_meant_alone_is_found_by_its_name_and_brought_to_base(tmp_pa
         )
 
 
-def test_the_tool_is_found_from_joint_states_and_clocks_that_differ_do_not_count(
+def test_tool_is_found_from_joint_states(
     tmp_path: Path,
 ) -> None:
+    """The tool is found from joint states and clocks that differ do not count."""
     settings = Settings()
     begin_ns = STAMPS[0]
     joints = np.array(settings.arm.posture) + np.outer(WAY, np.ones(7))
@@ -295,7 +296,7 @@ def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
             read_demonstration(path)
 
 
-def test_a_daemons_recording_is_a_demonstration_of_the_arm_as_measured() -> None:
+def test_recording_of_a_daemon_is_a_demonstration() -> None:
     """The golden session: with a dropout, spoilt samples, and no `tool/pose`."""
     remarks: list[str] = []
     got = read_demonstration(RECORDINGS / "golden.mcap", say=remarks.append)

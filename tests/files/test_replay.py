@@ -33,7 +33,8 @@ from thirdhand_sim.script import HandScript
 GOLDEN = RECORDINGS / "golden.mcap"
 
 
-def test_the_golden_session_replays_bit_for_bit_also_with_two_blas_threads_asked_for() -> None:
+def test_golden_session_replays_with_two_blas_threads() -> None:
+    """The golden session replays bit for bit also with two blas threads asked for."""
     two = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
     done = thirdhand("replay", str(GOLDEN), timeout=110, env=os.environ | two)
     assert (done.returncode, done.stdout) == (0, "10000 ticks, 10000 frames identical\n"), (
@@ -175,9 +176,8 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
     assert [file.name for file in tmp_path.iterdir()] == ["damaged.mcap"]
 
 
-def test_a_cut_is_told_and_only_forbidden_where_exactness_is_asked_for(
-    recorded: Path, tmp_path: Path
-) -> None:
+def test_cut_is_forbidden_only_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
+    """A cut is told and only forbidden where exactness is asked for."""
     data = recorded.read_bytes()
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[: len(data) * 2 // 3])
@@ -207,9 +207,10 @@ def checked(recorded: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.quick
-def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
+def test_recording_of_checksums_becomes_one_of_frames(
     recorded: Path, checked: Path, tmp_path: Path
 ) -> None:
+    """A recording of checksums becomes one of frames bit for bit."""
     output = tmp_path / "whole.mcap"
     done = told("replay", str(checked), "--exact", "--output", str(output))
     assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
@@ -226,9 +227,8 @@ def test_a_recording_of_checksums_becomes_one_of_frames_bit_for_bit(
     assert replay(output).exact
 
 
-def test_a_change_where_a_checksum_alone_is_kept_is_found_and_named(
-    checked: Path, tmp_path: Path
-) -> None:
+def test_change_at_a_checksum_is_found_and_named(checked: Path, tmp_path: Path) -> None:
+    """A change where a checksum alone is kept is found and named."""
     recording = Recording.open(checked)
     steps = list(recording.steps(whole=False))
     path = tmp_path / "changed.mcap"

@@ -154,9 +154,8 @@ def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.thorough
-def test_each_constant_matters_and_none_is_better_halved_or_doubled(
-    clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_constant_matters(clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each constant matters and none is better halved or doubled."""
     cases = [
         (take, spoilt(take, spoil, 100 * number + seed)[0])
         for spoil in (*spoiled.SPOILS, *spoiled.SUBTLE)

@@ -138,9 +138,8 @@ def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message:
 
 
 @pytest.mark.parametrize("begin", [b"", b"PK\x01\x02"], ids=["anywhere", "in the directory"])
-def test_a_bit_that_flips_in_a_file_changes_nothing_or_is_refused(
-    aimed: Skill, begin: bytes
-) -> None:
+def test_flipped_bit_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -> None:
+    """A bit that flips in a file changes nothing or is refused."""
     random = np.random.default_rng(8)
     whole = aimed.file
     unchanged = 0

@@ -95,7 +95,7 @@ main()
         "thirdhand.cli.status",
     ],
 )
-def test_an_interrupt_while_the_command_is_imported_leaves_no_traceback(module: str) -> None:
+def test_interrupt_during_imports_leaves_no_traceback(module: str) -> None:
     """At imports from the first line of the program on; Python's own come before that."""
     code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace(
         "MODULE", module
@@ -143,7 +143,8 @@ def test_an_interrupt_ends_a_command_with_one_line(
 
 
 @pytest.mark.thorough
-def test_an_interrupt_after_the_work_does_not_change_the_exit_code(tmp_path: Path) -> None:
+def test_interrupt_after_the_work_keeps_the_exit_code(tmp_path: Path) -> None:
+    """An interrupt after the work does not change the exit code."""
     output = tmp_path / "said"
     skill = tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
@@ -182,7 +183,7 @@ def test_a_demo_that_is_ended_leaves_no_process_behind(
     assert "Traceback" not in output.read_text()
 
 
-def test_a_bench_that_says_nothing_ends_with_the_process_that_runs_it(tmp_path: Path) -> None:
+def test_silent_bench_ends_with_its_parent(tmp_path: Path) -> None:
     """A bench that prints would end with the pipe that nobody reads any more."""
     output = tmp_path / "said"
     with subprocess.Popen(["sleep", "600"]) as runs_it:
@@ -218,7 +219,8 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
     assert (process.returncode, error_text) == (130, f"{SAID}\n")
 
 
-def test_an_interrupt_just_before_there_is_something_to_put_away_is_not_lost() -> None:
+def test_early_interrupt_is_not_lost() -> None:
+    """An interrupt just before there is something to put away is not lost."""
     done = python(INTERRUPTED_JUST_BEFORE)
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 

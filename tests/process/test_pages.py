@@ -25,7 +25,8 @@ print(used_mb, left_mb)
 """
 
 
-def test_code_that_only_the_start_used_is_released_and_runs_again() -> None:
+def test_code_of_the_start_is_released_and_runs_again() -> None:
+    """Code that only the start used is released and runs again."""
     done = python(PROGRAM)
     assert done.returncode == 0, done.stderr
     used_mb, left_mb = map(float, done.stdout.split())

@@ -59,9 +59,10 @@ def test_no_encoding_of_the_output_ends_in_a_traceback(
 @pytest.mark.parametrize(
     "command", ["serve", "serve --check", "arm service/thirdhand/arms/ur5.urdf"]
 )
-def test_a_module_of_another_python_is_one_sentence_with_file_and_variable(
+def test_module_of_another_python_is_one_sentence(
     tmp_path: Path, command: str, variable: str
 ) -> None:
+    """A module of another python is one sentence with file and variable."""
     module = tmp_path / "pinocchio" / "__init__.py"
     library = "libboost.so"
     module.parent.mkdir()
@@ -83,9 +84,10 @@ def test_a_module_of_another_python_is_one_sentence_with_file_and_variable(
     assert f"${variable} leads to" in sentence
 
 
-def test_a_user_without_a_home_needs_a_variable_and_gets_no_folder(
+def test_user_without_a_home_gets_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A user without a home needs a variable and gets no folder."""
     monkeypatch.setenv("HOME", "/home/me")
     for state, code, words in (
         (

@@ -265,9 +265,10 @@ def recorded(
     return path
 
 
-def test_after_a_full_disk_nothing_is_left_and_the_next_try_works(
+def test_full_disk_leaves_nothing_behind(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """After a full disk nothing is left and the next try works."""
     path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
     with small_disk(tmp_path / "disk", "24k") as disk:
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1

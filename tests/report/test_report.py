@@ -141,9 +141,10 @@ def session(golden: Path) -> Report:
     return reported(golden)
 
 
-def test_the_distance_of_a_stop_is_that_of_the_measured_tool_and_is_compared_with_people(
+def test_stop_distance_is_compared_with_people(
     golden: Path,
 ) -> None:
+    """The distance of a stop is that of the measured tool and is compared with people."""
     columns = read(Recording.open(golden))
     report = Report(columns)
     assert report.stop_mm is not None
@@ -166,7 +167,8 @@ def test_the_distance_of_a_stop_is_that_of_the_measured_tool_and_is_compared_wit
     assert list(shown_mm.values()) == [f"{distance_mm:.1f}", f"{distance_mm - assumed_mm:.1f}"]
 
 
-def test_the_spans_of_a_session_follow_each_other_and_name_what_happened(session: Report) -> None:
+def test_spans_of_a_session_name_what_happened(session: Report) -> None:
+    """The spans of a session follow each other and name what happened."""
     ends = [span.start_s + span.lasts_s for span in session.spans]
     assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
     assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SESSION_S, abs=0.05)
@@ -219,9 +221,10 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][is_hand_seen].min()
 
 
-def test_via_points_are_met_while_the_hands_are_there_and_told_apart_by_when_they_were_taught(
+def test_via_points_are_met_while_the_hands_are_there(
     session: Report,
 ) -> None:
+    """Via points are met while the hands are there and told apart by when they were taught."""
     by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
     first, second = [point for point in session.via_points if point.name == "handover"]
@@ -290,9 +293,10 @@ def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(
         ),
     ],
 )
-def test_a_fault_has_the_words_of_its_status_and_tells_what_was_before_it_and_how_it_ended(
+def test_fault_tells_cause_and_end(
     skill: Skill, tmp_path: Path, what: str, reason: Reason, why: str, about: str, statuses: bool
 ) -> None:
+    """A fault has the words of its status and tells what was before it and how it ended."""
     session = Told(skill, tmp_path / "a.mcap", what, statuses=statuses)
     report = reported(tmp_path / "a.mcap")
     fault = report.faults[0]
@@ -324,7 +328,9 @@ def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path
     assert words in lines
 
 
-def test_waiting_for_hands_and_the_end_of_a_session_are_no_holds_of_it(golden: Path) -> None:
+def test_waiting_is_no_hold_of_the_session(golden: Path) -> None:
+    """Waiting for hands and the end of a session are no holds of it."""
+
     def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
         timeline = []
         at_s = 0.0
@@ -384,9 +390,8 @@ def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: 
     assert last.why.startswith("no joint states for ")
 
 
-def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_no_mode(
-    skill: Skill, tmp_path: Path
-) -> None:
+def test_promptness_is_that_of_the_timings(skill: Skill, tmp_path: Path) -> None:
+    """Promptness is that of the timings and what is not recorded belongs to no mode."""
     Told(skill, tmp_path / "a.mcap", lost_at=700)
     report = reported(tmp_path / "a.mcap")
     assert report.missed == 3
@@ -401,9 +406,10 @@ def test_promptness_is_that_of_the_timings_and_what_is_not_recorded_belongs_to_n
     assert report.lasts_s == pytest.approx(1200 * PERIOD_S)
 
 
-def test_names_in_a_skill_and_of_a_file_have_no_effect_in_tables_and_on_the_page(
+def test_names_have_no_effect_on_tables_and_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Names in a skill and of a file have no effect in tables and on the page."""
     path = tmp_path / "$\\frac$ <b>\x1b[31m.mcap"
     Told(decoded(wicked_skill(), origin="wicked"), path)
     html_path = tmp_path / "page.html"

@@ -50,9 +50,9 @@ def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[s
     return drawn(path)
 
 
-def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_is(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_omitted_frames_are_a_gap_and_nothing_else(tmp_path: Path, skill: Skill) -> None:
+    """Frames that are left out are a gap in curves and log and nothing else is."""
+
     def feed(view: LiveView) -> None:
         for message in received(first=0, end=END, skill_at=HELD_AT + 100, skill=skill.file):
             view.add(message)
@@ -85,7 +85,9 @@ def test_frames_that_are_left_out_are_a_gap_in_curves_and_log_and_nothing_else_i
     assert values(rows["/about/skill"], "TextDocument:text")
 
 
-def test_once_all_that_waited_is_drawn_new_frames_are_drawn_again(tmp_path: Path) -> None:
+def test_frames_are_drawn_again_after_the_backlog(tmp_path: Path) -> None:
+    """Once all that waited is drawn new frames are drawn again."""
+
     def feed(view: LiveView) -> None:
         for message in received(first=0, end=HELD_AT):
             view.add(message)

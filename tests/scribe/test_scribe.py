@@ -118,9 +118,10 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
     assert len(list(recording.steps())) == 201
 
 
-def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_the_gap(
+def test_stopped_process_costs_ticks_but_no_time(
     tmp_path: Path,
 ) -> None:
+    """A stopped process costs ticks but no time and the recording tells of the gap."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         pid = writer.status()["pid"]
         os.kill(pid, signal.SIGSTOP)
@@ -160,9 +161,10 @@ def test_a_stopped_process_costs_ticks_but_no_time_and_the_recording_tells_of_th
     )
 
 
-def test_a_killed_process_is_started_anew_with_a_recording_that_stands_alone(
+def test_killed_process_is_replaced_with_a_new_recording(
     tmp_path: Path,
 ) -> None:
+    """A killed process is started anew with a recording that stands alone."""
     with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as writer:
         tell(writer, 20)
         killed = writer.status()["pid"]
@@ -198,7 +200,8 @@ def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> N
     assert [step.tick for step in Recording.open(path).steps()] == list(range(-1, 400))
 
 
-def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Path) -> None:
+def test_everything_told_is_on_disk_when_the_loop_is_gone(tmp_path: Path) -> None:
+    """When the loops process is gone everything told is on disk."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         tell(writer, 300)
         pid = writer.status()["pid"]
@@ -213,7 +216,8 @@ def test_when_the_loops_process_is_gone_everything_told_is_on_disk(tmp_path: Pat
     assert not recording.truncated
 
 
-def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_path: Path) -> None:
+def test_silent_process_is_replaced_and_its_gap_marked(tmp_path: Path) -> None:
+    """A silent process is replaced and what it had not written is marked."""
     with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as writer:
         tell(writer, 100)
         time.sleep(1.2)  # two flushes
@@ -248,9 +252,7 @@ def test_a_silent_process_is_replaced_and_what_it_had_not_written_is_marked(tmp_
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("is_killed", [True, False])
-def test_the_ticks_lost_at_the_end_of_a_scribe_that_is_behind_are_those_not_on_disk(
-    tmp_path: Path, is_killed: bool
-) -> None:
+def test_lost_ticks_are_those_not_on_disk(tmp_path: Path, is_killed: bool) -> None:
     """Thousands of ticks wait, and more reports come than the socket holds unless they are read.
     One chunk may be on disk whose report a kill prevents.
     """
@@ -288,9 +290,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("how", ["running", "stopped"])
-def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(
-    tmp_path: Path, how: str
-) -> None:
+def test_scribe_ends_with_its_daemon(tmp_path: Path, how: str) -> None:
+    """A scribe ends with its daemon and writes what it was told."""
     command = [sys.executable, "-c", DAEMON, str(tmp_path), how]
     path = os.pathsep.join(sys.path)
     environment = os.environ | {"PYTHONPATH": path}
@@ -306,7 +307,8 @@ def test_a_scribe_ends_with_its_daemon_and_writes_what_it_was_told(
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
-def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(place: str) -> None:
+def test_unwritable_recording_spares_the_live_view(place: str) -> None:
+    """A recording that cannot be written is told and spares the live view."""
     with scribe(recording=Path(place), live_port=0) as writer:
         tell(writer, 100)
         until(lambda: writer.supervise() or writer.status()["live"])
@@ -319,7 +321,8 @@ def test_a_recording_that_cannot_be_written_is_told_and_spares_the_live_view(pla
     assert status["live"].startswith("rerun+http://127.0.0.1:")
 
 
-def test_without_anything_to_write_there_is_no_process_and_nothing_is_lost() -> None:
+def test_no_process_without_anything_to_write() -> None:
+    """Without anything to write there is no process and nothing is lost."""
     with scribe() as writer:
         tell(writer, 5)
         writer.note("requests", "x", 0)

@@ -64,9 +64,10 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
     return sorted(folder.glob("*.mcap"))
 
 
-def test_recordings_rotate_without_losing_a_tick_and_each_replays_by_itself(
+def test_recordings_rotate_without_losing_a_tick(
     rotated: list[Path],
 ) -> None:
+    """Recordings rotate without losing a tick and each replays by itself."""
     assert len(rotated) >= 3
     steps = [step for path in rotated for step in Recording.open(path).steps()]
     decided = [step for step in steps if step.frame is not None or step.checksum is not None]
@@ -93,9 +94,10 @@ def with_limits(**limits: float) -> Settings:
     return msgspec.structs.replace(CELL, files=Files(**limits))
 
 
-def test_the_oldest_of_this_cells_recordings_make_room_and_nothing_else_does(
+def test_oldest_recordings_of_the_cell_make_room(
     tmp_path: Path,
 ) -> None:
+    """The oldest of this cells recordings make room and nothing else does."""
     settings = with_limits()
     current = RecordingPaths(settings, str(tmp_path), None).next()
     assert current is not None
@@ -289,9 +291,10 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> No
         assert [r.truncated for r in result] == [True, False]
 
 
-def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_lost(
+def test_removed_folder_is_made_again(
     tmp_path: Path,
 ) -> None:
+    """A folder that is removed is made again and what was in it counts as lost."""
     folder = tmp_path / "records"
     with session(folder=folder) as sender:
         sender.until(lambda status: status["sent"] > 200)
@@ -306,7 +309,8 @@ def test_a_folder_that_is_removed_is_made_again_and_what_was_in_it_counts_as_los
     assert sender.missing == f"{lost} of {sender.told} ticks are not recorded"
 
 
-def test_a_recording_that_is_moved_is_ended_where_it_is_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_moved_recording_is_ended_where_it_is(tmp_path: Path) -> None:
+    """A recording that is moved is ended where it is and nothing is lost."""
     with session(folder=tmp_path) as sender:
         status = sender.until(lambda status: status["sent"] > 200)
         first = Path(status["recording"])

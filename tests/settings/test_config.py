@@ -172,7 +172,8 @@ def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, acce
     assert accepted in message.split(path, 1)[1]
 
 
-def test_all_contradictions_between_valid_values_are_reported_at_once() -> None:
+def test_contradictions_are_reported_at_once() -> None:
+    """All contradictions between valid values are reported at once."""
     text = """
     [reach]
     inner = 3
@@ -238,9 +239,10 @@ def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, l
     assert is_local(endpoint) == local
 
 
-def test_an_endpoint_of_the_command_line_or_the_environment_is_used_before_that_of_the_settings(
+def test_endpoint_of_the_command_line_goes_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """An endpoint of the command line or the environment is used before that of the settings."""
     settings = Settings(network=Network(listen=("tcp/127.0.0.1:1",)))
     args = argparse.Namespace(connect=None, cell=None)
     assert reaching(args).connect == ()
@@ -251,7 +253,8 @@ def test_an_endpoint_of_the_command_line_or_the_environment_is_used_before_that_
     assert reaching(args, settings).connect == ("tcp/127.0.0.1:3",)
 
 
-def test_a_daemon_listens_on_this_machine_only_unless_told_otherwise() -> None:
+def test_daemon_listens_on_this_machine_only() -> None:
+    """A daemon listens on this machine only unless told otherwise."""
     network = Settings().network
     assert [is_local(endpoint) for endpoint in network.listen] == [True]
     assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
@@ -280,7 +283,8 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 @pytest.mark.parametrize(
     "number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf, math.nan]
 )
-def test_a_number_of_a_size_that_no_cell_has_is_refused_everywhere(number: float) -> None:
+def test_absurd_numbers_are_refused_everywhere(number: float) -> None:
+    """A number of a size that no cell has is refused everywhere."""
     usual = msgspec.json.decode(msgspec.json.encode(Settings()))
     paths = list(leaves(usual))
     assert len(paths) > 100
@@ -371,7 +375,8 @@ def test_paths_become_absolute_where_the_configuration_is_read(
     assert robot_description(reparsed) == robot_description(read)
 
 
-def test_a_continuous_joint_without_a_velocity_gets_it_from_the_settings(tmp_path: Path) -> None:
+def test_continuous_joint_gets_its_velocity_from_settings(tmp_path: Path) -> None:
+    """A continuous joint without a velocity gets it from the settings."""
     bare = re.sub(
         r'(<joint name="wrist_3_joint" type="continuous">.*\n.*)<limit[^>]*/>',
         r"\1",
@@ -447,9 +452,10 @@ network.listen = ["tcp/127.0.0.1:7448"]
 """
 
 
-def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_own(
+def test_file_of_several_cells_holds_shared_and_own_values(
     tmp_path: Path,
 ) -> None:
+    """A file of several cells holds what they share and what each has of its own."""
     path = tmp_path / "lab.toml"
     path.write_text(LAB, encoding="utf-8")
     first, second, third = (
@@ -479,9 +485,8 @@ def test_a_file_of_several_cells_holds_what_they_share_and_what_each_has_of_its_
         ("[cells.a]\ntool = 3", "a", "tool: 3 given"),
     ],
 )
-def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(
-    text: str, cell: str, words: str
-) -> None:
+def test_unknown_cell_is_refused_with_the_known_ones(text: str, cell: str, words: str) -> None:
+    """A cell that a file does not have is refused with those that it has."""
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
@@ -500,7 +505,8 @@ def test_a_cell_that_a_file_does_not_have_is_refused_with_those_that_it_has(
         ({"listen": ("unixsock-stream//run/th.sock",)}, ("unixsock-stream//run/th.sock",)),
     ],
 )
-def test_programs_of_this_machine_reach_the_daemon_where_it_listens(
+def test_programs_reach_the_daemon_where_it_listens(
     network: dict[str, Any], endpoints: tuple[str, ...]
 ) -> None:
+    """Programs of this machine reach the daemon where it listens."""
     assert Network(**network).reached_at == endpoints

@@ -60,7 +60,7 @@ def box(x: float, y: float, z: float) -> Points:
         float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)
     )
 )
-def test_every_point_is_inside_a_capsule_no_larger_than_a_sphere_around_them(
+def test_every_point_is_inside_a_capsule(
     points: Points,
 ) -> None:
     """Flat ones, and one alone, too."""
@@ -159,9 +159,8 @@ def test_a_mesh_is_found_where_its_name_leads(
         ("broken.stl", "cannot be read"),
     ],
 )
-def test_a_mesh_that_is_not_found_or_is_none_is_refused_by_its_name(
-    tmp_path: Path, name: str, told: str
-) -> None:
+def test_missing_mesh_is_refused_by_its_name(tmp_path: Path, name: str, told: str) -> None:
+    """A mesh that is not found or is none is refused by its name."""
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(described(name))
@@ -221,9 +220,10 @@ TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
         ),
     ],
 )
-def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
+def test_mesh_has_the_size_and_direction_of_the_urdf(
     name: str, data: bytes | str, scale: str, expected: Points, tmp_path: Path
 ) -> None:
+    """A mesh has the size and direction that file and urdf say."""
     (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
     (tmp_path / "arm.urdf").write_text(described(name, scale))
     shape = next(
@@ -237,7 +237,8 @@ def test_a_mesh_has_the_size_and_direction_that_file_and_urdf_say(
     assert volume(ends, shape.size[6]) < 1.1 * plain(expected)
 
 
-def test_each_of_several_meshes_of_a_link_has_a_capsule_of_its_own(tmp_path: Path) -> None:
+def test_each_mesh_of_a_link_has_its_capsule(tmp_path: Path) -> None:
+    """Each of several meshes of a link has a capsule of its own."""
     for name, points in (("a.stl", LEG), ("b.stl", LEG + np.array((0.2, 0.0, 0.0)))):
         (tmp_path / name).write_bytes(stl(points))
     second = '</collision><collision><geometry><mesh filename="b.stl"/></geometry></collision>'

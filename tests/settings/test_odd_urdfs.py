@@ -292,8 +292,9 @@ def spoilt(draw: st.DrawFn) -> bytes:
 
 @settings(deadline=None, max_examples=120, derandomize=True)
 @given(spoilt())
-def test_a_spoilt_description_is_refused_or_has_finite_numbers_alone(
+def test_spoilt_description_is_refused_or_finite(
     tmp_path_factory: pytest.TempPathFactory, text: bytes
 ) -> None:
+    """A spoilt description is refused or has finite numbers alone."""
     with contextlib.suppress(SettingsError):
         tried(tmp_path_factory.getbasetemp(), text)

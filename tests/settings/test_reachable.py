@@ -85,16 +85,18 @@ def targets(cell: Settings, count: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("mount", MOUNTS.values(), ids=MOUNTS)
-def test_all_targets_of_a_default_reach_are_reached_by_inverse_kinematics(
+def test_targets_of_the_default_reach_are_reached(
     mount: tuple[str, str] | None, tmp_path: Path
 ) -> None:
+    """All targets of a default reach are reached by inverse kinematics."""
     cell = cell_in(tmp_path, mounted(UR5, *mount) if mount else UR5)
     assert cell.reach.outer > 0.85
     assert reached(cell, targets(cell, 60)) >= 0.95
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_the_shipped_cells_have_a_reach_about_as_their_kinematics_give(arm: str) -> None:
+def test_shipped_cells_have_the_reach_of_their_kinematics(arm: str) -> None:
+    """The shipped cells have a reach about as their kinematics give."""
     cell = cell_of(arm)
     joints = cell.joints
     reach = cell.reach
@@ -134,9 +136,10 @@ def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
         (("0 0 0", "0 0 0"), "min_x = 1.0", "0 %"),
     ],
 )
-def test_a_reach_that_the_arm_has_not_is_refused_with_what_it_has(
+def test_impossible_reach_is_refused(
     mount: tuple[str, str], reach: str, share: str, tmp_path: Path
 ) -> None:
+    """A reach that the arm has not is refused with what it has."""
     with pytest.raises(
         SettingsError,
         match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics",

@@ -24,7 +24,8 @@ from thirdhand.workbench.first_cell.rates import rates
 from thirdhand_sim.scene import Scene
 
 
-def test_the_chain_to_the_tool_has_the_joints_in_order_with_their_limits() -> None:
+def test_chain_has_its_joints_in_order_with_limits() -> None:
+    """The chain to the tool has the joints in order with their limits."""
     joints = Urdf(URDF).movable("tool_plate")
     assert tuple(joint.name for joint in joints) == JOINT_NAMES
     assert (joints[3].lower, joints[3].upper, joints[3].velocity) == (-0.9, 3.1, 2.0)
@@ -97,9 +98,10 @@ CHAIN = '<robot name="r"><link name="l0"/>{}</robot>'.format(
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
     | st.just((0, 1, 0, 1))
 )
-def test_quaternions_limits_and_rates_of_newer_urdfs_are_those_of_every_reader(
+def test_newer_urdfs_are_read_as_by_every_reader(
     quaternion: tuple[float, ...],
 ) -> None:
+    """Quaternions limits and rates of newer urdfs are those of every reader."""
     turn = np.array(quaternion) / np.linalg.norm(quaternion)
     origin = f'<origin xyz="1 0 0" quat_xyzw="{" ".join(map(repr, turn.tolist()))}"/><axis'
     text = readable(LIMITED.replace("<axis", origin).encode())

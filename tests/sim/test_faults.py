@@ -39,9 +39,8 @@ def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["tracker frozen"])
-def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
-    suffered: dict[str, Any], name: str
-) -> None:
+def test_silent_tracker_stops_the_arm(suffered: dict[str, Any], name: str) -> None:
+    """A tracker that is not heard stops the arm when its hands are stale."""
     fault = suffered["faults"][name]
     assert fault["reason"] == "stale_hand"
     assert 80 <= fault["hold_ms"] <= 120
@@ -53,9 +52,8 @@ def test_a_tracker_that_is_not_heard_stops_the_arm_when_its_hands_are_stale(
 
 
 @pytest.mark.parametrize("name", ["network to the arm silent", "cable pulled"])
-def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it(
-    suffered: dict[str, Any], name: str
-) -> None:
+def test_cut_network_leaves_no_arm_in_motion(suffered: dict[str, Any], name: str) -> None:
+    """A network that is cut leaves no arm in motion and nothing late moves it."""
     if name not in suffered["faults"]:
         pytest.skip("a network namespace is not allowed here")
     fault = suffered["faults"][name]
@@ -71,9 +69,10 @@ def test_a_network_that_is_cut_leaves_no_arm_in_motion_and_nothing_late_moves_it
     assert fault["lost_ticks"] == 0
 
 
-def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whole(
+def test_killed_service_leaves_no_arm_in_motion(
     suffered: dict[str, Any],
 ) -> None:
+    """A service that is killed leaves no arm in motion and its recording whole."""
     fault = suffered["faults"]["service killed"]
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
@@ -81,7 +80,8 @@ def test_a_service_that_is_killed_leaves_no_arm_in_motion_and_its_recording_whol
     assert fault["moves_again_ms"] > 0  # begun anew, it goes on by itself
 
 
-def test_a_router_that_is_killed_stops_the_arm_and_all_meet_again(suffered: dict[str, Any]) -> None:
+def test_killed_router_stops_the_arm(suffered: dict[str, Any]) -> None:
+    """A router that is killed stops the arm and all meet again."""
     fault = suffered["faults"]["router killed"]
     assert fault["reason"] in ("stale_hand", "arm_error", "arm_silent")
     assert fault["hold_ms"] <= 120
@@ -89,9 +89,10 @@ def test_a_router_that_is_killed_stops_the_arm_and_all_meet_again(suffered: dict
     assert fault["moves_again_ms"] > 0
 
 
-def test_a_scribe_that_is_killed_costs_ticks_of_the_recording_and_no_motion(
+def test_killed_scribe_costs_ticks_and_no_motion(
     suffered: dict[str, Any],
 ) -> None:
+    """A scribe that is killed costs ticks of the recording and no motion."""
     fault = suffered["faults"]["scribe killed"]
     assert fault["lost_ticks"] > 0
     assert fault["command_mean_gap_ms"] < 1.5 * fault["command_mean_gap_before_ms"]

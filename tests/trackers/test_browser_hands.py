@@ -87,7 +87,9 @@ async def reason(socket: aiohttp.ClientWebSocketResponse) -> tuple[int | None, s
     return socket.close_code, ""
 
 
-def test_hands_are_published_as_they_were_sent_and_a_prediction_is_stamped_now() -> None:
+def test_hands_are_published_as_sent() -> None:
+    """Hands are published as they were sent and a prediction is stamped now."""
+
     async def scenario() -> None:
         async with serving_page(page) as address, opened(page, address) as socket:
             before_ns = time.time_ns()
@@ -139,7 +141,9 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
         asyncio.run(scenario())
 
 
-def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None:
+def test_refusals_have_a_reason() -> None:
+    """Each refusal has a reason and the hands of another page go on."""
+
     async def scenario() -> None:
         async with serving_page(page) as address, opened(page, address) as good:
 
@@ -180,9 +184,10 @@ def test_each_refusal_has_a_reason_and_the_hands_of_another_page_go_on() -> None
         asyncio.run(scenario())
 
 
-def test_hands_pass_to_another_page_once_the_first_has_left_or_is_silent(
+def test_hands_pass_to_another_page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Hands pass to another page once the first has left or is silent."""
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
 
@@ -233,7 +238,8 @@ def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
         asyncio.run(scenario())
 
 
-def test_a_self_signed_certificate_serves_https_under_its_name_alone(tmp_path: Path) -> None:
+def test_self_signed_certificate_serves_https(tmp_path: Path) -> None:
+    """A self signed certificate serves https under its name alone."""
     certificate = server_certificate("Localhost", tmp_path / "state")
     (file,) = (tmp_path / "state").iterdir()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600

@@ -197,9 +197,10 @@ REFUSED: dict[str, tuple[Callable[[HeldTool], HeldTool], str]] = {
 
 @pytest.mark.parametrize("kind", ["mocap", "headset"])
 @pytest.mark.parametrize(("spoil", "words"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_calibrated_is_refused_with_the_likely_cause(
+def test_impossible_calibration_is_refused_with_its_cause(
     spoil: Callable[[HeldTool], HeldTool], words: str, kind: str
 ) -> None:
+    """What cannot be calibrated is refused with the likely cause."""
     with pytest.raises(CalibrationError, match=f"(?s)^.*({words})"):
         solve_held(spoil(held_by(kind)), CORNERS)
 
@@ -246,9 +247,7 @@ def test_points_that_show_nothing_are_refused() -> None:
 @pytest.mark.parametrize("missed_m", [0.0, 0.05, 0.3])
 @pytest.mark.parametrize("noise_m", [0.001, 0.003, 0.008])
 @pytest.mark.one_case
-def test_points_never_give_a_pose_that_is_off_by_twice_its_accuracy(
-    noise_m: float, missed_m: float
-) -> None:
+def test_pose_by_points_is_within_twice_its_accuracy(noise_m: float, missed_m: float) -> None:
     """Points in the plane of the table and one to three above it, as the page asks for, of which
     one may be missed. No left-handed tracker is taken for a right-handed one.
     """
@@ -468,7 +467,8 @@ def test_the_settings_are_changed_and_nothing_else(
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)
 
 
-def test_a_file_that_cannot_be_changed_stays_and_a_record_must_be_there(tmp_path: Path) -> None:
+def test_unchangeable_file_stays(tmp_path: Path) -> None:
+    """A file that cannot be changed stays and a record must be there."""
     path = tmp_path / "cell.toml"
     path.write_text("rate_hz = 200\n")
     values = hand_settings(FOUND, "webxr") | {"unit": "miles"}
@@ -529,12 +529,13 @@ def no_room(_: int) -> None:
 
 
 @pytest.mark.parametrize(("prepare", "words"), NOT_WRITTEN.values(), ids=NOT_WRITTEN)
-def test_a_calibration_that_cannot_be_written_is_printed_and_the_file_stays(
+def test_unwritable_calibration_is_printed(
     prepare: Callable[[Path, pytest.MonkeyPatch], object],
     words: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """A calibration that cannot be written is printed and the file stays."""
     path = tmp_path / "cell.toml"
     prepare(path, monkeypatch)
     before = path.read_text() if path.is_file() else ""
@@ -663,9 +664,10 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     )
 
 
-def test_the_frame_of_the_hand_names_the_table_that_is_calibrated_and_checked(
+def test_frame_of_the_hand_names_the_calibrated_table(
     tmp_path: Path,
 ) -> None:
+    """The frame of the hand names the table that is calibrated and checked."""
     cell = tmp_path / "cell.toml"
     led = str(tmp_path / "led.mcap")
     text = '[hands]\nframe = "webxr"\n[trackers.mocap]  # beside it\n'

@@ -74,7 +74,8 @@ def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) ->
 @pytest.mark.skipif(
     not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'"
 )
-def test_a_camera_that_is_not_there_and_a_file_that_is_no_model_are_refused(tmp_path: Path) -> None:
+def test_missing_camera_and_bad_model_are_refused(tmp_path: Path) -> None:
+    """A camera that is not there and a file that is no model are refused."""
     with pytest.raises(CameraError, match="no camera 63"):
         next(pictures("63"))
     (tmp_path / "model.task").write_bytes(b"nothing")

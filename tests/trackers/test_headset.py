@@ -93,9 +93,10 @@ def send_more(tab: Tab, count: int) -> None:
 
 
 @pytest.mark.thorough
-def test_poses_are_within_a_millimetre_and_a_tenth_of_a_degree_and_stamps_are_right(
+def test_poses_and_stamps_are_accurate(
     hearing: tuple[zenoh.Session, str], tmp_path: Path, record_property: Any
 ) -> None:
+    """Poses are within a millimetre and a tenth of a degree and stamps are right."""
     session, endpoint = hearing
     heard = Heard(session)
     with headset.serving_hands(endpoint, tmp_path) as served:
@@ -188,9 +189,8 @@ class Stalling:
 
 
 @pytest.mark.thorough
-def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
-    hearing: tuple[zenoh.Session, str], tmp_path: Path
-) -> None:
+def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Path) -> None:
+    """Behind a slow network hands are dropped and none arrives late."""
     session, endpoint = hearing
     heard = Heard(session)
     with headset.serving_hands(endpoint, tmp_path) as served:
@@ -223,9 +223,10 @@ def test_behind_a_slow_network_hands_are_dropped_and_none_arrives_late(
 
 
 @pytest.mark.thorough
-def test_a_daemon_follows_hands_until_they_are_raised_and_again_once_they_pinch_there(
+def test_daemon_follows_hands_until_they_are_raised(
     tmp_path: Path,
 ) -> None:
+    """A daemon follows hands until they are raised and again once they pinch there."""
     at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up
     one_raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]", 1)

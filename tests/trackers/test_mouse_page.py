@@ -75,9 +75,8 @@ def until_arrived(
 
 
 @pytest.mark.thorough
-def test_hands_begin_at_the_skills_first_via_point_and_are_published_as_they_are_drawn(
-    daemon: Daemon, url: str, tmp_path: Path
-) -> None:
+def test_hands_begin_at_the_first_via_point(daemon: Daemon, url: str, tmp_path: Path) -> None:
+    """Hands begin at the skills first via point and are published as they are drawn."""
     received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         status = daemon.until(lambda status: status["mode"] == "follow")
@@ -161,9 +160,10 @@ def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
 
 
 @pytest.mark.thorough
-def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_undone(
+def test_correction_by_dragging_is_made_and_undone(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
+    """In a hold the tool is dragged to where it belongs and the correction undone."""
     with person_at(url, tmp_path, timeout_s=5 * TIMEOUT_S) as person:
         tab = person.tab
         wait_for_the_skill_worker(daemon)
@@ -206,9 +206,8 @@ def test_in_a_hold_the_tool_is_dragged_to_where_it_belongs_and_the_correction_un
         daemon.until(lambda status: status["mode"] == "follow")
 
 
-def test_a_hidden_page_sends_nothing_and_its_hands_wait_where_they_were(
-    daemon: Daemon, url: str, tmp_path: Path
-) -> None:
+def test_hidden_page_sends_nothing(daemon: Daemon, url: str, tmp_path: Path) -> None:
+    """A hidden page sends nothing and its hands wait where they were."""
     received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         daemon.until(lambda status: status["mode"] == "follow")

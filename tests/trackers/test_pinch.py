@@ -35,9 +35,10 @@ def said(pinches: Pinches, distances_m: dict[str, float], watch: Watch) -> Any:
 
 
 @pytest.mark.parametrize(("left_m", "pressed"), LEFT_M.values(), ids=LEFT_M)
-def test_the_left_hand_presses_the_clutch_and_the_right_one_closes_the_gripper(
+def test_left_hand_clutches_and_right_hand_grips(
     left_m: list[float | None], pressed: list[bool]
 ) -> None:
+    """The left hand presses the clutch and the right one closes the gripper."""
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
         Watch(hearing, "bench", "clutch", timeout_s=2) as clutch,

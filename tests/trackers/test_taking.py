@@ -167,9 +167,10 @@ def put_until(
         ),
     ],
 )
-def test_what_is_published_otherwise_than_needed_is_said_before_anything_is_recorded(
+def test_unsuitable_streams_are_reported_before_recording(
     sessions: tuple[zenoh.Session, zenoh.Session], poses: dict[str, Any], wait_s: float, words: str
 ) -> None:
+    """What is published otherwise than needed is said before anything is recorded."""
     over = threading.Event()
     tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
     tracker.start()
@@ -181,7 +182,7 @@ def test_what_is_published_otherwise_than_needed_is_said_before_anything_is_reco
         tracker.join(10)
 
 
-def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
+def test_take_too_far_away_says_where_and_in_which_unit(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
     """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
@@ -236,9 +237,10 @@ def test_a_take_that_is_too_far_away_says_where_and_in_which_unit(
 
 
 @pytest.mark.parametrize("key", ["hands/right", "tool/pose"])
-def test_a_pose_in_a_frame_of_which_nothing_is_known_ends_a_take_before_it_begins(
+def test_pose_in_an_unknown_frame_ends_the_take_early(
     sessions: tuple[zenoh.Session, zenoh.Session], key: str
 ) -> None:
+    """A pose in a frame of which nothing is known ends a take before it begins."""
     for hands, refused in ((HandSettings(), True), (HandSettings(frame="camera"), False)):
         taken = Capture(sessions[0], "bench", Settings(hands=hands))
         taken.close()

@@ -27,9 +27,11 @@ from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
-def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followed(
+def test_picture_is_of_the_last_followed_moment(
     tmp_path: Path,
 ) -> None:
+    """A picture without a time is of the last moment at which the arm followed."""
+
     def change(_: Viewer, k: int, frame: Record) -> None:
         if k >= 400:
             frame["mode"] = Mode.FAULT
@@ -51,9 +53,10 @@ def test_a_picture_without_a_time_is_of_the_last_moment_at_which_the_arm_followe
     assert (corners[0] != corners[1]).any()
 
 
-def test_an_arm_without_its_meshes_is_drawn_by_its_capsules_and_that_is_said(
+def test_arm_without_meshes_is_drawn_by_capsules(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """An arm without its meshes is drawn by its capsules and that is said."""
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
     (tmp_path / "arm.urdf").write_text(

@@ -38,7 +38,8 @@ def measured(tick: int, joints: Record) -> tuple[str, bytes]:
     )
 
 
-def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: Path) -> None:
+def test_recording_becomes_a_drawing_with_every_tick(tmp_path: Path) -> None:
+    """A recording becomes a drawing with every tick in the curves."""
     entries = write(tmp_path / "a.mcap", 1200)
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 1200
     rows = drawn(tmp_path / "a.rrd")
@@ -56,7 +57,8 @@ def test_a_recording_becomes_a_drawing_with_every_tick_in_the_curves(tmp_path: P
     assert work == pytest.approx([timing["work_us"] for *_, timing in entries])
 
 
-def test_hands_and_target_are_drawn_once_there_are_hands_and_the_arm_moves(tmp_path: Path) -> None:
+def test_hands_and_target_are_drawn_once_they_are_known(tmp_path: Path) -> None:
+    """Hands and target are drawn once there are hands and the arm moves."""
     entries = list(ticks(600))
 
     def change(one: Viewer, k: int, _: Record) -> None:
@@ -105,9 +107,11 @@ def test_every_curve_names_its_unit(tmp_path: Path) -> None:
     assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
 
 
-def test_a_trail_begins_where_the_hand_was_first_seen_and_anew_where_it_is_seen_again(
+def test_trail_begins_anew_where_the_hand_reappears(
     tmp_path: Path,
 ) -> None:
+    """A trail begins where the hand was first seen and anew where it is seen again."""
+
     def change(_: Viewer, k: int, frame: Record) -> None:
         if 300 <= k < 600:  # away, and then back elsewhere
             frame["hand_ages"][0] = k - 300
@@ -146,9 +150,8 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
     }
 
 
-def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taught(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill) -> None:
+    """The shipped skill is drawn with its demonstrations and what it was taught."""
     point = ViaPoint(
         "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
     )
@@ -180,9 +183,8 @@ def test_the_shipped_skill_is_drawn_with_its_demonstrations_and_what_it_was_taug
     assert gate == pytest.approx(1000 * skill.threshold)
 
 
-def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_orientation_and_gripper_are_drawn(tmp_path: Path, skill: Skill) -> None:
+    """What turns and grips is drawn where the skill knows of it."""
     turned = Rotation.from_euler("x", 3, degrees=True)
 
     def change(_: Viewer, k: int, frame: Record) -> None:
@@ -206,9 +208,10 @@ def test_what_turns_and_grips_is_drawn_where_the_skill_knows_of_it(
     assert curves["/gripper/commanded"] == pytest.approx([100.0] * 100)
 
 
-def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_the_scene(
+def test_undrawable_skill_spares_the_scene(
     tmp_path: Path,
 ) -> None:
+    """A skill of which nothing can be drawn is named in the log and spares the scene."""
     rows = viewed(tmp_path / "a.rrd", 30, skill=b"nonsense")
     assert len(values(rows["/joints/position"], "tick")) == 30
     assert any(
@@ -216,7 +219,8 @@ def test_a_skill_of_which_nothing_can_be_drawn_is_named_in_the_log_and_spares_th
     )
 
 
-def test_things_are_drawn_where_they_are_and_go_where_they_are_no_more(tmp_path: Path) -> None:
+def test_objects_are_drawn_where_they_are(tmp_path: Path) -> None:
+    """Things are drawn where they are and go where they are no more."""
     board = SceneObject(
         "board",
         "box",
@@ -285,7 +289,8 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
         convert(tmp_path / "a.mcap", "/dev/full")
 
 
-def test_the_live_view_listens_on_this_machine_only_and_ends_when_it_is_closed() -> None:
+def test_live_view_listens_on_this_machine_only() -> None:
+    """The live view listens on this machine only and ends when it is closed."""
     viewer = Viewer(urdf=WAM, settings=Settings(), live_port=0)
     assert viewer.url is not None
     port = int(viewer.url.rsplit(":", 1)[1].split("/")[0])
@@ -335,9 +340,11 @@ def test_what_cannot_be_shown_is_said_in_words(
     assert len(stderr.splitlines()) == 1
 
 
-def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_small_to_see(
+def test_unmeasured_arm_is_drawn_too_small_to_see(
     tmp_path: Path,
 ) -> None:
+    """Every link of an arm that is not measured yet is somewhere and too small to see."""
+
     def change(_: Viewer, k: int, frame: Record) -> list[tuple[str, bytes]]:
         return [measured(k, frame["joints"])] if k > 50 else []
 
@@ -349,7 +356,9 @@ def test_every_link_of_an_arm_that_is_not_measured_yet_is_somewhere_and_too_smal
         assert not any(row.get("Transform3D:scale") for row in later)
 
 
-def test_what_the_right_hand_conducts_is_drawn_before_the_left_is_seen(tmp_path: Path) -> None:
+def test_hands_of_a_one_handed_skill_are_drawn(tmp_path: Path) -> None:
+    """What the right hand conducts is drawn before the left is seen."""
+
     def change(_: Viewer, k: int, frame: Record) -> None:
         frame["hand_ages"][0] = -1
         frame["covariance"][:] *= k >= 10  # nothing is predicted before

@@ -37,9 +37,8 @@ def log_of(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
     return {row[TEXT][0]: row["seconds"].total_seconds() for row in rows["/log"] if row.get(TEXT)}
 
 
-def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(
-    tmp_path: Path, skill: Skill
-) -> None:
+def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill) -> None:
+    """A drawing shows what a recording holds between its whole frames."""
     taught = with_file(replace(skill, via_points=(VISE,))).file
     with Recorder(
         tmp_path / "a.mcap", settings=Settings(), skill=skill.file, thin=True
@@ -87,7 +86,7 @@ def test_a_drawing_shows_what_a_recording_holds_between_its_whole_frames(
 @pytest.mark.parametrize(
     ("lost", "pause_ticks", "is_broken"), [(5, 5, True), (0, 500, True), (0, 3, False)]
 )
-def test_curves_and_trails_are_interrupted_where_frames_are_missing(
+def test_curves_are_interrupted_where_frames_are_missing(
     tmp_path: Path, lost: int, pause_ticks: int, is_broken: bool
 ) -> None:
     """Ticks that are not recorded, or a loop that was stopped for a second; missed deadlines are no
@@ -128,9 +127,10 @@ def test_curves_and_trails_are_interrupted_where_frames_are_missing(
     ) == bool(lost)
 
 
-def test_a_recording_that_cannot_be_read_to_its_end_leaves_no_part_of_a_drawing(
+def test_unreadable_recording_leaves_no_part_of_a_drawing(
     tmp_path: Path,
 ) -> None:
+    """A recording that cannot be read to its end leaves no part of a drawing."""
     path = tmp_path / "a.mcap"
     with Recorder(path, settings=Settings(), skill=SKILL) as recorder:
         for tick, frame, timing in ticks(40):
