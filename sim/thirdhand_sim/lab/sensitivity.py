@@ -45,10 +45,7 @@ CHANGED = 2  # seeds of the sessions at other values
 FACTORS = (0.5, 2.0)
 MOTION_S = 4.0
 STOP_RATES_HZ = {100: 0.0005, 30: 0.002, 15: 0.002}  # noise [m] of the trackers
-# begin and end of the time without a hand, and with two sources
-UNSEEN_S = (1.7, 2.3)
-TWO_SOURCES_S = (2.5, 3.5)
-APART_M = 0.04  # between the positions of two sources
+UNSEEN_S = (1.7, 2.3)  # begin and end of the time without a hand
 # bursts of three outliers, and how far away they are
 BURSTS = 4
 BURST_M = 0.2
@@ -149,28 +146,19 @@ def stops(tuning: Tuning, seed: int) -> Figures:
 
 
 def disturbed(tuning: Tuning, seed: int) -> Figures:
-    """A hand out of sight, with late samples; two sources for a while; bursts of outliers."""
+    """A hand out of sight, with late samples; bursts of outliers."""
     hands = _person(seed)[0]
     random = np.random.default_rng([TUNING_STREAMS["disturbed"].seed, seed])
     late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
     late[(hands.stamps > UNSEEN_S[0]) & (hands.stamps < UNSEEN_S[1]), seed % 2] = math.inf
 
-    twice = hands.samples.copy()
     wrong = hands.samples.copy()
-    second = np.flatnonzero((hands.stamps > TWO_SOURCES_S[0]) & (hands.stamps < TWO_SOURCES_S[1]))[
-        ::2
-    ]
-    twice[second, :3] += APART_M
     for begin in random.integers(0, len(wrong) - 3, BURSTS):
         away = random.standard_normal(3)
         wrong[begin : begin + 3, :3] += BURST_M * away / np.linalg.norm(away)
 
-    variants = [
-        replace(hands, late=late),
-        replace(hands, samples=twice),
-        replace(hands, samples=wrong),
-    ]
-    named = list(zip(("late", "twice", "wrong"), _followed(variants, tuning), strict=True))
+    variants = [replace(hands, late=late), replace(hands, samples=wrong)]
+    named = list(zip(("late", "wrong"), _followed(variants, tuning), strict=True))
     errors = {f"{name}_error_rms_mm": row.error_rms_mm for name, row in named}
     return errors | {f"{name}_jerk_ratio": row.jerk_ratio for name, row in named}
 
