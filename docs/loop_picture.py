@@ -1,10 +1,12 @@
-"""`python docs/loop_picture.py` draws loop.png: the loop of a cell with signals, units and rates.
+"""`python docs/loop_picture.py` draws loop.png, the loop of a cell with signals, units and rates,
+and processes.png, its processes and the messages between them.
 
 Rates of messages are those of the table of channels.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +21,7 @@ from matplotlib.patches import FancyBboxPatch
 from thirdhand.contract.channels import BY_KEY
 from thirdhand.settings.config import Settings
 
-PICTURE = Path(__file__).with_name("loop.png")
+FOLDER = Path(__file__).parent
 # of a box
 WIDTH = 1.9
 HEIGHT = 0.8
@@ -90,6 +92,36 @@ ARROWS = (
 )
 
 
+PROCESSES = {
+    "clients": Box(0.0, 4.8, "any language, ROS 2", OUTSIDE),
+    "trackers": Box(0.0, 2.7, "any; sim, play, hands", OUTSIDE),
+    "driver": Box(0.0, 0.6, "moves the arm", OUTSIDE),
+    "requests": Box(4.2, 4.8, "threads: check, reply", STAGE),
+    "inbox": Box(8.1, 4.8, "orders, new skills", STAGE),
+    "status": Box(12.0, 4.8, "a thread: 10 Hz, log", STAGE),
+    "subscribers": Box(4.2, 2.7, "the newest samples", STAGE),
+    "core": Box(8.1, 2.7, "decides a frame", STAGE),
+    "publishers": Box(6.15, 0.6, "command, target, ...", STAGE),
+    "skill worker": Box(16.2, 4.8, "process: adapts skills", OUTSIDE),
+    "scribe": Box(16.2, 2.7, "process: records", OUTSIDE),
+    "fork server": Box(16.2, 0.6, "process: starts both", OUTSIDE),
+}
+MESSAGES = (
+    Arrow("clients", "requests", "JSON: via_points,\nhold, resume, ..."),
+    Arrow("requests", "inbox", "checked"),
+    Arrow("inbox", "core", "events of a tick", 0.75, 0.0),
+    Arrow("trackers", "subscribers", "hands/left,\nhands/right"),
+    Arrow("driver", "subscribers", "joints/state", 0.5, -0.35),
+    Arrow("subscribers", "core", "samples"),
+    Arrow("core", "publishers", "messages", 0.55, 0.0),
+    Arrow("publishers", "driver", "joints/command"),
+    Arrow("core", "status", "copies", 0.5, 0.0),
+    Arrow("status", "skill worker", "searches"),
+    Arrow("core", "scribe", "tick and frame, sent without waiting", -1.0),
+    Arrow("fork server", "scribe", "", 0.0, 0.0),
+)
+
+
 def draw_box(axes: Axes, name: str, box: Box) -> None:
     """A box with its name and what it does."""
     corner = (box.x - WIDTH / 2, box.y - HEIGHT / 2)
@@ -113,10 +145,10 @@ def edge(begin: Box, end: Box) -> tuple[float, float]:
     return begin.x + share * dx, begin.y + share * dy
 
 
-def draw_arrow(axes: Axes, arrow: Arrow) -> None:
+def draw_arrow(axes: Axes, boxes: Mapping[str, Box], arrow: Arrow) -> None:
     """An arrow from edge to edge, and its text."""
-    end = BOXES[arrow.end]
-    begin = BOXES.get(arrow.begin, Box(CORE_RIGHT - WIDTH / 2, end.y, "", STAGE))
+    end = boxes[arrow.end]
+    begin = boxes.get(arrow.begin, Box(CORE_RIGHT - WIDTH / 2, end.y, "", STAGE))
     start = edge(begin, end)
     stop = edge(end, begin)
     axes.annotate(
@@ -126,11 +158,11 @@ def draw_arrow(axes: Axes, arrow: Arrow) -> None:
     axes.text(*middle, arrow.text, ha="center", va="center", fontsize=8.5, bbox=LABEL)
 
 
-def main() -> None:
-    """Writes the picture beside this file."""
+def draw(name: str, title: str, boxes: Mapping[str, Box], arrows: Sequence[Arrow]) -> None:
+    """Write a picture: boxes and arrows, with a frame of this title around the middle columns."""
     figure = plt.figure(figsize=(13.6, 6.2))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    core = FancyBboxPatch(
+    frame = FancyBboxPatch(
         (CORE_LEFT + 0.1, -0.25),
         CORE_RIGHT - CORE_LEFT - 0.2,
         5.9,
@@ -139,23 +171,23 @@ def main() -> None:
         edgecolor="#3a6ea5",
         linestyle="--",
     )
-    axes.add_patch(core)
-    rate_hz = Settings().rate_hz
-    axes.text(
-        8.1,
-        5.95,
-        f"the core: one tick every {1000 / rate_hz:g} ms",
-        ha="center",
-        fontsize=11,
-        color="#3a6ea5",
-    )
-    for name, box in BOXES.items():
-        draw_box(axes, name, box)
-    for arrow in ARROWS:
-        draw_arrow(axes, arrow)
+    axes.add_patch(frame)
+    axes.text(8.1, 5.95, title, ha="center", fontsize=11, color="#3a6ea5")
+    for label, box in boxes.items():
+        draw_box(axes, label, box)
+    for arrow in arrows:
+        draw_arrow(axes, boxes, arrow)
     axes.set(xlim=(-1.3, 17.5), ylim=(-0.6, 6.95))
     axes.set_axis_off()
-    figure.savefig(PICTURE, dpi=DPI)
+    figure.savefig(FOLDER / name, dpi=DPI)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Writes the pictures beside this file."""
+    period_ms = 1000 / Settings().rate_hz
+    draw("loop.png", f"the core: one tick every {period_ms:g} ms", BOXES, ARROWS)
+    draw("processes.png", "the control process", PROCESSES, MESSAGES)
 
 
 if __name__ == "__main__":
