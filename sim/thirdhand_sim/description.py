@@ -30,28 +30,38 @@ def simulated(settings: Settings, **compiler: str) -> str:
     for joint in robot.findall("joint"):
         if joint.get("name") not in names:
             joint.set("type", "fixed")
-    links = {link.get("name"): link for link in robot.findall("link")}
+    links = {link.get("name", ""): link for link in robot.findall("link")}
     driven = {joint.child for joint in urdf.joints if joint.name in names}
     for name, link in links.items():
         if not _is_massive(link):
-            for without in link.findall("inertial"):
-                link.remove(without)
-            # without it, PyBullet gives 1 kg also to links without a body
-            inertial = SubElement(link, "inertial")
-            SubElement(inertial, "mass", value=UNKNOWN_KG if name in driven else "0")
-            SubElement(inertial, "inertia", UNKNOWN_INERTIA if name in driven else NO_INERTIA)
+            _weigh(link, is_driven=name in driven)
     if robot.find(".//mesh") is not None:
-        for link in links.values():
-            for shape in [*link.findall("visual"), *link.findall("collision")]:
-                link.remove(shape)
-        moved = {joint.name: joint.child for joint in urdf.joints}
-        for capsule in body_of(settings, text).capsules:
-            number = int(capsule["link"])
-            link = links[moved[names[number - 1]] if number else urdf.root]
-            _cover(link, capsule["ends"].tolist(), float(capsule["radius"]))
+        _cover_links(links, settings, urdf, text)
     if compiler:
         SubElement(SubElement(robot, "mujoco"), "compiler", compiler)
     return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _weigh(link: Element, *, is_driven: bool) -> None:
+    """Give a link a mass: without one, PyBullet gives 1 kg also to links without a body."""
+    for without in link.findall("inertial"):
+        link.remove(without)
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "mass", value=UNKNOWN_KG if is_driven else "0")
+    SubElement(inertial, "inertia", UNKNOWN_INERTIA if is_driven else NO_INERTIA)
+
+
+def _cover_links(links: dict[str, Element], settings: Settings, urdf: Urdf, text: str) -> None:
+    """Replace all shapes of the links by the capsules of the arm's body."""
+    for link in links.values():
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    names = settings.joints.names
+    moved = {joint.name: joint.child for joint in urdf.joints}
+    for capsule in body_of(settings, text).capsules:
+        number = int(capsule["link"])
+        link = links[moved[names[number - 1]] if number else urdf.root]
+        _cover(link, capsule["ends"].tolist(), float(capsule["radius"]))
 
 
 def _is_massive(link: Element) -> bool:

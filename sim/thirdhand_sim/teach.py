@@ -244,6 +244,37 @@ def _are_heard(publishers: list[Publisher]) -> bool:
 
 def main(arguments: list[str] | None = None) -> int:
     """Make or publish demonstrations; exit code 0, 1 on failure, 2 on bad usage."""
+    p = _parser()
+    args = p.parse_args(arguments)
+    _check(p, args)
+    try:
+        scene = Scene.load(args.scene) if args.scene else Scene()
+        reach = client_settings(connect=args.connect, cell=args.cell)
+        if args.via_points:
+            points = msgspec.json.encode({"op": "add", "points": visits(1).via_points})
+            args.via_points.write_bytes(msgspec.json.format(points) + b"\n")
+            return 0
+        if args.live:
+            return _perform_all(scene, args, reach)
+        args.output.mkdir(parents=True, exist_ok=True)
+        seed = scene.seed if args.seed is None else args.seed
+        takes = by_people(args.count)
+        if not args.people:
+            takes = demonstrations(scene, count=args.count, seed=seed, gripper=args.gripper)
+        for number, taught in enumerate(takes, start=1):
+            path = args.output / f"demonstration-{number}.mcap"
+            write_demonstration(path, taught, cell=reach.cell)
+            print(path)
+    except SettingsError as error:
+        p.error(str(error))
+    except (SceneError, OSError) as error:
+        print(f"python -m thirdhand_sim.teach: {in_words(error)}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The options."""
     p = argparse.ArgumentParser(
         prog="python -m thirdhand_sim.teach",
         description=(
@@ -280,7 +311,11 @@ def main(arguments: list[str] | None = None) -> int:
     )
     option(p, "--cell", "NAME", "prefix of topics and keys ($THIRDHAND_CELL, else thirdhand)")
     p.add_argument("--gripper", action="store_true", help="include the closure of the gripper")
-    args = p.parse_args(arguments)
+    return p
+
+
+def _check(p: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """End with bad usage if options are out of range or exclude each other."""
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
     if args.seed is not None and args.seed < 0:
@@ -293,32 +328,6 @@ def main(arguments: list[str] | None = None) -> int:
         p.error("--people needs --output, not --live")
     if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
-    try:
-        scene = Scene.load(args.scene) if args.scene else Scene()
-        reach = client_settings(connect=args.connect, cell=args.cell)
-        if args.via_points:
-            points = msgspec.json.encode({"op": "add", "points": visits(1).via_points})
-            args.via_points.write_bytes(msgspec.json.format(points) + b"\n")
-            return 0
-        if args.live:
-            return _perform_all(scene, args, reach)
-        args.output.mkdir(parents=True, exist_ok=True)
-        seed = scene.seed if args.seed is None else args.seed
-        takes = (
-            by_people(args.count)
-            if args.people
-            else demonstrations(scene, count=args.count, seed=seed, gripper=args.gripper)
-        )
-        for number, taught in enumerate(takes, start=1):
-            path = args.output / f"demonstration-{number}.mcap"
-            write_demonstration(path, taught, cell=reach.cell)
-            print(path)
-    except SettingsError as error:
-        p.error(str(error))
-    except (SceneError, OSError) as error:
-        print(f"python -m thirdhand_sim.teach: {in_words(error)}", file=sys.stderr)
-        return 1
-    return 0
 
 
 def _perform_all(scene: Scene, args: argparse.Namespace, reach: ClientSettings) -> int:

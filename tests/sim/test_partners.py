@@ -125,7 +125,7 @@ def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
                     for part in ("left", "right", "tool")
                 },
             )
-            for p in d.places
+            for p in d.via_points
         )
         d = d._replace(
             left=d.left + moved, right=d.right + moved, tool=d.tool + moved, via_points=via_points

@@ -7,8 +7,10 @@ included.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -293,18 +295,17 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     if options.hands is not None:
         return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
+    chase = [name for name in by_name if name.startswith("chase")][-1]
+    by_both = ["ours", chase]
+    floor_hands = [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
     tasks = [
         (name, SHIPPED, sequence)
-        for name in by_name
-        for sequence in hands
+        for name, sequence in itertools.product(by_name, hands)
         if name != TRUTH or sequence.group == SMOOTH
     ]
-    by_both = ["ours", [name for name in by_name if name.startswith("chase")][-1]]
     tasks += [
         (name, OF_SUCH_HANDS, sequence)
-        for name in by_both
-        for sequence in hands
-        if sequence.group in FLOOR_GROUPS
+        for name, sequence in itertools.product(by_both, floor_hands)
     ]
     measured = _measured(tasks, options)
     table = {
@@ -314,31 +315,29 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     }
     for name, groups in table.items():
         results.say(f"{name}: {brief(groups)}")
-    floors = {
-        group: best_linear(
-            [sequence for sequence in hands if sequence.group == group], skill, rate_hz=rate_hz
-        )
-        for group, rate_hz in FLOOR_GROUPS.items()
-    }
     _record(results, hands[1], by_name["ours"](hands[1]))
     numbers = {
         "hands": "modelled",
         "by_follower": table,
         "by_person": _by_person(results, [row for row in measured if math.isnan(row.overshoot_mm)]),
-        "best_linear_filter": {
-            group: [floor._asdict() for floor in rows] for group, rows in floors.items()
-        },
-        "gain_by_frequency": _gains(
-            results, options, dict(zip(("ours", "chase"), by_both, strict=True))
-        ),
+        "best_linear_filter": _floors(floor_hands, skill),
+        "gain_by_frequency": _gains(results, options, {"ours": "ours", "chase": chase}),
         "joint_speeds_in_the_scene": _joint_speeds(measured, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(row) for row in measured if row.follower == "ours"],
-        "by_arm": _by_arm(
-            results, options, [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
-        ),
+        "by_arm": _by_arm(results, options, floor_hands),
     }
     draw_numbers(results, numbers)
     return numbers
+
+
+def _floors(hands: Sequence[Any], skill: Skill) -> dict[str, list[dict[str, Any]]]:
+    """The best linear filters of each group of hands."""
+    floors: dict[str, list[dict[str, Any]]] = {}
+    for group, rate_hz in FLOOR_GROUPS.items():
+        sequences_of_group = [sequence for sequence in hands if sequence.group == group]
+        rows = best_linear(sequences_of_group, skill, rate_hz=rate_hz)
+        floors[group] = [floor._asdict() for floor in rows]
+    return floors
 
 
 def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -319,23 +319,32 @@ def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:
     """The numbers of the service in one setting."""
     folds = [part.service[name] for part in found]
     accepted = [take is not None for fold in folds for take in fold.accepted]
-    reasons = [text for fold in folds for text in (*fold.refusals, *fold.take_refusals)]
-    residuals = [text for fold in folds for text in fold.residual]
     return summary(_accepted(folds)) | {
         "folds": len(folds),
         "folds_refused": sum(bool(fold.refusals) for fold in folds),
         "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
-        "risks": list(dict.fromkeys(residuals))[:2],
+        "risks": _first_two(fold.residual for fold in folds),
         "refuses": accepted.count(False),
-        "reasons": list(dict.fromkeys(reasons))[:2],
-        "again": {
-            f"{rest_s:g}": summary([rounds[i] for fold in folds for rounds in fold.again])
-            for i, rest_s in enumerate(SESSION_RESTS_S)
-        },
+        "reasons": _first_two((*fold.refusals, *fold.take_refusals) for fold in folds),
+        "again": _again(folds),
         "in_spite_of_refusal": summary([take for fold in folds for take in fold.in_spite]),
         "beside_mm": _beside(found, name.removeprefix(SERVICE), accepted),
         "model": next((fold.model for fold in folds if fold.model), None),
         **_said([fold.figures for fold in folds if fold.figures]),
+    }
+
+
+def _first_two(texts: Iterable[Iterable[str]]) -> list[str]:
+    """The first two different texts."""
+    return list(dict.fromkeys(itertools.chain.from_iterable(texts)))[:2]
+
+
+def _again(folds: Sequence[Fold]) -> dict[str, dict[str, Any]]:
+    """The numbers of further rounds, by the rest before them [s]."""
+    rounds = [take for fold in folds for take in fold.again]
+    return {
+        f"{rest_s:g}": summary([take[i] for take in rounds])
+        for i, rest_s in enumerate(SESSION_RESTS_S)
     }
 
 

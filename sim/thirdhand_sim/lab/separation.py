@@ -356,15 +356,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         by_kind[row.kind].append(row)
         if len(by_kind[row.kind]) % max(1, len(scenes) // 5) == 0:
             results.say(f"{row.kind}: {brief(_summary(by_kind[row.kind]))}")
-    recorded = ("capsules_mm", "shapes_mm", "excess_after_reaction")
-    results.series(
-        {
-            f"/{name}/{k}": [getattr(o, name) for o in rows]
-            for k, rows in by_kind.items()
-            for name in recorded
-        },
-        "scene",
-    )
+    _draw_errors(results, by_kind)
     numbers = {
         "scenes": len(scenes),
         "rate_hz": RATE_HZ,
@@ -372,24 +364,36 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         **{kind: _summary(rows) for kind, rows in by_kind.items()},
         "later_than_unheeded_s": _later(by_kind["random"], by_kind["unheeded"]),
         "later_for_a_thrust_s": _later_for(by_kind["thrust"], by_kind["random"]),
-        "worst_scene": {
-            kind: max(rows, key=lambda one: one.excess_after_reaction).number
-            for kind, rows in by_kind.items()
-        },
-        "failed_scenes": {
-            kind: [row.number for row in rows if not row.success] for kind, rows in by_kind.items()
-        },
-        "shown": {
-            kind: _shown([row for row in rows if row.number < SHOWN_SCENES])
-            for kind, rows in by_kind.items()
-        },
+        "worst_scene": {kind: _worst(rows) for kind, rows in by_kind.items()},
+        "failed_scenes": {kind: _failed(rows) for kind, rows in by_kind.items()},
+        "shown": {kind: _shown(rows) for kind, rows in by_kind.items()},
     }
     draw_numbers(results, numbers)
     return numbers
 
 
+def _draw_errors(results: Results, by_kind: dict[str, list[Outcome]]) -> None:
+    """The smallest distances and the largest excess over the scenes, by kind."""
+    series: dict[str, list[float]] = {}
+    for kind, rows in by_kind.items():
+        for name in ("capsules_mm", "shapes_mm", "excess_after_reaction"):
+            series[f"/{name}/{kind}"] = [getattr(row, name) for row in rows]
+    results.series(series, "scene")
+
+
+def _worst(rows: list[Outcome]) -> int:
+    """The number of the scene with the largest excess."""
+    return max(rows, key=lambda row: row.excess_after_reaction).number
+
+
+def _failed(rows: list[Outcome]) -> list[int]:
+    """The numbers of the scenes that did not succeed."""
+    return [row.number for row in rows if not row.success]
+
+
 def _shown(rows: list[Outcome]) -> dict[str, Any]:
-    """Content of the figure: points at distances [mm] and speeds [mm/s]."""
+    """Content of the figure, of its scenes: points at distances [mm] and speeds [mm/s]."""
+    rows = [row for row in rows if row.number < SHOWN_SCENES]
     near = np.concatenate([row.near for row in rows])
     return {
         "scenes": len(rows),

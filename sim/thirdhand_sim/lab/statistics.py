@@ -89,17 +89,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"scene {row.number} missed: {row.errors_mm} mm")
         if len(done) % max(1, count // 5) == 0:
             results.say(f"{row.method}: {sum(o.success for o in done)} of {len(done)} scenes")
-    paths = {
-        f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)
-    }
-    styles = {
-        path: rr.SeriesPoints(colors=[rgb(colour_of(method))], names=[method])
-        for path, (method, _) in paths.items()
-    }
-    values = {
-        path: [row.errors_mm[i] for row in by_method[method]] for path, (method, i) in paths.items()
-    }
-    results.series(values, "scene", styles)
+    _draw_errors(results, by_method)
     numbers = {
         "scenes": count,
         "rate_hz": {"ours": OURS_HZ, "rivals": RIVALS_HZ},
@@ -113,6 +103,21 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     }
     draw_numbers(results, numbers)
     return numbers
+
+
+def _draw_errors(results: Results, by_method: dict[str, list[Outcome]]) -> None:
+    """The errors of each event over the scenes, by method."""
+    paths = {
+        f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)
+    }
+    styles = {
+        path: rr.SeriesPoints(colors=[rgb(colour_of(method))], names=[method])
+        for path, (method, _) in paths.items()
+    }
+    values = {
+        path: [row.errors_mm[i] for row in by_method[method]] for path, (method, i) in paths.items()
+    }
+    results.series(values, "scene", styles)
 
 
 def _summary(rows: list[Outcome]) -> dict[str, Any]:

@@ -149,18 +149,8 @@ def outcomes(task: Task) -> list[Outcome]:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
     group = options.group
-    people = max(2, round(PEOPLE[group] * options.share))
-    scenes = SCENES[group]
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
-    tasks = [Task(TEACHER, 0, group, "", people, scenes, options.hands)]
-    for method, entry in METHODS.items():
-        tried = (
-            range(len(entry.candidates)) if group == "tuning" and options.share == 1 else range(1)
-        )
-        tasks += [
-            Task(method, number, group, "", people, scenes, options.hands) for number in tried
-        ]
-        tasks += [Task(method, 0, group, kind, 0, breaking_scenes, None) for kind in BREAKING]
+    tasks = _tasks(options, breaking_scenes)
     by_task: dict[Task, list[Outcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
         by_task[task] = rows
@@ -168,30 +158,14 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             results.say(f"{task.method:<17} {task.kind}: {_broken(rows)}")
         else:
             results.say(f"{task.method:<17} {task.candidate}: {brief(summary(rows))}")
-    main = {
-        task.method: rows for task, rows in by_task.items() if not task.kind and task.candidate == 0
-    }
-    broken = {
-        method: {
-            kind: _broken(by_task[task])
-            for task in tasks
-            for kind in [task.kind]
-            if task.method == method and kind
-        }
-        for method in METHODS
-    }
-    for method, entry in METHODS.items():
-        compared = [
-            rows for task, rows in by_task.items() if task.method == method and not task.kind
-        ]
-        if (best := chosen(compared)) > 0:
-            results.say(
-                f"{method}: {entry.candidates[best]} is better than what is chosen; put it first"
-            )
+    _say_better_candidates(results, by_task)
+
+    usual = {task: rows for task, rows in by_task.items() if not task.kind}
+    main = {task.method: rows for task, rows in usual.items() if task.candidate == 0}
     numbers = {
         "set": group,
         "people": len({row.person for row in main["ours"]}),
-        "scenes_of_each": scenes,
+        "scenes_of_each": SCENES[group],
         "breaking_scenes_of_each": breaking_scenes,
         "demonstrations": len(_taught()),
         "rate_hz": RATE_HZ,
@@ -204,24 +178,58 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         },
         "falsely_followed_is_farther_from_the_teacher_than_m": WRONG_M,
         "levels": LEVELS,
-        "methods": {
-            method: {
-                **(
-                    {} if method == TEACHER else {"parameters": repr(METHODS[method].candidates[0])}
-                ),
-                **summary(rows),
-            }
-            for method, rows in main.items()
-        },
-        "breaking": broken,
+        "methods": {method: _of_method(method, rows) for method, rows in main.items()},
+        "breaking": _breaking(by_task),
         "candidates": {
             f"{task.method} {METHODS[task.method].candidates[task.candidate]!r}": summary(rows)
-            for task, rows in by_task.items()
-            if not task.kind and task.method != TEACHER and group == "tuning"
+            for task, rows in usual.items()
+            if group == "tuning" and task.method != TEACHER
         },
     }
     draw_numbers(results, numbers)
     return numbers
+
+
+def _tasks(options: Options, breaking_scenes: int) -> list[Task]:
+    """What is measured: the teacher, each method with its candidates, and with broken hands."""
+    group = options.group
+    people = max(2, round(PEOPLE[group] * options.share))
+    has_candidates = group == "tuning" and options.share == 1
+    tasks = [Task(TEACHER, 0, group, "", people, SCENES[group], options.hands)]
+    for method, entry in METHODS.items():
+        for number in range(len(entry.candidates) if has_candidates else 1):
+            tasks.append(Task(method, number, group, "", people, SCENES[group], options.hands))
+        for kind in BREAKING:
+            tasks.append(Task(method, 0, group, kind, 0, breaking_scenes, None))
+    return tasks
+
+
+def _say_better_candidates(results: Results, by_task: dict[Task, list[Outcome]]) -> None:
+    """Report each method whose first candidate is not its best one."""
+    for method, entry in METHODS.items():
+        compared = [
+            rows for task, rows in by_task.items() if task.method == method and not task.kind
+        ]
+        if (best := chosen(compared)) > 0:
+            results.say(
+                f"{method}: {entry.candidates[best]} is better than what is chosen; put it first"
+            )
+
+
+def _breaking(by_task: dict[Task, list[Outcome]]) -> dict[str, dict[str, Any]]:
+    """The figures of broken hands, by method and kind."""
+    broken: dict[str, dict[str, Any]] = {method: {} for method in METHODS}
+    for task, rows in by_task.items():
+        if task.kind:
+            broken[task.method][task.kind] = _broken(rows)
+    return broken
+
+
+def _of_method(method: str, rows: Sequence[Outcome]) -> dict[str, Any]:
+    """The figures of a method, with its parameters."""
+    if method == TEACHER:
+        return summary(rows)
+    return {"parameters": repr(METHODS[method].candidates[0]), **summary(rows)}
 
 
 MEASURES: dict[str, Callable[[Outcome], float]] = {
