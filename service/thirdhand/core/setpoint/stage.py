@@ -5,9 +5,9 @@ A linear-quadratic tracker with jerk as its input leads the setpoint. It minimis
     integral of |target - setpoint|² + jerk_weight |jerk|².
 
 Discrete control barrier functions (Agrawal and Sreenath, RSS 2017) limit this jerk along the motion
-(`step._track`). The setpoint can stop, within its limits, where the hands can stop at the earliest;
-a little before that if their tracker shows a stop late. It can reach the target's own speed before
-it passes the target. Its speed stays within the speed that the joints and the tool's lag allow.
+(`step._track`). The setpoint can stop, within its limits, where the hands can stop at the earliest.
+It can reach the target's own speed before it passes the target. Its speed stays within the speed
+that the joints and the tool's lag allow.
 
 A step is taken only if the stop after it keeps every limit. Otherwise the setpoint begins the stop
 that the step before has checked. So these limits hold by induction, whatever the target does:
