@@ -256,13 +256,6 @@ def test_names_on_a_page_exist(page: Path) -> None:
         assert (ROOT / file).exists(), file
 
 
-def test_the_data_flow_is_drawn_once() -> None:
-    drawn = [
-        page.name for page in PAGES if "Tick(index, inbox)" in page.read_text(encoding="utf-8")
-    ]
-    assert drawn == ["how-it-works.md"]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_has_lines_of_100_characters_at_most(page: Path) -> None:
     text = re.sub(
