@@ -22,7 +22,7 @@ html_copy_source = False
 LINK = re.compile(r"(!?\[[^]]*\])\(([^)\s]+)\)")
 # The navigation: four parts, each in the order to read it. Pages without a part are under "More".
 GROUPS = {
-    "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm"),
+    "Tutorials": ("first-demo", "tutorial", "first-tracker", "first-arm", "first-task"),
     "How to": (
         "install",
         "mouse",
