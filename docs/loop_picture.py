@@ -21,7 +21,7 @@ from matplotlib.patches import FancyBboxPatch
 from thirdhand.contract.channels import BY_KEY
 from thirdhand.settings.config import Settings
 
-FOLDER = Path(__file__).parent
+PICTURE = Path(__file__).with_name("loop.png")
 # of a box
 WIDTH = 1.9
 HEIGHT = 0.8
@@ -179,14 +179,14 @@ def draw(name: str, title: str, boxes: Mapping[str, Box], arrows: Sequence[Arrow
         draw_arrow(axes, boxes, arrow)
     axes.set(xlim=(-1.3, 17.5), ylim=(-0.6, 6.95))
     axes.set_axis_off()
-    figure.savefig(FOLDER / name, dpi=DPI)
+    figure.savefig(PICTURE.with_name(name), dpi=DPI)
     plt.close(figure)
 
 
 def main() -> None:
     """Writes the pictures beside this file."""
     period_ms = 1000 / Settings().rate_hz
-    draw("loop.png", f"the core: one tick every {period_ms:g} ms", BOXES, ARROWS)
+    draw(PICTURE.name, f"the core: one tick every {period_ms:g} ms", BOXES, ARROWS)
     draw("processes.png", "the control process", PROCESSES, MESSAGES)
 
 

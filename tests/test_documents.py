@@ -20,7 +20,6 @@ from thirdhand import command_line as main
 from thirdhand.contract import incidents, requests, ros2
 from thirdhand.contract.channels import CHANNELS, Channel, topic
 from thirdhand.contract.messages import BASE
-from thirdhand.contract.records import Reason
 from thirdhand.contract.roles import ROLES
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.frame import FRAME, TIMING_FIELDS
@@ -51,13 +50,6 @@ def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
     )
     scribe = next(row[1] for row in table("field") if row[0] == "`scribe`")
     assert named([scribe]) == sorted(Scribe(Settings()).status())
-
-
-def test_reasons_that_a_page_lists_are_all_that_there_are() -> None:
-    page = (ROOT / "docs" / "how-it-works.md").read_text(encoding="utf-8")
-    section = page.partition("### Decision")[2].partition("\n\nOne hand")[0]
-    listed = set(re.findall(r"`([a-z_]+)`", section)) - {"reset"}
-    assert listed == {incidents.word(reason) for reason in Reason if reason is not Reason.NONE}
 
 
 def test_what_to_do_names_fields_settings_and_causes_that_exist() -> None:
