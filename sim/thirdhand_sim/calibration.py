@@ -40,7 +40,7 @@ SWING_RAD = (0.5, 0.35, 0.5, 0.35)
 WRIST_SWING_RAD = (0.6, 0.6, 0.8)
 MARGIN_RAD = 0.05
 # y of the tracker points up, and its axes are a few degrees off the bench's
-TURN = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]) * Rotation.from_rotvec([0.02, 0.09, -0.03])
+TRUE_TURN = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]) * Rotation.from_rotvec([0.02, 0.09, -0.03])
 ORIGIN = np.array([1.4, 0.03, -0.75])
 BENCH = np.stack(
     np.meshgrid(np.linspace(0.4, 1.0, 5), np.linspace(-0.4, 0.4, 5), np.linspace(0.0, 0.4, 3)), -1
@@ -57,7 +57,7 @@ class TrackerKind(NamedTuple):
     delay_s: float
 
 
-KINDS = {
+TRACKER_KINDS = {
     "mocap": TrackerKind(0.0005, 0.0003, 0.0),
     "headset": TrackerKind(0.002, 0.006, 0.035),
     "camera": TrackerKind(0.005, 0.020, 0.080),
@@ -109,7 +109,9 @@ def tracked(
         )
         errors[i] = wandering
     return np.asarray(
-        TURN.inv().apply(base - ORIGIN) + kind.noise_m * random.normal(size=base.shape) + errors
+        TRUE_TURN.inv().apply(base - ORIGIN)
+        + kind.noise_m * random.normal(size=base.shape)
+        + errors
     )
 
 
@@ -150,12 +152,12 @@ def touched(
 def error_m(found: Calibration, bench: Array = BENCH) -> float:
     """Mean error of mapped positions over the bench [m]."""
     return float(
-        np.linalg.norm(found.mapped(TURN.inv().apply(bench - ORIGIN)) - bench, axis=1).mean()
+        np.linalg.norm(found.mapped(TRUE_TURN.inv().apply(bench - ORIGIN)) - bench, axis=1).mean()
     )
 
 
 # points, or seconds
-METHODS = {
+CALIBRATION_METHODS = {
     "points, 4": 4,
     "points, 8": 8,
     "held, 15 s": 15.0,
@@ -187,11 +189,14 @@ def errors_mm(arm: str, kind: TrackerKind, method: float, seeds: range) -> Array
 
 def table(seeds: range) -> str:
     """The errors of all arms, trackers and methods, as a table in Markdown."""
-    lines = [f"| arm | tracker | {' | '.join(METHODS)} |", "|---" * (2 + len(METHODS)) + "|"]
+    lines = [
+        f"| arm | tracker | {' | '.join(CALIBRATION_METHODS)} |",
+        "|---" * (2 + len(CALIBRATION_METHODS)) + "|",
+    ]
     for arm in ARMS:
-        for name, kind in KINDS.items():
+        for name, kind in TRACKER_KINDS.items():
             cells = []
-            for method in METHODS.values():
+            for method in CALIBRATION_METHODS.values():
                 error, expected = errors_mm(arm, kind, method, seeds).T
                 cells.append(
                     f"{np.median(error):.1f} ({error.max():.1f}; {np.median(expected):.1f})"

@@ -72,7 +72,7 @@ HAND_BOX = np.array([[0.42, -0.60, 0.04], [1.10, 0.60, 0.40]])  # limits of a ha
 RESTS = np.array([[0.52, -0.05, 0.04], [1.00, 0.50, 0.20]])  # limits of an idle right hand's place
 
 
-class Take(NamedTuple):
+class MadeTake(NamedTuple):
     """A demonstration and the number of its person."""
 
     person: int
@@ -149,14 +149,14 @@ class TaskScene(NamedTuple):
     turns: Array
 
 
-def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list[Take]:
+def takes(kind: str, *, people: Sequence[int], each: int, seed: int = 0) -> list[MadeTake]:
     """`each` demonstrations of each of these people, one every five minutes. Another `seed` gives
     another task of the same kind.
 
     Raises ValueError for a kind outside TASK_KINDS.
     """
     return [
-        Take(subject, run(kind, subject, number, seed=seed).demonstration())
+        MadeTake(subject, run(kind, subject, number, seed=seed).demonstration())
         for subject in people
         for number in range(each)
     ]

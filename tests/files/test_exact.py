@@ -25,7 +25,7 @@ from thirdhand.settings.config import robot_description
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import skill_in
 from thirdhand.skills.via_points import adapted
-from thirdhand_sim.lab.people.left_out import RATE_HZ, hand_events
+from thirdhand_sim.lab.people.left_out import CORE_HZ, hand_events
 from thirdhand_sim.scene import Scene
 
 PROCESSORS = {
@@ -67,7 +67,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Recordings of hands with noise, unseen for a while, with a hold; one for each kind."""
     folder = tmp_path_factory.mktemp("sessions")
     out = [RECORDINGS / "golden.mcap"]
-    settings = msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ)
+    settings = msgspec.structs.replace(ASSUMED, rate_hz=CORE_HZ)
     for number, kind in enumerate((*KINDS, "corrected")):
         skill, take = corrected() if kind == "corrected" else learned(kind)
         random = np.random.default_rng(number)
@@ -76,7 +76,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             for hand in (take.left, take.right)
         )
         received = hand_events(take._replace(left=left, right=right), range(2))
-        unseen = slice(len(received) // 2, len(received) // 2 + RATE_HZ)
+        unseen = slice(len(received) // 2, len(received) // 2 + CORE_HZ)
         received[unseen] = [[] for _ in received[unseen]]
         received[len(received) // 4].append(order("hold"))
         received[len(received) // 4 + 50].append(order("resume"))

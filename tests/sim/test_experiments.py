@@ -32,7 +32,7 @@ from thirdhand_sim.lab.load.live import is_evidence
 from thirdhand_sim.lab.reproduction.writing import recorded, write
 from thirdhand_sim.lab.results import Array, ExperimentError
 from thirdhand_sim.lab.scenes import draw
-from thirdhand_sim.lab.statistics import SCENES
+from thirdhand_sim.lab.statistics import TASK_SCENES
 from thirdhand_sim.scene import MOST_MOVED, Scene
 
 pytestmark = pytest.mark.timeout(300)
@@ -138,7 +138,9 @@ def test_experiment_bears_out_its_claim(
     name: str, tmp_path: Path, letters: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Experiment makes its files and bears out its claim."""
-    monkeypatch.setattr("thirdhand_sim.lab.statistics.SCENES", SCENES._replace(numbers=range(10)))
+    monkeypatch.setattr(
+        "thirdhand_sim.lab.statistics.TASK_SCENES", TASK_SCENES._replace(numbers=range(10))
+    )
     monkeypatch.setattr("thirdhand_sim.lab.statistics.OURS_HZ", 250)
     more = {
         "separation": ("--share", "0.02"),
@@ -182,7 +184,7 @@ def test_figures_are_of_shipped_numbers(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", range(100))
 def test_random_scenes_are_within_reach_and_end(number: int) -> None:
-    drawn = draw(number, seed=SCENES.seed)
+    drawn = draw(number, seed=TASK_SCENES.seed)
     nominal = Scene()
     for name in ("handover", "glass", "soldering"):
         place = getattr(drawn.scene, name)

@@ -25,7 +25,7 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.lab import rehearsal
 from thirdhand_sim.lab.people.moving_hands import stops
-from thirdhand_sim.lab.people.trials import RATE_HZ, Seen, seen, served
+from thirdhand_sim.lab.people.trials import TRIAL_HZ, SeenSession, seen, served
 from thirdhand_sim.lab.reached import ours
 from thirdhand_sim.lab.rivals import followers
 from thirdhand_sim.lab.rivals.service import LearnedByService
@@ -56,35 +56,37 @@ def sample(side: str, at: list[float], stamp_ns: int) -> Event:
 
 
 @pytest.fixture(scope="module")
-def shown() -> Seen:
+def shown() -> SeenSession:
     """A session in which the service holds too, and meets its limit of a target's acceleration."""
     return seen(session(person("tuning", 0), 0, group="tuning", sigma_m=0.005))
 
 
 @pytest.fixture(scope="module")
-def taught(shown: Seen) -> Skill:
+def taught(shown: SeenSession) -> Skill:
     return adapted(shipped_skill(), via_points_of(shown.session.told), tolerance=TOLERANCE_M)
 
 
 @pytest.fixture(scope="module")
-def wanted(shown: Seen, taught: Skill) -> np.ndarray:
+def wanted(shown: SeenSession, taught: Skill) -> np.ndarray:
     """The service's frames, from what the trackers say in the order in which it comes."""
     inboxes: list[list[Event]] = [[] for _ in shown.times]
     for side, (stamps, samples) in zip(SIDES, shown.session.samples(), strict=True):
         for stamp, position in zip(stamps, samples, strict=True):
-            arrives = int(np.ceil(stamp * RATE_HZ - 1e-9))
+            arrives = int(np.ceil(stamp * TRIAL_HZ - 1e-9))
             if arrives < len(inboxes):
                 inboxes[arrives].append(
                     sample(side, position.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp)))
                 )
     ticks = [Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes)]
-    return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=RATE_HZ))
+    return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=TRIAL_HZ))
 
 
 class TestPeople:
     """`people`: every method's trial is a run of the service."""
 
-    def test_ours_is_what_the_controller_decides(self, shown: Seen, wanted: np.ndarray) -> None:
+    def test_ours_is_what_the_controller_decides(
+        self, shown: SeenSession, wanted: np.ndarray
+    ) -> None:
         """What is called ours is what the controller predicts and decides."""
         placed = LearnedByService(shipped_skill(), start=True).place(shown.session.told)
         frames = served(placed, shown)
@@ -92,7 +94,9 @@ class TestPeople:
             assert frames[name].tobytes() == wanted[name].tobytes(), name
         assert 0 < (wanted["mode"] == Mode.FOLLOW).sum() < len(wanted)
 
-    def test_hands_are_those_of_the_controller(self, shown: Seen, wanted: np.ndarray) -> None:
+    def test_hands_are_those_of_the_controller(
+        self, shown: SeenSession, wanted: np.ndarray
+    ) -> None:
         """Hands are estimated as the controller does."""
         assert shown.estimates[:, 0].tobytes() == wanted["hands"].tobytes()
         assert shown.estimates[:, 1].tobytes() == wanted["hand_velocities"].tobytes()

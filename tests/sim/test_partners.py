@@ -14,7 +14,7 @@ from thirdhand.core.skill.model import LEVELS
 from thirdhand.skills.skill_file import decoded
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.takes.demonstration_reader import write_demonstration
-from thirdhand_sim.lab.partners import Fold, Found, as_command, numbers_of, served
+from thirdhand_sim.lab.partners import Found, SkillFold, as_command, numbers_of, served
 from thirdhand_sim.lab.people.left_out import LeftOut, judged, left_out, predicted
 from thirdhand_sim.lab.results import Options, Results
 from thirdhand_sim.lab.rivals.method import Predicted
@@ -172,7 +172,7 @@ def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut])
             {"service, told": fold(takes_, tested)},
         )
 
-    def fold(takes_: list[LeftOut], tested: list[LeftOut]) -> Fold:
+    def fold(takes_: list[LeftOut], tested: list[LeftOut]) -> SkillFold:
         return served(takes_, tested, told=True)
 
     good = found(shown, asked)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from thirdhand.core.skill.skill import Skill
-from thirdhand_sim.lab.people.comparison import METHODS, run
-from thirdhand_sim.lab.people.trials import Seen, judge, seen
+from thirdhand_sim.lab.people.comparison import PEOPLE_METHODS, run
+from thirdhand_sim.lab.people.trials import SeenSession, judge, seen
 from thirdhand_sim.lab.results import Options, Results
 from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
 from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
@@ -34,7 +34,7 @@ def run_of_tuning() -> Session:
 
 
 @pytest.fixture(scope="module")
-def as_seen(run_of_tuning: Session) -> Seen:
+def as_seen(run_of_tuning: Session) -> SeenSession:
     return seen(run_of_tuning)
 
 
@@ -89,7 +89,7 @@ class Still:
 class TestJudging:
     """What is counted, on skills whose outcome is known."""
 
-    def test_teacher_succeeds(self, as_seen: Seen) -> None:
+    def test_teacher_succeeds(self, as_seen: SeenSession) -> None:
         """The teacher succeeds and is on the way."""
         judgement = judge(None, as_seen)
         assert judgement.success
@@ -97,14 +97,14 @@ class TestJudging:
         assert judgement.falsely_followed == 0.0
         assert judgement.path_mm < 15  # what the places are perceived off by
 
-    def test_still_tool_follows_falsely(self, as_seen: Seen) -> None:
+    def test_still_tool_follows_falsely(self, as_seen: SeenSession) -> None:
         """A tool that stays reaches its place alone and follows falsely."""
         judgement = judge(Still(as_seen.session.told.glass, far=False), as_seen)
         assert [event.reached for event in judgement.events] == [False, True, False]
         assert judgement.falsely_followed > 0.3
         assert judgement.inside[-1] == 1.0
 
-    def test_skill_always_far_never_moves(self, as_seen: Seen) -> None:
+    def test_skill_always_far_never_moves(self, as_seen: SeenSession) -> None:
         """A skill that is always far holds and never moves."""
         judgement = judge(Still(as_seen.session.told.glass, far=True), as_seen)
         assert judgement.held == 1.0
@@ -115,7 +115,7 @@ class TestJudging:
         # stale and swapped hands are held for rightly
         assert judgement.falsely_held == pytest.approx(1.0 - due)
 
-    def test_a_passage_by_a_hand_is_no_success(self, as_seen: Seen) -> None:
+    def test_a_passage_by_a_hand_is_no_success(self, as_seen: SeenSession) -> None:
         """By one that is not where the tracker says."""
         unseen = replace(as_seen, hands=np.hstack([as_seen.tool, as_seen.hands[:, 3:]]))
         judgement = judge(None, unseen)
@@ -152,7 +152,7 @@ def test_skills_go_to_told_places(
 def test_each_method_had_as_many_candidates() -> None:
     assert {
         len(entry.candidates)
-        for name, entry in METHODS.items()
+        for name, entry in PEOPLE_METHODS.items()
         if not name.startswith(("ours", "as_paper"))
     } == {6}
 
@@ -166,8 +166,8 @@ def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.Monk
             f"thirdhand_sim.lab.people.comparison.{table}", {"tuning": value, "test": value}
         )
     monkeypatch.setattr("thirdhand_sim.lab.people.comparison.BREAKING", BREAKING[:1])
-    few = {name: METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
-    monkeypatch.setattr("thirdhand_sim.lab.people.comparison.METHODS", few)
+    few = {name: PEOPLE_METHODS[name] for name in ("ours", "none", "look_up", "gmr")}
+    monkeypatch.setattr("thirdhand_sim.lab.people.comparison.PEOPLE_METHODS", few)
     results = Results(tmp_path, "people", said=False)
     result = json.loads(
         results.numbers(run(results, Options(group="tuning", share=0.99))).read_text()

@@ -48,7 +48,17 @@ from thirdhand.workbench.trackers.calibration.solver import (
     solve_held,
     solve_points,
 )
-from thirdhand_sim.calibration import GRIP, KINDS, ORIGIN, TURN, LedArm, error_m, held, led, touched
+from thirdhand_sim.calibration import (
+    GRIP,
+    ORIGIN,
+    TRACKER_KINDS,
+    TRUE_TURN,
+    LedArm,
+    error_m,
+    held,
+    led,
+    touched,
+)
 
 SEEDS = range(8)
 CORNERS = bench_corners(Settings())
@@ -61,7 +71,7 @@ def path_of(arm: str, seed: int) -> LedArm:
 
 
 def held_by(kind: str, *, arm: str = "wam", seed: int = 0) -> HeldTool:
-    return held(path_of(arm, seed), KINDS[kind], np.random.default_rng([seed, 1]))
+    return held(path_of(arm, seed), TRACKER_KINDS[kind], np.random.default_rng([seed, 1]))
 
 
 # --- accuracy -------------------------------------------------------------------------------------
@@ -87,12 +97,12 @@ def test_a_held_tool_shows_where_the_tracker_is(
         errors.append(1e3 * error_m(calibration))
         corners = np.array(calibration.corners)
         off_m = np.linalg.norm(
-            calibration.mapped(TURN.inv().apply(corners - ORIGIN)) - corners, axis=1
+            calibration.mapped(TRUE_TURN.inv().apply(corners - ORIGIN)) - corners, axis=1
         )
         shares.append(np.square(off_m / np.array(calibration.corner_std_m)).mean())
         assert np.linalg.norm(np.array(calibration.hand_in_tool) - GRIP) < 1e-3 * worst_mm
         assert (
-            abs(calibration.delay_s - KINDS[kind].delay_s)
+            abs(calibration.delay_s - TRACKER_KINDS[kind].delay_s)
             < {"mocap": 0.002, "headset": 0.02, "camera": 0.06}[kind]
         )
         assert calibration.outliers < 5
@@ -137,7 +147,7 @@ def test_spoilt_samples_cost_little(how: str) -> None:
 def never_turned(held: HeldTool) -> HeldTool:
     still = held._replace(turn=np.repeat(held.turn[:1], len(held.turn), 0))
     tool = np.stack([np.interp(still.hand_s, still.tool_s, axis) for axis in still.tool.T], 1)
-    hand = TURN.inv().apply(tool + Rotation.from_quat(held.turn[0]).apply(GRIP) - ORIGIN)
+    hand = TRUE_TURN.inv().apply(tool + Rotation.from_quat(held.turn[0]).apply(GRIP) - ORIGIN)
     return still._replace(hand=hand + 0.002 * np.random.default_rng(0).normal(size=hand.shape))
 
 
@@ -234,7 +244,7 @@ def test_a_hand_far_away_is_refused(far_m: float) -> None:
 
 
 def test_points_that_show_nothing_are_refused() -> None:
-    hand, base = touched(path_of("wam", 0), 8, KINDS["mocap"], np.random.default_rng(0))
+    hand, base = touched(path_of("wam", 0), 8, TRACKER_KINDS["mocap"], np.random.default_rng(0))
     with pytest.raises(CalibrationError, match="3 points given; 4 or more needed, 8 recommended"):
         solve_points(hand[:3], base[:3], CORNERS)
     with pytest.raises(
@@ -621,7 +631,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     assert "cell.toml; the earlier file is cell.toml.before-" in done.stdout
     after = load(tmp_path / "cell.toml")
     assert after.hands.frame == "mocap"
-    true = (*ORIGIN, *TURN.as_quat())
+    true = (*ORIGIN, *TRUE_TURN.as_quat())
     np.testing.assert_allclose(after.hands.base_from_tracker, true, atol=0.002)
     done = succeeded(*cell, "--check")
     assert done.stdout == CHECKED
@@ -679,7 +689,7 @@ def test_frame_of_the_hand_names_the_calibrated_table(
     done = succeeded(*command, "--hand", "left")
     assert "\n[trackers.mocap]\nbase_from_tracker = [" in done.stdout
     np.testing.assert_allclose(
-        load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.002
+        load(cell).trackers["mocap"].base_from_tracker, (*ORIGIN, *TRUE_TURN.as_quat()), atol=0.002
     )
     assert load(cell).hands == HandSettings(frame="webxr")
     assert record_path(cell, "mocap").exists()
@@ -729,7 +739,7 @@ def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
             points += ["--at", *map(str, point)]
         with started("calibrate", *points) as process:
             for number, point in enumerate(POINTS, 1):
-                tracker.right = tuple(TURN.inv().apply(point - ORIGIN).tolist())
+                tracker.right = tuple(TRUE_TURN.inv().apply(point - ORIGIN).tolist())
                 line_with(process, f"{number}: touch ({point[0]:g}, ")
                 time.sleep(0.8)
                 process.stdin.write("\n")
@@ -739,7 +749,7 @@ def test_points_that_a_hand_touches_calibrate_a_cell(tmp_path: Path) -> None:
     assert out.startswith("right hand     points, ")
     assert ", 6 points, 0 outliers" in out
     np.testing.assert_allclose(
-        load(cell).hands.base_from_tracker, (*ORIGIN, *TURN.as_quat()), atol=0.005
+        load(cell).hands.base_from_tracker, (*ORIGIN, *TRUE_TURN.as_quat()), atol=0.005
     )
     assert len(list(tmp_path.glob("my.toml.before-*"))) == 1
 
@@ -754,7 +764,9 @@ def test_a_point_that_decides_the_sense_of_an_axis_is_no_outlier() -> None:
     flat = np.array([[x, y, 0.0] for x in (0.4, 0.6, 0.8) for y in (-0.3, 0.3)] + [[0.7, 0.0, 0.0]])
     base = np.concatenate([flat, [[0.5, -0.2, 0.25]]])
     base[-1, 2] -= 0.2
-    hand = TURN.inv().apply(base - ORIGIN) + np.random.default_rng(0).normal(0.0, 0.002, base.shape)
+    hand = TRUE_TURN.inv().apply(base - ORIGIN) + np.random.default_rng(0).normal(
+        0.0, 0.002, base.shape
+    )
     base[-1, 2] += 0.2
     with pytest.raises(
         CalibrationError,

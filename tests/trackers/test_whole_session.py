@@ -26,7 +26,7 @@ from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings, load
-from thirdhand_sim.calibration import BENCH, GRIP, ORIGIN, TURN, LedArm, led
+from thirdhand_sim.calibration import BENCH, GRIP, ORIGIN, TRUE_TURN, LedArm, led
 from thirdhand_sim.scene import Scene
 
 pytestmark = [
@@ -64,7 +64,7 @@ MOVED = """(() => {
 
 def in_tracker(base: headset.Array) -> headset.Array:
     """Positions (..., 3) [m] in the headset's frame."""
-    return np.asarray(TURN.inv().apply(base - ORIGIN))
+    return np.asarray(TRUE_TURN.inv().apply(base - ORIGIN))
 
 
 class LeadingHand:
@@ -76,7 +76,9 @@ class LeadingHand:
         self._end = threading.Event()
         self._begun_ns = time.time_ns()
         turns = Rotation.from_quat(arm.turn)
-        rows = np.hstack([in_tracker(arm.tool + turns.apply(GRIP)), (TURN.inv() * turns).as_quat()])
+        rows = np.hstack(
+            [in_tracker(arm.tool + turns.apply(GRIP)), (TRUE_TURN.inv() * turns).as_quat()]
+        )
         step = round(ROW_MS / 10)  # the arm has 100 rows a second
         tab.ask(
             f"rows = {json.dumps(rows[::step].round(6).tolist())}; begunMs = {self._begun_ns / 1e6}"

@@ -95,8 +95,8 @@ def _letters(seed: int) -> dict[str, Stream]:
 
 # The constants of separation were chosen on these scenes.
 TUNED_SCENES = {"scenes": Stream("random scene", 2019, range(100))}
-SHIPPED = Stream("demonstration", 1, range(1, 6))
-_SHIPPED = {"demonstrations": SHIPPED}
+SHIPPED_TAKES = Stream("demonstration", 1, range(1, 6))
+_SHIPPED = {"demonstrations": SHIPPED_TAKES}
 # The ridge of ProMP was chosen on the letters of seed 0.
 _WRITTEN = Seeds(_letters(1), tuning=_letters(0))
 _TUNED_HANDS = {

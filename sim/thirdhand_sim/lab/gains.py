@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S, SMALL_JUDGED_S, SMALL_KINDS
-from thirdhand_sim.lab.results import ADAPTED, TOOL, Array, Results, pyplot
+from thirdhand_sim.lab.results import ADAPTED, TOOL_COLOUR, Array, Results, pyplot
 
 PATHS = ("setpoint", "tool")
 FOLLOWER_LABELS = {
-    "ours": ("ours", TOOL),
+    "ours": ("ours", TOOL_COLOUR),
     "chase": ("One-Euro filter, then Ruckig after the target", ADAPTED),
 }
 

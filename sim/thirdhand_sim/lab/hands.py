@@ -20,28 +20,37 @@ from thirdhand_sim.lab.load.live import SKIPPED, is_evidence, steady_run
 from thirdhand_sim.lab.reached import EVENTS, ours
 from thirdhand_sim.lab.rehearsal import demonstrated, rehearse
 from thirdhand_sim.lab.reproduction.beside_the_paper import differences
-from thirdhand_sim.lab.results import LEFT, RIGHT, TOOL, Array, Options, Results, equal_box, pyplot
+from thirdhand_sim.lab.results import (
+    LEFT_COLOUR,
+    RIGHT_COLOUR,
+    TOOL_COLOUR,
+    Array,
+    Options,
+    Results,
+    equal_box,
+    pyplot,
+)
 from thirdhand_sim.lab.scenes import Drawn
 from thirdhand_sim.network import RunReport
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.world import pixels
 
-SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
-NOMINAL = Drawn(Scene(), 1.0, (), SEED)
+HANDS_SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
+NOMINAL = Drawn(Scene(), 1.0, (), HANDS_SEED)
 MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)),
     1.0,
     (),
-    SEED,
+    HANDS_SEED,
 )
 MOVING_M_S = 0.05  # a hand at this speed has started
 # rates of the paths in the figure, and of their recordings
-SHOWN_HZ = 20
+DRAWN_HZ = 20
 SERVICE_HZ = 500
-EYE = (1.45, -0.95, 0.85)
-TARGET = (0.57, 0.03, 0.24)
+CAMERA_EYE = (1.45, -0.95, 0.85)
+CAMERA_TARGET = (0.57, 0.03, 0.24)
 SIZE = (640, 480)
-THINGS = {
+SCENE_THINGS = {
     "board": "board",
     "glass": "magnifying glass",
     "iron": "soldering iron",
@@ -117,7 +126,7 @@ def _recorded(path: Path) -> Traces:
     frames = read(Recording.open(path)).frames
     following = frames[frames["mode"] == Mode.FOLLOW]
     moving = np.linalg.norm(following["hand_velocities"], axis=2).max(axis=1) > MOVING_M_S
-    shown_frames = following[int(np.argmax(moving)) :: SERVICE_HZ // SHOWN_HZ]
+    shown_frames = following[int(np.argmax(moving)) :: SERVICE_HZ // DRAWN_HZ]
     return Traces(shown_frames["hands"][:, 0], shown_frames["hands"][:, 1], shown_frames["tool"])
 
 
@@ -126,7 +135,7 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
     adapt = ours(drawn.scene) if taught else lambda bench: skill
     rehearsal = rehearse(drawn.script(), adapt, rate_hz=250, keep=True)
     began = int(np.argmax(rehearsal.time_s > 0))
-    stride = 250 // SHOWN_HZ
+    stride = 250 // DRAWN_HZ
     return Traces(
         rehearsal.hands[began::stride, 0],
         rehearsal.hands[began::stride, 1],
@@ -164,7 +173,11 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         axes.tick_params(labelsize=7)
     handles = [
         plt.Line2D([], [], color=c, label=n)
-        for c, n in ((LEFT, "left hand"), (RIGHT, "right hand"), (TOOL, "robot's tool"))
+        for c, n in (
+            (LEFT_COLOUR, "left hand"),
+            (RIGHT_COLOUR, "right hand"),
+            (TOOL_COLOUR, "robot's tool"),
+        )
     ]
     handles += [
         plt.Line2D([], [], color="black", marker=m, lw=0, label=n)
@@ -191,7 +204,7 @@ def _mark(ran: dict[str, Any] | None) -> str:
 
 
 def _trace(axes: Any, traces: Traces, style: str, width: float) -> None:
-    for line, colour in zip(traces, (LEFT, RIGHT, TOOL), strict=True):
+    for line, colour in zip(traces, (LEFT_COLOUR, RIGHT_COLOUR, TOOL_COLOUR), strict=True):
         axes.plot(*line.T, style, color=colour, lw=width)
         axes.plot(*line[:1].T, "*", color=colour, ms=7)
         axes.plot(*line[-1:].T, "+", color=colour, ms=9, mew=1.8)
@@ -224,11 +237,11 @@ def _draw_stages(results: Results) -> None:
                 )
             )
         if len(shots) < len(middle) and bench.time_s > middle[len(shots)]:
-            colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
+            colours, matrix = bench.world.picture(eye=CAMERA_EYE, target=CAMERA_TARGET, size=SIZE)
             path = np.array(so_far)
             if not shots:
                 things.extend(
-                    bench.world.pose(getattr(bench.world, name)).position for name in THINGS
+                    bench.world.pose(getattr(bench.world, name)).position for name in SCENE_THINGS
                 )
             shots.append((colours, matrix, Traces(path[:, 0], path[:, 1], path[:, 2])))
             so_far.clear()
@@ -238,7 +251,7 @@ def _draw_stages(results: Results) -> None:
     figure, grid = plt.subplots(2, 2, figsize=(9, 6.6))
     for axes, (colours, matrix, traces), title in zip(grid.flat, shots, titles, strict=True):
         axes.imshow(colours)
-        for line, colour in zip(traces, (LEFT, RIGHT, TOOL), strict=True):
+        for line, colour in zip(traces, (LEFT_COLOUR, RIGHT_COLOUR, TOOL_COLOUR), strict=True):
             if np.ptp(line, axis=0).max() > 0.02:
                 pixel_path = pixels(line, matrix, SIZE)
                 axes.plot(*pixel_path.T, color=colour, lw=2)
@@ -256,7 +269,7 @@ def _draw_stages(results: Results) -> None:
         axes.set_title(title, loc="left")
         axes.set_axis_off()
     for pixel, name in zip(
-        pixels(np.array(things), shots[0][1], SIZE), THINGS.values(), strict=True
+        pixels(np.array(things), shots[0][1], SIZE), SCENE_THINGS.values(), strict=True
     ):
         aside = (-35, 45) if name == "solder" else (25, -38)  # the iron stands behind it
         grid[0, 0].annotate(
@@ -269,9 +282,9 @@ def _draw_stages(results: Results) -> None:
     handles = [
         plt.Line2D([], [], color=c, label=n)
         for c, n in (
-            (LEFT, "path of the left hand"),
-            (RIGHT, "of the right hand"),
-            (TOOL, "of the robot's tool"),
+            (LEFT_COLOUR, "path of the left hand"),
+            (RIGHT_COLOUR, "of the right hand"),
+            (TOOL_COLOUR, "of the robot's tool"),
         )
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)

@@ -41,11 +41,11 @@ from thirdhand_sim.lab.people.moving_hands import (
 )
 from thirdhand_sim.lab.results import (
     ADAPTED,
-    LEFT,
+    LEFT_COLOUR,
     OTHER,
     REFERENCE,
-    RIGHT,
-    TOOL,
+    RIGHT_COLOUR,
+    TOOL_COLOUR,
     Array,
     Options,
     Results,
@@ -66,9 +66,9 @@ from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
 from thirdhand_sim.lab.workers import shared_out
 
 TRIED_LAGS_S = (-0.06, 0.2)  # lags that are tried
-SEEDS = EXPERIMENTS["motion"].seeds
+MOTION_SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE, SMALL = (
-    SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small")
+    MOTION_SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small")
 )
 SMALL_HZ = range(1, 13)
 SECONDS = 15.0
@@ -78,7 +78,7 @@ DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
 # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
-LABELS = {
+FOLLOWER_LABELS = {
     "ours": "ours, by [tool] follow (ringed: the default)",
     "chase": "One-Euro filter, then Ruckig after the target",
     "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
@@ -93,9 +93,9 @@ HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is meas
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
 # the skills, appended to a group's name
-SHIPPED = ""
+SHIPPED_SKILL_HANDS = ""
 OF_SUCH_HANDS = ", skill of such hands"
-TEACHERS = SEEDS.learned["teachers"].numbers  # people who are not followed
+TEACHERS = MOTION_SEEDS.learned["teachers"].numbers  # people who are not followed
 # ticks from one sample to the next
 TAUGHT_S = 20.0
 TAUGHT_EVERY = 10
@@ -105,7 +105,7 @@ RIGHT_GAIN = 0.5
 
 
 @dataclass(frozen=True)
-class Figures:
+class MotionFigures:
     """One sequence with one follower.
 
     Overshoot and settling are those of sudden stops, the rest of all others.
@@ -222,11 +222,11 @@ def prepare(share: float, arm: str) -> None:
     # A function of the hands' positions alone, so that only the followers differ.
     skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
-    for skill_key, loaded_skill in ((SHIPPED, skill), (OF_SUCH_HANDS, other)):
+    for skill_key, loaded_skill in ((SHIPPED_SKILL_HANDS, skill), (OF_SUCH_HANDS, other)):
         _known[skill_key] = loaded_skill, settings, followers(loaded_skill, settings, share)
 
 
-def measure(task: tuple[str, str, Moving]) -> Figures:
+def measure(task: tuple[str, str, Moving]) -> MotionFigures:
     """The figures of one sequence with one follower, by one of the skills."""
     name, skill_key, hands = task
     skill, settings, by_name = _known[skill_key]
@@ -243,7 +243,7 @@ def measure(task: tuple[str, str, Moving]) -> Figures:
 def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     """Gains of small motion of a kind and a frequency [Hz], from target to setpoint and tool."""
     name, kind, rate_hz, number = task
-    skill, settings, by_name = _known[SHIPPED]
+    skill, settings, by_name = _known[SHIPPED_SKILL_HANDS]
     hands = small_motion(skill.hands.mean(axis=0), kind, rate_hz, number)
     target = targets(skill, hands.truth, settings)
     followed = by_name[name](hands)
@@ -251,7 +251,7 @@ def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     return [gains.gain(target, path, rate_hz) for path in (followed.setpoint, followed.tool)]
 
 
-def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
+def figures(name: str, hands: Moving, target: Array, seen: Followed) -> MotionFigures:
     """Figures of a path against the truth's target (N, 3) [m], from BEGUN_S on."""
     tool = seen.tool
     begun = round(BEGUN_S / PERIOD_S)
@@ -268,7 +268,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
     target = target[begun:]
     off_mm = 1000 * np.linalg.norm(tool - target, axis=1)
     wanted_acceleration, acceleration = (derivative(x, PERIOD_S, order=2) for x in (target, tool))
-    return Figures(
+    return MotionFigures(
         name,
         hands.group,
         hands.name,
@@ -291,7 +291,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> Figures:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """Follows all hands with all followers; returns the numbers for its JSON."""
     prepare(options.share, options.arm)
-    skill, _, by_name = _known[SHIPPED]
+    skill, _, by_name = _known[SHIPPED_SKILL_HANDS]
     if options.hands is not None:
         return _of_recorded(results, options, recorded(options.hands, skill.hands.mean(axis=0)))
     hands = sequences(options, skill.hands.mean(axis=0))
@@ -299,7 +299,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     by_both = ["ours", chase]
     floor_hands = [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
     tasks = [
-        (name, SHIPPED, sequence)
+        (name, SHIPPED_SKILL_HANDS, sequence)
         for name, sequence in itertools.product(by_name, hands)
         if name != TRUTH or sequence.group == SMOOTH
     ]
@@ -340,7 +340,7 @@ def _floors(hands: Sequence[Any], skill: Skill) -> dict[str, list[dict[str, Any]
     return floors
 
 
-def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
+def _summary(rows: list[MotionFigures]) -> dict[str, dict[str, float]]:
     """Means over the sequences of each group; of stops the worst too."""
     out: dict[str, dict[str, float]] = {}
     for group in dict.fromkeys(row.group for row in rows):
@@ -370,7 +370,7 @@ def _summary(rows: list[Figures]) -> dict[str, dict[str, float]]:
     return out
 
 
-def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Figures]:
+def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[MotionFigures]:
     """The figures of all tasks, shared out over processes."""
     begin = functools.partial(prepare, options.share, options.arm)
     return list(shared_out(measure, tasks, options.workers, prepare=begin))
@@ -378,8 +378,12 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Fi
 
 def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
     """The tasks of ours and of the chases on these hands."""
-    names = [name for name in _known[SHIPPED][2] if name == "ours" or name.startswith("chase")]
-    return [(name, SHIPPED, sequence) for name in names for sequence in hands]
+    names = [
+        name
+        for name in _known[SHIPPED_SKILL_HANDS][2]
+        if name == "ours" or name.startswith("chase")
+    ]
+    return [(name, SHIPPED_SKILL_HANDS, sequence) for name in names for sequence in hands]
 
 
 def _by_arm(
@@ -428,7 +432,11 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
 
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
     """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
-    harder = [("ours", SHIPPED, sequence) for sequence in hands if sequence.group in HARDER_GROUPS]
+    harder = [
+        ("ours", SHIPPED_SKILL_HANDS, sequence)
+        for sequence in hands
+        if sequence.group in HARDER_GROUPS
+    ]
     hands = [sequence for sequence in hands if sequence.group in FLOOR_GROUPS]
     measured = _measured(_beside_chases(hands), options)
     takes = Counter(sequence.person for sequence in hands if sequence.group == "clean")
@@ -474,12 +482,12 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
 
 
 def _bound(
-    results: Results, hands: list[Moving], found: list[Figures]
+    results: Results, hands: list[Moving], found: list[MotionFigures]
 ) -> dict[str, dict[str, float]]:
     """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
     fitted to each recording; medians over recordings.
     """
-    skill = _known[SHIPPED][0]
+    skill = _known[SHIPPED_SKILL_HANDS][0]
     mine = {
         row.name: row for row in found if row.follower == "ours" and row.group == hands[0].group
     }
@@ -499,7 +507,9 @@ def _bound(
     return out
 
 
-def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dict[str, float]]]:
+def _by_person(
+    results: Results, rows: list[MotionFigures]
+) -> dict[str, dict[str, dict[str, float]]]:
     """The errors of each group and person, as of `_compared`."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for group in dict.fromkeys(row.group for row in rows):
@@ -512,7 +522,7 @@ def _by_person(results: Results, rows: list[Figures]) -> dict[str, dict[str, dic
     return out
 
 
-def _compared(rows: list[Figures]) -> dict[str, float]:
+def _compared(rows: list[MotionFigures]) -> dict[str, float]:
     """Errors [mm] over sequences, root mean square and median: ours, and those of the best chase
     for each person. Our lag is a median too.
     """
@@ -538,12 +548,12 @@ def _compared(rows: list[Figures]) -> dict[str, float]:
     return {**out, **ratios, **medians, "lag_ms": lag_ms, "takes": len(errors["ours"])}
 
 
-def _usual_tracker(rows: list[Figures], name: str) -> str:
+def _usual_tracker(rows: list[MotionFigures], name: str) -> str:
     """The kind of tracker that recorded most sequences of a person."""
     return Counter(row.tracker for row in rows if row.person == name).most_common(1)[0][0]
 
 
-def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def _joint_speeds(found: list[MotionFigures], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """The joints' speeds by frequency and the share of ripple, for each follower."""
     rows = {
         row.follower: row.joint_speeds
@@ -556,7 +566,7 @@ def _joint_speeds(found: list[Figures], names: tuple[str, ...]) -> dict[str, dic
     }
 
 
-def _pooled(rows: list[Figures], follower: str) -> float:
+def _pooled(rows: list[MotionFigures], follower: str) -> float:
     return math.sqrt(np.mean([row.error_rms_mm**2 for row in rows if row.follower == follower]))
 
 
@@ -597,7 +607,7 @@ def _draw_followers(
     panel: Any, table: dict[str, Any], group: str, floor: list[dict[str, float]]
 ) -> None:
     styles = {
-        "ours": (TOOL, "o"),
+        "ours": (TOOL_COLOUR, "o"),
         "chase": (ADAPTED, "s"),
         "servo": (OTHER, "^"),
         "no smoothing": (REFERENCE, "D"),
@@ -605,7 +615,7 @@ def _draw_followers(
     for family, (colour, marker) in styles.items():
         rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
         points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
-        label = LABELS.get(family, family)
+        label = FOLLOWER_LABELS.get(family, family)
         panel.plot(
             *zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label
         )
@@ -636,7 +646,7 @@ def _draw_people(panel: Any, rows: dict[str, dict[str, float]]) -> None:
         ms=5,
         label="the best One-Euro filter and Ruckig",
     )
-    panel.plot(ours, range(len(names)), "o", color=TOOL, ms=6, label="ours")
+    panel.plot(ours, range(len(names)), "o", color=TOOL_COLOUR, ms=6, label="ours")
     panel.set(xscale="log", xlabel="error, rms [mm]")
     panel.set_yticks(range(len(names)), names)
     panel.set_xticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
@@ -658,7 +668,7 @@ def _record(results: Results, hands: Moving, seen: Followed) -> None:
         index = [rr.TimeColumn("time", duration=when)]
         stream.send_columns(path, index, rr.Points3D.columns(positions=positions))
 
-    for side, (name, colour) in enumerate((("left", LEFT), ("right", RIGHT))):
+    for side, (name, colour) in enumerate((("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))):
         part = slice(3 * side, 3 * side + 3)
         points(f"/{name}/truth", times, hands.truth[:, part], REFERENCE, 0.006)
         points(f"/{name}/raw", times[ticks], hands.samples[:, part], OTHER, 0.004)
@@ -666,7 +676,7 @@ def _record(results: Results, hands: Moving, seen: Followed) -> None:
     for name, path, colour in (
         ("target", seen.target, ADAPTED),
         ("setpoint", seen.setpoint, REFERENCE),
-        ("tool", seen.tool, TOOL),
+        ("tool", seen.tool, TOOL_COLOUR),
     ):
         assert path is not None
         points(f"/{name}", times, path, colour, 0.008)

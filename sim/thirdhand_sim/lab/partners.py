@@ -41,7 +41,7 @@ from thirdhand_sim.lab.results import (
     ADAPTED,
     OTHER,
     REFERENCE,
-    TOOL,
+    TOOL_COLOUR,
     ExperimentError,
     Options,
     Results,
@@ -62,25 +62,25 @@ RECORDED = {  # the beginnings of the files' names
     "give": ("give",),
     "walk": ("walk",),
 }
-PEOPLE = ("give",)  # its groups are persons
+GROUPED_BY_PERSON = ("give",)  # its groups are persons
 NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
-BLOCK = 9  # takes of `walk` that are left out together
-SEEDS = EXPERIMENTS["partners"].seeds
+TAKES_OF_BLOCK = 9  # takes of `walk` that are left out together
+PARTNER_SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 OWN = 3  # takes by which a person refines the skill of the others
-DEMONSTRATORS = len(SEEDS.learned[TASK_KINDS[0]].numbers)
+PARTNERS_SHOWING = len(PARTNER_SEEDS.learned[TASK_KINDS[0]].numbers)
 WANTED_TOLD = 90.0  # [%] of the samples with an error above UNSURE_M should be held or unsure
 ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the others may be
 # in the figure: label, and colour of refused skills
 GIVEN = ", via-points given"
 REFUSED = "#F6D2BD"
-SHOWN = {
+SHOWN_SETS = {
     SERVICE: ("service", ADAPTED, "o"),
     "same elapsed time": ("same elapsed time", REFERENCE, "|"),
     "linear": ("linear", REFERENCE, "x"),
     "Gaussian process": ("Gaussian process", OTHER, "s"),
-    "with 2 s of memory": ("Gaussian process with 2 s of memory", TOOL, "^"),
-    "memory and clock": ("Gaussian process with memory and clock", TOOL, "v"),
+    "with 2 s of memory": ("Gaussian process with 2 s of memory", TOOL_COLOUR, "^"),
+    "memory and clock": ("Gaussian process with memory and clock", TOOL_COLOUR, "v"),
     "HMM over demonstrations": ("HMM over demonstrations", "#CC79A7", "D"),
 }
 
@@ -94,7 +94,7 @@ class Part(NamedTuple):
     data: Path | None
 
 
-class Fold(NamedTuple):
+class SkillFold(NamedTuple):
     """The skill of the service in one fold, as `thirdhand learn` makes it with its defaults."""
 
     refusals: tuple[str, ...]  # reasons why the command writes no skill
@@ -114,10 +114,10 @@ class Found(NamedTuple):
     """
 
     rivals: dict[str, list[Judged]]
-    service: dict[str, Fold]
+    service: dict[str, SkillFold]
     moved: RigidMap | None = None  # of recorded takes, into the arm's reach
     # the skill refined by OWN takes of the person who is left out, on the rest
-    own: Fold | None = None
+    own: SkillFold | None = None
 
 
 @functools.lru_cache(maxsize=2)
@@ -131,7 +131,7 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
                     takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed)
                 )
             ]
-            for stream in (SEEDS.learned[task], SEEDS.evaluation[task])
+            for stream in (PARTNER_SEEDS.learned[task], PARTNER_SEEDS.evaluation[task])
         ]
         return groups[0], groups[1]
     assert data is not None
@@ -144,7 +144,9 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
         left_out(
             path.stem,
             group,
-            read(path, named=task in NAMES_PLACES)._replace(person=group * (task in PEOPLE)),
+            read(path, named=task in NAMES_PLACES)._replace(
+                person=group * (task in GROUPED_BY_PERSON)
+            ),
         )
         for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
     ]
@@ -154,7 +156,7 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
 def _group(task: str, number: int, name: str) -> str:
     if task == "give":
         return name.split("_")[1]
-    return f"block {number // BLOCK}" if task == "walk" else name
+    return f"block {number // TAKES_OF_BLOCK}" if task == "walk" else name
 
 
 def part(one: Part) -> Found:
@@ -176,7 +178,7 @@ def part(one: Part) -> Found:
                 judged(*pair) for pair in zip(asked, predictions, strict=True)
             ]
         result.service[SERVICE + TOLD * has_places] = served(training, asked, told=has_places)
-    if one.task in PEOPLE:
+    if one.task in GROUPED_BY_PERSON:
         skill, _ = as_command(training, told=named)
         result = result._replace(own=served(asked[:OWN], asked[OWN:], told=named, refined=skill))
     return result
@@ -214,7 +216,7 @@ def served(
     *,
     told: bool,
     refined: StoredSkill | None = None,
-) -> Fold:
+) -> SkillFold:
     """The service's skill of the shown takes, on those that are left out.
 
     An accepted skill is judged within the reach of the arm. A refused one is judged without it, as
@@ -222,9 +224,11 @@ def served(
     """
     skill, refusals = as_command(shown, told=told, refined=refined)
     if skill is None:
-        return Fold(refusals, (), None, "", [None] * len(asked), [], [], [])
+        return SkillFold(refusals, (), None, "", [None] * len(asked), [], [], [])
     figures = figures_of(skill)
-    fold = Fold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [], [])
+    fold = SkillFold(
+        refusals, figures.residual, figures, type(skill.model).__name__, [], [], [], []
+    )
     for take in asked:
         rounds: list[Judged] = []
         try:
@@ -246,7 +250,7 @@ def served(
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers of all sets."""
-    people = max(2, round(DEMONSTRATORS * options.share))
+    people = max(2, round(PARTNERS_SHOWING * options.share))
     parts = [
         Part(kind, "", people, None)
         for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]
@@ -310,7 +314,7 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
     return numbers
 
 
-def _accepted(folds: Sequence[Fold]) -> list[Judged]:
+def _accepted(folds: Sequence[SkillFold]) -> list[Judged]:
     """The accepted takes of some folds."""
     return [take for fold in folds for take in fold.accepted if take]
 
@@ -339,7 +343,7 @@ def _first_two(texts: Iterable[Iterable[str]]) -> list[str]:
     return list(dict.fromkeys(itertools.chain.from_iterable(texts)))[:2]
 
 
-def _again(folds: Sequence[Fold]) -> dict[str, dict[str, Any]]:
+def _again(folds: Sequence[SkillFold]) -> dict[str, dict[str, Any]]:
     """The numbers of further rounds, by the rest before them [s]."""
     rounds = [take for fold in folds for take in fold.again]
     return {
@@ -399,13 +403,13 @@ def _share(counts: Sequence[float | None], total: int) -> float | None:
     return sum(known_counts) / total if known_counts and total > 0 else None
 
 
-def _line(fold: Fold) -> str:
+def _line(fold: SkillFold) -> str:
     """A fold as a line of progress."""
     text = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
     return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
 
 
-class Verdict(NamedTuple):
+class SetVerdict(NamedTuple):
     """A set as `learn` judges it: summaries of accepted takes, and of refused skills in spite."""
 
     accepted: Mapping[str, Any]
@@ -422,7 +426,7 @@ class Verdict(NamedTuple):
         )
 
 
-def verdict(task: Mapping[str, Any], method: str) -> Verdict:
+def verdict(task: Mapping[str, Any], method: str) -> SetVerdict:
     """The verdict on the service in a set's numbers.
 
     In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
@@ -438,10 +442,10 @@ def verdict(task: Mapping[str, Any], method: str) -> Verdict:
         else f"{numbers['refuses']} of {takes} takes"
     )
     if "in_spite_of_refusal" not in numbers and folds_refused:
-        return Verdict(none, numbers, folds_refused, refused)
+        return SetVerdict(none, numbers, folds_refused, refused)
     in_spite = numbers.get("in_spite_of_refusal", none)
     at_risk = numbers.get("folds_at_risk", 0)
-    return Verdict(
+    return SetVerdict(
         numbers, in_spite, folds_refused, refused if numbers["refuses"] else "none", at_risk
     )
 
@@ -477,7 +481,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             ours = verdict(task, SERVICE + ending)
             labels.append(name + f"\n({ours.refused} refused)" * (ours.refused != "none"))
             ax.axhline(y, color="#dddddd", lw=0.8, zorder=0)
-            for method, (_, colour, marker) in SHOWN.items():
+            for method, (_, colour, marker) in SHOWN_SETS.items():
                 scores = (
                     ours.accepted if method == SERVICE else task["methods"].get(method + ending, {})
                 )
@@ -504,7 +508,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         ax.set_yticks(range(len(rows)), labels)
         ax.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, None))
         ax.set_title(title, loc="left", fontsize=9)
-    for label, colour, marker in SHOWN.values():
+    for label, colour, marker in SHOWN_SETS.values():
         axes[0, 0].plot([], [], marker, color=colour, ms=5, ls="", label=label)
     axes[0, 0].plot(
         [],
@@ -533,7 +537,7 @@ def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
     inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
     warned.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
     for part, colour, label in (
-        ("recorded", TOOL, "recorded partners"),
+        ("recorded", TOOL_COLOUR, "recorded partners"),
         ("made", ADAPTED, "made tasks"),
     ):
         for task in numbers[part].values():

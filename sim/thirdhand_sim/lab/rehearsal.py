@@ -21,7 +21,7 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand_sim.bench import Bench, TaskEvents
 from thirdhand_sim.closed_loop import ClosedLoop
-from thirdhand_sim.lab.catalogue import SHIPPED, Stream
+from thirdhand_sim.lab.catalogue import SHIPPED_TAKES, Stream
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import Array, HandScript
 from thirdhand_sim.teach import demonstrate
@@ -29,7 +29,7 @@ from thirdhand_sim.world import World
 
 # deviations of hands and tracker, each axis
 TREMOR_M = 0.0015
-NOISE_M = 0.0005
+TRACKER_NOISE_M = 0.0005
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def rehearse(
         return Rehearsed(bench.events(), held * settings.period_s, *arrays)
 
 
-def demonstrated(stream: Stream = SHIPPED) -> list[Demonstration]:
+def demonstrated(stream: Stream = SHIPPED_TAKES) -> list[Demonstration]:
     """Demonstrations of the nominal scene, 100 Hz."""
     return [
         demonstrate(Scene(), seed=1000 * stream.seed + n, begin_s=60 * n) for n in stream.numbers

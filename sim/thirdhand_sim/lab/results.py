@@ -30,9 +30,9 @@ Array = NDArray[np.float64]
 
 # Okabe and Ito's colours, which people with colour vision deficiencies distinguish. As in the
 # paper, the left hand is red, the right one blue, and the robot green.
-LEFT = "#D55E00"
-RIGHT = "#0072B2"
-TOOL = "#009E73"
+LEFT_COLOUR = "#D55E00"
+RIGHT_COLOUR = "#0072B2"
+TOOL_COLOUR = "#009E73"
 ADAPTED = "#D55E00"
 OTHER = "#0072B2"
 DESIRED = "#CC79A7"

@@ -30,22 +30,22 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.open_loop import targets
 from thirdhand_sim.lab.people import moving_hands
 from thirdhand_sim.lab.people.moving_hands import Moving
-from thirdhand_sim.lab.rehearsal import NOISE_M, TREMOR_M, rehearse
+from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M, rehearse
 from thirdhand_sim.lab.results import Options, Results, brief
 from thirdhand_sim.lab.rivals.followers import ours
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
-Figures: TypeAlias = dict[str, float]
+SensitivityFigures: TypeAlias = dict[str, float]
 
 TUNING_STREAMS = EXPERIMENTS["sensitivity"].seeds.tuning
-SEEDS = len(TUNING_STREAMS["people"].numbers)
+SEEDS_AT_USUAL = len(TUNING_STREAMS["people"].numbers)
 CHANGED = 2  # seeds of the sessions at other values
 FACTORS = (0.5, 2.0)
 MOTION_S = 4.0
 STOP_RATES_HZ = {100: 0.0005, 30: 0.002, 15: 0.002}  # noise [m] of the trackers
-UNSEEN_S = (1.7, 2.3)  # begin and end of the time without a hand
+WITHOUT_HAND_S = (1.7, 2.3)  # begin and end of the time without a hand
 # bursts of three outliers, and how far away they are
 BURSTS = 4
 BURST_M = 0.2
@@ -105,7 +105,7 @@ def _skill() -> Skill:
     return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
 
 
-def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.Figures]:
+def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.MotionFigures]:
     """Figures of sequences of hands that the core alone follows."""
     follow = ours(_skill(), Settings(), tuning)
     return [
@@ -122,7 +122,7 @@ def _person(seed: int) -> list[Moving]:
     return [sequence for sequence in people if sequence.group in motion.FLOOR_GROUPS]
 
 
-def moving(tuning: Tuning, seed: int) -> Figures:
+def moving(tuning: Tuning, seed: int) -> SensitivityFigures:
     """Hands as in `motion`, seen by a precise and by a poor tracker."""
     rows = _followed(_person(seed), tuning)
     return {
@@ -131,7 +131,7 @@ def moving(tuning: Tuning, seed: int) -> Figures:
     }
 
 
-def stops(tuning: Tuning, seed: int) -> Figures:
+def stops(tuning: Tuning, seed: int) -> SensitivityFigures:
     """Overshoot of sudden stops, as in `motion`, by the rate of the tracker."""
     middle = _skill().hands.mean(axis=0)
     stop = functools.partial(
@@ -145,12 +145,14 @@ def stops(tuning: Tuning, seed: int) -> Figures:
     }
 
 
-def disturbed(tuning: Tuning, seed: int) -> Figures:
+def disturbed(tuning: Tuning, seed: int) -> SensitivityFigures:
     """A hand out of sight, with late samples; bursts of outliers."""
     hands = _person(seed)[0]
     random = np.random.default_rng([TUNING_STREAMS["disturbed"].seed, seed])
     late = random.uniform(0.0, moving_hands.MOST_LATE_S, (len(hands.stamps), 2))
-    late[(hands.stamps > UNSEEN_S[0]) & (hands.stamps < UNSEEN_S[1]), seed % 2] = math.inf
+    late[(hands.stamps > WITHOUT_HAND_S[0]) & (hands.stamps < WITHOUT_HAND_S[1]), seed % 2] = (
+        math.inf
+    )
 
     wrong = hands.samples.copy()
     for begin in random.integers(0, len(wrong) - 3, BURSTS):
@@ -163,10 +165,10 @@ def disturbed(tuning: Tuning, seed: int) -> Figures:
     return errors | {f"{name}_jerk_ratio": row.jerk_ratio for name, row in named}
 
 
-def beside_a_box(tuning: Tuning, seed: int) -> Figures:
+def beside_a_box(tuning: Tuning, seed: int) -> SensitivityFigures:
     """The nominal scene on the bench, with a box on the way to the handover."""
     hands_seed = TUNING_STREAMS["hands"].numbers[seed]
-    script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=NOISE_M)
+    script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=TRACKER_NOISE_M)
     settings = msgspec.structs.replace(Settings(), obstacles=Obstacles(boxes=(BOX,)))
     skill_for = reached.ours(Scene())
     rehearsal = rehearse(
@@ -183,7 +185,7 @@ def beside_a_box(tuning: Tuning, seed: int) -> Figures:
     }
 
 
-def implausible(tuning: Tuning, seed: int) -> Figures:
+def implausible(tuning: Tuning, seed: int) -> SensitivityFigures:
     """An arm that trembles ever less, joint states and hands that cannot be, and a fast clock."""
     skill = reached.taught(shipped_skill(), Scene().via_points())
     settings = msgspec.structs.replace(
@@ -230,7 +232,7 @@ def implausible(tuning: Tuning, seed: int) -> Figures:
 SESSIONS = (moving, stops, disturbed, beside_a_box, implausible)
 
 
-def measured(task: tuple[str, float, int]) -> Figures | str:
+def measured(task: tuple[str, float, int]) -> SensitivityFigures | str:
     """Figures of all sessions with a seed and a number, by its key (an empty one: none), times a
     factor; or the error with which they fail.
     """
@@ -247,16 +249,16 @@ def measured(task: tuple[str, float, int]) -> Figures | str:
     }
 
 
-def effect(rows: list[Figures | str], tuned: list[Figures]) -> dict[str, Any]:
+def effect(rows: list[SensitivityFigures | str], tuned: list[SensitivityFigures]) -> dict[str, Any]:
     """Mean change of the figures of `moving` [%] and `stops` [mm], and the largest change of any
     other figure in units of its noise. A change of a figure without noise counts as one noise.
     """
     failures = [row for row in rows if isinstance(row, str)]
     if failures:
         return {"fails": failures[0]}
-    changes = Figures()
-    shares = Figures()
-    noises = Figures()
+    changes = SensitivityFigures()
+    shares = SensitivityFigures()
+    noises = SensitivityFigures()
     for name in tuned[0]:
         pairs = zip(rows, tuned, strict=False)
         changes[name] = float(
@@ -279,7 +281,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """Effect of each number, by its key and the factor; with fewer seeds for a quick look."""
     all_numbers = numbers().values()
     seeds = range(math.ceil(options.share * CHANGED))
-    noise_seeds = range(max(3, round(options.share * SEEDS)))
+    noise_seeds = range(max(3, round(options.share * SEEDS_AT_USUAL)))
     tasks = [("", 1.0, seed) for seed in noise_seeds]
     tasks += [
         (number.key, factor, seed) for number in all_numbers for factor in FACTORS for seed in seeds

@@ -27,7 +27,7 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.reached import EVENTS, ours
-from thirdhand_sim.lab.rehearsal import NOISE_M, TREMOR_M, Rehearsed, rehearse
+from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M, Rehearsed, rehearse
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.scenes import OFFSET_M, Drawn, draw
 from thirdhand_sim.lab.workers import shared_out
@@ -42,22 +42,22 @@ from thirdhand_sim.script import (
 )
 
 # half the rate, to save time
-SCENES = EXPERIMENTS["separation"].seeds.evaluation["scenes"]
-RATE_HZ = 250
-KINDS = ("random", "thrust", "unheeded")
+RANDOM_SCENES = EXPERIMENTS["separation"].seeds.evaluation["scenes"]
+SEPARATION_HZ = 250
+SCENE_KINDS = ("random", "thrust", "unheeded")
 EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
 GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
 # durations of a thrust
-REACH_S = (0.35, 0.7)
+THRUST_S = (0.35, 0.7)
 STAY_S = 2 * PAUSE_RAMP_S
 # a hand is thrust this far ahead of the tool on its path, and at most this time
 AHEAD_M = 0.22
 AHEAD_S = 1.5
 THRUST_STEP_S = 0.02  # times at which the path is sampled
 CLEARANCE_TICKS = 5
-WITHIN_M = 0.3
+SEARCHED_M = 0.3
 SHOWN_M = 0.3
-STEP_S = 1e-6
+SPEED_STEP_S = 1e-6
 # the figure shows the first scenes, and every tenth tick
 SHOWN_SCENES = 5
 SHOWN_TICKS = 10
@@ -76,7 +76,7 @@ class ThrustScript(HandScript):
         clock = Clock(speed=drawn.speed, pauses=drawn.pauses)
         teacher = Teacher(drawn.scene, seed=drawn.seed, clock=clock)
         self.side = int(random.integers(2))
-        self.lasts_s = float(random.uniform(*REACH_S))
+        self.lasts_s = float(random.uniform(*THRUST_S))
         self.away_s = 2 * self.lasts_s + STAY_S
         self.at_s, self._place = _thrust(
             random, teacher, drawn, clock.elapsed(drawn.scene.duration_s), self.lasts_s
@@ -91,7 +91,7 @@ class ThrustScript(HandScript):
             pauses=(*later, back),
             offset_std=OFFSET_M,
             tremor_rms=TREMOR_M,
-            noise_std=NOISE_M,
+            noise_std=TRACKER_NOISE_M,
         )
 
     def truth(self, t: float) -> HandMotions:
@@ -141,7 +141,7 @@ def _reach(u: float) -> tuple[float, float]:
     return u**3 * (10 - 15 * u + 6 * u * u), 30 * (u * (1 - u)) ** 2
 
 
-class Outcome(NamedTuple):
+class SeparationOutcome(NamedTuple):
     """One run. While the tool offers the board to the left hand, the contact speed applies, as in
     the service.
     """
@@ -167,10 +167,10 @@ class Outcome(NamedTuple):
     near: Array  # (N, 2): distance [m] and speed [m/s] of the pair nearest to its limit, some ticks
 
 
-def run_one(task: tuple[str, int]) -> Outcome:
+def run_one(task: tuple[str, int]) -> SeparationOutcome:
     """The outcome of one scene."""
     kind, number = task
-    drawn = draw(number, seed=SCENES.seed)
+    drawn = draw(number, seed=RANDOM_SCENES.seed)
     script = ThrustScript(drawn) if kind == "thrust" else drawn.script()
     clearances: list[tuple[float, float]] = []
 
@@ -179,14 +179,14 @@ def run_one(task: tuple[str, int]) -> Outcome:
             world = bench.world
             clearances.append(
                 (
-                    world.clearance(world.left, within=WITHIN_M),
-                    world.clearance(world.right, within=WITHIN_M),
+                    world.clearance(world.left, within=SEARCHED_M),
+                    world.clearance(world.right, within=SEARCHED_M),
                 )
             )
 
     skill_for = ours(drawn.scene)
     with patch.object(Separation, "step") if kind == "unheeded" else nullcontext():
-        done = rehearse(script, skill_for, rate_hz=RATE_HZ, keep=True, look=look)
+        done = rehearse(script, skill_for, rate_hz=SEPARATION_HZ, keep=True, look=look)
     away_s = script.away_s if isinstance(script, ThrustScript) else 0.0
     return _judged(kind, number, drawn, away_s, done, clearances)
 
@@ -198,9 +198,9 @@ def _judged(
     away_s: float,
     done: Rehearsed,
     clearances: list[tuple[float, float]],
-) -> Outcome:
-    settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
-    dt = 1 / RATE_HZ
+) -> SeparationOutcome:
+    settings = msgspec.structs.replace(Settings(), rate_hz=SEPARATION_HZ)
+    dt = 1 / SEPARATION_HZ
     people = settings.people
     body = body_of(settings, robot_description(settings))
     distance, speed, coming, self_m, table = nearest(settings, body, done.joints, done.hands)
@@ -226,7 +226,7 @@ def _judged(
     worst = np.argmax((speed - allowed).reshape(len(speed), -1), axis=1)
     rows = np.arange(len(speed))
     picked = np.stack([x.reshape(len(x), -1)[rows, worst] for x in (distance, speed)], axis=1)
-    return Outcome(
+    return SeparationOutcome(
         kind,
         number,
         done.events.success,
@@ -296,7 +296,7 @@ def _measure(
     for t in range(len(joints)):
         q = joints[t, 0]
         place(q, frames, axes, capsules, segments)
-        place(q + STEP_S * joints[t, 1], frames, axes, capsules, moved)
+        place(q + SPEED_STEP_S * joints[t, 1], frames, axes, capsules, moved)
         for pair in range(len(kept_apart)):
             capsule = kept_apart[pair, 0]
             other = kept_apart[pair, 1]
@@ -327,7 +327,7 @@ def _measure(
                 for i in range(3):
                     first = moved[c, 0, i] - segments[c, 0, i]
                     second = moved[c, 1, i] - segments[c, 1, i]
-                    along += near[6 + i] * ((1.0 - share) * first + share * second) / STEP_S
+                    along += near[6 + i] * ((1.0 - share) * first + share * second) / SPEED_STEP_S
                     coming -= near[6 + i] * hands[t, side, 1, i]
                 pairs[1, t, side, c - fixed] = along
                 pairs[2, t, side, c - fixed] = max(coming, 0.0)
@@ -347,10 +347,13 @@ def _allow(
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    scenes = SCENES.share(options.share)
-    by_kind: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
+    scenes = RANDOM_SCENES.share(options.share)
+    by_kind: dict[str, list[SeparationOutcome]] = {kind: [] for kind in SCENE_KINDS}
     tasks = [
-        (kind, n) for n in scenes for kind in KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0
+        (kind, n)
+        for n in scenes
+        for kind in SCENE_KINDS
+        if kind != "unheeded" or n % UNHEEDED_EVERY == 0
     ]
     for row in shared_out(run_one, tasks, options.workers):
         by_kind[row.kind].append(row)
@@ -359,7 +362,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     _draw_errors(results, by_kind)
     numbers = {
         "scenes": len(scenes),
-        "rate_hz": RATE_HZ,
+        "rate_hz": SEPARATION_HZ,
         "slip_m_per_s": TUNING.separation.slip_speed_mps,
         **{kind: _summary(rows) for kind, rows in by_kind.items()},
         "later_than_unheeded_s": _later(by_kind["random"], by_kind["unheeded"]),
@@ -372,7 +375,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _draw_errors(results: Results, by_kind: dict[str, list[Outcome]]) -> None:
+def _draw_errors(results: Results, by_kind: dict[str, list[SeparationOutcome]]) -> None:
     """The smallest distances and the largest excess over the scenes, by kind."""
     series: dict[str, list[float]] = {}
     for kind, rows in by_kind.items():
@@ -381,17 +384,17 @@ def _draw_errors(results: Results, by_kind: dict[str, list[Outcome]]) -> None:
     results.series(series, "scene")
 
 
-def _worst(rows: list[Outcome]) -> int:
+def _worst(rows: list[SeparationOutcome]) -> int:
     """The number of the scene with the largest excess."""
     return max(rows, key=lambda row: row.excess_after_reaction).number
 
 
-def _failed(rows: list[Outcome]) -> list[int]:
+def _failed(rows: list[SeparationOutcome]) -> list[int]:
     """The numbers of the scenes that did not succeed."""
     return [row.number for row in rows if not row.success]
 
 
-def _shown(rows: list[Outcome]) -> dict[str, Any]:
+def _shown(rows: list[SeparationOutcome]) -> dict[str, Any]:
     """Content of the figure, of its scenes: points at distances [mm] and speeds [mm/s]."""
     rows = [row for row in rows if row.number < SHOWN_SCENES]
     near = np.concatenate([row.near for row in rows])
@@ -403,7 +406,7 @@ def _shown(rows: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _summary(rows: list[Outcome]) -> dict[str, Any]:
+def _summary(rows: list[SeparationOutcome]) -> dict[str, Any]:
     closest = np.array([row.shapes_mm for row in rows])
     return {
         "successes": sum(row.success for row in rows),
@@ -418,7 +421,7 @@ def _summary(rows: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
+def _later(ours: list[SeparationOutcome], free: list[SeparationOutcome]) -> dict[str, Any]:
     """Delay of the events [s] against the same scenes without separation."""
     late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
     return {
@@ -427,7 +430,9 @@ def _later(ours: list[Outcome], free: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _later_for(thrust: list[Outcome], undisturbed: list[Outcome]) -> dict[str, Any]:
+def _later_for(
+    thrust: list[SeparationOutcome], undisturbed: list[SeparationOutcome]
+) -> dict[str, Any]:
     """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
     both runs succeed.
     """
@@ -454,7 +459,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), sharey=True)
     titles = ("random scenes", "a hand thrust into the path", "random scenes, without separation")
     colours = (OTHER, ADAPTED, "#595959")
-    for ax, kind, title, colour in zip(axes, KINDS, titles, colours, strict=True):
+    for ax, kind, title, colour in zip(axes, SCENE_KINDS, titles, colours, strict=True):
         content = numbers["shown"][kind]
         distance_mm, speed_mm_s = np.array(content["points"])
         ax.scatter(

@@ -10,15 +10,15 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S
-from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL, Array, Results, pyplot
+from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL_COLOUR, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)
-PARTS = 3  # bands within RIPPLE_HZ
-EDGES_HZ = RIPPLE_HZ[0] * (RIPPLE_HZ[1] / RIPPLE_HZ[0]) ** (np.arange(-5, 7) / PARTS)
+BANDS = 3  # bands within RIPPLE_HZ
+EDGES_HZ = RIPPLE_HZ[0] * (RIPPLE_HZ[1] / RIPPLE_HZ[0]) ** (np.arange(-5, 7) / BANDS)
 MOVING_MPS = 0.05  # speed of a moving tool
-LABELS = {
+SPECTRUM_LABELS = {
     "truth": ("true hands, through the arm", REFERENCE, "--"),
-    "ours": ("ours", TOOL, "-"),
+    "ours": ("ours", TOOL_COLOUR, "-"),
     "chase": ("One-Euro filter, then Ruckig after the target", ADAPTED, "-"),
     "no smoothing": ("no smoothing", OTHER, "-"),
 }
@@ -42,7 +42,7 @@ def speeds(tool: Array, joints: Array) -> list[float]:
 def ripple(bands: list[float]) -> float:
     """The share of such speeds that lies in RIPPLE_HZ."""
     begin = int(np.argmin(abs(EDGES_HZ - RIPPLE_HZ[0]))) + 1
-    return float(np.linalg.norm(bands[begin : begin + PARTS]) / np.linalg.norm(bands))
+    return float(np.linalg.norm(bands[begin : begin + BANDS]) / np.linalg.norm(bands))
 
 
 def draw(results: Results, by_follower: dict[str, list[float]]) -> None:
@@ -51,7 +51,7 @@ def draw(results: Results, by_follower: dict[str, list[float]]) -> None:
     figure, panel = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
     panel.axvspan(*RIPPLE_HZ, color="0.93", lw=0)
     for name, bands in by_follower.items():
-        label, colour, style = LABELS[name]
+        label, colour, style = SPECTRUM_LABELS[name]
         middles = np.sqrt(EDGES_HZ[1:] * EDGES_HZ[:-1])
         panel.plot(
             middles,

@@ -18,30 +18,36 @@ from thirdhand_sim.lab.rehearsal import rehearse
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Options, Results, pyplot, rgb
 from thirdhand_sim.lab.rivals.as_skill import in_bench
 from thirdhand_sim.lab.rivals.gaussian_process import SampleProcess
-from thirdhand_sim.lab.rivals.method import Learn, Model
+from thirdhand_sim.lab.rivals.method import Learn, RivalModel
 from thirdhand_sim.lab.rivals.mixtures import MixtureRegression
 from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
-from thirdhand_sim.lab.rivals.service import COMPONENTS, LearnedByService
+from thirdhand_sim.lab.rivals.service import GMR_COMPONENTS, LearnedByService
 from thirdhand_sim.lab.scenes import draw
 from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.people import Places
 from thirdhand_sim.scene import GRASP_DISTANCE
 
-SEEDS = EXPERIMENTS["statistics"].seeds
-SCENES = SEEDS.evaluation["scenes"]
-ELL = 5.0  # [1/m²] as the shipped skill
+TASK_SEEDS = EXPERIMENTS["statistics"].seeds
+TASK_SCENES = TASK_SEEDS.evaluation["scenes"]
+SHIPPED_ELL = 5.0  # [1/m²] as the shipped skill
 # to save time: the lower rate changes errors by 2 mm at most
 OURS_HZ = 500
 RIVALS_HZ = 125
-METHODS: dict[str, tuple[str, Learn]] = {
+TASK_METHODS: dict[str, tuple[str, Learn]] = {
     "ours": ("KMP, via-points\n(the service)", lambda shown: LearnedByService(shipped_skill())),
-    "none": ("the places and the start,\nno demonstrations", NoDemonstrations(ell=ELL).learn),
+    "none": (
+        "the places and the start,\nno demonstrations",
+        NoDemonstrations(ell=SHIPPED_ELL).learn,
+    ),
     "look_up": ("look-up of these,\nweighted by distance", LookUp().learn),
-    "gaussian_process_5": ("Gaussian process,\nour ell, same places", SampleProcess(ell=ELL).learn),
+    "gaussian_process_5": (
+        "Gaussian process,\nour ell, same places",
+        SampleProcess(ell=SHIPPED_ELL).learn,
+    ),
     "gaussian_process": ("Gaussian process,\nsame places", SampleProcess().learn),
-    "gmr": ("GMR alone", MixtureRegression(COMPONENTS).learn),
+    "gmr": ("GMR alone", MixtureRegression(GMR_COMPONENTS).learn),
 }
-LEAST_MM = 1e-3  # errors are rounded to it; a logarithmic axis shows nothing smaller
+SHOWN_LEAST_MM = 1e-3  # errors are rounded to it; a logarithmic axis shows nothing smaller
 
 
 def colour_of(method: str) -> str:
@@ -49,7 +55,7 @@ def colour_of(method: str) -> str:
     return ADAPTED if method == "ours" else OTHER
 
 
-class Outcome(NamedTuple):
+class TaskOutcome(NamedTuple):
     """One scene with one method: errors [mm] of the three events, success, and the time in which
     the service held [s].
     """
@@ -62,26 +68,26 @@ class Outcome(NamedTuple):
 
 
 @functools.cache
-def _learned(method: str) -> Model[Places]:
+def _learned(method: str) -> RivalModel[Places]:
     """The model of a method, learned once in a process."""
-    return METHODS[method][1](shown())
+    return TASK_METHODS[method][1](shown())
 
 
-def outcome(task: tuple[str, int]) -> Outcome:
+def outcome(task: tuple[str, int]) -> TaskOutcome:
     """One scene with one method."""
     method, number = task
-    drawn = draw(number, seed=SCENES.seed)
+    drawn = draw(number, seed=TASK_SCENES.seed)
     skill_for = in_bench(shipped_skill(), _learned(method).place(places_in(drawn.scene)))
     done = rehearse(drawn.script(), skill_for, rate_hz=OURS_HZ if method == "ours" else RIVALS_HZ)
-    return Outcome(method, number, done.errors_mm, done.events.success, done.held_s)
+    return TaskOutcome(method, number, done.errors_mm, done.events.success, done.held_s)
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    scenes = SCENES.share(options.share)
+    scenes = TASK_SCENES.share(options.share)
     count = len(scenes)
-    tasks = [(method, number) for method in METHODS for number in scenes]
-    by_method: dict[str, list[Outcome]] = {method: [] for method in METHODS}
+    tasks = [(method, number) for method in TASK_METHODS for number in scenes]
+    by_method: dict[str, list[TaskOutcome]] = {method: [] for method in TASK_METHODS}
     for row in shared_out(outcome, tasks, options.workers):
         by_method[row.method].append(row)
         done = by_method[row.method]
@@ -105,7 +111,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _draw_errors(results: Results, by_method: dict[str, list[Outcome]]) -> None:
+def _draw_errors(results: Results, by_method: dict[str, list[TaskOutcome]]) -> None:
     """The errors of each event over the scenes, by method."""
     paths = {
         f"/{name}/{method}": (method, i) for method in by_method for i, name in enumerate(EVENTS)
@@ -120,7 +126,7 @@ def _draw_errors(results: Results, by_method: dict[str, list[Outcome]]) -> None:
     results.series(values, "scene", styles)
 
 
-def _summary(rows: list[Outcome]) -> dict[str, Any]:
+def _summary(rows: list[TaskOutcome]) -> dict[str, Any]:
     errors = np.array([row.errors_mm for row in rows])
     successes = sum(row.success for row in rows)
     low, high = wilson(successes, len(rows))
@@ -169,9 +175,9 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         errors = np.array(numbers["errors_mm_by_scene"][method])
         for axes, name, error in zip(events, EVENTS, errors.T, strict=True):
             y = i + random.uniform(-0.25, 0.25, len(error))
-            axes.scatter(np.maximum(error, LEAST_MM), y, s=5, color=colour, alpha=0.5, lw=0)
+            axes.scatter(np.maximum(error, SHOWN_LEAST_MM), y, s=5, color=colour, alpha=0.5, lw=0)
             axes.plot(
-                [max(scores[f"{name}_mm"]["median"], LEAST_MM)] * 2,
+                [max(scores[f"{name}_mm"]["median"], SHOWN_LEAST_MM)] * 2,
                 (i - 0.38, i + 0.38),
                 color="black",
                 lw=1.6,
@@ -181,7 +187,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         xticks=range(0, 101, 25),
         xlabel="scenes in which all three\nevents succeeded [%]",
     )
-    rates.set_yticks(range(len(methods)), [METHODS[method][0] for method in methods])
+    rates.set_yticks(range(len(methods)), [TASK_METHODS[method][0] for method in methods])
     rates.invert_yaxis()
     titles = (
         "board handed over:\ntool to left hand",
@@ -190,7 +196,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     )
     for axes, title in zip(events, titles, strict=True):
         axes.axvline(numbers["within_mm"], color="black", ls="--", lw=0.8)
-        axes.set(xscale="log", xlim=(0.7 * LEAST_MM, 1500), xticks=[1e-3, 0.1, 10, 1000])
+        axes.set(xscale="log", xlim=(0.7 * SHOWN_LEAST_MM, 1500), xticks=[1e-3, 0.1, 10, 1000])
         axes.set_xticklabels(["0.001", "0.1", "10", "1000"])
         axes.set_title(title, fontsize=9)
         axes.minorticks_off()

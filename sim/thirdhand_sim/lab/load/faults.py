@@ -32,14 +32,14 @@ from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.workbench.report.columns import read
 from thirdhand_sim.faulty_cell import Command, Fault, FaultTimes, FaultyCell, Network
-from thirdhand_sim.lab.results import DESIRED, REFERENCE, TOOL, Options, Results, pyplot
+from thirdhand_sim.lab.results import DESIRED, REFERENCE, TOOL_COLOUR, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
 from thirdhand_sim.script import Array
 
 STANDS_M = 0.001  # a tool that stays within this distance of its end is at rest
 DISK_MB = 64
 # the figure shows this time around a fault
-BEFORE_S = 0.3
+BEFORE_FAULT_S = 0.3
 AFTER_S = 1.0
 SCRIBE_SILENT_S = 8.0  # time in which a stopped scribe is replaced, and the new one writes
 Act = Callable[[FaultyCell], None]
@@ -237,7 +237,11 @@ def figures(
     else:
         gaps = np.diff([event.struck_s, *(command[0] for command in commands)])
         before = np.diff(
-            [command[0] for command in cell.commands if 0 < event.struck_s - command[0] < BEFORE_S]
+            [
+                command[0]
+                for command in cell.commands
+                if 0 < event.struck_s - command[0] < BEFORE_FAULT_S
+            ]
         )
         numbers |= {
             "command_largest_gap_ms": 1e3 * float(gaps.max()),
@@ -329,7 +333,8 @@ def _suffer(
     for event in events:
         result.figures[event.fault] = figures(cell, event, FAULTS[event.fault], recorded, steps)
         near = steps[
-            (steps[:, 0] > event.struck_s - BEFORE_S) & (steps[:, 0] < event.struck_s + AFTER_S)
+            (steps[:, 0] > event.struck_s - BEFORE_FAULT_S)
+            & (steps[:, 0] < event.struck_s + AFTER_S)
         ]
         result.speeds[event.fault] = np.column_stack([near[:, 0] - event.struck_s, near[:, 4]])
     recorded_ticks = set(recorded.ticks.tolist())
@@ -394,7 +399,7 @@ def _draw(results: Results, came: Suffered) -> None:
     for axes, name in zip(grid.flat, stopping, strict=False):
         speed = came.speeds[name]
         numbers = came.figures[name]
-        axes.plot(1e3 * speed[:, 0], speed[:, 1], color=TOOL)
+        axes.plot(1e3 * speed[:, 0], speed[:, 1], color=TOOL_COLOUR)
         axes.axvline(0, color=REFERENCE, linewidth=0.8)
         if numbers["hold_ms"] is not None:
             axes.axvline(numbers["hold_ms"], color=DESIRED, linewidth=0.8, linestyle="--")

@@ -20,19 +20,19 @@ from thirdhand_sim.lab.people.recorded_people import recorded_people
 from thirdhand_sim.lab.people.trials import (
     FAST_MPS,
     FOR_S,
-    NEAR_M,
-    RATE_HZ,
+    NEAR_HAND_M,
     SLOW_MPS,
+    TRIAL_HZ,
     WITHIN_M,
     WRONG_M,
-    Outcome,
-    Seen,
+    SeenSession,
+    TrialOutcome,
     judge,
     seen,
 )
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.rivals.gaussian_process import GaussianProcess
-from thirdhand_sim.lab.rivals.method import Method, Model
+from thirdhand_sim.lab.rivals.method import RivalMethod, RivalModel
 from thirdhand_sim.lab.rivals.mixtures import MixtureRegression
 from thirdhand_sim.lab.rivals.places import LookUp, NoDemonstrations
 from thirdhand_sim.lab.rivals.promp import InteractionProMP
@@ -41,14 +41,22 @@ from thirdhand_sim.lab.workers import shared_out
 from thirdhand_sim.people import Group, Places, person
 from thirdhand_sim.sessions import BREAKING, SessionDemonstration, breaking, demonstrations, session
 
-SEEDS = EXPERIMENTS["people"].seeds
-PARTS: dict[Group, Mapping[str, Stream]] = {"tuning": SEEDS.tuning, "test": SEEDS.evaluation}
-DEMONSTRATORS = len(SEEDS.learned["people"].numbers)
-PEOPLE: dict[Group, int] = {group: len(part["people"].numbers) for group, part in PARTS.items()}
-SCENES: dict[Group, int] = {"tuning": 2, "test": 4}  # scenes of a person, half with each sigma
+PEOPLE_SEEDS = EXPERIMENTS["people"].seeds
+STREAMS_OF_GROUP: dict[Group, Mapping[str, Stream]] = {
+    "tuning": PEOPLE_SEEDS.tuning,
+    "test": PEOPLE_SEEDS.evaluation,
+}
+PEOPLE_SHOWING = len(PEOPLE_SEEDS.learned["people"].numbers)
+PEOPLE_OF_GROUP: dict[Group, int] = {
+    group: len(part["people"].numbers) for group, part in STREAMS_OF_GROUP.items()
+}
+SCENES_OF_GROUP: dict[Group, int] = {
+    "tuning": 2,
+    "test": 4,
+}  # scenes of a person, half with each sigma
 SIGMAS_M = (0.005, 0.010)
 BREAKING_SCENES: dict[Group, int] = {
-    group: len(part["breaking"].numbers) for group, part in PARTS.items()
+    group: len(part["breaking"].numbers) for group, part in STREAMS_OF_GROUP.items()
 }
 RESAMPLED = 2000
 SAME = 0.05  # candidates within this difference of success are equally good
@@ -59,10 +67,10 @@ class Entry(NamedTuple):
     """A method: its label, and the parameters that were tried, the chosen ones first."""
 
     label: str
-    candidates: tuple[Method, ...]
+    candidates: tuple[RivalMethod, ...]
 
 
-METHODS = {
+PEOPLE_METHODS = {
     "ours": Entry("ours, between places", (Service(),)),
     "as_paper": Entry("ours, the paper's way:\nplaces are via-points", (ServiceAsPaper(),)),
     "none": Entry(
@@ -98,7 +106,7 @@ METHODS = {
 }
 
 
-class Task(NamedTuple):
+class MethodTask(NamedTuple):
     """One method with one candidate's parameters, in the people's scenes or in those that break."""
 
     method: str
@@ -112,16 +120,18 @@ class Task(NamedTuple):
 
 @functools.cache
 def _taught() -> list[SessionDemonstration]:
-    return demonstrations(DEMONSTRATORS)
+    return demonstrations(PEOPLE_SHOWING)
 
 
 @functools.cache
-def _learned(method: str, candidate: int) -> Model[Places]:
-    return METHODS[method].candidates[candidate].learn(_taught())
+def _learned(method: str, candidate: int) -> RivalModel[Places]:
+    return PEOPLE_METHODS[method].candidates[candidate].learn(_taught())
 
 
 @functools.lru_cache(maxsize=8)
-def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | None) -> list[Seen]:
+def _sessions(
+    group: Group, kind: str, people: int, scenes: int, hands: Path | None
+) -> list[SeenSession]:
     """The sessions of a group: scene by scene with alternating sigma; exact places where one kind
     of difference is tried.
     """
@@ -137,7 +147,7 @@ def _sessions(group: Group, kind: str, people: int, scenes: int, hands: Path | N
     ]
 
 
-def outcomes(task: Task) -> list[Outcome]:
+def outcomes(task: MethodTask) -> list[TrialOutcome]:
     """The outcomes of a task's sessions."""
     runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
     if task.method == TEACHER:
@@ -151,7 +161,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     group = options.group
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
     tasks = _tasks(options, breaking_scenes)
-    by_task: dict[Task, list[Outcome]] = {}
+    by_task: dict[MethodTask, list[TrialOutcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
         by_task[task] = rows
         if task.kind:
@@ -165,15 +175,15 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     numbers = {
         "set": group,
         "people": len({row.person for row in main["ours"]}),
-        "scenes_of_each": SCENES[group],
+        "scenes_of_each": SCENES_OF_GROUP[group],
         "breaking_scenes_of_each": breaking_scenes,
         "demonstrations": len(_taught()),
-        "rate_hz": RATE_HZ,
+        "rate_hz": TRIAL_HZ,
         "success_is": {
             "within_mm": 1000 * WITHIN_M,
             "for_s": FOR_S,
             "below_m_per_s": SLOW_MPS,
-            "no_nearer_to_a_hand_than_m": NEAR_M,
+            "no_nearer_to_a_hand_than_m": NEAR_HAND_M,
             "when_faster_than_m_per_s": FAST_MPS,
         },
         "falsely_followed_is_farther_from_the_teacher_than_m": WRONG_M,
@@ -181,7 +191,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "methods": {method: _of_method(method, rows) for method, rows in main.items()},
         "breaking": _breaking(by_task),
         "candidates": {
-            f"{task.method} {METHODS[task.method].candidates[task.candidate]!r}": summary(rows)
+            f"{task.method} {PEOPLE_METHODS[task.method].candidates[task.candidate]!r}": summary(
+                rows
+            )
             for task, rows in usual.items()
             if group == "tuning" and task.method != TEACHER
         },
@@ -190,23 +202,25 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _tasks(options: Options, breaking_scenes: int) -> list[Task]:
+def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
     """What is measured: the teacher, each method with its candidates, and with broken hands."""
     group = options.group
-    people = max(2, round(PEOPLE[group] * options.share))
+    people = max(2, round(PEOPLE_OF_GROUP[group] * options.share))
     has_candidates = group == "tuning" and options.share == 1
-    tasks = [Task(TEACHER, 0, group, "", people, SCENES[group], options.hands)]
-    for method, entry in METHODS.items():
+    tasks = [MethodTask(TEACHER, 0, group, "", people, SCENES_OF_GROUP[group], options.hands)]
+    for method, entry in PEOPLE_METHODS.items():
         for number in range(len(entry.candidates) if has_candidates else 1):
-            tasks.append(Task(method, number, group, "", people, SCENES[group], options.hands))
+            tasks.append(
+                MethodTask(method, number, group, "", people, SCENES_OF_GROUP[group], options.hands)
+            )
         for kind in BREAKING:
-            tasks.append(Task(method, 0, group, kind, 0, breaking_scenes, None))
+            tasks.append(MethodTask(method, 0, group, kind, 0, breaking_scenes, None))
     return tasks
 
 
-def _say_better_candidates(results: Results, by_task: dict[Task, list[Outcome]]) -> None:
+def _say_better_candidates(results: Results, by_task: dict[MethodTask, list[TrialOutcome]]) -> None:
     """Report each method whose first candidate is not its best one."""
-    for method, entry in METHODS.items():
+    for method, entry in PEOPLE_METHODS.items():
         compared = [
             rows for task, rows in by_task.items() if task.method == method and not task.kind
         ]
@@ -216,23 +230,23 @@ def _say_better_candidates(results: Results, by_task: dict[Task, list[Outcome]])
             )
 
 
-def _breaking(by_task: dict[Task, list[Outcome]]) -> dict[str, dict[str, Any]]:
+def _breaking(by_task: dict[MethodTask, list[TrialOutcome]]) -> dict[str, dict[str, Any]]:
     """The figures of broken hands, by method and kind."""
-    broken: dict[str, dict[str, Any]] = {method: {} for method in METHODS}
+    broken: dict[str, dict[str, Any]] = {method: {} for method in PEOPLE_METHODS}
     for task, rows in by_task.items():
         if task.kind:
             broken[task.method][task.kind] = _broken(rows)
     return broken
 
 
-def _of_method(method: str, rows: Sequence[Outcome]) -> dict[str, Any]:
+def _of_method(method: str, rows: Sequence[TrialOutcome]) -> dict[str, Any]:
     """The figures of a method, with its parameters."""
     if method == TEACHER:
         return summary(rows)
-    return {"parameters": repr(METHODS[method].candidates[0]), **summary(rows)}
+    return {"parameters": repr(PEOPLE_METHODS[method].candidates[0]), **summary(rows)}
 
 
-MEASURES: dict[str, Callable[[Outcome], float]] = {
+MEASURES: dict[str, Callable[[TrialOutcome], float]] = {
     "success": lambda one: one.success,
     "success_on_the_way": lambda one: one.kept,
     "path_rms_mm": lambda one: one.path_mm,
@@ -248,7 +262,7 @@ MEASURES: dict[str, Callable[[Outcome], float]] = {
 }
 
 
-def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
+def summary(rows: Sequence[TrialOutcome]) -> dict[str, Any]:
     """The mean of each measure with its 95 % interval by bootstrap over people, and more."""
     out: dict[str, Any] = {}
     for name, measure in MEASURES.items():
@@ -269,7 +283,7 @@ def summary(rows: Sequence[Outcome]) -> dict[str, Any]:
     return out
 
 
-def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
+def chosen(tried: Sequence[Sequence[TrialOutcome]]) -> int:
     """The chosen candidate: among those whose success is within SAME of the best, the one whose
     target is nearest to the teacher's tool.
     """
@@ -278,7 +292,7 @@ def chosen(tried: Sequence[Sequence[Outcome]]) -> int:
     return min((p, i) for i, p in enumerate(path) if success[i] >= max(success) - SAME)[1]
 
 
-def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, float]:
+def _resampled(rows: Sequence[TrialOutcome], values: Array) -> tuple[float, float, float]:
     """The mean of values (M,), and its 95 % interval by drawing people with replacement."""
     names = sorted({row.person for row in rows})
     index = np.array([names.index(row.person) for row in rows])
@@ -289,7 +303,7 @@ def _resampled(rows: Sequence[Outcome], values: Array) -> tuple[float, float, fl
     return float(values.mean()), float(np.percentile(means, 2.5)), float(np.percentile(means, 97.5))
 
 
-def _broken(rows: Sequence[Outcome]) -> dict[str, int]:
+def _broken(rows: Sequence[TrialOutcome]) -> dict[str, int]:
     """Successes, and failures in which the tool held through each event that it missed."""
     held = [
         not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near
@@ -305,9 +319,9 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     figure, axes = plt.subplots(1, 4, figsize=(13.5, 4.8), width_ratios=(1.1, 1, 1, 1.3))
     labels = {
         TEACHER: "teacher who knows\nthe scene",
-        **{name: entry.label for name, entry in METHODS.items()},
+        **{name: entry.label for name, entry in PEOPLE_METHODS.items()},
     }
-    colours = {TEACHER: "#444444", **dict.fromkeys(METHODS, OTHER), "ours": ADAPTED}
+    colours = {TEACHER: "#444444", **dict.fromkeys(PEOPLE_METHODS, OTHER), "ours": ADAPTED}
     bars = (
         ("success", 100.0, "success [%]\n(dark: on the teacher's path throughout)"),
         ("path_rms_mm", 1.0, "distance of target and\nteacher's tool, rms [mm]"),

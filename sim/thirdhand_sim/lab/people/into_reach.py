@@ -26,7 +26,7 @@ from thirdhand_sim.lab.results import Array
 
 SHALLOW_SHARE = 0.02  # of the tool's samples that may be less deep
 GRID_M = 0.05  # distance of the centres that are tried
-SAMPLES = 20  # of a take
+PLACED_SAMPLES = 20  # of a take
 
 
 def depth_m(points: Array, reach: Reach) -> Array:
@@ -60,7 +60,9 @@ class RigidMap(NamedTuple):
     @staticmethod
     def of(shown: Sequence[LeftOut], reach: Reach) -> RigidMap:
         """The map that brings the tool of these takes best into the reach."""
-        tool = np.concatenate([take.tool[:: max(1, len(take.tool) // SAMPLES)] for take in shown])
+        tool = np.concatenate(
+            [take.tool[:: max(1, len(take.tool) // PLACED_SAMPLES)] for take in shown]
+        )
         mean = tool.mean(axis=0)
         low = np.array(reach.centre) - reach.outer
         high = np.array(reach.centre) + reach.outer

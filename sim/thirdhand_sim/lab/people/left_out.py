@@ -36,13 +36,13 @@ from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.results import Array, ExperimentError
 from thirdhand_sim.lab.rivals.method import Observed, Predicted
 
-RATE_HZ = 125
+CORE_HZ = 125
 JUDGED_HZ = 25
 LONGEST_SHIFT_S = 1.0
 SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
 BACK_S = 2.0  # the hands' way back to where the take begins
-FAR_M = 1e3  # the corner of a workspace that clamps nothing
-ANYWHERE = Reach(inner=1e-6, outer=FAR_M, min_x=-FAR_M, min_z=-FAR_M)
+UNBOUNDED_M = 1e3  # the corner of a workspace that clamps nothing
+UNBOUNDED_REACH = Reach(inner=1e-6, outer=UNBOUNDED_M, min_x=-UNBOUNDED_M, min_z=-UNBOUNDED_M)
 VIA_POINT_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
 
 
@@ -83,7 +83,7 @@ class Judged(NamedTuple):
 
 @cache
 def _settings(reach: Reach) -> Settings:
-    return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ, reach=reach)
+    return msgspec.structs.replace(Settings(), rate_hz=CORE_HZ, reach=reach)
 
 
 def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
@@ -187,17 +187,17 @@ def _through_core(
 
     While no hands are known, it holds what it predicted last.
     """
-    settings = _settings(reach or ANYWHERE)
+    settings = _settings(reach or UNBOUNDED_REACH)
     used = skill or shipped_skill()
     if reach is None:
-        used = replace(used, workspace=np.array([[-FAR_M] * 3, [FAR_M] * 3]))
+        used = replace(used, workspace=np.array([[-UNBOUNDED_M] * 3, [UNBOUNDED_M] * 3]))
     intake = Intake(settings)
     stage = SkillStage(settings, used)
     state = start_state(settings, used)
     frame = blank(frame_layout(len(settings.joints.names)))
     alone = None if demonstration.conducts == "both" else SIDES.index(demonstration.conducts)
     received = hand_events(demonstration, range(2) if alone is None else [alone])
-    every = RATE_HZ // JUDGED_HZ
+    every = CORE_HZ // JUDGED_HZ
     moving = []
     means = []
     covariances = []
@@ -233,11 +233,11 @@ def _through_core(
 def hand_events(demonstration: Demonstration, sides: Sequence[int]) -> list[list[Event]]:
     """The samples of a take's hands at each tick, RATE_HZ."""
     since = demonstration.stamps_ns - demonstration.stamps_ns[0]
-    inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * RATE_HZ) + 1)]
+    inboxes: list[list[Event]] = [[] for _ in range(int(since[-1] * 1e-9 * CORE_HZ) + 1)]
     for side in sides:
         poses = (demonstration.left, demonstration.right)[side].tolist()
         for ns, (x, y, z, *turn) in zip(since.tolist(), poses, strict=True):
-            if (tick := int(np.ceil(ns * 1e-9 * RATE_HZ - 1e-6))) < len(inboxes):
+            if (tick := int(np.ceil(ns * 1e-9 * CORE_HZ - 1e-6))) < len(inboxes):
                 inboxes[tick].append(hand_event(SIDES[side], (x, y, z), START_NS + ns, tuple(turn)))
     return inboxes
 

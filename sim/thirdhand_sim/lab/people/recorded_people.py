@@ -17,7 +17,7 @@ from thirdhand_sim.people import Person, TrackerModel, person
 from thirdhand_sim.sessions import SHAPE_STEPS
 
 # a reach lies between slow moments, and is at least this long
-SLOW_MPS = 0.05
+RECORDED_SLOW_MPS = 0.05
 LEAST_REACH_M = 0.06
 MOST_UNEVEN = 5.0  # largest ratio of a reach's highest speed to its mean speed
 FIRST_NUMBER = 100  # seeds of their other habits, which no modelled person has
@@ -57,7 +57,9 @@ def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
     per metre, with the way along x.
     """
     speed = np.linalg.norm(np.gradient(x, 1 / rate_hz, axis=0), axis=1)
-    moving = np.flatnonzero(np.diff(np.concatenate([[0], (speed > SLOW_MPS).astype(int), [0]])))
+    moving = np.flatnonzero(
+        np.diff(np.concatenate([[0], (speed > RECORDED_SLOW_MPS).astype(int), [0]]))
+    )
     out = []
     for begin, end in moving.reshape(-1, 2):
         part = x[begin:end]

@@ -24,31 +24,31 @@ from thirdhand.settings.config import Settings
 from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.open_loop import controller, frames
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.as_skill import Said, along_hands, rival
-from thirdhand_sim.lab.rivals.method import DependsOn, Mask, Observed, Placed, Predicted
+from thirdhand_sim.lab.rivals.as_skill import RivalSaid, along_hands, rival
+from thirdhand_sim.lab.rivals.method import DependsOn, Mask, Observed, PlacedModel, Predicted
 from thirdhand_sim.scene import TOOL_FROM_HAND
 from thirdhand_sim.sessions import Session
 from thirdhand_sim.teach import via_points_of
 
-RATE_HZ = 125
+TRIAL_HZ = 125
 # an event succeeds within 10 mm for 0.3 s below 5 cm/s
 WITHIN_M = 0.010
 FOR_S = 0.3
 SLOW_MPS = 0.05
 # nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
-NEAR_M = 0.05
+NEAR_HAND_M = 0.05
 FAST_MPS = 0.25
 WRONG_M = 0.10  # a target farther from the teacher's tool is followed falsely
 SMOOTHED = 5  # ticks; velocity of a target of a rival with a memory is taken over them
 LONGEST_DELAY_S = 0.6
-KEPT = 0.05  # largest share of the time falsely followed on the teacher's path
+MAX_ASTRAY_SHARE = 0.05  # largest share of the time falsely followed on the teacher's path
 # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
 SWAP_NOTICED_S = 0.3
 SWAP_OVER_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenSession:
     """A session as the service sees it, tick by tick, and as it is."""
 
     session: Session
@@ -69,24 +69,24 @@ class Seen:
 
 def settings() -> Settings:
     """The service's own, at the rate of the trials."""
-    return msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
+    return msgspec.structs.replace(Settings(), rate_hz=TRIAL_HZ)
 
 
 def ticks(session: Session) -> Iterator[Tick]:
     """The tracker's samples of a session, tick by tick."""
-    inboxes: list[list[Event]] = [[] for _ in range(int(session.lasts_s * RATE_HZ))]
+    inboxes: list[list[Event]] = [[] for _ in range(int(session.lasts_s * TRIAL_HZ))]
     for side, (stamps, samples) in zip(SIDES, session.samples(), strict=True):
         for stamp, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
-            if (k := int(np.ceil(stamp * RATE_HZ - 1e-9))) < len(inboxes):
+            if (k := int(np.ceil(stamp * TRIAL_HZ - 1e-9))) < len(inboxes):
                 inboxes[k].append(hand_event(side, (x, y, z), START_NS + round(1e9 * stamp)))
     return (Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes))
 
 
-def seen(session: Session) -> Seen:
+def seen(session: Session) -> SeenSession:
     """The session through tracker and service, which holds only because of the hands."""
     all_ticks = tuple(ticks(session))
     core = controller(replace(shipped_skill(), threshold=np.inf), settings())
-    times = np.arange(len(all_ticks)) / RATE_HZ
+    times = np.arange(len(all_ticks)) / TRIAL_HZ
     estimates = np.zeros((len(all_ticks), 3, 6))
     stillness = np.zeros((len(all_ticks), 2))
     fresh = np.zeros(len(all_ticks), bool)
@@ -97,7 +97,7 @@ def seen(session: Session) -> Seen:
         stillness[k] = state["hand_stillness"]
     begin, end = session.swapped_s
     swapped = (times >= begin) & (times < end + SWAP_OVER_S)
-    return Seen(
+    return SeenSession(
         session,
         all_ticks,
         times,
@@ -121,7 +121,7 @@ class EventOutcome(NamedTuple):
     held: bool
 
 
-class Outcome(NamedTuple):
+class TrialOutcome(NamedTuple):
     """The outcome of a session with a skill. Shares are of the session's ticks."""
 
     person: str
@@ -145,21 +145,21 @@ class Outcome(NamedTuple):
     @property
     def kept(self) -> bool:
         """True for a success on the teacher's path, not only at its places."""
-        return self.success and self.falsely_followed <= KEPT
+        return self.success and self.falsely_followed <= MAX_ASTRAY_SHARE
 
 
-def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
+def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
     """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
     served_frames = served(placed, one)
     target = served_frames["target"]
     tool = served_frames["tool"]
     held = served_frames["mode"] != Mode.FOLLOW
-    speed = np.linalg.norm(np.gradient(tool, 1.0 / RATE_HZ, axis=0), axis=1)
+    speed = np.linalg.norm(np.gradient(tool, 1.0 / TRIAL_HZ, axis=0), axis=1)
     events = tuple(_event(one, tool, speed, held, i) for i in range(3))
     hand_distance_m = np.linalg.norm(tool[:, None] - one.hands.reshape(-1, 2, 3), axis=2).min(
         axis=1
     )
-    too_near = bool(((hand_distance_m < NEAR_M) & (speed > FAST_MPS)).any())
+    too_near = bool(((hand_distance_m < NEAR_HAND_M) & (speed > FAST_MPS)).any())
     judged = one.times > 0.5
     good = judged & ~one.due
     delay, _ = _delayed(target, one.tool, good)
@@ -180,15 +180,15 @@ def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
         & (one.times < one.session.swapped_s[1])
         & judged
     )
-    return Outcome(
+    return TrialOutcome(
         one.session.person.name,
         one.session.number,
         all(event.reached for event in events) and not too_near,
         events,  # type: ignore[arg-type]
         too_near,
         1000 * float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
-        delay / RATE_HZ,
-        tool_delay / RATE_HZ,
+        delay / TRIAL_HZ,
+        tool_delay / TRIAL_HZ,
         float(held[judged].mean()),
         float((held & good).sum() / judged.sum()),
         float((~held & wrong & judged).sum() / judged.sum()),
@@ -201,7 +201,7 @@ def judge(placed: Placed | Skill | None, one: Seen) -> Outcome:
     )
 
 
-def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
+def served(placed: PlacedModel | Skill | None, one: SeenSession) -> NDArray[np.void]:
     """The service's frames (T,) of a session: with its skill, or with a rival in its place."""
     if isinstance(placed, Skill):
         return frames(placed, one.ticks, settings())
@@ -219,13 +219,15 @@ def served(placed: Placed | Skill | None, one: Seen) -> NDArray[np.void]:
 
     skill = rival(
         shipped_skill(),
-        lambda *moving: Said(motion[now], covariance[now], held is not None and bool(held[now])),
+        lambda *moving: RivalSaid(
+            motion[now], covariance[now], held is not None and bool(held[now])
+        ),
         via_points=via_points_of(one.session.told),
     )
     return frames(skill, counted(), settings())
 
 
-def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
+def _moving(placed: PlacedModel | None, one: SeenSession) -> tuple[Predicted, Array]:
     """A rival's predictions at all ticks, and the motion of its target (T, 3, 3).
 
     The target of a function of the hands moves along with them, as that of the service's skill; the
@@ -246,11 +248,11 @@ def _moving(placed: Placed | None, one: Seen) -> tuple[Predicted, Array]:
     before = np.concatenate(
         [np.repeat(predicted.mean[:1], SMOOTHED, axis=0), predicted.mean[:-SMOOTHED]]
     )
-    velocity = (predicted.mean - before) * RATE_HZ / SMOOTHED
+    velocity = (predicted.mean - before) * TRIAL_HZ / SMOOTHED
     return predicted, np.stack([predicted.mean, velocity, np.zeros_like(velocity)], axis=1)
 
 
-def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
+def _event(one: SeenSession, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
     if i == 0:  # the board belongs where the hand is seen
@@ -263,7 +265,7 @@ def _event(one: Seen, tool: Array, speed: Array, held: Mask, i: int) -> EventOut
         )
     distance_m = np.linalg.norm(tool[window] - perceived, axis=1)
     is_within = (distance_m <= WITHIN_M) & (speed[window] < SLOW_MPS)
-    steps = int(FOR_S * RATE_HZ)
+    steps = int(FOR_S * TRIAL_HZ)
     runs = (
         np.convolve(is_within, np.ones(steps), mode="valid")
         if len(is_within) >= steps
@@ -282,7 +284,7 @@ def _delayed(x: Array, wanted: Array, good: Mask) -> tuple[int, float]:
     """Delay [ticks] of `x` (T, 3) behind `wanted`, and the mean square distance at it [m²]."""
     count = len(x)
     candidates = []
-    for delay in range(0, int(LONGEST_DELAY_S * RATE_HZ), 2):
+    for delay in range(0, int(LONGEST_DELAY_S * TRIAL_HZ), 2):
         squares = np.sum((x[delay:] - wanted[: count - delay]) ** 2, axis=1)[good[delay:]]
         candidates.append((float(squares.mean()) if len(squares) else np.inf, delay))
     least, delay = min(candidates)

@@ -22,12 +22,12 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.reached import at_the_events, open_loop_mm, taught
 from thirdhand_sim.lab.rehearsal import demonstrated
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.service import COMPONENTS
+from thirdhand_sim.lab.rivals.service import GMR_COMPONENTS
 from thirdhand_sim.lab.scenes import draw
 from thirdhand_sim.scene import GRASP_DISTANCE
 
 PAPER_ELL = 0.5  # section III-C, which names no unit; metres are assumed
-SCENES = EXPERIMENTS["hands"].seeds.evaluation["scenes"]
+REAL_SCENES = EXPERIMENTS["hands"].seeds.evaluation["scenes"]
 
 
 class Variant(NamedTuple):
@@ -60,7 +60,7 @@ class Reached(NamedTuple):
 
 def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
     """The figures with our numbers, with each difference undone, and with all undone."""
-    learned = functools.partial(learn, demonstrated(), components=COMPONENTS)
+    learned = functools.partial(learn, demonstrated(), components=GMR_COMPONENTS)
     ours = learned()
     variants = {
         "ours": Variant(ours, bare=False),
@@ -69,7 +69,7 @@ def differences(share: float = 1.0) -> dict[str, dict[str, Any]]:
         "one point a place": Variant(ours, bare=True),
         "all three: the paper's": Variant(learned(ell=PAPER_ELL, spread_m=0.0), bare=True),
     }
-    numbers = SCENES.share(share, least=3)
+    numbers = REAL_SCENES.share(share, least=3)
     return {name: reached(variant, numbers).numbers() for name, variant in variants.items()}
 
 
@@ -79,7 +79,7 @@ def reached(variant: Variant, numbers: Sequence[int]) -> Reached:
     steepness = []
     refused = 0
     for number in numbers:
-        drawn = draw(number, seed=SCENES.seed)
+        drawn = draw(number, seed=REAL_SCENES.seed)
         via_points = drawn.scene.via_points()
         if variant.bare:
             via_points = tuple(

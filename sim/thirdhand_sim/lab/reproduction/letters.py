@@ -24,12 +24,12 @@ from thirdhand_sim.lab.results import (
 )
 
 # the paper's; time in seconds
-ELL = 8.0
+LETTER_ELL = 8.0
 LAMBDA = 0.1
-SEEDS = EXPERIMENTS["letters"].seeds
-COMPONENTS = 8
-SEED = SEEDS.method
-WRITTEN = SEEDS.evaluation["letters"]
+LETTER_SEEDS = EXPERIMENTS["letters"].seeds
+LETTER_COMPONENTS = 8
+LETTER_SEED = LETTER_SEEDS.method
+WRITTEN = LETTER_SEEDS.evaluation["letters"]
 REGULARIZATION = 1e-4  # [cm², s²]
 VIA_VARIANCE = 1e-6  # [cm²]
 # below half of the reference's step: each desired point replaces one reference point
@@ -70,12 +70,12 @@ def learned(name: str, demonstrations: Array) -> Letter:
         [np.column_stack([TIMES, demonstration]) for demonstration in demonstrations]
     )
     mixture = GaussianMixture.fit(
-        samples, components=COMPONENTS, seed=SEED, regularization=REGULARIZATION
+        samples, components=LETTER_COMPONENTS, seed=LETTER_SEED, regularization=REGULARIZATION
     )
     primitive = KMP.fit(
         TIMES[:, None],
         mixture.regress(TIMES[:, None]),
-        kernel=GaussianKernel(ELL),
+        kernel=GaussianKernel(LETTER_ELL),
         lambda_mean=LAMBDA,
     )
     return Letter(name, demonstrations, mixture, primitive)
@@ -85,7 +85,7 @@ def cases(letter: Letter) -> list[Case]:
     """Three adaptations of one letter: a new start and a via-point; a via-point and a new end; a
     new start, via-point and end.
     """
-    random = np.random.default_rng([SEED, *map(ord, letter.name)])
+    random = np.random.default_rng([LETTER_SEED, *map(ord, letter.name)])
     size = float(np.ptp(letter.reference, axis=0).max())
     chosen = (
         ("start and via-point", (0, 110)),
@@ -165,9 +165,9 @@ def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     numbers: dict[str, Any] = {
-        "ell": ELL,
+        "ell": LETTER_ELL,
         "lambda": LAMBDA,
-        "components": COMPONENTS,
+        "components": LETTER_COMPONENTS,
         "duration_s": DURATION_S,
         "unit": "cm",
     }

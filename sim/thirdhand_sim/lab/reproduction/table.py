@@ -34,15 +34,15 @@ from thirdhand_sim.lab.results import (
 )
 from thirdhand_sim.lab.rivals.promp import BASES, learned_promp
 
-VIA_VARIANCE = 1e-6  # [cm²] as for KMP
-WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
-METHODS = {
+RIVAL_VIA_VARIANCE = 1e-6  # [cm²] as for KMP
+DMP_WEIGHTS = 20  # weights of the DMP for each of x and y: the number of ProMP's basis functions
+LETTER_METHODS = {
     "kmp": ("KMP", ADAPTED),
     "promp": ("ProMP", OTHER),
     "dmp": ("DMP", "#009E73"),
     "gmm": ("GMM", DESIRED),
 }
-SHOWN = ("B", "G")
+SHOWN_LETTERS = ("B", "G")
 
 Trajectory: TypeAlias = Callable[[Letter, Case], Array]
 """A method: from a letter and an adaptation to a trajectory (200, 2) [cm]."""
@@ -56,7 +56,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "dmp": configured,
         "gmm": lambda letter, _: letter.reference,
     }
-    numbers: dict[str, Any] = {"unit": "cm", "dmp_weights_per_output": WEIGHTS}
+    numbers: dict[str, Any] = {"unit": "cm", "dmp_weights_per_output": DMP_WEIGHTS}
     examples: list[dict[str, Line]] = []
     for name, rows in gathered(results, options).items():
         line_sets = [
@@ -69,7 +69,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         }
         last = [lines for lines in line_sets if len(lines["kmp"].case.times) == 3]
         examples += [
-            lines for lines in last if lines["kmp"].letter.name in SHOWN or len(last) < len(SHOWN)
+            lines
+            for lines in last
+            if lines["kmp"].letter.name in SHOWN_LETTERS or len(last) < len(SHOWN_LETTERS)
         ]
     _draw(results, examples)
     return numbers
@@ -82,7 +84,7 @@ def conditioned(letter: Letter, case: Case) -> Array:
     )
     for t, point in zip(case.times, case.points, strict=True):
         primitive = primitive.condition_position(
-            point, VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S
+            point, RIVAL_VIA_VARIANCE * np.eye(2), t=t, t_max=DURATION_S
         )
     return np.asarray(primitive.mean_trajectory(TIMES.copy()))
 
@@ -96,7 +98,7 @@ def configured(letter: Letter, case: Case) -> Array:
             "DMPs need movement_primitives and pytransform3d: pip install 'thirdhand[experiments]'"
         ) from None
     mean = letter.demonstrations.mean(axis=0)
-    primitive = DMP(2, execution_time=DURATION_S, dt=TIMES[1], n_weights_per_dim=WEIGHTS)
+    primitive = DMP(2, execution_time=DURATION_S, dt=TIMES[1], n_weights_per_dim=DMP_WEIGHTS)
     primitive.imitate(TIMES, mean)
     points = {float(t): point for t, point in zip(case.times, case.points, strict=True)}
     primitive.configure(
@@ -123,7 +125,9 @@ def _summary(lines: list[Line]) -> dict[str, float]:
 def _draw(results: Results, shown: list[dict[str, Line]]) -> None:
     figure, grid = pyplot().subplots(1, len(shown), figsize=(2.6 * len(shown), 3.2), squeeze=False)
     for axes, example in zip(grid[0], shown, strict=True):
-        lines = {label: (example[key].points, colour) for key, (label, colour) in METHODS.items()}
+        lines = {
+            label: (example[key].points, colour) for key, (label, colour) in LETTER_METHODS.items()
+        }
         draw_lines(axes, example["kmp"].letter, example["kmp"].case, lines, "black")
     grid[0][0].set_ylabel("cm")
     figure.legend(

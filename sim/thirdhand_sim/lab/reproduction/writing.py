@@ -17,9 +17,9 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from thirdhand_sim.lab.results import Array, ExperimentError
 
 DURATION_S = 2.0
-SAMPLES = 200
-TIMES = np.linspace(0.0, DURATION_S, SAMPLES)
-DEMONSTRATIONS = 5
+LETTER_SAMPLES = 200
+TIMES = np.linspace(0.0, DURATION_S, LETTER_SAMPLES)
+DEMONSTRATED_LETTERS = 5
 
 # Targets of the pen [cm], in the order of writing.
 TARGETS: dict[str, list[tuple[float, float]]] = {
@@ -83,7 +83,7 @@ SMALLEST_CURVATURE = 0.05  # [1/cm] below it the pen gains no more speed
 STARTING_SHARE = 0.12  # share of the path on which the pen accelerates
 
 
-def write(letter: str, *, count: int = DEMONSTRATIONS, seed: int) -> Array:
+def write(letter: str, *, count: int = DEMONSTRATED_LETTERS, seed: int) -> Array:
     """Demonstrations (count, 200, 2) [cm] of a letter at even times, 0 to 2 s, from the model."""
     random = np.random.default_rng([seed, ord(letter)])
     return np.stack(
@@ -119,7 +119,7 @@ def _written(targets: Array, random: np.random.Generator) -> Array:
     return np.asarray(spline(np.interp(TIMES, warped_s, u)))
 
 
-def recorded(folder: Path, *, count: int = DEMONSTRATIONS) -> dict[str, Array]:
+def recorded(folder: Path, *, count: int = DEMONSTRATED_LETTERS) -> dict[str, Array]:
     """The letters in a folder, each (count, 200, 2) [cm], even in time from 0 to 2 s:
 
     X.npz with demo00, demo01, ... Raises ExperimentError.

@@ -19,7 +19,7 @@ from thirdhand.core.skill.skill import Earlier, Prediction, Skill
 from thirdhand.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.method import Observed, Placed
+from thirdhand_sim.lab.rivals.method import Observed, PlacedModel
 
 HandsToTool: TypeAlias = Callable[[Array], Array]
 """From hands (M, 6) [m] to tool (M, 3) [m]."""
@@ -48,7 +48,7 @@ def differences(behind: Array, now: Array, ahead: Array) -> Array:
     return np.stack(motion, axis=-2)
 
 
-class Said(NamedTuple):
+class RivalSaid(NamedTuple):
     """A rival's prediction: motion (3, 3), covariance (3, 3) [m²], and whether the hands are far
     from its data.
     """
@@ -64,7 +64,7 @@ class Rival(Skill):
     all else is that of the skill it was made from.
     """
 
-    says: Callable[[Array, Array, Array], Said] = field(kw_only=True)
+    says: Callable[[Array, Array, Array], RivalSaid] = field(kw_only=True)
 
     def predicted(self, seen: Seen, before: Earlier | None) -> Prediction:
         """The law's tool, rounded as the service does; the gate is 1 where hands are far."""
@@ -77,7 +77,7 @@ class Rival(Skill):
         )
 
 
-def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: Any) -> Skill:
+def rival(skill: Skill, says: Callable[[Array, Array, Array], RivalSaid], **changed: Any) -> Skill:
     """The skill with another law, and with other changed fields."""
     values = {attribute.name: getattr(skill, attribute.name) for attribute in fields(Skill)}
     # The digest is of the name alone: nothing is recorded that would need the rest.
@@ -87,13 +87,13 @@ def rival(skill: Skill, says: Callable[[Array, Array, Array], Said], **changed: 
     )
 
 
-def in_bench(skill: Skill, placed: Placed | Skill) -> Callable[[Bench], Skill]:
+def in_bench(skill: Skill, placed: PlacedModel | Skill) -> Callable[[Bench], Skill]:
     """A placed model as a bench's skill, made from `skill`. A rival is never far from its data."""
     if isinstance(placed, Skill):
         return lambda bench: placed
 
-    def of_hands(*moving: Array) -> Said:
-        return Said(
+    def of_hands(*moving: Array) -> RivalSaid:
+        return RivalSaid(
             along_hands(lambda at: placed.mean(Observed.resting(at)), *(x[None] for x in moving))[0]
         )
 

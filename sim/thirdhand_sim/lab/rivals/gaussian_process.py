@@ -22,7 +22,7 @@ from thirdhand.core.skill.via_points import neighbourhoods
 from thirdhand_sim.lab.people.left_out import LeftOut
 from thirdhand_sim.lab.results import Array
 from thirdhand_sim.lab.rivals.method import DependsOn, Law, Learn, Observed, Predicted
-from thirdhand_sim.lab.rivals.service import SEED, joined
+from thirdhand_sim.lab.rivals.service import GMR_SEED, joined
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import via_points_of
@@ -33,8 +33,8 @@ PROCESS_SAMPLES = 400
 FOLDS = 4
 # Tried lengths of the hands, and of other inputs relative to them, in the inputs' median distance.
 LENGTHS = (0.15, 0.3, 0.6, 1.2)
-OTHERS = (1.0, 0.3, 3.0)
-NOISES = (0.01, 0.1, 1.0)
+LENGTH_RATIOS = (1.0, 0.3, 3.0)
+PROCESS_NOISES = (0.01, 0.1, 1.0)
 
 
 class Posterior(NamedTuple):
@@ -62,7 +62,7 @@ class Posterior(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Kernel:
+class ProcessKernel:
     """A squared exponential: variance [m²], and a length for each input [m]."""
 
     variance: float
@@ -80,7 +80,7 @@ class PlacedProcess:
     shares all kernels; with the other groups it shares the first one only.
     """
 
-    kernels: Sequence[Kernel]
+    kernels: Sequence[ProcessKernel]
     inputs: Array
     scene: Any
     posterior: Posterior
@@ -89,7 +89,7 @@ class PlacedProcess:
 
     @staticmethod
     def of(
-        kernels: Sequence[Kernel],
+        kernels: Sequence[ProcessKernel],
         inputs: Sequence[Array],
         outputs: Sequence[Array],
         noise: Sequence[Array],
@@ -189,7 +189,8 @@ class GaussianProcess:
             ).x
         )
         kernels = [
-            Kernel(optimum[i] ** 2, np.repeat(optimum[2 + 2 * i : 4 + 2 * i], 3)) for i in (0, 1)
+            ProcessKernel(optimum[i] ** 2, np.repeat(optimum[2 + 2 * i : 4 + 2 * i], 3))
+            for i in (0, 1)
         ]
         base = LearnedProcess(
             kernels[0], kernels[1], float(optimum[6]), inputs, outputs, owner, centre, np.inf
@@ -202,8 +203,8 @@ class GaussianProcess:
 class LearnedProcess:
     """Samples (N, 6) and (N, 3) [m], the demonstration of each, and the kernels."""
 
-    shared: Kernel
-    own: Kernel
+    shared: ProcessKernel
+    own: ProcessKernel
     noise: float
     inputs: Array
     outputs: Array
@@ -272,11 +273,13 @@ class SampleProcess:
             lengths = RBF(np.full(6, (2 * self.ell) ** -0.5), "fixed")
             kernel = ConstantKernel(0.05) * lengths + WhiteKernel(1e-4, "fixed")
         fitted = (
-            GaussianProcessRegressor(kernel, random_state=SEED)
+            GaussianProcessRegressor(kernel, random_state=GMR_SEED)
             .fit(inputs, outputs - centre)
             .kernel_
         )
-        shared = Kernel(float(fitted.k1.k1.constant_value), np.asarray(fitted.k1.k2.length_scale))
+        shared = ProcessKernel(
+            float(fitted.k1.k1.constant_value), np.asarray(fitted.k1.k2.length_scale)
+        )
         return LearnedSamples(shared, float(fitted.k2.noise_level), inputs, outputs, centre)
 
 
@@ -284,7 +287,7 @@ class SampleProcess:
 class LearnedSamples:
     """Samples (N, 6) and (N, 3) [m], kernel and noise [m²]."""
 
-    kernel: Kernel
+    kernel: ProcessKernel
     noise: float
     inputs: Array
     outputs: Array
@@ -330,7 +333,7 @@ def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
 
         tried = []
         for length, other, noise in itertools.product(
-            LENGTHS, OTHERS if len(groups) > 1 else OTHERS[:1], NOISES
+            LENGTHS, LENGTH_RATIOS if len(groups) > 1 else LENGTH_RATIOS[:1], PROCESS_NOISES
         ):
             lengths = length**2 * np.array(usual) * [1.0, *[other**2] * (len(groups) - 1)]
             gram = np.exp(

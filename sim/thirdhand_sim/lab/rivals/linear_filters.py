@@ -13,9 +13,9 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S, Moving
 from thirdhand_sim.lab.results import Array
 
-REACH_S = 0.5  # length of the filters
+FILTER_S = 0.5  # length of the filters
 LEAST_OUTPUT_HZ = 90  # a slower tracker's samples are filtered to a multiple of its rate
-WEIGHTS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6)  # [s⁶] of squared jerk against squared error
+JERK_WEIGHTS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6)  # [s⁶] of squared jerk against squared error
 
 
 class Floor(NamedTuple):
@@ -35,7 +35,7 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     Sequences with gaps in their samples are taken as they are: the samples in order.
     """
     up = max(1, -(-LEAST_OUTPUT_HZ // rate_hz))
-    taps = round(REACH_S * rate_hz)
+    taps = round(FILTER_S * rate_hz)
     step = 1 / (rate_hz * up)
     size = taps * up
     square = np.zeros((size, size))
@@ -68,7 +68,7 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     scale = float(np.trace(square)) / size
     whole = np.kron(np.eye(up), np.ones(taps))  # what rests is met
     floors = []
-    for weight in WEIGHTS:
+    for weight in JERK_WEIGHTS:
         left = square + weight * jerk + 1e3 * scale * whole.T @ whole + 1e-9 * scale * np.eye(size)
         w = np.linalg.solve(left, cross + 1e3 * scale * whole.T @ np.ones(up))
         error = max(float(w @ square @ w - 2 * w @ cross + energy), 0.0) / count * 3

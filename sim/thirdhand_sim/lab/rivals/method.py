@@ -59,7 +59,7 @@ class Predicted(NamedTuple):
     radii: tuple[float, ...] = CHI_SQUARE
 
 
-class Placed(Protocol):
+class PlacedModel(Protocol):
     """A model in a scene."""
 
     @property
@@ -73,21 +73,21 @@ class Placed(Protocol):
         """The means alone (T, 3) [m]."""
 
 
-class Model(Protocol[Scene_contra]):
+class RivalModel(Protocol[Scene_contra]):
     """The result of learning from demonstrations."""
 
-    def place(self, scene: Scene_contra) -> Placed | Skill:
+    def place(self, scene: Scene_contra) -> PlacedModel | Skill:
         """The model, or a skill of the service, in a scene."""
 
 
-Learn: TypeAlias = Callable[[Sequence[Any]], Model[Any]]
+Learn: TypeAlias = Callable[[Sequence[Any]], RivalModel[Any]]
 """From demonstrations to a model."""
 
 
-class Method(Protocol):
+class RivalMethod(Protocol):
     """A way to learn, with its parameters."""
 
-    def learn(self, demonstrations: Sequence[Any]) -> Model[Any]:
+    def learn(self, demonstrations: Sequence[Any]) -> RivalModel[Any]:
         """The model of demonstrations."""
 
 

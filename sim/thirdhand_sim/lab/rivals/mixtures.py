@@ -15,10 +15,10 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.scene import TOOL_FROM_HAND
 from thirdhand_sim.sessions import SessionDemonstration
 
-SEED = EXPERIMENTS["people"].seeds.method
+MIXTURE_SEED = EXPERIMENTS["people"].seeds.method
 # Hands are far below this quantile of the demonstrations' log densities, less a slack [nat].
 UNUSUAL = 0.001
-SLACK = 10.0
+THRESHOLD_SLACK = 10.0
 
 
 def frames(places: Places) -> Array:
@@ -60,7 +60,7 @@ class MixtureRegression:
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedMixture:
         """The mixture, by EM."""
         samples = np.concatenate([joined(demonstration) for demonstration in demonstrations])
-        mixture = GaussianMixture.fit(samples, components=self.components, seed=SEED)
+        mixture = GaussianMixture.fit(samples, components=self.components, seed=MIXTURE_SEED)
         return LearnedMixture(
             mixture,
             threshold(
@@ -121,4 +121,4 @@ def log_normal(x: Array, mean: Array, covariance: Array) -> Array:
 
 def threshold(densities: Sequence[Array]) -> float:
     """The log density [nat] below which hands are far from the demonstrations."""
-    return float(np.quantile(np.concatenate(densities), UNUSUAL)) - SLACK
+    return float(np.quantile(np.concatenate(densities), UNUSUAL)) - THRESHOLD_SLACK

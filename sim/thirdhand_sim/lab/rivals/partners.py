@@ -26,7 +26,7 @@ MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now
 HMM_STATES = 6000
 CORRELATED = 0.2  # weight of an observation in the HMM: consecutive ones are correlated
 RESTARTS = 1e-4  # probability, at each sample, that the hands are anywhere in any demonstration
-STEP_S = 0.01  # step of the numerical derivative by which velocities are carried
+DERIVATIVE_STEP_S = 0.01  # step of the numerical derivative by which velocities are carried
 OFF_PLACE_M = 0.02  # nearer to a via-point, its own displacement dominates
 
 
@@ -54,7 +54,9 @@ def in_mean_scene(take: LeftOut, mean: Array | None) -> LeftOut:
         return np.hstack([carried(x[:, 3 * i : 3 * i + 3], scene[i], mean[i]) for i in (0, 1)])
 
     hands = of_both(take.hands)
-    velocities = (of_both(take.hands + STEP_S * take.velocities) - hands) / STEP_S
+    velocities = (
+        of_both(take.hands + DERIVATIVE_STEP_S * take.velocities) - hands
+    ) / DERIVATIVE_STEP_S
     return take._replace(
         hands=hands, velocities=velocities, tool=carried(take.tool, scene[2], mean[2])
     )

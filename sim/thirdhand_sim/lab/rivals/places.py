@@ -10,14 +10,14 @@ import numpy as np
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill.via_points import neighbourhoods
 from thirdhand_sim.lab.results import Array
-from thirdhand_sim.lab.rivals.gaussian_process import Kernel, PlacedProcess
+from thirdhand_sim.lab.rivals.gaussian_process import PlacedProcess, ProcessKernel
 from thirdhand_sim.lab.rivals.method import DependsOn, Observed, Predicted
 from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import via_points_of
 
 # d tool / d hands where the tool follows the left hand
-FOLLOW = np.hstack([np.eye(3), np.zeros((3, 3))])
+FOLLOW_LEFT = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class NoDemonstrations:
     def place(self, places: Places) -> PlacedProcess:
         """The regression through these places."""
         inputs, outputs, std = neighbourhoods(via_points_of(places))
-        kernel = Kernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
+        kernel = ProcessKernel(self.deviation_m**2, np.full(6, 1.0 / np.sqrt(2.0 * self.ell)))
         return PlacedProcess.of(
             [kernel], [inputs], [outputs], [std**2], centre=outputs.mean(axis=0)
         )
@@ -82,7 +82,7 @@ class PlacedLookUp:
         away = hands[:, None] - via_hands
         tools = np.array([p.tool for p in self.points]) + np.stack(
             [
-                away[:, i] @ (FOLLOW.T if p.follow == "left" else np.zeros((6, 3)))
+                away[:, i] @ (FOLLOW_LEFT.T if p.follow == "left" else np.zeros((6, 3)))
                 for i, p in enumerate(self.points)
             ],
             axis=1,

@@ -18,7 +18,7 @@ BASES = 20  # basis functions of each axis over time
 # Multiple of the mean variance of the weights: of 0 to 100, about where ProMP changes the rest of a
 # letter as little as KMP does.
 RIDGE = 10.0
-LEAST_STD_M = 0.001
+PROMP_LEAST_STD_M = 0.001
 
 
 def learned_promp(
@@ -124,7 +124,7 @@ class LearnedInteraction:
         method = self.method
         mean = self.mean
         covariance = self.covariance
-        std = max(places.std_m / np.sqrt(3.0), LEAST_STD_M)
+        std = max(places.std_m / np.sqrt(3.0), PROMP_LEAST_STD_M)
         noise = np.concatenate([np.full(6, std**2 + method.hands_m**2), np.full(3, std**2)])
         for phase, frame in zip(self.at, frames(places), strict=True):
             rows = np.kron(np.eye(9), method.basis(np.array([phase])))

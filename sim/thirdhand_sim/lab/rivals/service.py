@@ -18,8 +18,8 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import recorded, via_points_of
 
-COMPONENTS = 10
-SEED = EXPERIMENTS["statistics"].seeds.method
+GMR_COMPONENTS = 10
+GMR_SEED = EXPERIMENTS["statistics"].seeds.method
 
 
 @dataclass(frozen=True)
