@@ -7,8 +7,9 @@ is given, the inputs are the positions.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -112,70 +113,30 @@ class HandInputs:
         If a skill is refined, the weight of the new takes is chosen with the kind.
         """
         takes = taught.new
-        earlier = taught.earlier
-        remarks = [self.why_not_segmented] if self.why_not_segmented else []
-        points = self.options.points
         ell = self.options.ell
         tempos = [Tempo.of(take.demonstration) for take in taught.all]
         outcome = (
             Chosen(POSITIONS, {}, {1.0: 0.0})
             if ell is not None
-            else _chosen(taught, tempos, points, progress)
+            else _chosen(taught, tempos, self.options.points, progress)
         )
-        kind = outcome.kind
-        if kind.order and kind.clock is None:
-            kind = kind._replace(
-                clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0)
-            )
-        elif kind.clock is not None:
-            remarks.append(
-                f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where "
-                "demonstrations begin starts it anew, and one of more than "
-                f"{kind.clock.rest_s:.1f} s after the task"
-            )
-        if kind.alone is not None:
-            remarks.append(
-                f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, "
-                "and the other one makes no difference, and may be absent"
-            )
-        inputs = [
-            take.hands if ell is not None else kind.of(take.demonstration, tempo)
-            for take, tempo in zip(taught.all, tempos, strict=True)
-        ]
-        before = inputs[len(takes) :]
-        inputs = inputs[: len(takes)]
+        kind = _with_memory_clock(outcome.kind, tempos)
         weight, weights = chosen(outcome.by_weight_m)
-        if math.isinf(weight):
-            earlier = []
-            before = []
-        progress(f"choosing parameters over {len(takes) + len(earlier)} demonstrations")
-        fit = refit(
-            kind,
-            [*takes, *earlier],
-            [*inputs, *before],
-            points,
-            ell,
-            earlier=len(earlier),
-            weight=weight,
-        )
-        progress(f"learning from all {len(takes) + len(earlier)}")
+        used = _Used.of(kind, taught, tempos, weight, self.options)
+        count = len(used.takes)
+        progress(f"choosing parameters over {count} demonstrations")
+        fit = used.fit()
+        progress(f"learning from all {count}")
         primitive = fit(None)
+        inputs = used.inputs[: len(takes)]
         held_out = held_out_takes(takes, inputs, fit, progress)
         gate = gate_of(primitive, held_out, kind.order, CEILING_M)
+
         errors = None
         if len({take.person for take in takes}) >= LEAST_PERSONS:
             progress("calibrating the covariance")
-
-            def refitted(kept: list[int]) -> HandsKMP:
-                used_takes = [*(takes[i] for i in kept), *earlier]
-                used_inputs = [*(inputs[i] for i in kept), *before]
-                others = refit(
-                    kind, used_takes, used_inputs, points, ell, earlier=len(earlier), weight=weight
-                )
-                return HandsKMP(others(None), kind.turned, kind.clock)
-
             timed, errors = local_errors(
-                refitted_errors(takes, inputs, refitted), inputs, takes, primitive
+                refitted_errors(takes, inputs, used.refitted), inputs, takes, primitive
             )
             held_out = [
                 result._replace(timed=take_errors)
@@ -188,9 +149,83 @@ class HandInputs:
             conductor=kind.alone,
             taken=kind.name,
             tried_m=outcome.tried_m,
-            remarks=remarks,
+            remarks=[*filter(None, [self.why_not_segmented]), *_remarks(outcome.kind)],
             weights=weights if taught.earlier else None,
         )
+
+
+def _with_memory_clock(kind: Inputs, tempos: Sequence[Tempo]) -> Inputs:
+    """The kind; inputs with memory and no clock get one without weight."""
+    if not kind.order or kind.clock is not None:
+        return kind
+    return kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
+
+
+def _remarks(kind: Inputs) -> Iterator[str]:
+    """Sentences on a chosen kind of inputs."""
+    if kind.clock is not None:
+        yield (
+            f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where "
+            "demonstrations begin starts it anew, and one of more than "
+            f"{kind.clock.rest_s:.1f} s after the task"
+        )
+    if kind.alone is not None:
+        yield (
+            f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, "
+            "and the other one makes no difference, and may be absent"
+        )
+
+
+class _Used(NamedTuple):
+    """The takes that are learned from with their inputs (T, I), the new ones first; the last
+    `earlier` ones are of a skill that is refined.
+    """
+
+    kind: Inputs
+    takes: Sequence[Take]
+    inputs: Sequence[Vector]
+    earlier: int
+    weight: float  # of a new take
+    options: Options
+
+    @classmethod
+    def of(
+        cls,
+        kind: Inputs,
+        taught: Taught,
+        tempos: Sequence[Tempo],
+        weight: float,
+        options: Options,
+    ) -> Self:
+        """The takes, without the earlier ones if the weight is infinite."""
+        takes = taught.new if math.isinf(weight) else taught.all
+        inputs = [
+            take.hands if options.ell is not None else kind.of(take.demonstration, tempo)
+            for take, tempo in zip(takes, tempos, strict=False)
+        ]
+        return cls(kind, takes, inputs, len(takes) - len(taught.new), weight, options)
+
+    def fit(self) -> Fit:
+        """The function that fits primitives to these takes, see `refit`."""
+        return refit(
+            self.kind,
+            self.takes,
+            self.inputs,
+            self.options.points,
+            self.options.ell,
+            earlier=self.earlier,
+            weight=self.weight,
+        )
+
+    def refitted(self, new: list[int]) -> HandsKMP:
+        """The skill from the new takes of these numbers and the earlier ones, with
+        hyper-parameters chosen anew.
+        """
+        rows = [*new, *range(len(self.takes) - self.earlier, len(self.takes))]
+        subset = self._replace(
+            takes=[self.takes[i] for i in rows], inputs=[self.inputs[i] for i in rows]
+        )
+        return HandsKMP(subset.fit()(None), self.kind.turned, self.kind.clock)
 
 
 def _weighted(
@@ -277,49 +312,78 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     `paired` are held out; if a skill is refined, the new takes show the pace that counts, and are
     held out one by one.
     """
-    persons = persons_of(taught.all)
-    blocks = persons if taught.earlier else paired(persons)
-
-    def error_m(kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
-        return _weighted(kind, taught, tempos, weight, points, held_out).best_mean(
-            may_be_linear=True
-        )[0]
-
-    def by_weight_m(kind: Inputs) -> dict[float, float]:
-        weights = WEIGHTS if taught.earlier else WEIGHTS[:1]
-        return {weight: error_m(kind, weight, persons) for weight in weights}
-
+    trial = _Trial(taught, tempos, points, persons_of(taught.all))
     kinds = candidates([take.demonstration for take in taught.all])
     errors_m = dict[str, dict[float, float]]()
     for kind in kinds:
         progress(f"trying {kind.name}")
-        errors_m[kind.name] = by_weight_m(kind)
+        errors_m[kind.name] = trial.by_weight_m(kind)
     tried_m = {name: min(kind_errors_m.values()) for name, kind_errors_m in errors_m.items()}
     simplest = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
+    without_clock = Chosen(simplest, tried_m, errors_m[simplest.name])
+
+    blocks = trial.persons if taught.earlier else paired(trial.persons)
     if not blocks.any():
-        return Chosen(simplest, tried_m, errors_m[simplest.name])
+        return without_clock
     best = min(kinds, key=lambda kind: tried_m[kind.name])
     first = next(kind for kind in kinds if kind.alone == simplest.alone)
     bases = sorted({first, simplest, best}, key=kinds.index)
-    timed = list[Inputs]()
-    weights = {kind: min(found := errors_m[kind.name], key=found.__getitem__) for kind in bases}
-    limit_m = clock_limit_m(min(error_m(kind, weights[kind], blocks) for kind in bases))
-    for kind in bases:
-        for waits, name in CLOCKS.items():
-            progress(f"trying {kind.name}{name}")
-            clock = clock_of(tempos, kind.alone, waits=waits)
-            weighted = [
-                kind._replace(name=kind.name + name, clock=clock._replace(weight=w))
-                for w in WEIGHTS_MPS
-            ]
-            with_clock_m = [error_m(candidate, weights[kind], blocks) for candidate in weighted]
-            weighed = preferred(weighted, with_clock_m, AS_GOOD * min(with_clock_m))
-            tried_m[weighed.name] = error_m(weighed, weights[kind], persons)
-            timed += [weighed] * (min(with_clock_m) < limit_m)
+    weights = {
+        kind: min(errors_m[kind.name], key=errors_m[kind.name].__getitem__) for kind in bases
+    }
+    timed = _timed(trial, weights, blocks, tried_m, progress)
     if not timed:
-        return Chosen(simplest, tried_m, errors_m[simplest.name])
+        return without_clock
     kind = _simplest(timed, [tried_m[kind.name] for kind in timed])
-    return Chosen(kind, tried_m, by_weight_m(kind))
+    return Chosen(kind, tried_m, trial.by_weight_m(kind))
+
+
+class _Trial(NamedTuple):
+    """Trials of kinds of inputs by the errors of held-out takes."""
+
+    taught: Taught
+    tempos: Sequence[Tempo]
+    points: int
+    persons: NDArray[np.intp]  # (H,) of the takes
+
+    def error_m(self, kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
+        """The error [m] with this weight of new takes, if blocks (H,) are held out."""
+        selection = _weighted(kind, self.taught, self.tempos, weight, self.points, held_out)
+        return selection.best_mean(may_be_linear=True)[0]
+
+    def by_weight_m(self, kind: Inputs) -> dict[float, float]:
+        """The errors [m] by weight, if persons are held out."""
+        weights = WEIGHTS if self.taught.earlier else WEIGHTS[:1]
+        return {weight: self.error_m(kind, weight, self.persons) for weight in weights}
+
+
+def _timed(
+    trial: _Trial,
+    weights: Mapping[Inputs, float],
+    blocks: NDArray[np.intp],
+    tried_m: dict[str, float],
+    progress: Progress,
+) -> list[Inputs]:
+    """The kinds with each clock that predicts clearly better than all without one; the errors [m]
+    of all clocks are added to `tried_m`.
+    """
+    limit_m = clock_limit_m(
+        min(trial.error_m(kind, weight, blocks) for kind, weight in weights.items())
+    )
+    timed = list[Inputs]()
+    for kind, (waits, name) in itertools.product(weights, CLOCKS.items()):
+        progress(f"trying {kind.name}{name}")
+        clock = clock_of(trial.tempos, kind.alone, waits=waits)
+        weighted = [
+            kind._replace(name=kind.name + name, clock=clock._replace(weight=weight_mps))
+            for weight_mps in WEIGHTS_MPS
+        ]
+        errors_m = [trial.error_m(candidate, weights[kind], blocks) for candidate in weighted]
+        weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))
+        tried_m[weighed.name] = trial.error_m(weighed, weights[kind], trial.persons)
+        if min(errors_m) < limit_m:
+            timed.append(weighed)
+    return timed
 
 
 def clock_limit_m(least_m: float) -> float:
@@ -327,6 +391,11 @@ def clock_limit_m(least_m: float) -> float:
     return min(CLOCK_ERROR_SHARE * least_m, least_m - AS_GOOD_M)
 
 
+def as_good_m(least_m: float) -> float:
+    """The largest error [m] that is as good as the least one."""
+    return max(AS_GOOD * least_m, least_m + AS_GOOD_M)
+
+
 def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
     """The first of the kinds whose error is as good as the least of theirs."""
-    return preferred(kinds, errors_m, max(AS_GOOD * min(errors_m), min(errors_m) + AS_GOOD_M))
+    return preferred(kinds, errors_m, as_good_m(min(errors_m)))

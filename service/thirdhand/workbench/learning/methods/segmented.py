@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -44,7 +44,14 @@ from thirdhand.workbench.learning.division import (
     task_of,
     via_points_never_reached,
 )
-from thirdhand.workbench.learning.gate import CEILING_M, FLOOR_M, every_few, gate_between, nonsense
+from thirdhand.workbench.learning.gate import (
+    CEILING_M,
+    FLOOR_M,
+    Gate,
+    every_few,
+    gate_between,
+    nonsense,
+)
 from thirdhand.workbench.learning.methods.clock import (
     Tempo,
     begins_of,
@@ -55,10 +62,10 @@ from thirdhand.workbench.learning.methods.clock import (
 from thirdhand.workbench.learning.methods.held_out import held_out_takes
 from thirdhand.workbench.learning.methods.inputs import (
     AS_GOOD,
-    AS_GOOD_M,
     CLOCKS,
     LEAST_TURN_RAD,
     POSITIONS,
+    as_good_m,
     clock_limit_m,
     refit,
 )
@@ -426,12 +433,13 @@ class Candidate(NamedTuple):
             samples=samples, parameters=samples.best(self.parameters.weight), tempos=tempos
         )
 
-    def without(
-        self, block: Sequence[int], primitive: KMP, step: int = 1
+    def held_out(
+        self, block: Sequence[int], blocks: Sequence[Sequence[int]], step: int = 1
     ) -> dict[int, _Prediction]:
-        """The predictions of a block's demonstrations at one of every `step` samples, by a
-        primitive that was learned without them.
+        """The predictions of a block's demonstrations at one of every `step` samples, learned
+        without them, unless it is the only block.
         """
+        primitive = self.samples.fitted(self.parameters, block if len(blocks) > 1 else ())
         clock = self.samples.clock
         predictions = dict[int, _Prediction]()
         for h in block:
@@ -447,17 +455,12 @@ class Candidate(NamedTuple):
         step = 1 + max(len(demo.labels) for demo in self.encoded) // SAMPLES_TRIED
         predictions: dict[int, _Prediction] = {}
         for block in blocks:
-            predictions |= self.without(
-                block, self.samples.fitted(self.parameters, _left_out(blocks, block)), step
-            )
+            predictions |= self.held_out(block, blocks, step)
         return np.array([rms(predictions[h].errors) ** 2 for h in range(self.samples.new)])
 
-
-def _left_out(blocks: Sequence[Sequence[int]], block: Sequence[int]) -> Sequence[int]:
-    """The demonstrations that are left out to predict a block: the block, or none if it is the only
-    one.
-    """
-    return block if len(blocks) > 1 else ()
+    def error_m(self, blocks: Sequence[Sequence[int]]) -> float:
+        """The error [m] of the held-out demonstrations, root mean square, at some samples."""
+        return math.sqrt(self.squares(blocks).mean())
 
 
 def is_clear(gains: Vector) -> bool:
@@ -521,183 +524,55 @@ class Segmented:
         Raises SkillError if the tool never came near a via-point.
         """
         takes = taught.new
-        demonstrations = [take.demonstration for take in taught.all]
         names = [take.name for take in taught.all]
-        remarks = via_points_never_reached(self.task, demonstrations, names)
+        remarks = via_points_never_reached(
+            self.task, [take.demonstration for take in taught.all], names
+        )
         progress(f"learning between the via-points {', '.join(self.task.names)}")
         blocks = blocks_of(persons_of(takes))
-        best, delay, tried_m, taken, weights = self._chosen(taught, blocks, progress)
-        task = best.task
-        encoded = best.encoded
-        off_m = best.off
+        choice = _Choice.of(self.task, taught, blocks, self.options.delay_s, progress)
+        weights = choice.make()
+        best = choice.best
         if best.samples.clock is not None:
             remarks.append(f"{remark_on(best.samples.clock)}. It starts anew in each segment")
-        tempos = [Tempo.of(take.demonstration) for take in takes]
-        demos = encoded[: len(takes)]
-        untimed = segment_clock_of(
-            tempos, [demo.segments for demo in demos], [demo.labels for demo in demos], waits=False
-        )._replace(weight=0.0)
-        predictions: dict[int, _Prediction] = {}
+
+        by_take: dict[int, _Prediction] = {}
         for block in blocks:
             progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
-            primitive = best.samples.fitted(best.parameters, _left_out(blocks, block))
-            predictions |= best.without(block, primitive)
-        errors = [predictions[h].retained(ERRORS_RETAINED // len(takes)) for h in range(len(takes))]
-        unknown = Unknown(unknown_std(takes), _scatters(task, encoded))
-        # the via-points of held-out takes are given
-        known_places = unknown._replace(scatters=np.zeros_like(unknown.scatters))
+            by_take |= best.held_out(block, blocks)
+        predictions = [by_take[h] for h in range(len(takes))]
+
         progress(f"learning from all {len(takes)}")
-        model = SegmentedKMP(
-            best.samples.fitted(best.parameters),
-            task,
-            self._nominal(takes),
-            off_m,
-            np.concatenate(errors),
-            delay.mean_s,
-            clock=best.samples.clock or untimed,
-            unknown=unknown,
-        )
-        held_out: dict[int, HeldOut] = {}
-        wrong: dict[int, list[Vector]] = {}
-        for block in blocks:
-            others = np.concatenate(
-                [take_errors for h, take_errors in enumerate(errors) if h not in block] or errors
-            )
-            for h in block:
-                placed = Placed.of(
-                    task,
-                    encoded[h].at,
-                    off_m,
-                    model.primitive,
-                    others,
-                    best.samples.clock,
-                    known_places,
-                )
-                held_out[h] = _held_out(takes[h], encoded[h], placed, predictions[h])
-                wrong[h] = [
-                    placed.gates_m(moved) for moved in nonsense(every_few(encoded[h].moving[:, 0]))
-                ]
-        in_order = [held_out[h] for h in range(len(takes))]
-        kinds = [
-            np.concatenate(kind)
-            for kind in zip(*(wrong[h] for h in range(len(takes))), strict=True)
-        ]
-        reached = np.concatenate([result.gate_m for result in in_order])
-        gate = gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
-        baselines = {WITHOUT_VIA_POINTS: self._without_via_points(takes, progress)}
+        errors = [prediction.retained(ERRORS_RETAINED // len(takes)) for prediction in predictions]
+        model = self._model(best, choice.delay, takes, np.concatenate(errors))
+        placements = _placements(best, model.primitive, takes, blocks, errors)
+        held_out = list(map(_held_out, takes, best.encoded, placements, predictions))
         return Fitted(
             model,
-            in_order,
-            gate,
-            delay,
-            taken=taken,
-            tried_m=tried_m,
-            baselines=baselines,
+            held_out,
+            _gate(held_out, best.encoded, placements),
+            choice.delay,
+            taken=choice.name,
+            tried_m=choice.tried_m if len(choice.tried_m) > 1 else {},
+            baselines={WITHOUT_VIA_POINTS: self._without_via_points(takes, progress)},
             remarks=remarks,
             weights=weights,
         )
 
-    def _chosen(
-        self, taught: Taught, blocks: Sequence[Sequence[int]], progress: Progress
-    ) -> tuple[Candidate, Delay, Mapping[str, float], str, Weights | None]:
-        """The candidate that predicts held-out new takes best, its delay, the errors [m] of all
-        candidates, its name, and the weights.
-        """
-        new, earlier = (
-            [Divided.of(self.task, take.demonstration) for take in takes]
-            for takes in (taught.new, taught.earlier)
+    def _model(
+        self, best: Candidate, delay: Delay, takes: Sequence[Take], errors: Vector
+    ) -> SegmentedKMP:
+        """The skill of a candidate, with held-out errors (M, 6) as in `_Prediction.retained`."""
+        return SegmentedKMP(
+            best.samples.fitted(best.parameters),
+            best.task,
+            self._nominal(takes),
+            best.off,
+            errors,
+            delay.mean_s,
+            clock=best.samples.clock or _clock_without_weight(best, takes),
+            unknown=Unknown(unknown_std(takes), _scatters(best.task, best.encoded)),
         )
-        demonstrations = [take.demonstration for take in taught.new]
-        given_s = self.options.delay_s
-        progress(f"choosing the delay over {len(new)} demonstrations")
-        # to judge what all persons share
-        everybody = [*new, *earlier]
-        all_blocks = blocks_of(persons_of(taught.all))
-        usual_s = (
-            with_delay(self.task, everybody, all_blocks, given_s=given_s)[1].mean_s
-            if earlier
-            else None
-        )
-        best, delay, error_m = with_delay(self.task, new, blocks, usual_s, given_s)
-
-        def tried(task: Task) -> Candidate:
-            return Candidate.of(task, everybody, delay.mean_s)
-
-        if earlier:
-            error_m = math.sqrt(tried(self.task).squares(all_blocks).mean())
-        taken = POSITIONS.name
-        tried_m = {POSITIONS.name: error_m}
-        for is_simpler in (True, False):
-            demos = tried(best.task).encoded if earlier else best.encoded
-            tasks = (
-                leading_tasks(best.task, demos)
-                if is_simpler
-                else turning_tasks(best.task, demonstrations)
-            )
-            errors_m = {taken: tried_m[taken]}
-            for name, task in tasks.items():
-                progress(f"trying {name}")
-                errors_m[name] = math.sqrt(tried(task).squares(all_blocks).mean())
-            least_m = min(errors_m.values())
-            limit_m = least_m if is_simpler else max(AS_GOOD * least_m, least_m + AS_GOOD_M)
-            taken = preferred(list(errors_m), list(errors_m.values()), limit_m)
-            if taken in tasks:
-                best, delay, least_m = with_delay(tasks[taken], new, blocks, usual_s, given_s)
-                errors_m[taken] = errors_m[taken] if earlier else least_m
-            tried_m |= errors_m
-        clocked = _with_clocks(best, taught, progress)
-        errors_m = {
-            taken + name: math.sqrt(candidate.squares(blocks).mean())
-            for name, candidate in clocked.items()
-        }
-        without_m = (
-            math.sqrt(best.squares(blocks).mean()) if earlier and errors_m else tried_m[taken]
-        )
-        if errors_m and min(errors_m.values()) < clock_limit_m(without_m):
-            best = clocked[
-                preferred(list(clocked), list(errors_m.values()), AS_GOOD * min(errors_m.values()))
-            ]
-            taken = next(
-                name
-                for name, candidate in zip(errors_m, clocked.values(), strict=True)
-                if candidate is best
-            )
-        if not earlier or taken in errors_m:  # else these are errors of the new takes alone
-            tried_m |= errors_m
-        if len(tried_m) == 1:
-            tried_m = {}
-        if not earlier:
-            return best, delay, tried_m, taken, None
-        progress(
-            f"choosing the weight of {len(new)} demonstrations against {len(earlier)} earlier ones"
-        )
-        before_s = with_delay(
-            best.task, earlier, blocks_of(persons_of(taught.earlier)), given_s=given_s
-        )[1].mean_s
-        weighted = {
-            weight: Candidate.of(
-                best.task,
-                new,
-                delay.mean_s,
-                earlier if math.isfinite(weight) else (),
-                before_s,
-                weight,
-            )
-            for weight in WEIGHTS
-        }
-        if (clock := best.samples.clock) is not None:
-            tempos = [Tempo.of(take.demonstration) for take in taught.all]
-            weighted = {
-                weight: candidate.clocked(tempos[: len(candidate.encoded)], clock)
-                for weight, candidate in weighted.items()
-            }
-        weight, weights = chosen(
-            {
-                weight: math.sqrt(candidate.squares(blocks).mean())
-                for weight, candidate in weighted.items()
-            }
-        )
-        return weighted[weight], delay, tried_m, taken, weights
 
     def _nominal(self, takes: Sequence[Take]) -> NamedViaPoints:
         """The mean via-points of the takes."""
@@ -717,6 +592,144 @@ class Segmented:
         return [take.errors for take in held_out_takes(takes, inputs, fit, progress)]
 
 
+@dataclass
+class _Choice:
+    """The choice of a task's delay, inputs, clock and weight by held-out takes: the candidate that
+    is the best up to now, its delay and name, and the errors [m] of all candidates.
+
+    If a skill is refined, tasks are judged by what all persons share, and their delay, clock and
+    weight by the new takes.
+    """
+
+    taught: Taught
+    new: Sequence[Divided]
+    earlier: Sequence[Divided]  # of a skill that is refined
+    blocks: Sequence[Sequence[int]]  # of new takes
+    all_blocks: Sequence[Sequence[int]]
+    usual_s: float | None  # delay of all persons; None if no skill is refined
+    fixed_s: float | None  # the delay of the options
+    progress: Progress
+    best: Candidate
+    delay: Delay
+    tried_m: dict[str, float]
+    name: str = POSITIONS.name
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        taught: Taught,
+        blocks: Sequence[Sequence[int]],
+        fixed_s: float | None,
+        progress: Progress,
+    ) -> Self:
+        """The choice of the delay alone."""
+        new, earlier = (
+            [Divided.of(task, take.demonstration) for take in takes]
+            for takes in (taught.new, taught.earlier)
+        )
+        progress(f"choosing the delay over {len(new)} demonstrations")
+        all_blocks = blocks_of(persons_of(taught.all))
+        usual_s = None
+        if earlier:
+            usual_s = with_delay(task, [*new, *earlier], all_blocks, given_s=fixed_s)[1].mean_s
+        best, delay, error_m = with_delay(task, new, blocks, usual_s, fixed_s)
+        choice = cls(
+            taught, new, earlier, blocks, all_blocks, usual_s, fixed_s, progress, best, delay, {}
+        )
+        choice.tried_m[choice.name] = (
+            choice.of_everybody(task).error_m(all_blocks) if earlier else error_m
+        )
+        return choice
+
+    def of_everybody(self, task: Task) -> Candidate:
+        """The candidate of a task with the demonstrations of all persons, which count alike."""
+        return Candidate.of(task, [*self.new, *self.earlier], self.delay.mean_s)
+
+    def make(self) -> Weights | None:
+        """Choose the inputs, the clock and the weight; the weights' errors, or None if no skill is
+        refined.
+        """
+        demos = self.of_everybody(self.best.task).encoded if self.earlier else self.best.encoded
+        self.choose_task(leading_tasks(self.best.task, demos), as_good=lambda least_m: least_m)
+
+        # Tasks that turn are richer: the present one is kept while it is nearly as good.
+        turning = turning_tasks(self.best.task, [take.demonstration for take in self.taught.new])
+        self.choose_task(turning, as_good=as_good_m)
+        self.choose_clock()
+        return self.choose_weight() if self.earlier else None
+
+    def choose_task(self, tasks: Mapping[str, Task], as_good: Callable[[float], float]) -> None:
+        """Choose between the present task and these by name: the first whose error [m] is as good
+        as the least one, and then its delay.
+        """
+        errors_m = {self.name: self.tried_m[self.name]}
+        for name, task in tasks.items():
+            self.progress(f"trying {name}")
+            errors_m[name] = self.of_everybody(task).error_m(self.all_blocks)
+
+        self.name = preferred(
+            list(errors_m), list(errors_m.values()), as_good(min(errors_m.values()))
+        )
+        if self.name in tasks:
+            self.best, self.delay, error_m = with_delay(
+                tasks[self.name], self.new, self.blocks, self.usual_s, self.fixed_s
+            )
+            if not self.earlier:
+                errors_m[self.name] = error_m
+        self.tried_m |= errors_m
+
+    def choose_clock(self) -> None:
+        """Choose a clock, if one predicts the new takes clearly better."""
+        clocked = _with_clocks(self.best, self.taught, self.progress)
+        if not clocked:
+            return
+        errors_m = {
+            self.name + clock: candidate.error_m(self.blocks)
+            for clock, candidate in clocked.items()
+        }
+        without_m = self.best.error_m(self.blocks) if self.earlier else self.tried_m[self.name]
+        least_m = min(errors_m.values())
+        if least_m < clock_limit_m(without_m):
+            clock = preferred(list(clocked), list(errors_m.values()), AS_GOOD * least_m)
+            self.best = clocked[clock]
+            self.name += clock
+
+        # Errors of new takes alone are not comparable with those of everybody.
+        if not self.earlier or self.name in errors_m:
+            self.tried_m |= errors_m
+
+    def choose_weight(self) -> Weights:
+        """Choose the weight of the new takes against the earlier ones; the errors of all."""
+        self.progress(
+            f"choosing the weight of {len(self.new)} demonstrations against {len(self.earlier)} "
+            "earlier ones"
+        )
+        earlier_blocks = blocks_of(persons_of(self.taught.earlier))
+        earlier_delay = with_delay(
+            self.best.task, self.earlier, earlier_blocks, given_s=self.fixed_s
+        )[1]
+        weighted = {weight: self.weighted(weight, earlier_delay.mean_s) for weight in WEIGHTS}
+        weight, weights = chosen(
+            {weight: candidate.error_m(self.blocks) for weight, candidate in weighted.items()}
+        )
+        self.best = weighted[weight]
+        return weights
+
+    def weighted(self, weight: float, before_s: float) -> Candidate:
+        """The best candidate with this weight of the new takes; the earlier ones have the delay
+        `before_s`.
+        """
+        earlier = self.earlier if math.isfinite(weight) else ()
+        candidate = Candidate.of(
+            self.best.task, self.new, self.delay.mean_s, earlier, before_s, weight
+        )
+        if (clock := self.best.samples.clock) is None:
+            return candidate
+        takes = self.taught.all[: len(candidate.encoded)]
+        return candidate.clocked([Tempo.of(take.demonstration) for take in takes], clock)
+
+
 def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
     """The candidate with those clocks that may predict clearly better, by the clock's name.
 
@@ -734,16 +747,67 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
     tempos = [Tempo.of(take.demonstration) for take in taught.new]
     limit_m = clock_limit_m(error_m(best.samples))
     out = dict[str, Candidate]()
-    segments = [demo.segments for demo in best.encoded]
-    labels = [demo.labels for demo in best.encoded]
     for waits, name in CLOCKS.items():
         progress(f"trying {POSITIONS.name}{name}")
-        clock = segment_clock_of(tempos, segments, labels, waits=waits)
+        clock = _clock_of(best.encoded, tempos, waits=waits)
         tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
         errors_m = [error_m(best.samples.clocked(tempos, tried_clock)) for tried_clock in tried]
         if min(errors_m) < limit_m:
             out[name] = best.clocked(tempos, preferred(tried, errors_m, AS_GOOD * min(errors_m)))
     return out
+
+
+def _clock_of(demos: Sequence[Encoded], tempos: Sequence[Tempo], *, waits: bool) -> TaskClock:
+    """The clock of the segments of demonstrations with these tempos, with a weight of 1."""
+    segments = [demo.segments for demo in demos]
+    return segment_clock_of(tempos, segments, [demo.labels for demo in demos], waits=waits)
+
+
+def _clock_without_weight(best: Candidate, takes: Sequence[Take]) -> TaskClock:
+    """The clock of a skill that does not use it."""
+    tempos = [Tempo.of(take.demonstration) for take in takes]
+    return _clock_of(best.encoded[: len(takes)], tempos, waits=False)._replace(weight=0.0)
+
+
+def _placements(
+    best: Candidate,
+    primitive: KMP,
+    takes: Sequence[Take],
+    blocks: Sequence[Sequence[int]],
+    errors: Sequence[Vector],
+) -> list[Placed]:
+    """The skill between each held-out take's via-points, which are given, with the covariance from
+    the errors (M, 6) of the other blocks.
+    """
+    unknown = Unknown(unknown_std(takes), np.zeros((len(best.task.names), 3, 3)))
+    placements = dict[int, Placed]()
+    for block in blocks:
+        of_others = [take_errors for h, take_errors in enumerate(errors) if h not in block]
+        others = np.concatenate(of_others or errors)
+        for h in block:
+            placements[h] = Placed.of(
+                best.task,
+                best.encoded[h].at,
+                best.off,
+                primitive,
+                others,
+                best.samples.clock,
+                unknown,
+            )
+    return [placements[h] for h in range(len(errors))]
+
+
+def _gate(
+    held_out: Sequence[HeldOut], demos: Sequence[Encoded], placements: Sequence[Placed]
+) -> Gate:
+    """The gate between the distances of held-out hands and those of wrong ones, kind by kind."""
+    wrong = [
+        [placed.gates_m(hands) for hands in nonsense(every_few(demo.moving[:, 0]))]
+        for demo, placed in zip(demos, placements, strict=False)
+    ]
+    kinds = [np.concatenate(kind) for kind in zip(*wrong, strict=True)]
+    reached = np.concatenate([result.gate_m for result in held_out])
+    return gate_between(reached, kinds, ceiling=CEILING_M, floor=FLOOR_M, hold_share=HOLD_SHARE)
 
 
 def _scatters(task: Task, encoded: Sequence[Encoded]) -> Vector:
