@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,6 +24,7 @@ from thirdhand.workbench.learning.records import (
     Pose,
     Row,
     TimedErrors,
+    Verdict,
     persons_of,
 )
 from thirdhand.workbench.learning.regions import (
@@ -59,29 +60,10 @@ def judged(
     """
     takes = division.takes
     held_out = fitted.held_out
-    gate = fitted.gate
-    delay = fitted.delay
     persons = persons_of(takes)
     timed = [result.timed or timed_errors(result) for result in held_out]
     checked = calibrated_without(timed, persons)
-    others = {**fitted.baselines, **baselines(takes)}
-    rows = tuple(
-        _row(
-            result.take.name,
-            result.errors,
-            result.gate_m > gate.threshold,
-            checked[i : i + 1],
-            {name: errors[i] for name, errors in others.items()},
-        )
-        for i, result in enumerate(held_out)
-    )
-    overall = _row(
-        "all",
-        np.concatenate([result.errors for result in held_out]),
-        np.concatenate([result.gate_m for result in held_out]) > gate.threshold,
-        checked,
-        {name: np.concatenate(errors) for name, errors in others.items()},
-    )
+    rows, overall = _rows(held_out, fitted, checked, {**fitted.baselines, **baselines(takes)})
     contradicting = contradictions(
         held_out,
         [take.position for take in takes],
@@ -94,49 +76,96 @@ def judged(
         demonstrations=rows,
         all=overall,
         held_std=float(np.std([row.held for row in rows])),
-        gate_mm=1000 * gate.threshold,
-        swapped=100 * gate.caught.swapped,
-        beside=100 * gate.caught.beside,
-        one_beside=100 * gate.caught.one_beside,
+        gate_mm=1000 * fitted.gate.threshold,
+        swapped=100 * fitted.gate.caught.swapped,
+        beside=100 * fitted.gate.caught.beside,
+        one_beside=100 * fitted.gate.caught.one_beside,
         ambiguous=100 * contradicting.share,
         beyond_reach=100 * _share_beyond(held_out, reach),
         explained=_explained(held_out, constant_errors(takes)),
         orientation_error_deg=pose.turn_error_deg,
         gripper_right=pose.gripper_right,
-        tried_mm={name: 1000 * error_m for name, error_m in fitted.tried_m.items()},
-        taken=fitted.taken if fitted.tried_m else "",
-        weight=fitted.weights.taken if fitted.weights else "",
-        weights_mm={name: 1000 * error_m for name, error_m in fitted.weights.tried_m.items()}
-        if fitted.weights
-        else {},
         by_person=len(np.unique(persons)) < len(takes),
-        delay_s=delay.mean_s if delay else None,
-        delay_std_s=delay.std_s if delay else 0.0,
         alone=True if conductor_of(division, fitted) is not None else msgspec.UNSET,
+        **_of_choice(fitted),
     )
     subject = Subject(
         figures,
-        gate,
+        fitted.gate,
         sorted({take.demonstration.frame for take in takes}),
         f"{contradicting.pair} have the hands {1000 * contradicting.hands_m:.0f} mm from each "
         f"other and the tools {1000 * contradicting.tools:.0f} mm",
         float(np.median([row.error_mm for row in rows])),
         1000 * math.sqrt(3.0) * unknown_std(takes),
     )
-    findings = [*verdicts(subject), *pose.verdicts]
-    warnings, residual, unsafe = (
-        tuple(finding.text for finding in findings if finding.severity == kind)
-        for kind in ("warning", "residual", "unsafe")
+    remarks = (*division.remarks, *fitted.remarks)
+    figures = _with_verdicts(figures, [*verdicts(subject), *pose.verdicts], remarks, accepted_by)
+    inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
+    return Judgement(figures, calibrated(timed, persons), inside)
+
+
+def _rows(
+    held_out: Sequence[HeldOut],
+    fitted: Fitted,
+    checked: Sequence[tuple[TimedErrors, Regions]],
+    baselines_m: Mapping[str, Sequence[Vector]],
+) -> tuple[tuple[Row, ...], Row]:
+    """The figures of each held-out take and of all, with the errors (T, 3) [m] of each baseline."""
+    limit_m = fitted.gate.threshold
+    rows = tuple(
+        _row(
+            result.take.name,
+            result.errors,
+            result.gate_m > limit_m,
+            checked[i : i + 1],
+            {name: errors[i] for name, errors in baselines_m.items()},
+        )
+        for i, result in enumerate(held_out)
     )
-    figures = msgspec.structs.replace(
+    overall = _row(
+        "all",
+        np.concatenate([result.errors for result in held_out]),
+        np.concatenate([result.gate_m for result in held_out]) > limit_m,
+        checked,
+        {name: np.concatenate(errors) for name, errors in baselines_m.items()},
+    )
+    return rows, overall
+
+
+def _of_choice(fitted: Fitted) -> dict[str, Any]:
+    """The figures of what was chosen: inputs, weight and delay, with the errors of candidates."""
+    figures: dict[str, Any] = {}
+    if fitted.tried_m:
+        figures["tried_mm"] = _mm(fitted.tried_m)
+        figures["taken"] = fitted.taken
+    if fitted.weights:
+        figures["weights_mm"] = _mm(fitted.weights.tried_m)
+        figures["weight"] = fitted.weights.taken
+    if fitted.delay:
+        figures["delay_s"] = fitted.delay.mean_s
+        figures["delay_std_s"] = fitted.delay.std_s
+    return figures
+
+
+def _mm(errors_m: Mapping[str, float]) -> dict[str, float]:
+    return {name: 1000 * error_m for name, error_m in errors_m.items()}
+
+
+def _with_verdicts(
+    figures: Figures, findings: Sequence[Verdict], remarks: Sequence[str], accepted_by: str
+) -> Figures:
+    """The figures with verdicts by their severity; remarks are warnings, too."""
+    warnings, residual, unsafe = (
+        tuple(finding.text for finding in findings if finding.severity == severity)
+        for severity in ("warning", "residual", "unsafe")
+    )
+    return msgspec.structs.replace(
         figures,
-        warnings=(*division.remarks, *fitted.remarks, *warnings),
+        warnings=(*remarks, *warnings),
         residual=residual,
         accepted_by=accepted_by if residual else "",
         unsafe=unsafe,
     )
-    inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
-    return Judgement(figures, calibrated(timed, persons), inside)
 
 
 def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:

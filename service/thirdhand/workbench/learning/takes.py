@@ -9,7 +9,6 @@ import numpy as np
 
 from kmp.criteria.cross_validation import rms
 from thirdhand.contract.records import SIDES
-from thirdhand.contract.requests import Hands
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.skills.demonstration import (
@@ -59,7 +58,53 @@ def divided(
     `refined` are the demonstrations of a skill that is refined. Those by the persons of the new
     ones count as new ones. Raises SkillError if nothing can be learned from them.
     """
-    if refined and (options.components is not None or options.ell is not None):
+    _check_options(demonstrations, options, is_refined=bool(refined))
+    in_order = _in_order(demonstrations, names)
+    for entry in in_order:
+        _check(entry)
+
+    new, earlier, repeats = _without_repeats(in_order, refined)
+    _check_new(new, options, repeats)
+    conductor = _conductor([*new, *earlier])
+    if conductor is not None:
+        new, earlier = ([_of_one(entry, conductor) for entry in part] for part in (new, earlier))
+    new_demonstrations, new_names = _columns(new)
+    earlier_demonstrations, earlier_names = _columns(earlier)
+    method = method_of([*new_demonstrations, *earlier_demonstrations], options)
+    if options.delay_s is not None and not isinstance(method, Segmented):
+        raise SkillError(
+            "a delay goes with via-points that all demonstrations name; without them it is learned "
+            "too"
+        )
+    if earlier:
+        _check_alike(new, [point.name for point in earlier_demonstrations[0].via_points])
+
+    takes = takes_of(new_demonstrations, new_names)
+    first_earlier = 1 + max(take.person for take in takes)
+    single = (
+        "one demonstration: none was held out, so its error is of what was learned, and judges "
+        "nothing"
+    )
+    return Division(
+        takes,
+        [
+            take._replace(person=first_earlier + take.person)
+            for take in takes_of(earlier_demonstrations, earlier_names)
+        ],
+        method,
+        options,
+        same_hands_m(new_demonstrations),
+        conductor,
+        repeats,
+        [*repeats, *[single] * (len(new) == 1)],
+    )
+
+
+def _check_options(
+    demonstrations: Sequence[Demonstration], options: Options, *, is_refined: bool
+) -> None:
+    """Raise SkillError for options that exclude each other, or without demonstrations."""
+    if is_refined and (options.components is not None or options.ell is not None):
         raise SkillError(
             "a skill is refined with parameters that are chosen: neither a number of components "
             "nor ell"
@@ -68,97 +113,79 @@ def divided(
         raise SkillError("no demonstrations given, at least 1 needed")
     if options.components is None and options.penalty is not None:
         raise SkillError("a penalty goes with a number of components: without them it is chosen")
-    names = list(names) or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
-    # In the order of recording, so that the order of the files makes no difference.
-    in_order = sorted(
-        zip(names, demonstrations, strict=True), key=lambda one: (int(one[1].stamps_ns[0]), one[0])
+
+
+def _in_order(
+    demonstrations: Sequence[Demonstration], names: Sequence[str]
+) -> list[NamedDemonstration]:
+    """The demonstrations in the order of recording, so that the order of the files makes no
+    difference.
+    """
+    names = names or [f"demonstration {i + 1}" for i in range(len(demonstrations))]
+    return sorted(
+        [NamedDemonstration(*pair) for pair in zip(names, demonstrations, strict=True)],
+        key=lambda entry: (int(entry.demonstration.stamps_ns[0]), entry.name),
     )
-    names = [name for name, _ in in_order]
-    demonstrations = [demonstration for _, demonstration in in_order]
-    for name, demonstration in zip(names, demonstrations, strict=True):
-        try:
-            check(demonstration)
-        except SkillError as error:
-            raise SkillError(f"{name}: {error}") from None
-    named = [*refined, *map(NamedDemonstration, names, demonstrations)]
+
+
+def _check(entry: NamedDemonstration) -> None:
+    """Raise SkillError, with the name, for a demonstration that cannot be learned from."""
+    try:
+        check(entry.demonstration)
+    except SkillError as error:
+        raise SkillError(f"{entry.name}: {error}") from None
+
+
+def _without_repeats(
+    demonstrations: Sequence[NamedDemonstration], refined: Sequence[NamedDemonstration]
+) -> tuple[list[NamedDemonstration], list[NamedDemonstration], list[str]]:
+    """The new demonstrations, and the earlier ones, which are by other persons; each once. With
+    remarks on those that repeat another.
+    """
+    named = [*refined, *demonstrations]
     repeats = _repeats([entry.demonstration for entry in named])
-    repeated = [
+    remarks = [
         f"{named[i].name} repeats {named[j].name}, and is left out" for i, j in repeats.items()
     ]
-    new_persons = {demonstration.person for demonstration in demonstrations if demonstration.person}
-    of_others = [
-        i for i, entry in enumerate(refined) if entry.demonstration.person not in new_persons
-    ]
-    earlier = [named[i] for i in of_others if i not in repeats]
-    names, demonstrations = _columns(
-        [entry for i, entry in enumerate(named) if i not in {*repeats, *of_others}]
-    )
+    new_persons = {entry.demonstration.person for entry in demonstrations} - {""}
+    new = list[NamedDemonstration]()
+    earlier = list[NamedDemonstration]()
+    for i, entry in enumerate(named):
+        is_earlier = i < len(refined) and entry.demonstration.person not in new_persons
+        if i not in repeats:
+            (earlier if is_earlier else new).append(entry)
+    return new, earlier, remarks
+
+
+def _check_new(
+    demonstrations: Sequence[NamedDemonstration], options: Options, repeats: Sequence[str]
+) -> None:
+    """Raise SkillError if the new demonstrations that repeat no other are too few, or show no
+    motion.
+    """
     if not demonstrations:
         raise SkillError(
             "all demonstrations repeat those of the skill that is refined: there is nothing new to "
             "learn"
         )
-    if max(map(moved_m, demonstrations)) < LEAST_M:
+    if max(moved_m(entry.demonstration) for entry in demonstrations) < LEAST_M:
         raise SkillError(
             f"demonstrations in which hands or tool move by less than {1000 * LEAST_M:.0f} mm "
             "teach nothing"
         )
-    check_count(names, options.components, "".join(f"; {remark}" for remark in repeated))
-    before_names, before = _columns(earlier)
-    single = (
-        "one demonstration: none was held out, so its error is of what was learned, and judges "
-        "nothing"
-    )
-    remarks = [*repeated, *[single] * (len(names) == 1)]
-    hand = _conducting([*demonstrations, *before], [*names, *before_names])
-    conductor = None if hand == "both" else SIDES.index(hand)
-    if conductor is not None:
-        demonstrations, before = (
-            [
-                demonstration._replace(
-                    via_points=tuple(of_one(point, conductor) for point in demonstration.via_points)
-                )
-                for demonstration in subset
-            ]
-            for subset in (demonstrations, before)
-        )
-    method = method_of([*demonstrations, *before], options)
-    if options.delay_s is not None and not isinstance(method, Segmented):
-        raise SkillError(
-            "a delay goes with via-points that all demonstrations name; without them it is learned "
-            "too"
-        )
-    if before:
-        _check_alike(demonstrations, names, before)
-    takes = takes_of(demonstrations, names)
-    first = 1 + max(take.person for take in takes)
-    before_takes = [
-        take._replace(person=first + take.person) for take in takes_of(before, before_names)
-    ]
-    return Division(
-        takes,
-        before_takes,
-        method,
-        options,
-        same_hands_m(demonstrations),
-        conductor,
-        repeated,
-        remarks,
-    )
+    names = [entry.name for entry in demonstrations]
+    check_count(names, options.components, "".join(f"; {remark}" for remark in repeats))
 
 
-def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[str], list[Demonstration]]:
-    return [entry.name for entry in named], [entry.demonstration for entry in named]
+def _columns(named: Sequence[NamedDemonstration]) -> tuple[list[Demonstration], list[str]]:
+    return [entry.demonstration for entry in named], [entry.name for entry in named]
 
 
-def _check_alike(
-    demonstrations: Sequence[Demonstration], names: Sequence[str], earlier: Sequence[Demonstration]
-) -> None:
-    """Raise SkillError if new demonstrations name other via-points than the refined skill's."""
-    needed = [point.name for point in earlier[0].via_points]
-    if not needed:
-        return
-    for name, demonstration in zip(names, demonstrations, strict=True):
+def _check_alike(demonstrations: Sequence[NamedDemonstration], needed: Sequence[str]) -> None:
+    """Raise SkillError if new demonstrations name other via-points than the refined skill's, which
+    are needed.
+    """
+    for name, demonstration in demonstrations if needed else ():
         own_names = [point.name for point in demonstration.via_points]
         if set(own_names) != set(needed):
             present = ", ".join(own_names) or "(none)"
@@ -169,10 +196,12 @@ def _check_alike(
             )
 
 
-def _conducting(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> Hands:
-    """The hands that conduct all demonstrations. Raises SkillError if they differ."""
+def _conductor(demonstrations: Sequence[NamedDemonstration]) -> int | None:
+    """The side of the hand that conducts all demonstrations alone; None if both hands do. Raises
+    SkillError if they differ.
+    """
     by_hand: dict[str, list[str]] = {}
-    for name, demonstration in zip(names, demonstrations, strict=True):
+    for name, demonstration in demonstrations:
         by_hand.setdefault(demonstration.conducts, []).append(name)
     if len(by_hand) > 1:
         groups = "; ".join(f"{hand}: {', '.join(by_hand[hand])}" for hand in sorted(by_hand))
@@ -180,7 +209,14 @@ def _conducting(demonstrations: Sequence[Demonstration], names: Sequence[str]) -
             f"demonstrations that are conducted by different hands: {', '.join(sorted(by_hand))}; "
             f"take them alike, or leave out those of one kind ({groups})"
         )
-    return demonstrations[0].conducts
+    (hand,) = by_hand
+    return None if hand == "both" else SIDES.index(hand)
+
+
+def _of_one(entry: NamedDemonstration, conductor: int) -> NamedDemonstration:
+    """The demonstration with via-points of the hand that conducts alone."""
+    via_points = tuple(of_one(point, conductor) for point in entry.demonstration.via_points)
+    return entry._replace(demonstration=entry.demonstration._replace(via_points=via_points))
 
 
 def conductor_of(division: Division, fitted: Fitted) -> int | None:
