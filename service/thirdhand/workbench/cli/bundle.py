@@ -10,7 +10,7 @@ import re
 import subprocess
 import tarfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -46,6 +46,27 @@ def bundle(args: argparse.Namespace) -> int:
     args.connect = list(reaching(args, settings).connect)
     path = args.output or Path(f"thirdhand-{stem_of(args.cell)}-{now:%Y%m%dT%H%M%SZ}.tar.gz")
     check_writable(path)
+    texts = _texts(args, settings)
+    folder = (settings.files.record if settings else "") or _recorded_into(texts["status.json"])
+    candidates = named_after(args.cell, Path(folder)) if folder else []
+    after_s = time.time() - 60 * args.minutes
+    recordings = [file for file in candidates if file.stat().st_mtime > after_s] or candidates[-1:]
+
+    about = _contents(texts, recordings)
+    if not candidates:
+        unnamed = (
+            f"neither a daemon that records nor {'[files] record' if settings else '--config'} "
+            "names their folder"
+        )
+        about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
+    texts["README.txt"] = HEAD + about
+    _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
+    print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")
+    return 0
+
+
+def _texts(args: argparse.Namespace, settings: Settings | None) -> dict[str, str]:
+    """The texts in the archive, by the names of their files."""
     installed = {
         (package.metadata["Name"], package.version) for package in metadata.distributions()
     }
@@ -57,36 +78,25 @@ def bundle(args: argparse.Namespace) -> int:
         ),
         "log.txt": _log(args),
     }
-    folder = settings.files.record if settings else ""
-    texts |= (
-        {"settings.json": msgspec.json.encode(without_secrets(settings)).decode()}
-        if settings
-        else {}
-    )
+    if settings:
+        texts["settings.json"] = msgspec.json.encode(without_secrets(settings)).decode()
+    return texts
+
+
+def _recorded_into(status_text: str) -> str:
+    """The folder into which the daemon with this status records; empty if it does not."""
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
-        folder = folder or str(
-            Path(msgspec.json.decode(texts["status.json"])["scribe"]["recording"]).parent
-        )
-    candidates = named_after(args.cell, Path(folder)) if folder else []
-    recordings = [
-        file for file in candidates if file.stat().st_mtime > time.time() - 60 * args.minutes
-    ] or candidates[-1:]
-    about = "".join(f"{name}: {len(text.encode()) / 1000:.1f} kB\n" for name, text in texts.items())
-    about += "".join(
-        f"recordings/{file.name}: {file.stat().st_size / MB:.1f} MB\n" for file in recordings
-    )
+        return str(Path(msgspec.json.decode(status_text)["scribe"]["recording"]).parent)
+    return ""
+
+
+def _contents(texts: Mapping[str, str], recordings: Sequence[Path]) -> str:
+    """A line on each file in the archive, and on a status that is missing."""
+    lines = [f"{name}: {len(text.encode()) / 1000:.1f} kB" for name, text in texts.items()]
+    lines += (f"recordings/{file.name}: {file.stat().st_size / MB:.1f} MB" for file in recordings)
     if not texts["status.json"].startswith("{"):
-        about += f"no status: {without_keys(texts['status.json']).strip()}\n"
-    if not candidates:
-        unnamed = (
-            f"neither a daemon that records nor {'[files] record' if settings else '--config'} "
-            "names their folder"
-        )
-        about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
-    texts["README.txt"] = HEAD + about
-    _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
-    print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")
-    return 0
+        lines.append(f"no status: {without_keys(texts['status.json']).strip()}")
+    return "".join(f"{line}\n" for line in lines)
 
 
 def without_keys(text: str) -> str:

@@ -67,23 +67,30 @@ def calibrate(args: argparse.Namespace) -> int:
             "FILE"
         )
     if args.recording is not None:
-        led, settings = from_recording(args.recording, settings)
-        if only_check:
-            assert file is not None
-            return _checked(led, settings, _last(led, file, settings, args.hand), args)
-        solution = solved(led, settings, bench_corners(settings), args.hand)
-        record = _record(
-            solution.calibration, solution.side, solution.frame or settings.hands.frame, "held"
-        )
-        _show(record, args, solution.remarks, lasts_s=float(np.ptp(solution.held.hand_s)))
-        _write(file, record, solution.frame, settings)
-        return _checked(led, settings, record, args) if args.check else 0
+        return _from_recording(settings, file, only_check, args)
     settings = settings or Settings()
     with (
         inputs_session(args, CONNECT_TIMEOUT_S, settings) as session,
         contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
     ):
         return _live(live, settings, file, points, only_check, args)
+
+
+def _from_recording(
+    cell_settings: Settings | None, file: Path | None, only_check: bool, args: argparse.Namespace
+) -> int:
+    """Calibrate or check by a recording; the exit code."""
+    led, settings = from_recording(args.recording, cell_settings)
+    if only_check:
+        assert file is not None
+        return _checked(led, settings, _last(led, file, settings, args.hand), args)
+    solution = solved(led, settings, bench_corners(settings), args.hand)
+    record = _record(
+        solution.calibration, solution.side, solution.frame or settings.hands.frame, "held"
+    )
+    _show(record, args, solution.remarks, lasts_s=float(np.ptp(solution.held.hand_s)))
+    _write(file, record, solution.frame, settings)
+    return _checked(led, settings, record, args) if args.check else 0
 
 
 def points_given(args: argparse.Namespace) -> list[tuple[float, float, float]]:

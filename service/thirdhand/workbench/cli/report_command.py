@@ -22,7 +22,7 @@ from thirdhand.process.progress import progress
 from thirdhand.recordings.recording import Recording
 from thirdhand.settings.whole_file import whole
 from thirdhand.workbench.cli.many_files import of_each
-from thirdhand.workbench.report.columns import KEPT
+from thirdhand.workbench.report.columns import KEPT, Columns
 from thirdhand.workbench.report.report import Report, overview, reported
 from thirdhand.workbench.report.tables import (
     Table,
@@ -43,44 +43,65 @@ PLAIN_WIDTH = 120  # [characters] width of tables that are not printed on a term
 
 def report(args: argparse.Namespace) -> int:
     """Report on recordings; exit code 0 for any content, 1 if a file cannot be read."""
+    _check_outputs(args)
+    if len(args.files) > MANY and not args.lerobot:
+        return _report_many(args)
+    reports = [report for _, report in of_each(args, "reading", reported, alone=_reported)]
+    if reports:
+        _report_each(args, reports)
+    return 0 if len(reports) == len(args.files) else 1
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Raise UsageError for an output that cannot be written, before anything is read."""
     if args.html:
         check_writable(args.html)
     if args.csv and args.csv.exists() and not args.csv.is_dir():
         raise UsageError(f"--csv {args.csv} is a file; a folder needed")
     if args.lerobot and args.lerobot.exists():
         raise UsageError(f"--lerobot {args.lerobot} exists already; a new folder needed")
-    if len(args.files) > MANY and not args.lerobot:
-        return _report_many(args)
-    reports = [report for _, report in of_each(args, "reading", reported, alone=_reported)]
+
+
+def _report_each(args: argparse.Namespace, reports: Sequence[Report]) -> None:
+    """Print the reports and their comparison, and write the outputs."""
     console = plain_console()
-    for report in reports:
-        _print(console, report)
+    for one in reports:
+        _print(console, one)
     if len(reports) > 1:
         for table in comparison(reports):
             print_table(console, table)
-    if args.csv and reports:
+    if args.csv:
         write_csv(reports, args.csv)
-        console.print(Text(printable(f"tables in {args.csv}")))
-    if args.lerobot and reports:
-        from thirdhand.workbench.report import lerobot
+        _print_line(console, f"tables in {args.csv}")
+    if args.lerobot:
+        episodes, rows = _write_lerobot(args, [one.columns for one in reports])
+        _print_line(console, f"data set {args.lerobot}: {episodes} episodes, {rows} rows")
+    if args.html:
+        _write_page(args.html, reports)
+        _print_line(console, f"page {args.html}")
 
-        columns = [report.columns for report in reports]
-        task = args.task or ", ".join(
-            {change.skill.name: change.tick for recording in columns for change in recording.skills}
-        )
-        with whole(args.lerobot) as part:
-            parts, rows = lerobot.write(columns, part, fps=args.fps, task=task)
-        console.print(Text(printable(f"data set {args.lerobot}: {parts} episodes, {rows} rows")))
-    if args.html and reports:
-        from thirdhand.workbench.report.page import page  # its import is slow
 
-        with (
-            progress("drawing", unit="recordings", total=len(reports)) as done,
-            whole(args.html) as part,
-        ):
-            part.write_text(page(reports, progress=done), encoding="utf-8")
-        console.print(Text(printable(f"page {args.html}")))
-    return 0 if len(reports) == len(args.files) else 1
+def _write_lerobot(args: argparse.Namespace, recordings: Sequence[Columns]) -> tuple[int, int]:
+    """Write the data set; return the numbers of episodes and rows. Its task is named after the
+    skills, unless the arguments name it.
+    """
+    from thirdhand.workbench.report import lerobot
+
+    skills = dict.fromkeys(
+        change.skill.name for recording in recordings for change in recording.skills
+    )
+    with whole(args.lerobot) as part:
+        return lerobot.write(recordings, part, fps=args.fps, task=args.task or ", ".join(skills))
+
+
+def _write_page(path: Path, reports: Sequence[Report]) -> None:
+    from thirdhand.workbench.report.page import page  # its import is slow
+
+    with (
+        progress("drawing", unit="recordings", total=len(reports)) as done,
+        whole(path) as part,
+    ):
+        part.write_text(page(reports, progress=done), encoding="utf-8")
 
 
 def _report_many(args: argparse.Namespace) -> int:
@@ -96,14 +117,18 @@ def _report_many(args: argparse.Namespace) -> int:
         args.csv.mkdir(parents=True, exist_ok=True)
         for table in (*overview_tables, every_figure(recordings)):
             _write(args.csv / f"{table.name}.csv", table)
-        console.print(Text(printable(f"tables in {args.csv}")))
+        _print_line(console, f"tables in {args.csv}")
     if args.html:
         from thirdhand.workbench.report.page import page_of_many  # its import is slow
 
         with whole(args.html) as part:
             part.write_text(page_of_many(overview_tables), encoding="utf-8")
-        console.print(Text(printable(f"page {args.html}")))
+        _print_line(console, f"page {args.html}")
     return 0 if len(recordings) == len(args.files) else 1
+
+
+def _print_line(console: Console, text: str) -> None:
+    console.print(Text(printable(text)))
 
 
 def _reported(path: Path) -> Report:

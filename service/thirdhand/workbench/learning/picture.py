@@ -4,6 +4,7 @@ regions, the gate, and the segments of one demonstration.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,82 +43,18 @@ def draw(evidence: Evidence, path: Path) -> None:
 def drawn(evidence: Evidence) -> Figure:
     """The picture; for a segmented skill with the segments of one demonstration."""
     from matplotlib.figure import Figure  # loads slowly, and few need it
-    from matplotlib.ticker import LogFormatter
 
-    skill = evidence.skill
     held_out = evidence.held_out
     is_segmented = held_out[0].belief is not None
     mosaic = "ae;rg;ss" if is_segmented else "ae;rg"
     figure = Figure(figsize=(11, 3.75 * len(mosaic.split(";"))), layout="constrained", dpi=110)
     parts = figure.subplot_mosaic(mosaic)
-    above, errors, regions, gate = (parts[name] for name in "aerg")
     if is_segmented:
         _draw_segments(evidence, parts["s"])
-
-    above.set(title="the tool from above", xlabel="x [m]", ylabel="y [m]")
-    for i, result in enumerate(held_out):
-        tool = result.take.position
-        predicted = tool - result.errors
-        above.plot(
-            tool[:, 0], tool[:, 1], color=TOOL, lw=1, label="demonstrated" if i == 0 else None
-        )
-        label = "predicted from the others" if i == 0 else None
-        above.plot(predicted[:, 0], predicted[:, 1], color=TARGET, lw=1, label=label)
-    above.set_aspect("equal", adjustable="datalim")
-    above.legend(frameon=False)
-
-    grid = np.linspace(0.0, 1.0, 200)
-    lengths = np.array([_along(np.linalg.norm(result.errors, axis=1), grid) for result in held_out])
-    expected = np.array([_along(_deviation(result), grid) for result in held_out])
-    errors.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
-    errors.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
-    errors.plot(
-        grid,
-        1000 * np.sqrt((lengths**2).mean(axis=0)),
-        color=TOOL,
-        lw=2,
-        label="root mean square of all",
-    )
-    expected_mm = 1000 * np.sqrt((expected**2).mean(axis=0))
-    errors.plot(grid, expected_mm, color=TARGET, ls="--", lw=2, label="expected before calibration")
-    errors.set(
-        title="error of the predicted tool",
-        xlabel="share of the demonstration's time",
-        ylabel="[mm]",
-    )
-    errors.set(xlim=(0, 1), ylim=(0, None))
-    errors.legend(frameon=False)
-
-    regions.plot((0, 100), (0, 100), color="0.6", lw=1, label="exact")
-    inside = 100 * evidence.inside
-    regions.plot(
-        100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations"
-    )
-    regions.set(title="share of the samples inside each predicted region")
-    regions.set(xlabel="the region should contain [%]", ylabel="samples inside [%]")
-    regions.set(xlim=(0, 100), ylim=(0, 100))
-    regions.legend(frameon=False)
-
-    hands = np.concatenate([every_few(result.take.hands) for result in held_out])
-    curves = {"held-out hands": (np.concatenate([result.gate_m for result in held_out]), OFF)}
-    for (name, colour), wrong in zip(GREYS.items(), nonsense(hands), strict=True):
-        curves[name] = skill.model.gates_m(wrong), colour
-    for name, (values, colour) in curves.items():
-        gate.plot(
-            1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name
-        )
-    gate.axvline(
-        1000 * skill.threshold,
-        color=GATE,
-        ls="--",
-        lw=1,
-        label=f"gate, {1000 * skill.threshold:.0f} mm",
-    )
-    gate.set(title="the arm holds right of the gate", ylabel="samples up to this distance [%]")
-    gate.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
-    gate.xaxis.set_major_formatter("{x:g}")
-    gate.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
-    gate.legend(frameon=False, fontsize=8, loc="upper left")
+    _draw_from_above(held_out, parts["a"])
+    _draw_errors(held_out, parts["e"])
+    _draw_regions(evidence, parts["r"])
+    _draw_gate(evidence, parts["g"])
 
     overall = evidence.figures.all
     count = len(held_out)
@@ -128,8 +65,91 @@ def drawn(evidence: Evidence) -> Figure:
         else f"one demonstration, none held out: error of {overall.error_mm:.0f} mm rms in what "
         "was learned"
     )
-    figure.suptitle(f"{skill.name}: {basis}, {overall.predicted_mm:.0f} mm expected as calibrated")
+    figure.suptitle(
+        f"{evidence.skill.name}: {basis}, {overall.predicted_mm:.0f} mm expected as calibrated"
+    )
     return figure
+
+
+def _draw_from_above(held_out: Sequence[HeldOut], axes: Axes) -> None:
+    """Draw the tool's demonstrated and predicted paths."""
+    axes.set(title="the tool from above", xlabel="x [m]", ylabel="y [m]")
+    for i, result in enumerate(held_out):
+        tool = result.take.position
+        predicted = tool - result.errors
+        for path, colour, label in (
+            (tool, TOOL, "demonstrated"),
+            (predicted, TARGET, "predicted from the others"),
+        ):
+            axes.plot(path[:, 0], path[:, 1], color=colour, lw=1, label=None if i else label)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(frameon=False)
+
+
+def _draw_errors(held_out: Sequence[HeldOut], axes: Axes) -> None:
+    """Draw the errors over the share of the time, and those that were expected."""
+    grid = np.linspace(0.0, 1.0, 200)
+    lengths = np.array([_along(np.linalg.norm(result.errors, axis=1), grid) for result in held_out])
+    expected = np.array([_along(_deviation(result), grid) for result in held_out])
+    axes.plot(grid, 1000 * lengths.T, color="0.6", lw=0.8)
+    axes.plot([], [], color="0.6", lw=0.8, label="each demonstration, held out")
+    axes.plot(
+        grid,
+        1000 * np.sqrt((lengths**2).mean(axis=0)),
+        color=TOOL,
+        lw=2,
+        label="root mean square of all",
+    )
+    expected_mm = 1000 * np.sqrt((expected**2).mean(axis=0))
+    axes.plot(grid, expected_mm, color=TARGET, ls="--", lw=2, label="expected before calibration")
+    axes.set(
+        title="error of the predicted tool",
+        xlabel="share of the demonstration's time",
+        ylabel="[mm]",
+    )
+    axes.set(xlim=(0, 1), ylim=(0, None))
+    axes.legend(frameon=False)
+
+
+def _draw_regions(evidence: Evidence, axes: Axes) -> None:
+    """Draw the share of the samples inside each region over the one that it should contain."""
+    axes.plot((0, 100), (0, 100), color="0.6", lw=1, label="exact")
+    inside = 100 * evidence.inside
+    axes.plot(
+        100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations"
+    )
+    axes.set(title="share of the samples inside each predicted region")
+    axes.set(xlabel="the region should contain [%]", ylabel="samples inside [%]")
+    axes.set(xlim=(0, 100), ylim=(0, 100))
+    axes.legend(frameon=False)
+
+
+def _draw_gate(evidence: Evidence, axes: Axes) -> None:
+    """Draw the distances of held-out hands and of wrong ones as distributions, and the gate."""
+    from matplotlib.ticker import LogFormatter
+
+    skill = evidence.skill
+    held_out = evidence.held_out
+    hands = np.concatenate([every_few(result.take.hands) for result in held_out])
+    curves = {"held-out hands": (np.concatenate([result.gate_m for result in held_out]), OFF)}
+    for (name, colour), wrong in zip(GREYS.items(), nonsense(hands), strict=True):
+        curves[name] = skill.model.gates_m(wrong), colour
+    for name, (values, colour) in curves.items():
+        axes.plot(
+            1000 * np.sort(values), 100 * np.linspace(0, 1, len(values)), color=colour, label=name
+        )
+    axes.axvline(
+        1000 * skill.threshold,
+        color=GATE,
+        ls="--",
+        lw=1,
+        label=f"gate, {1000 * skill.threshold:.0f} mm",
+    )
+    axes.set(title="the arm holds right of the gate", ylabel="samples up to this distance [%]")
+    axes.set(xlabel=f"{skill.model.measure} [mm]", xscale="log", ylim=(0, 100))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
 
 
 def _draw_segments(evidence: Evidence, axes: Axes) -> None:

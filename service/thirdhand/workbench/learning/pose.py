@@ -8,7 +8,7 @@ stays constant. Takes that contradict each other are reported, and refused if th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,39 +61,47 @@ def learned_pose(
     turn, turn_error_deg, missed = _learned_turn(mean, held_out, signed, points)
     verdicts: list[Verdict] = []
     if turn is not None:
-        conflicts = contradictions(
-            held_out,
-            unit,
-            missed,
-            lambda tools, others: angles(tools[:, None], others),
-            different=DIFFERENT_RAD,
-            near_m=near_m,
-        )
-        if conflicts.share > NOTED_SHARE:
-            text = (
-                f"the tool's orientation contradicts itself in {100 * conflicts.share:.0f} % of "
-                f"the samples, up to {100 * UNSAFE_SHARE:.0f} % accepted: {conflicts.pair} have "
-                f"the hands {1000 * conflicts.hands_m:.0f} mm from each other and the tools turned "
-                f"by {math.degrees(conflicts.tools):.0f}°"
-            )
-            verdicts.append(
-                Verdict("unsafe" if conflicts.share > UNSAFE_SHARE else "warning", text)
-            )
+        verdicts += _contradicting(held_out, unit, missed, near_m)
     if turn_error_deg is not None and turn_error_deg > NOTED_DEG:
-        text = (
-            f"the tool's orientation in held-out demonstrations is missed by {turn_error_deg:.0f}° "
-            "rms"
-        )
-        if turn_error_deg > UNSAFE_DEG:
-            turned_deg = max(math.degrees(turned_rad(q)) for q in unit)
-            text += (
-                f", up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one "
-                f"of them; let it turn by less than {MOST_TURN_DEG:.0f}°, the same way in each"
-            )
-        verdicts.append(Verdict("unsafe" if turn_error_deg > UNSAFE_DEG else "warning", text))
+        verdicts.append(_missed(turn_error_deg, unit))
     gripper, right, remarks = _learned_gripper(held_out, points=points, ell=gripper_ell)
     verdicts += (Verdict("warning", text) for text in remarks)
     return Pose(mean, turn, gripper, turn_error_deg, right, verdicts)
+
+
+def _contradicting(
+    held_out: Sequence[HeldOut], unit: Sequence[Vector], missed: Sequence[Vector], near_m: float
+) -> Iterator[Verdict]:
+    """A verdict on orientations (T, 4) that contradict each other; none if few do."""
+    conflicts = contradictions(
+        held_out,
+        unit,
+        missed,
+        lambda tools, others: angles(tools[:, None], others),
+        different=DIFFERENT_RAD,
+        near_m=near_m,
+    )
+    if conflicts.share > NOTED_SHARE:
+        yield Verdict(
+            "unsafe" if conflicts.share > UNSAFE_SHARE else "warning",
+            f"the tool's orientation contradicts itself in {100 * conflicts.share:.0f} % of "
+            f"the samples, up to {100 * UNSAFE_SHARE:.0f} % accepted: {conflicts.pair} have "
+            f"the hands {1000 * conflicts.hands_m:.0f} mm from each other and the tools turned "
+            f"by {math.degrees(conflicts.tools):.0f}°",
+        )
+
+
+def _missed(error_deg: float, unit: Sequence[Vector]) -> Verdict:
+    """The verdict on a large held-out error [deg] of orientations (T, 4)."""
+    text = f"the tool's orientation in held-out demonstrations is missed by {error_deg:.0f}° rms"
+    if error_deg <= UNSAFE_DEG:
+        return Verdict("warning", text)
+    turned_deg = max(math.degrees(turned_rad(q)) for q in unit)
+    return Verdict(
+        "unsafe",
+        f"{text}, up to {UNSAFE_DEG:.0f}° accepted: it turns by up to {turned_deg:.0f}° in one "
+        f"of them; let it turn by less than {MOST_TURN_DEG:.0f}°, the same way in each",
+    )
 
 
 def turned_rad(quaternions: Vector) -> float:

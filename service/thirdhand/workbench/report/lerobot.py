@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import msgspec
@@ -84,93 +84,155 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             }
 
 
-def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:
-    """Write a data set of one task to a new folder; return the numbers of episodes and rows.
-
-    Raises ExplainedError if arms differ, or if there is no episode.
+class _DataSet(NamedTuple):
+    """The episodes of one arm, the row at which each begins and the last ends, and the feature of
+    each video with sampled pixels of each episode.
     """
-    pairs = [
-        (columns.recording, part) for columns in recordings for part in episodes(columns, fps=fps)
-    ]
-    parts = [part for _, part in pairs]
-    camera_rows = [
-        CameraRows(recording, part.pop("times_ns").astype(np.int64)) for recording, part in pairs
-    ]
-    arm_specs = [
-        (columns.recording.urdf, columns.recording.settings.joints.names) for columns in recordings
-    ]
-    arms = {(ElementTree.fromstring(urdf).get("name"), names) for urdf, names in arm_specs}
-    if len(arms) > 1 or not parts:
-        why = (
-            "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
-        )
-        raise ExplainedError(f"no data set is written: {why}")
-    ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
-    for i, part in enumerate(parts):
-        row = np.arange(ends[i + 1] - ends[i])
-        part |= {
-            "timestamp": (row / fps).astype(np.float32),
-            "frame_index": row,
-            "episode_index": np.full_like(row, i),
-        }
-        part |= {"index": row + ends[i], "task_index": np.zeros_like(row)}
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    ((arm, joints),) = arms
-    names = dict(zip(FEATURES, (joints, HANDS, joints), strict=True))
-    first = FILE.format(chunk_index=0, file_index=0)
 
-    def video_of(key: str) -> Path:
-        return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)
+    arm: str | None
+    joints: tuple[str, ...]
+    episodes: Sequence[Episode]
+    ends: Sequence[int]
+    videos: Mapping[str, tuple[dict[str, Any], list[Any]]]
+    fps: int
 
-    videos = {
-        _named(key): video for key, video in write_videos(camera_rows, video_of, fps=fps).items()
-    }
-    info = {
-        "codebase_version": "v3.0",
-        "robot_type": arm,
-        "fps": fps,
-        "splits": {"train": f"0:{len(parts)}"},
-        "total_episodes": len(parts),
-        "total_frames": ends[-1],
-        "total_tasks": 1,
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "data_path": f"data/{FILE}",
-        "video_path": VIDEO if videos else None,
-        "features": {
+    def info(self, columns: Episode) -> dict[str, Any]:
+        """The description of the data set with these columns."""
+        names = dict(zip(FEATURES, (self.joints, HANDS, self.joints), strict=True))
+        features = {
             name: {
                 "dtype": str(column.dtype),
                 "shape": column.shape[1:] or (1,),
                 "names": names.get(name),
             }
-            for name, column in whole.items()
+            for name, column in columns.items()
         }
-        | {name: feature for name, (feature, _) in videos.items()},
-    }
-    about = [
-        {"episode_index": i, "tasks": [task], "length": len(part["action"])}
-        | {"dataset_from_index": ends[i], "dataset_to_index": ends[i + 1]}
-        | {
-            f"{of}/{number}_index": 0
-            for of in ("data", "meta/episodes")
-            for number in ("chunk", "file")
+        return {
+            "codebase_version": "v3.0",
+            "robot_type": self.arm,
+            "fps": self.fps,
+            "splits": {"train": f"0:{len(self.episodes)}"},
+            "total_episodes": len(self.episodes),
+            "total_frames": self.ends[-1],
+            "total_tasks": 1,
+            "chunks_size": 1000,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "data_path": f"data/{FILE}",
+            "video_path": VIDEO if self.videos else None,
+            "features": features | {name: feature for name, (feature, _) in self.videos.items()},
         }
-        | {f"videos/{name}/{number}_index": 0 for name in videos for number in ("chunk", "file")}
-        | {
-            f"videos/{name}/{side}_timestamp": ends[i + k] / fps
-            for name in videos
-            for k, side in enumerate(("from", "to"))
+
+    def about(self, i: int, task: str) -> dict[str, Any]:
+        """The description of an episode: its rows, its files and its statistics."""
+        begin, end = self.ends[i : i + 2]
+        row = {
+            "episode_index": i,
+            "tasks": [task],
+            "length": end - begin,
+            "dataset_from_index": begin,
+            "dataset_to_index": end,
         }
-        | {
+        files = ("data", "meta/episodes", *(f"videos/{name}" for name in self.videos))
+        row |= {f"{file}/{number}_index": 0 for file in files for number in ("chunk", "file")}
+        for name in self.videos:
+            row[f"videos/{name}/from_timestamp"] = begin / self.fps
+            row[f"videos/{name}/to_timestamp"] = end / self.fps
+        statistics = self.statistics(self.episodes[i], slice(i, i + 1))
+        return row | {
             f"stats/{name}/{kind}": value
-            for name, kinds in (
-                _statistics(part) | _video_statistics(videos, slice(i, i + 1))
-            ).items()
+            for name, kinds in statistics.items()
             for kind, value in kinds.items()
         }
-        for i, part in enumerate(parts)
-    ]
+
+    def statistics(self, columns: Episode, episodes: slice) -> dict[str, dict[str, Any]]:
+        """The statistics of columns and of the videos of these episodes."""
+        return _statistics(columns) | _video_statistics(self.videos, episodes)
+
+
+def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:
+    """Write a data set of one task to a new folder; return the numbers of episodes and rows.
+
+    Raises ExplainedError if arms differ, or if there is no episode.
+    """
+    parts: list[Episode] = []
+    camera_rows: list[CameraRows] = []
+    for columns in recordings:
+        for part in episodes(columns, fps=fps):
+            times_ns = part.pop("times_ns").astype(np.int64)
+            camera_rows.append(CameraRows(columns.recording, times_ns))
+            parts.append(part)
+    arm, joints = _arm_of(recordings, parts)
+    ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
+    for i, part in enumerate(parts):
+        part.update(_indices(i, ends, fps))
+    data_set = _DataSet(arm, joints, parts, ends, _videos(camera_rows, folder, fps), fps)
+    _write_data_set(data_set, folder, task)
+    return len(parts), ends[-1]
+
+
+def _arm_of(
+    recordings: Sequence[Columns], parts: Sequence[Episode]
+) -> tuple[str | None, tuple[str, ...]]:
+    """The name of the arm and those of its joints. Raises ExplainedError if arms differ, or without
+    an episode.
+    """
+    arms = {
+        (
+            ElementTree.fromstring(columns.recording.urdf).get("name"),
+            columns.recording.settings.joints.names,
+        )
+        for columns in recordings
+    }
+    if len(arms) > 1 or not parts:
+        why = (
+            "one arm is needed" if parts else "nothing was commanded after both hands had been seen"
+        )
+        raise ExplainedError(f"no data set is written: {why}")
+    return arms.pop()
+
+
+def _indices(i: int, ends: Sequence[int], fps: int) -> Episode:
+    """The columns of time and place of episode `i` in the data set."""
+    row = np.arange(ends[i + 1] - ends[i])
+    return {
+        "timestamp": (row / fps).astype(np.float32),
+        "frame_index": row,
+        "episode_index": np.full_like(row, i),
+        "index": row + ends[i],
+        "task_index": np.zeros_like(row),
+    }
+
+
+def _videos(
+    camera_rows: Sequence[CameraRows], folder: Path, fps: int
+) -> dict[str, tuple[dict[str, Any], list[Any]]]:
+    """Write the videos; what `write_videos` returns, by the names of the features."""
+
+    def video_of(key: str) -> Path:
+        return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)
+
+    videos = write_videos(camera_rows, video_of, fps=fps)
+    return {_named(key): video for key, video in videos.items()}
+
+
+def _write_data_set(data_set: _DataSet, folder: Path, task: str) -> None:
+    """Write all files but the videos."""
+    parts = data_set.episodes
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    about = [data_set.about(i, task) for i in range(len(parts))]
+    first = FILE.format(chunk_index=0, file_index=0)
+    meta = folder / "meta"
+    _write(folder / "data" / first, *(_table(part) for part in parts))
+    _write(meta / "episodes" / first, pa.Table.from_pylist(about))
+    _write(meta / "tasks.parquet", _tasks(task))
+    (meta / "info.json").write_bytes(msgspec.json.encode(data_set.info(columns)))
+    statistics = data_set.statistics(columns, slice(None))
+    (meta / "stats.json").write_bytes(msgspec.json.encode(statistics))
+
+
+def _tasks(task: str) -> pa.Table:
+    """The table of the task, with the index that pandas reads."""
     text = {
         "name": "task",
         "field_name": "task",
@@ -180,18 +242,9 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
     }
     as_index = msgspec.json.encode(
         {"index_columns": ["task"], "columns": [text], "column_indexes": []}
-    )  # for pandas
-    tasks = pa.table({"task_index": [0], "task": [task]}).replace_schema_metadata(
-        {"pandas": as_index}
     )
-    meta = folder / "meta"
-    _write(folder / "data" / first, *(_table(part) for part in parts))
-    _write(meta / "episodes" / first, pa.Table.from_pylist(about))
-    _write(meta / "tasks.parquet", tasks)
-    (meta / "info.json").write_bytes(msgspec.json.encode(info))
-    statistics = _statistics(whole) | _video_statistics(videos, slice(None))
-    (meta / "stats.json").write_bytes(msgspec.json.encode(statistics))
-    return len(parts), ends[-1]
+    tasks = pa.table({"task_index": [0], "task": [task]})
+    return tasks.replace_schema_metadata({"pandas": as_index})
 
 
 def _named(key: str) -> str:

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from thirdhand.contract.incidents import what_happened, what_to_do, word
 from thirdhand.contract.printable import printable
@@ -50,27 +50,36 @@ class Table(NamedTuple):
 
 def tables(report: Report) -> Iterator[Table]:
     """The tables of one report; empty ones are left out."""
-    return (table for table in _tables(report) if table.rows)
+    return (table for table in (make(report) for make in TABLES) if table.rows)
 
 
-def _tables(report: Report) -> Iterator[Table]:
-    yield Table(
-        "missing", "Missing in the recording", ("what",), tuple((line,) for line in report.lacks)
+def _missing(report: Report) -> Table:
+    rows = tuple((line,) for line in report.lacks)
+    return Table("missing", "Missing in the recording", ("what",), rows)
+
+
+def _modes(report: Report) -> Table:
+    return Table(
+        "modes",
+        "Modes of the arm",
+        ("from [s]", "for [s]", "mode", "why"),
+        tuple((_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans),
+        numbers=0,
     )
-    spans = tuple(
-        (_s(span.start_s), _s(span.lasts_s), span.doing, span.why) for span in report.spans
-    )
-    yield Table(
-        "modes", "Modes of the arm", ("from [s]", "for [s]", "mode", "why"), spans, numbers=0
-    )
-    yield Table(
+
+
+def _faults(report: Report) -> Table:
+    return Table(
         "faults",
         "Faults",
         ("at [s]", "reason", "what happened, what preceded it, and what to do"),
         tuple(_fault(fault) for fault in report.faults),
         numbers=0,
     )
-    yield Table(
+
+
+def _segments(report: Report) -> Table:
+    return Table(
         "segments",
         "Segments of the task",
         ("from [s]", "for [s]", "segment", "probability [%]"),
@@ -85,7 +94,10 @@ def _tables(report: Report) -> Iterator[Table]:
         ),
         numbers=0,
     )
-    yield Table(
+
+
+def _via_points(report: Report) -> Table:
+    return Table(
         "via_points",
         "Via-points",
         (
@@ -108,7 +120,10 @@ def _tables(report: Report) -> Iterator[Table]:
             for point in report.via_points
         ),
     )
-    yield Table(
+
+
+def _timing(report: Report) -> Table:
+    return Table(
         "times",
         "Timing and accuracy",
         ("what", "median", "99 %", "largest", "unit", "values"),
@@ -123,23 +138,24 @@ def _tables(report: Report) -> Iterator[Table]:
             if percentiles is not None
         ),
     )
-    if report.approach is not None:
-        near = report.approach
-        yield Table(
-            "approach",
-            "Closest approach of the arm to a hand",
-            ("distance [cm]", "at [s]", "mode then", "allowed speed toward it [m/s]"),
-            (
-                (
-                    f"{100 * near.distance_m:.1f}",
-                    _s(near.at_s),
-                    near.doing,
-                    f"{near.allowed_m_s:.2f}",
-                ),
-            ),
-            numbers=0,
-        )
-    yield Table(
+
+
+def _approach(report: Report) -> Table:
+    rows: tuple[tuple[str, ...], ...] = ()
+    if (near := report.approach) is not None:
+        distance = f"{100 * near.distance_m:.1f}"
+        rows = ((distance, _s(near.at_s), near.doing, f"{near.allowed_m_s:.2f}"),)
+    return Table(
+        "approach",
+        "Closest approach of the arm to a hand",
+        ("distance [cm]", "at [s]", "mode then", "allowed speed toward it [m/s]"),
+        rows,
+        numbers=0,
+    )
+
+
+def _limits(report: Report) -> Table:
+    return Table(
         "limits",
         "Active limits",
         ("limit", "for [s]", "times [1]", "first at [s]", "what happened"),
@@ -155,8 +171,11 @@ def _tables(report: Report) -> Iterator[Table]:
         ),
         numbers=0,
     )
+
+
+def _binding(report: Report) -> Table:
     followed_s = max(report.seconds(Mode.FOLLOW), report.columns.period_s)
-    yield Table(
+    return Table(
         "binding",
         "What limited the tool while it followed",
         ("limit", "for [s]", "share [%]", "times", "first at [s]"),
@@ -171,7 +190,10 @@ def _tables(report: Report) -> Iterator[Table]:
             for limit in report.binding
         ),
     )
-    yield Table(
+
+
+def _tool_limits(report: Report) -> Table:
+    return Table(
         "tool_limits",
         "What the arm can do where the tool was",
         ("direction", "speed [m/s]", "limited by", "acceleration [m/s²]", "limited by"),
@@ -187,7 +209,10 @@ def _tables(report: Report) -> Iterator[Table]:
         ),
         numbers=0,
     )
-    yield Table(
+
+
+def _joints(report: Report) -> Table:
+    return Table(
         "joints",
         "Use of the joints' limits",
         ("joint", "from a limit [rad]", "speed [% of limit]", "acceleration [% of limit]"),
@@ -201,7 +226,10 @@ def _tables(report: Report) -> Iterator[Table]:
             for joint in report.joints
         ),
     )
-    yield Table(
+
+
+def _rejections(report: Report) -> Table:
+    return Table(
         "rejections",
         "Rejected samples",
         ("cause", "count [samples]", "first at [s]", "what to do"),
@@ -218,6 +246,21 @@ def _tables(report: Report) -> Iterator[Table]:
     )
 
 
+# the order of the tables in a report
+TABLES = (
+    _missing,
+    _modes,
+    _faults,
+    _segments,
+    _via_points,
+    _timing,
+    _approach,
+    _limits,
+    _binding,
+    _tool_limits,
+    _joints,
+    _rejections,
+)
 NO_LIMIT_RAD = 1000.0  # limits of a continuous joint that are farther away do not matter
 
 
@@ -247,52 +290,73 @@ def verdict(report: Report) -> str:
     """The report in one sentence: share of following, number of stops, and the worst."""
     if not report.spans:
         return "There is nothing to report: the recording holds no tick."
-    following = [span for span in report.spans if span.mode is Mode.FOLLOW]
-    first_s, last_s = (
-        (following[0].start_s, following[-1].end_s) if following else (-1.0, report.lasts_s)
-    )
-    holds = [span for span in report.spans if span.mode is Mode.HOLD]
-    waited = [span for span in holds if span.start_s < first_s]
-    ended = [span for span in holds if span.start_s >= last_s]
-    if report.spans[-1].mode is Mode.FAULT:
-        ended = []  # a fault is no end of a session
-    stops = [
-        span
-        for span in report.spans
-        if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)
-    ]
+    session = _Session.of(report)
     faults = len(report.faults)
-    counts = f"{_times_of(len(stops) - faults, 'hold')} and {_times_of(faults, 'fault')}"
-    if stops:
-        worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
-        most = f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
-    else:
-        most = (
-            f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else NONE
+    holds = _times_of(len(session.stops) - faults, "hold")
+    worst = _worst_stop(session.stops) if session.stops else _worst_distance(report)
+    lasts_s = session.end_s - max(session.begin_s, 0.0) if session.ended else report.lasts_s
+    since = f", from {session.begin_s:.1f} s on" if session.waited else ""
+    end = ""
+    if session.ended:
+        since = f", from {max(session.begin_s, 0.0):.1f} to {session.end_s:.1f} s"
+        end = (
+            f" It ended with {session.ended[0].doing}, "
+            f"{report.lasts_s - session.ended[0].start_s:.1f} s before the end."
         )
-        if initial := report.initial_mm:
-            approach = (
-                f"initial approach of {initial.largest:.0f} mm, which took {report.initial_s:.1f} s"
-            )
-            most = (
-                f"{most}, after an {approach}"
-                if report.lag_mm
-                else f"an {approach} and did not reach the target"
-            )
-    lasts_s = last_s - max(first_s, 0.0) if ended else report.lasts_s
-    since = f", from {first_s:.1f} s on" if waited else ""
-    since = f", from {max(first_s, 0.0):.1f} to {last_s:.1f} s" if ended else since
-    end = (
-        f" It ended with {ended[0].doing}, {report.lasts_s - ended[0].start_s:.1f} s before the "
-        "end."
-        if ended
-        else ""
-    )
     followed = 100 * report.seconds(Mode.FOLLOW) / lasts_s
     return (
-        f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {counts}; the worst was "
-        f"{most}.{end}"
+        f"It followed {followed:.0f} % of {lasts_s:.1f} s{since}, with {holds} and "
+        f"{_times_of(faults, 'fault')}; the worst was {worst}.{end}"
     )
+
+
+class _Session(NamedTuple):
+    """The part of a recording from the first to the last time that the arm followed: its begin and
+    end [s], and the spans of holds before, stops within, and holds after it.
+    """
+
+    begin_s: float
+    end_s: float
+    waited: list[Span]
+    stops: list[Span]
+    ended: list[Span]
+
+    @classmethod
+    def of(cls, report: Report) -> Self:
+        """The session in a report. Where the arm never followed, all spans are stops."""
+        following = [span for span in report.spans if span.mode is Mode.FOLLOW]
+        begin_s = following[0].start_s if following else -1.0
+        end_s = following[-1].end_s if following else report.lasts_s
+        waited = [
+            span for span in report.spans if span.mode is Mode.HOLD and span.start_s < begin_s
+        ]
+        ended = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s >= end_s]
+        if report.spans[-1].mode is Mode.FAULT:
+            ended = []  # a fault is no end of a session
+        stops = [
+            span
+            for span in report.spans
+            if span.mode is not Mode.FOLLOW and span not in (*waited, *ended)
+        ]
+        return cls(begin_s, end_s, waited, stops, ended)
+
+
+def _worst_stop(stops: Sequence[Span]) -> str:
+    """The longest fault, or else the longest hold."""
+    worst = max(stops, key=lambda span: (span.mode is Mode.FAULT, span.lasts_s))
+    return f"{worst.doing}, for {worst.lasts_s:.1f} s from {worst.start_s:.1f} s on"
+
+
+def _worst_distance(report: Report) -> str:
+    """The largest distance [mm] of the tool from its target, and the initial approach."""
+    largest = f"{report.lag_mm.largest:.0f} mm from the tool to its target" if report.lag_mm else ""
+    if not report.initial_mm:
+        return largest or NONE
+    approach = (
+        f"an initial approach of {report.initial_mm.largest:.0f} mm, which took "
+        f"{report.initial_s:.1f} s"
+    )
+    return f"{largest}, after {approach}" if largest else f"{approach} and did not reach the target"
 
 
 def _times_of(count: int, what: str) -> str:

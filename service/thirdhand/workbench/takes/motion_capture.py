@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import csv
 import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -37,71 +39,119 @@ Captured = dict[str, tuple[list[int], Vector]]
 """Stamps (N,) [ns] and poses (N, 7) [m] by the name of a body or marker; NaN if it is not seen."""
 
 
+class _Motive(NamedTuple):
+    """A take of Motive as text: its header, the numbers of the rows with the columns' axes and of
+    the first frame, and whether a comma separates decimals.
+    """
+
+    path: Path
+    rows: list[list[str]]
+    about: Mapping[str, str]
+    axes_row: int
+    has_decimal_commas: bool
+
+    @classmethod
+    def of(cls, path: Path) -> Self:
+        """The rows of a file that are not empty. Raises RecordingError."""
+        try:
+            with path.open(newline="", encoding="utf-8-sig") as stream:
+                begin = stream.readline()
+                separator = next(
+                    (mark for mark in ";\t" if begin.startswith(f"Format Version{mark}")), ","
+                )
+                table = csv.reader(itertools.chain([begin], stream), delimiter=separator)
+                rows = [*filter(any, table)]
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            raise RecordingError(
+                f"{path} is not a CSV file that can be read: {in_words(error, named=False)}"
+            ) from None
+        about = dict(zip(rows[0][::2], rows[0][1::2], strict=False)) if rows else {}
+        axes_row = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
+        return cls(path, rows, about, axes_row, separator != ",")
+
+    def unit_m(self) -> float:
+        """The unit of positions [m]. Raises RecordingError if this is no export of Motive, or with
+        an unknown unit or rotations that are no quaternions.
+        """
+        if "Format Version" not in self.about or self.axes_row < 4:
+            raise RecordingError(
+                f"{self.path} is not a CSV file as Motive exports it (Format Version in its first "
+                "row, Frame in the row above the numbers). Other tables become takes from arrays: "
+                "docs/arrays.md"
+            )
+        unit = self.about.get("Length Units", "").lower()
+        if unit not in UNITS_M or self.about.get("Rotation Type", "Quaternion") != "Quaternion":
+            raise RecordingError(
+                f"{self.path}: Length Units {self.about.get('Length Units')!r}, Rotation Type "
+                f"{self.about.get('Rotation Type')!r}; export it in Meters, Centimeters or "
+                "Millimeters, with Rotation Type Quaternion"
+            )
+        return UNITS_M[unit]
+
+    def columns(self) -> dict[str, dict[tuple[str, str], int]]:
+        """The numbers of the columns that are read, by body or marker, kind and axis."""
+        labelled = {
+            row[1]: row
+            for row in self.rows[1 : self.axes_row]
+            if len(row) > 1 and row[1] in ("Type", "Name")
+        }
+        heads = zip(
+            labelled.get("Type", self.rows[1]),
+            labelled.get("Name", self.rows[2]),
+            self.rows[self.axes_row - 1],
+            self.rows[self.axes_row],
+            strict=False,
+        )
+        columns: dict[str, dict[tuple[str, str], int]] = {}
+        for i, (kind, name, *axis) in enumerate(heads):
+            if kind in POSED_TYPES and tuple(axis) in POSE_COLUMNS:
+                columns.setdefault(name, {})[axis[0], axis[1]] = i
+        return columns
+
+    def numbers(self, columns: Sequence[int]) -> Vector:
+        """The table with the numbers of these columns; NaN elsewhere, where there may be text.
+        Raises RecordingError.
+        """
+        frames = self.rows[self.axes_row + 1 :]
+        table = np.full((len(frames), len(self.rows[self.axes_row])), np.nan)
+        for values, row in zip(table, frames, strict=True):
+            filled = [i for i in columns if i < len(row) and row[i]]
+            try:
+                values[filled] = [self.number(row[i]) for i in filled]
+            except ValueError as error:
+                raise RecordingError(
+                    f"{self.path}: frame {row[0]}: {error}; numbers and empty cells needed"
+                ) from None
+        return table
+
+    def number(self, cell: str) -> float:
+        """The number in a cell. Raises ValueError."""
+        return float(cell.replace(",", ".") if self.has_decimal_commas else cell)
+
+
 def read_motive(path: Path) -> Captured:
     """The rigid bodies, bones and single markers of a take exported by Motive. Raises
     RecordingError.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            begin = stream.readline()
-            separator = next(
-                (mark for mark in ";\t" if begin.startswith(f"Format Version{mark}")), ","
-            )
-            rows = [
-                row
-                for row in csv.reader(itertools.chain([begin], stream), delimiter=separator)
-                if any(row)
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(
-            f"{path} is not a CSV file that can be read: {in_words(error, named=False)}"
-        ) from None
-    about = dict(zip(rows[0][::2], rows[0][1::2], strict=False)) if rows else {}
-    axes_at = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
-    if "Format Version" not in about or axes_at < 4:
-        raise RecordingError(
-            f"{path} is not a CSV file as Motive exports it (Format Version in its first row, "
-            "Frame in the row above the numbers). Other tables become takes from arrays: "
-            "docs/arrays.md"
-        )
-    unit = about.get("Length Units", "").lower()
-    if unit not in UNITS_M or about.get("Rotation Type", "Quaternion") != "Quaternion":
-        raise RecordingError(
-            f"{path}: Length Units {about.get('Length Units')!r}, Rotation Type "
-            f"{about.get('Rotation Type')!r}; export it in Meters, Centimeters or Millimeters, "
-            "with Rotation Type Quaternion"
-        )
-    labelled = {
-        row[1]: row for row in rows[1:axes_at] if len(row) > 1 and row[1] in ("Type", "Name")
-    }
-    types = labelled.get("Type", rows[1])
-    names = labelled.get("Name", rows[2])
-    columns: dict[str, dict[tuple[str, str], int]] = {}
-    for i, head in enumerate(zip(types, names, rows[axes_at - 1], rows[axes_at], strict=False)):
-        if head[0] in POSED_TYPES and head[2:] in POSE_COLUMNS:
-            columns.setdefault(head[1], {})[head[2:]] = i
-    table = np.full((len(rows) - axes_at - 1, len(rows[axes_at])), np.nan)
-    # others may hold text, as a time code
-    numeric = [1, *(i for body_columns in columns.values() for i in body_columns.values())]
-    for values, row in zip(table, rows[axes_at + 1 :], strict=True):
-        try:
-            for i in numeric:
-                if i < len(row) and row[i]:
-                    values[i] = float(row[i] if separator == "," else row[i].replace(",", "."))
-        except ValueError as error:
-            raise RecordingError(
-                f"{path}: frame {row[0]}: {error}; numbers and empty cells needed"
-            ) from None
+    take = _Motive.of(path)
+    unit_m = take.unit_m()
+    columns = take.columns()
+    table = take.numbers([1, *itertools.chain(*map(dict.values, columns.values()))])
     stamps = _stamps(path, table[:, 1])
-    out = Captured()
-    for name, body_columns in columns.items():
-        if all(column in body_columns for column in POSE_COLUMNS[:3]):
-            poses = np.tile([np.nan] * 3 + list(NO_ROTATION), (len(table), 1))
-            for k, column in enumerate(POSE_COLUMNS):
-                if column in body_columns:
-                    poses[:, k] = table[:, body_columns[column]] * (UNITS_M[unit] if k < 3 else 1.0)
-            out[name] = stamps, poses
-    return out
+    return {
+        name: (stamps, _poses(table, body_columns, unit_m))
+        for name, body_columns in columns.items()
+        if all(position in body_columns for position in POSE_COLUMNS[:3])
+    }
+
+
+def _poses(table: Vector, columns: Mapping[tuple[str, str], int], unit_m: float) -> Vector:
+    """The poses (N, 7) [m] in the columns of a table; without rotations for a marker."""
+    poses = np.tile([np.nan] * 3 + list(NO_ROTATION), (len(table), 1))
+    for k, axis in enumerate(POSE_COLUMNS):
+        if axis in columns:
+            poses[:, k] = table[:, columns[axis]] * (unit_m if k < 3 else 1.0)
+    return poses
 
 
 def read_c3d(path: Path) -> Captured:
