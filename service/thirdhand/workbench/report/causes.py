@@ -79,21 +79,26 @@ def before(columns: Columns, begin: int) -> Iterator[str]:
         yield f"rejected in the second before: {rejected}"
     for name, cause, refused in _refused(columns, int(frames["tick"][first]), tick):
         yield f"{input_name(name)}: rejected as {cause}: {refused}"
-    timing = columns.timing[
-        (columns.timing["tick"] >= frames["tick"][first]) & (columns.timing["tick"] <= tick)
-    ]
-    if len(timing):
-        missed = int(timing["missed"][-1] - timing["missed"][0])
-        late_us = float(timing["lateness_us"].max())
-        if missed or late_us >= LATE_US:
-            yield (
-                f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} "
-                "ms late"
-            )
+    yield from _late(columns, int(frames["tick"][first]), tick)
     for order in columns.orders:
         ago_s = (tick - order.tick) * columns.period_s
         if order.kind != "fault" and 0.0 <= ago_s <= BEFORE_S:
             yield f"{f'{ago_s:.2f} s before: ' if ago_s > 0.005 else ''}{ORDERS[order.kind]}"
+
+
+def _late(columns: Columns, first: int, last: int) -> Iterator[str]:
+    """A sentence on ticks between two that were missed, or late by LATE_US or more."""
+    timing = columns.timing
+    timing = timing[(timing["tick"] >= first) & (timing["tick"] <= last)]
+    if not len(timing):
+        return
+    missed = int(timing["missed"][-1] - timing["missed"][0])
+    late_us = float(timing["lateness_us"].max())
+    if missed or late_us >= LATE_US:
+        yield (
+            f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} "
+            "ms late"
+        )
 
 
 def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, str]]:

@@ -149,58 +149,84 @@ class Columns:
         return since
 
 
+class _Reading:
+    """The ticks of a recording that were read, with whole frames of the newest BLOCK alone."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.columns = Columns(recording)
+        self.gaps = list[Gap]()
+        self.newest_tick: int | None = None
+        self.ticks: list[int] = []  # of all frames, recorded or left out
+        self._times_ns: list[int] = []
+        self._timing: list[Record] = []
+        self._layout = frame_layout(len(recording.settings.joints.names))
+        self._blocks: list[Records] = []
+        self._block: list[Record] = []
+        self._mode = Mode.HOLD
+        self._followed_tick = -(1 << 62)  # newest tick in which the arm followed
+
+    def add(self, step: Step) -> bool:
+        """Take in a step; False if it is a state alone, which has no time."""
+        is_after_gap = bool(step.lost or step.damage)
+        if is_after_gap:
+            self.gaps.append(Gap(self.newest_tick, step.tick, step.lost, step.damage))
+        self.newest_tick = step.tick
+        if step.frame is None and step.checksum is None:
+            return False
+        if step.frame is not None:
+            self._mode = step.frame["mode"]
+        if self._mode == Mode.FOLLOW:
+            self._followed_tick = step.tick
+        _take_events(self.columns, step, self._followed_tick)
+        if is_after_gap:
+            self.columns.breaks.append(len(self.ticks))
+        self.ticks.append(step.tick)
+        self._times_ns.append(step.time_ns)
+        self._keep(step)
+        return True
+
+    def _keep(self, step: Step) -> None:
+        """Keep the frame and the timing of a step, if they were recorded."""
+        if step.frame is not None:
+            self._block.append(step.frame)
+        if step.timing is not None:
+            self._timing.append(step.timing)
+        if len(self._block) == BLOCK:
+            self._end_block()
+
+    def _end_block(self) -> None:
+        self._blocks.append(repack_fields(np.array(self._block, self._layout)[list(KEPT)]))
+        self._block.clear()
+
+    def end(self) -> None:
+        """Give the columns all that was read."""
+        self._end_block()
+        columns = self.columns
+        columns.frames = np.concatenate(self._blocks)
+        columns.timing = np.array(self._timing, TIMING)
+        columns.ticks = np.array(self.ticks, np.int64)
+        columns.times_ns = np.array(self._times_ns, np.int64)
+        _fill(columns, columns.ticks)
+
+
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
     """The columns of a recording. Raises RecordingError if it cannot be read."""
-    columns = Columns(recording)
-    last = None
-    gaps = list[Gap]()
-    layout = frame_layout(len(recording.settings.joints.names))
-    blocks: list[Records] = []
-    block: list[Record] = []
-    timing: list[Record] = []
-    ticks: list[int] = []  # of all frames, recorded or left out
-    times_ns: list[int] = []
-    followed = -(1 << 62)  # newest tick in which the arm followed
-    mode = Mode.HOLD
-
-    def kept() -> Records:
-        return repack_fields(np.array(block, layout)[list(KEPT)])
-
+    reading = _Reading(recording)
+    columns = reading.columns
     _take_skill(columns, recording.skill, 0)
     for step in recording.steps():
-        if step.lost or step.damage:
-            gaps.append(Gap(last, step.tick, step.lost, step.damage))
-        last = step.tick
-        if step.frame is None and step.checksum is None:
-            continue
-        if step.frame is not None:
-            mode = step.frame["mode"]
-        followed = step.tick if mode == Mode.FOLLOW else followed
-        _take_events(columns, step, followed)
-        if step.lost or step.damage:
-            columns.breaks.append(len(ticks))
-        ticks.append(step.tick)
-        times_ns.append(step.time_ns)
-        if step.frame is not None:
-            block.append(step.frame)
-        if step.timing is not None:
-            timing.append(step.timing)
-        if len(block) == BLOCK:
-            blocks.append(kept())
-            block.clear()
-        if len(ticks) % BLOCK == 0:
-            progress(len(ticks))
-    columns.frames = np.concatenate([*blocks, kept()])
-    columns.timing = np.array(timing, TIMING)
-    columns.ticks = np.array(ticks, np.int64)
-    columns.times_ns = np.array(times_ns, np.int64)
-    _fill(columns, columns.ticks)
+        if reading.add(step) and len(reading.ticks) % BLOCK == 0:
+            progress(len(reading.ticks))
+    reading.end()
     for _, text, _ in recording.notes("status"):
         with contextlib.suppress(msgspec.MsgspecError):  # of another version
             columns.statuses.append(
                 msgspec.convert(printable_values(msgspec.json.decode(text)), Said)
             )
-    columns.gaps = [*map(str, gaps), *recording.unreported(gaps, last=last)]
+    columns.gaps = [
+        *map(str, reading.gaps),
+        *recording.unreported(reading.gaps, last=reading.newest_tick),
+    ]
     if columns.skills and len(columns.frames):
         columns.skills[0] = columns.skills[0]._replace(tick=int(columns.frames["tick"][0]))
     return columns

@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thirdhand.contract.printable import printable
@@ -113,23 +114,14 @@ def _svg(figure: Figure, salt: str) -> str:
     return drawn[drawn.index("<svg") :]
 
 
-def _over_time(report: Report) -> Figure:
-    """Modes, distances, errors, speeds and timing over time, one above the other."""
-    frames = report.columns.frames
-    times = report.columns.times
-    timing = report.columns.timing
-    rows = 6 if len(timing) else 5
-    figure = Figure(figsize=(10.5, 2 * rows), layout="constrained")
-    modes, *others = figure.subplots(rows, 1, sharex=True, height_ratios=(0.35, *(1,) * (rows - 1)))
-    near, errors, doubt, speed = others[:4]
+def _draw_modes(report: Report, modes: Axes, others: Sequence[Axes]) -> None:
+    """Draw the modes as bands, named where there is room; all but following shade other axes."""
     for span in report.spans:
         colour = MODE_COLOURS[span.mode]
-        modes.axvspan(span.start_s, span.start_s + span.lasts_s, color=colour, lw=0)
-        if span.mode is not Mode.FOLLOW:
-            for axes in others:
-                axes.axvspan(
-                    span.start_s, span.start_s + span.lasts_s, color=colour, alpha=TINT, lw=0
-                )
+        end_s = span.start_s + span.lasts_s
+        modes.axvspan(span.start_s, end_s, color=colour, lw=0)
+        for axes in others if span.mode is not Mode.FOLLOW else ():
+            axes.axvspan(span.start_s, end_s, color=colour, alpha=TINT, lw=0)
         if span.lasts_s > LETTER_SHARE * max(map(len, span.doing.split(": "))) * report.lasts_s:
             modes.text(
                 span.start_s + span.lasts_s / 2,
@@ -143,6 +135,33 @@ def _over_time(report: Report) -> Figure:
     modes.set(yticks=[], ylim=(0, 1), xlim=(0, max(report.lasts_s, 1e-3)))
     for mode, colour in MODE_COLOURS.items():
         modes.plot([], [], color=colour, lw=6, label=str(mode.name).lower())
+
+
+def _draw_timing(report: Report, axes: Axes) -> None:
+    """Draw the latency, the work and the lateness of ticks over time."""
+    timing = report.columns.timing
+    tick_s = (timing["tick"] - report.columns.frames["tick"][0]) * report.columns.period_s
+    for name, colour, label in (
+        ("latency_us", LATENCY, "hand stamped to command published"),
+        ("work_us", WORK, "work of a tick"),
+        ("lateness_us", LATENESS, "later than its deadline"),
+    ):
+        durations_us = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
+        axes.plot(*thinned(tick_s, durations_us), ".", color=colour, ms=2, label=label)
+    axes.set(yscale="log", ylabel="time [µs]")
+    axes.yaxis.set_major_formatter("{x:g}")
+
+
+def _over_time(report: Report) -> Figure:
+    """Modes, distances, errors, speeds and timing over time, one above the other."""
+    frames = report.columns.frames
+    times = report.columns.times
+    timing = report.columns.timing
+    rows = 6 if len(timing) else 5
+    figure = Figure(figsize=(10.5, 2 * rows), layout="constrained")
+    modes, *others = figure.subplots(rows, 1, sharex=True, height_ratios=(0.35, *(1,) * (rows - 1)))
+    near, errors, doubt, speed = others[:4]
+    _draw_modes(report, modes, others)
 
     is_seen = (frames["hand_ages"] >= 0).any(axis=1)
     _curve(
@@ -181,17 +200,8 @@ def _over_time(report: Report) -> Figure:
     speed.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
 
-    for late in others[4:]:
-        tick_s = (timing["tick"] - frames["tick"][0]) * report.columns.period_s
-        for name, colour, label in (
-            ("latency_us", LATENCY, "hand stamped to command published"),
-            ("work_us", WORK, "work of a tick"),
-            ("lateness_us", LATENESS, "later than its deadline"),
-        ):
-            durations_us = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
-            late.plot(*thinned(tick_s, durations_us), ".", color=colour, ms=2, label=label)
-        late.set(yscale="log", ylabel="time [µs]")
-        late.yaxis.set_major_formatter("{x:g}")
+    if len(timing):
+        _draw_timing(report, others[4])
     others[-1].set(xlabel="time since the first tick [s]")
     modes.set_ylabel("mode", rotation=0, ha="right", va="center")
     figure.align_ylabels()

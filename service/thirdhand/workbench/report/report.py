@@ -4,6 +4,7 @@ at via-points, and limits that were active.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -233,23 +234,12 @@ class Report:
         yield Figure("duration", self.lasts_s, "s", 1)
         yield Figure("missing or damaged", len(self.lacks), "times", 0)
         yield Figure("follow", self.seconds(Mode.FOLLOW), "s", 1)
-        for reason in Reason:
-            for mode in (Mode.HOLD, Mode.FAULT):
-                yield Figure(f"{word(mode)}: {word(reason)}", self.seconds(mode, reason), "s", 1)
+        for reason, mode in itertools.product(Reason, (Mode.HOLD, Mode.FAULT)):
+            yield Figure(f"{word(mode)}: {word(reason)}", self.seconds(mode, reason), "s", 1)
         yield Figure("faults", len(self.faults), "times", 0)
         yield Figure("rate", self.rate_hz, "Hz", 2)
         yield Figure("deadlines missed", self.missed, "", 0)
-        for name, percentiles, unit, digits in (
-            ("latency", self.latency_ms, "ms", 2),
-            ("lateness", self.lateness_us, "µs", 0),
-            ("work of a tick", self.work_us, "µs", 0),
-            ("tool to target, initial approach", self.initial_mm, "mm", 1),
-            ("tool to target", self.lag_mm, "mm", 1),
-        ):
-            for share, value in zip(
-                ("median", "99 %", "largest"), percentiles or (None,) * 3, strict=False
-            ):
-                yield Figure(f"{name}, {share}", value, unit, digits)
+        yield from self._durations_and_distances()
         yield Figure("closest approach", self.approach and 1000 * self.approach.distance_m, "mm", 0)
         touched = {limit.name: limit.lasts_s for limit in self.limits}
         for flag in Flag:
@@ -262,6 +252,20 @@ class Report:
             yield Figure(
                 f"via-point {name}: nearest", None if best is None else 1000 * best, "mm", 1
             )
+
+    def _durations_and_distances(self) -> Iterator[Figure]:
+        """The percentiles of timing and accuracy; None where nothing was measured."""
+        for name, percentiles, unit, digits in (
+            ("latency", self.latency_ms, "ms", 2),
+            ("lateness", self.lateness_us, "µs", 0),
+            ("work of a tick", self.work_us, "µs", 0),
+            ("tool to target, initial approach", self.initial_mm, "mm", 1),
+            ("tool to target", self.lag_mm, "mm", 1),
+        ):
+            for share, value in zip(
+                ("median", "99 %", "largest"), percentiles or (None,) * 3, strict=False
+            ):
+                yield Figure(f"{name}, {share}", value, unit, digits)
 
 
 def overview(path: Path) -> Overview:

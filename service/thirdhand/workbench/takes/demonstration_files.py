@@ -11,8 +11,8 @@ import numpy as np
 
 from thirdhand.contract.channels import JOINTS, POSE
 from thirdhand.core.frame import Vector
-from thirdhand.recordings.mcap_file import RecordingError, whole_file
-from thirdhand.recordings.mcap_reader import Messages
+from thirdhand.recordings.mcap_file import McapFile, RecordingError, whole_file
+from thirdhand.recordings.mcap_reader import Found, Messages
 from thirdhand.settings import palette
 from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import LEAST_M, Demonstration
@@ -22,6 +22,7 @@ from thirdhand.workbench.takes.hands_and_tool import chosen
 from thirdhand.workbench.takes.pose_streams import TRACK_NAMES, PoseRecording
 from thirdhand.workbench.takes.track import Track
 
+SAMPLE_TYPES = (POSE.type, JOINTS.type)  # messages of these types are trimmed
 NAME = r"\w[\w .-]{0,63}"
 GAP_S = 0.1  # after this time without a sample the daemon holds for a stale hand
 GAP_RATIO = 5.0  # nothing was seen in a gap longer than GAP_S and 5 usual gaps
@@ -283,21 +284,15 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
     rows = list(messages)
     if messages.faults:
         raise RecordingError(f"{path}: {'; '.join(map(str, messages.faults))}; it was not trimmed")
-    streams = {POSE.type, JOINTS.type}
-    times_ns = [row[2].log_time for row in rows if row[0] and row[0].name in streams] or [0]
+    samples = [row for row in rows if row[0] and row[0].name in SAMPLE_TYPES]
+    times_ns = [message.log_time for _, _, message in samples] or [0]
     begin_ns = min(times_ns)
-    lasts_s = (max(times_ns) - min(times_ns)) / 1e9
+    lasts_s = (max(times_ns) - begin_ns) / 1e9
     kept_s = [t for t in ((ns - begin_ns) / 1e9 for ns in times_ns) if start_s <= t <= end_s]
     if len(kept_s) == len(times_ns):
         return f"nothing was cut: {path} lasts {lasts_s:.1f} s"
-    joints = next(
-        (
-            len(JOINTS.decode(row[2].data).names)
-            for row in rows
-            if row[0] and row[0].name == JOINTS.type
-        ),
-        0,
-    )
+
+    joints = _count_joints(samples)
     original = uncut(path)
     existed = original.exists()
     try:
@@ -306,25 +301,10 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
                 file.writer.add_metadata(name, content)
             for name, data in messages.attachments.items():
                 file.attach(name, data, begin_ns)
-            for schema, channel, message in rows:
-                if schema is None or channel.message_encoding != "cdr":
-                    raise RecordingError(
-                        f"{path}: {channel.topic} is no stream of a take; it was not trimmed"
-                    )
-                at_s = (message.log_time - begin_ns) / 1e9
-                if schema.name not in streams or start_s <= at_s <= end_s:
-                    file.put(
-                        channel.topic, schema.name, message.data, message.log_time, message.sequence
-                    )
+            for row in rows:
+                _put_trimmed(path, file, row, begin_ns, (start_s, end_s))
             file.close()
-            try:
-                summary(file.path)
-            except RecordingError:
-                left = (
-                    f"from {start_s:g} to {end_s:g} s too little is left to learn from, so it was "
-                    "not trimmed"
-                )
-                raise RecordingError(f"{path} lasts {lasts_s:.1f} s: {left}") from None
+            _check_trimmed(path, file, lasts_s, (start_s, end_s))
             if not existed:
                 path.replace(original)
     except KeyError as error:
@@ -333,3 +313,37 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
         ) from None
     cut = f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s"
     return f"{cut}; the uncut take is {'still' if existed else 'kept as'} {original}"
+
+
+def _count_joints(samples: Sequence[Found]) -> int:
+    """The number of joints in a take's first joint state; 0 without any."""
+    for schema, _, message in samples:
+        if schema and schema.name == JOINTS.type:
+            return len(JOINTS.decode(message.data).names)
+    return 0
+
+
+def _put_trimmed(
+    path: Path, file: McapFile, row: Found, begin_ns: int, span_s: tuple[float, float]
+) -> None:
+    """Write a message of a take, unless it is a sample outside a span of time [s] from its begin.
+    Raises RecordingError for one that is not of a take's encoding.
+    """
+    schema, channel, message = row
+    if schema is None or channel.message_encoding != "cdr":
+        raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it was not trimmed")
+    start_s, end_s = span_s
+    at_s = (message.log_time - begin_ns) / 1e9
+    if schema.name not in SAMPLE_TYPES or start_s <= at_s <= end_s:
+        file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+
+
+def _check_trimmed(path: Path, file: McapFile, lasts_s: float, span_s: tuple[float, float]) -> None:
+    """Raise RecordingError if too little to learn from is left of a take of `lasts_s` [s]."""
+    try:
+        summary(file.path)
+    except RecordingError:
+        raise RecordingError(
+            f"{path} lasts {lasts_s:.1f} s: from {span_s[0]:g} to {span_s[1]:g} s too little is "
+            "left to learn from, so it was not trimmed"
+        ) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,40 +52,24 @@ def write_demonstration(
     Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
     finite, and for stamps that are not integers from 0 on.
     """
-    stamps_ns, left, right, tool = np.asarray(demonstration.stamps_ns), *demonstration[1:4]
-    if stamps_ns.dtype.kind not in "iu" or np.any(stamps_ns < 0):
-        lowest = f" from {stamps_ns.min():g} on" if stamps_ns.size else ""
-        raise ValueError(
-            f"stamps_ns: {stamps_ns.dtype}{lowest} given, integers [ns] from 0 on needed: "
-            "np.round(1e9 * seconds).astype(np.int64)"
-        )
-    poses = [np.asarray(stream, np.float64) for stream in (left, right, tool)]
-    gripper = demonstration.gripper
+    stamps_ns = np.asarray(demonstration.stamps_ns)
+    _check_stamps(stamps_ns)
     count = len(stamps_ns)
-    arrays: list[tuple[str, Vector, tuple[int, ...]]]
-    arrays = [(name, stream, (count, 7)) for name, stream in zip(_STREAMS, poses, strict=True)]
-    if demonstration.conducts != "both":
-        arrays = [
-            entry
-            for entry in arrays
-            if entry[0] in (TAKE_KEYS[demonstration.conducts], TAKE_KEYS["tool"])
-        ]
-    arrays += [] if gripper is None else [(GRIPPER_STATE, gripper, (count,))]
-    for name, stream, shape in arrays:
-        if stream.shape != shape or not np.isfinite(stream).all():
-            raise ValueError(
-                f"{name}: shape {stream.shape} given, finite numbers of shape {shape} needed"
-            )
+    poses = _poses_of(demonstration)
+    for name, stream in poses.items():
+        _check_array(name, stream, (count, 7))
+    gripper = demonstration.gripper
+    if gripper is not None:
+        _check_array(GRIPPER_STATE, gripper, (count,))
+
     with McapFile(Path(path), joints=0, attached=False) as file:
         about = {"hands": demonstration.conducts, "person": demonstration.person}
         if about := {name: word for name, word in about.items() if word not in ("both", "")}:
             file.writer.add_metadata("thirdhand", about)
-        streams = [(name, stream) for name, stream, shape in arrays if shape == (count, 7)]
-        for i, (stamp, *rows) in enumerate(
-            zip(stamps_ns.tolist(), *(stream.tolist() for _, stream in streams), strict=True)
-        ):
-            for (name, _), row in zip(streams, rows, strict=True):
-                data = cdr.encode_pose(PoseStamped(stamp, BASE, tuple(row[:3]), tuple(row[3:])))
+        for i, stamp in enumerate(stamps_ns.tolist()):
+            for name, stream in poses.items():
+                x, y, z, *quaternion = stream[i].tolist()
+                data = cdr.encode_pose(PoseStamped(stamp, BASE, (x, y, z), tuple(quaternion)))
                 file.put(topic(cell, name), POSE.type, data, stamp, i)
             if gripper is not None:
                 data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
@@ -99,6 +83,35 @@ def write_demonstration(
                 int(stamps_ns[0]),
                 0,
             )
+
+
+def _check_stamps(stamps_ns: NDArray[Any]) -> None:
+    """Raise ValueError for stamps that are not integers from 0 on."""
+    if stamps_ns.dtype.kind not in "iu" or np.any(stamps_ns < 0):
+        lowest = f" from {stamps_ns.min():g} on" if stamps_ns.size else ""
+        raise ValueError(
+            f"stamps_ns: {stamps_ns.dtype}{lowest} given, integers [ns] from 0 on needed: "
+            "np.round(1e9 * seconds).astype(np.int64)"
+        )
+
+
+def _poses_of(demonstration: Demonstration) -> dict[str, Vector]:
+    """The poses (T, 7) of the tool and of the hands that conduct it, by their keys."""
+    streams = dict(zip(TAKE_KEYS, demonstration[1:4], strict=True))
+    conducts = demonstration.conducts
+    return {
+        TAKE_KEYS[name]: np.asarray(stream, np.float64)
+        for name, stream in streams.items()
+        if conducts == "both" or name in (conducts, "tool")
+    }
+
+
+def _check_array(name: str, array: Vector, shape: tuple[int, ...]) -> None:
+    """Raise ValueError for an array of another shape, or that is not finite."""
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"{name}: shape {array.shape} given, finite numbers of shape {shape} needed"
+        )
 
 
 def read_demonstration(
@@ -122,42 +135,32 @@ def read_demonstration(
     or left out.
     """
     recorded = PoseRecording(path)
-    if settings is None and recorded.settings is None and recorded.is_ours:
-        raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
-    settings = settings or recorded.settings or Settings()
-    if any(not fault.cut for fault in recorded.faults):
-        readable = (
-            ", ".join(f"{count} poses on {source}" for source, count in recorded.streams())
-            or "no poses"
-        )
-        faults = "; ".join(map(str, recorded.faults))
-        raise RecordingError(
-            f"{path}: {faults}; {readable} can be read; nothing is learned from it"
-        )
+    settings = _settings_of(recorded, settings)
+    _check_faults(recorded)
+
+    def report(*lines: str) -> None:
+        for line in filter(None, lines):
+            say(f"{path}: {line}")
+
     selection = chosen(recorded, topics or {}, settings)
-    for fault in recorded.faults:
-        read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in selection.tracks)
-        say(f"{path}: {fault}; {read} were read")
+    read = ", ".join(f"{len(track.poses)} poses on {track.name}" for track in selection.tracks)
+    report(*(f"{fault}; {read} were read" for fault in recorded.faults))
     one_clock = by_one_clock(selection.tracks)
-    tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
+    mapped_tracks, mapped = in_base(path, [sound(track) for track in one_clock.tracks], settings)
     tracks = [
-        _near(recorded, *pair, settings) for pair in zip(tracks, one_clock.tracks, strict=True)
+        _near(recorded, *pair, settings)
+        for pair in zip(mapped_tracks, one_clock.tracks, strict=True)
     ]
-    remarks = [*selection.guessed, *_invalid_in(tracks), *mapped]
-    if remarks:
-        say(f"{path}: {'; '.join(remarks)}")
-    if one_clock.remark:
-        say(f"{path}: {one_clock.remark}")
-    tracks = [_in_order(path, track) for track in tracks]
-    common = CommonPart.of(path, tracks, selection.conducts, settings)
-    for line in common.remarks:
-        say(f"{path}: {line}")
+    report("; ".join([*selection.guessed, *_invalid_in(tracks), *mapped]), one_clock.remark)
+
+    in_order = [_in_order(path, track) for track in tracks]
+    common = CommonPart.of(path, in_order, selection.conducts, settings)
+    report(*common.remarks)
     left, right, tool = (
         _resampled(common.stamps_ns, track.stamps_ns, track.poses) for track in common.tracks
     )
     closure = recorded.closures(common.stamps_ns, logged=one_clock.logged, part=one_clock.part)
-    for line in recorded.unused:
-        say(f"{path}: {line}")
+    report(*recorded.unused)
     common.stamps_ns.setflags(write=False)
     return Demonstration(
         common.stamps_ns,
@@ -171,6 +174,29 @@ def read_demonstration(
         recorded.person,
         common.begins,
     )
+
+
+def _settings_of(recorded: PoseRecording, cell: Settings | None) -> Settings:
+    """The settings of a cell, or else those in its recording, or else the defaults. Raises
+    RecordingError if those in the recording are not valid.
+    """
+    settings = cell or recorded.settings
+    if settings is None and recorded.is_ours:
+        raise RecordingError(f"{'; '.join(recorded.unused)}; --config gives others")
+    return settings or Settings()
+
+
+def _check_faults(recorded: PoseRecording) -> None:
+    """Raise RecordingError for a damaged file, unless it was cut."""
+    if any(not fault.cut for fault in recorded.faults):
+        readable = (
+            ", ".join(f"{count} poses on {source}" for source, count in recorded.streams())
+            or "no poses"
+        )
+        faults = "; ".join(map(str, recorded.faults))
+        raise RecordingError(
+            f"{recorded.path}: {faults}; {readable} can be read; nothing is learned from it"
+        )
 
 
 class CommonPart(NamedTuple):
@@ -203,18 +229,8 @@ class CommonPart(NamedTuple):
             tracks[:2] if conducts == "both" else tracks[:1], settings, longest_s=unseen_s
         )
         (tool,) = checked(tracks[2:], settings, longest_s=tool_s)
-        remarks: list[str] = []
-        if conducts == "both":
-            shares = [hand.seen_share for hand in hands]
-            if min(shares) < MIN_SEEN_SHARE <= max(shares):
-                side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
-                hands = [max(hands, key=lambda one: one.seen_share)]
-                conducts = side
-                remarks.append(
-                    f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the "
-                    "time"
-                )
-        rows = [*hands, tool]
+        leading, conducts, remarks = _leading(hands, conducts)
+        rows = [*leading, tool]
         start_ns = max(row.start_ns for row in rows)
         end_ns = min(row.end_ns for row in rows)
         if start_ns >= end_ns:
@@ -222,24 +238,12 @@ class CommonPart(NamedTuple):
                 f"{path}: hands and tool have fewer than two stamps of the tool in common: "
                 "were they stamped by different clocks?"
             )
-        named = [
-            stretch
-            for row in rows
-            for stretch in row.stretches
-            if stretch.begin_ns < end_ns and stretch.end_ns > start_ns
-        ]
         remarks += [row.remark for row in rows if row.remark]
         stamps, begins = _left_in(tool.track.stamps_ns, rows)
-        kept_s = (
-            sum(float(np.ptp(part)) for part in np.split(stamps, begins)) / 1e9
-            if len(stamps)
-            else 0.0
-        )
-        origin_ns = min(int(track.stamps_ns[0]) for track in tracks)
+        kept_s = sum(float(np.ptp(part)) for part in np.split(stamps, begins) if len(part)) / 1e9
         span_s = (end_ns - start_ns) / 1e9
-        named.sort(key=lambda one: one.begin_ns)
-        bad = "; ".join(stretch.text(origin_ns) for stretch in named[:MAX_NAMED_STRETCHES])
-        bad += f"; and {len(named) - MAX_NAMED_STRETCHES} more" * (len(named) > MAX_NAMED_STRETCHES)
+        origin_ns = min(int(track.stamps_ns[0]) for track in tracks)
+        bad = _stretches_in(rows, start_ns, end_ns, origin_ns)
         if kept_s < MIN_USABLE_SHARE * span_s:
             raise RecordingError(
                 f"{path}: {kept_s:.1f} of {span_s:.1f} s are usable, {MIN_USABLE_SHARE:.0%} needed"
@@ -248,8 +252,38 @@ class CommonPart(NamedTuple):
             )
         if bad:
             remarks.append(f"left out, {span_s - kept_s:.1f} of {span_s:.1f} s: {bad}")
-        common_tracks = [hands[0].track, hands[-1].track, tool.track]
+        common_tracks = [leading[0].track, leading[-1].track, tool.track]
         return CommonPart(common_tracks, conducts, stamps, tuple(begins), remarks)
+
+
+def _leading(
+    hands: Sequence[Checked], conducts: Hands
+) -> tuple[Sequence[Checked], Hands, list[str]]:
+    """The hands that lead the tool, without one that is hardly seen while the other is; with a
+    remark.
+    """
+    shares = [hand.seen_share for hand in hands]
+    if not min(shares) < MIN_SEEN_SHARE <= max(shares):
+        return hands, conducts, []
+    side: Literal["left", "right"] = "left" if shares[0] > shares[1] else "right"
+    remark = f"the {side} hand leads alone: the other is seen for {min(shares):.0%} of the time"
+    return [max(hands, key=lambda hand: hand.seen_share)], side, [remark]
+
+
+def _stretches_in(rows: Sequence[Checked], start_ns: int, end_ns: int, origin_ns: int) -> str:
+    """The bad stretches of tracks between two times, in words, by their begin after an origin."""
+    stretches = sorted(
+        (
+            stretch
+            for row in rows
+            for stretch in row.stretches
+            if stretch.begin_ns < end_ns and stretch.end_ns > start_ns
+        ),
+        key=lambda stretch: stretch.begin_ns,
+    )
+    more = len(stretches) - MAX_NAMED_STRETCHES
+    named = "; ".join(stretch.text(origin_ns) for stretch in stretches[:MAX_NAMED_STRETCHES])
+    return named + f"; and {more} more" * (more > 0)
 
 
 def _left_in(
@@ -258,24 +292,24 @@ def _left_in(
     """The tool's stamps [ns] at which all tracks are seen, without pieces that are too short, and
     the indices of the first stamps after the stretches that are left out.
     """
-    start_ns = max(
-        (int(row.track.stamps_ns[0]) if len(row.track.stamps_ns) else 2**62) for row in rows
-    )
-    end_ns = min(
-        (int(row.track.stamps_ns[-1]) if len(row.track.stamps_ns) else -(2**62)) for row in rows
-    )
-    stamps = stamps[(stamps >= start_ns) & (stamps <= end_ns)]
+    begins_ns, ends_ns = zip(*(_span_ns(row.track) for row in rows), strict=True)
+    stamps = stamps[(stamps >= max(begins_ns)) & (stamps <= min(ends_ns))]
     holes = [hole for row in rows for hole in row.stretches]
     for hole in holes:
         stamps = stamps[(stamps <= hole.begin_ns) | (stamps >= hole.end_ns)]
     cuts = sorted({int(np.searchsorted(stamps, hole.end_ns)) for hole in holes} - {0, len(stamps)})
-    pieces = [
-        piece
-        for piece in np.split(stamps, cuts)
-        if not cuts or (len(piece) and np.ptp(piece) >= round(1e9 * LEAST_PIECE_S))
-    ]
+    pieces = np.split(stamps, cuts)
+    if cuts:
+        least_ns = round(1e9 * LEAST_PIECE_S)
+        pieces = [piece for piece in pieces if len(piece) and np.ptp(piece) >= least_ns]
     begins = np.cumsum([len(piece) for piece in pieces])[:-1].tolist()
     return np.concatenate(pieces) if pieces else stamps[:0], begins
+
+
+def _span_ns(track: Track) -> tuple[int, int]:
+    """The first and the last stamp [ns] of a track; without stamps, an end far before the begin."""
+    stamps_ns = track.stamps_ns
+    return (int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else (2**62, -(2**62))
 
 
 def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settings) -> Track:
@@ -440,6 +474,11 @@ def _resampled(
     return out
 
 
+def _hand_key(topic: str) -> str:
+    """The key of the hand with which a topic ends; empty for another topic."""
+    return next((key for key in _STREAMS[:2] if f"/{topic}".endswith(f"/{key}")), "")
+
+
 def hand_samples(
     path: str | Path, *, say: Callable[[str], None] = lambda line: None
 ) -> list[tuple[int, str, PoseStamped]]:
@@ -459,7 +498,7 @@ def hand_samples(
         topic = channel.topic
         kind = type_of(schema, channel)
         types.setdefault(topic, kind)
-        name = next((name for name in _STREAMS[:2] if f"/{topic}".endswith(f"/{name}")), "")
+        name = _hand_key(topic)
         if not name or kind != POSE.type:
             continue
         if topics.setdefault(name, topic) != topic:

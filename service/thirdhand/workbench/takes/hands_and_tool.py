@@ -48,20 +48,8 @@ def chosen(
     be computed from joint states. If only one hand is found, it leads alone. Raises RecordingError.
     """
     guessed: list[str] = []
-    sources: dict[str, PoseTopic] = {}
+    sources = _hands(recorded, given, guessed)
     conducts = recorded.conducts
-    for name in TRACK_NAMES[:2]:
-        if conducts not in ("both", name):
-            continue
-        source = _given(recorded, name, given[name]) if name in given else by_ending(recorded, name)
-        if source is None and (source := _by_words(recorded, name)):
-            guessed.append(f"{name} is {source}")
-        if source is not None:
-            sources[name] = source
-    if not sources:
-        raise _not_found(recorded, conducts.replace("both", "left"), [])
-    if len(set(sources.values())) < len(sources):
-        sources = _side_of_the_one(recorded, sources["left"])
     if len(sources) == 1:
         (conducts,) = (name for name in get_args(Hands) if name in sources)
         other = TRACK_NAMES[1 - TRACK_NAMES.index(conducts)]
@@ -72,9 +60,34 @@ def chosen(
         )
         guessed.append(f"the {conducts} hand leads alone{hint}")
     hands = [recorded.track(TAKE_KEYS[name], source, settings) for name, source in sources.items()]
-    return HandsAndTool(
-        [hands[0], hands[-1], _tool(recorded, given, settings, guessed)], conducts, guessed
-    )
+    tool = _tool(recorded, given, settings, guessed)
+    return HandsAndTool([hands[0], hands[-1], tool], conducts, guessed)
+
+
+def _hands(
+    recorded: PoseRecording, given: Mapping[str, PoseTopic], guessed: list[str]
+) -> dict[str, PoseTopic]:
+    """The streams of the hands that lead the tool, by side; remarks on guesses are appended to
+    `guessed`. Raises RecordingError without any.
+    """
+    conducts = recorded.conducts
+    sources: dict[str, PoseTopic] = {}
+    for name in TRACK_NAMES[:2] if conducts == "both" else (conducts,):
+        source = _named(recorded, name, given)
+        if source is None and (source := _by_words(recorded, name)):
+            guessed.append(f"{name} is {source}")
+        if source is not None:
+            sources[name] = source
+    if not sources:
+        raise _not_found(recorded, conducts.replace("both", "left"), [])
+    if len(set(sources.values())) < len(sources):
+        return _side_of_the_one(recorded, sources["left"])
+    return sources
+
+
+def _named(recorded: PoseRecording, name: str, given: Mapping[str, PoseTopic]) -> PoseTopic | None:
+    """The stream that is `given`, or else that with the end of the service's own name."""
+    return _given(recorded, name, given[name]) if name in given else by_ending(recorded, name)
 
 
 def _side_of_the_one(recorded: PoseRecording, source: PoseTopic) -> dict[str, PoseTopic]:
@@ -94,9 +107,7 @@ def _tool(
     recorded: PoseRecording, given: Mapping[str, PoseTopic], settings: Settings, guessed: list[str]
 ) -> Track:
     """The tool's track; a remark on a guess is appended to `guessed`. Raises RecordingError."""
-    source = (
-        _given(recorded, "tool", given["tool"]) if "tool" in given else by_ending(recorded, "tool")
-    )
+    source = _named(recorded, "tool", given)
     joints = source.topic if source and recorded.topics[source.topic] == JOINTS.type else ""
     joints = recorded.joint_topic(settings) if source is None else joints
     if joints:
@@ -117,10 +128,11 @@ def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
     topic = next(
         (topic for topic in recorded.topics if topic.strip("/") == wanted.topic.strip("/")), ""
     )
-    if topic and recorded.topics[topic] == JOINTS.type and name == "tool":
+    kind = recorded.topics[topic] if topic else ""
+    if kind == JOINTS.type and name == "tool":
         return PoseTopic(topic)
-    if not topic or recorded.topics[topic] not in POSE_TYPES:
-        problem = f"a topic of type {recorded.topics[topic]}" if topic else "no topic there"
+    if kind not in POSE_TYPES:
+        problem = f"a topic of type {kind}" if topic else "no topic there"
         raise RecordingError(
             f"{recorded.path}: --{name} {wanted}: {problem}; {_poses_in(recorded)}"
         )
@@ -129,9 +141,15 @@ def _given(recorded: PoseRecording, name: str, wanted: PoseTopic) -> PoseTopic:
         return PoseTopic(topic, wanted.part)
     if len(parts) == 1 and not wanted.part:
         return PoseTopic(topic, parts[0])
-    part_kind = "an index" if recorded.topics[topic] == POSE_ARRAY else "a child frame"
-    needed = f"{part_kind} needed, one of {', '.join(parts)}" if any(parts) else "it has no parts"
-    raise RecordingError(f"{recorded.path}: --{name} {wanted}: {needed}")
+    raise RecordingError(f"{recorded.path}: --{name} {wanted}: {_needed(kind, parts)}")
+
+
+def _needed(kind: str, parts: Sequence[str]) -> str:
+    """The parts that a topic of this type has, in words."""
+    if not any(parts):
+        return "it has no parts"
+    part_kind = "an index" if kind == POSE_ARRAY else "a child frame"
+    return f"{part_kind} needed, one of {', '.join(parts)}"
 
 
 def by_ending(recorded: PoseRecording, name: str) -> PoseTopic | None:
@@ -157,19 +175,21 @@ def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:
     """The stream with a word of TRACK_WORDS in its name; None if there is none. Raises
     RecordingError if there are several.
     """
-    others = {word for other in TRACK_NAMES[:2] if other != name for word in TRACK_WORDS[other]}
-    streams = [] if recorded.is_ours else [source for source, _ in recorded.streams()]
-    words = {source: _words(str(source)) for source in streams}
-    fitting = [
-        source
-        for source in streams
-        if words[source] & TRACK_WORDS[name] and not words[source] & others
-    ]
+    if recorded.is_ours:
+        return None
+    fitting = [source for source, _ in recorded.streams() if _has_words(source, name)]
     if len(fitting) > 1 and name != "tool":
-        fitting = [source for source in fitting if words[source] & HAND_WORDS] or fitting
+        fitting = [source for source in fitting if _words(str(source)) & HAND_WORDS] or fitting
     if len(fitting) > 1:
         raise _not_found(recorded, name, fitting)
     return fitting[0] if fitting else None
+
+
+def _has_words(source: PoseTopic, name: str) -> bool:
+    """True if a stream has a word of this track in its name, and none of another hand."""
+    words = _words(str(source))
+    others = {word for hand in TRACK_NAMES[:2] if hand != name for word in TRACK_WORDS[hand]}
+    return bool(words & TRACK_WORDS[name]) and not words & others
 
 
 def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic]) -> RecordingError:

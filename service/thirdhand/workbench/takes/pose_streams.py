@@ -42,6 +42,8 @@ from thirdhand.workbench.takes.tool_poses import tool_poses
 from thirdhand.workbench.takes.track import Track, clock_parts
 
 Value = TypeVar("Value")
+StampedJoints = tuple[int, int, tuple[float, ...]]
+"""Time of recording [ns], stamp [ns] and positions of a joint state."""
 TRACK_NAMES = ("left", "right", "tool")
 JOINT_STATES = "joints/state"
 GRIPPER_STATE = "gripper/state"
@@ -204,6 +206,27 @@ class PoseRecording:
         from rosbags.rosbag1 import Reader as Ros1Reader
         from rosbags.rosbag2 import Reader as Ros2Reader
 
+        self._check_folder()
+        has_metadata = (self.path / "metadata.yaml").exists()
+        files = [self._existing()] if not self.path.is_dir() else sorted(self.path.glob("*.db3"))
+        for file in (*files, *self.path.glob("*.mcap")):
+            begin_of(file)
+        is_killed = any(Path(f"{file}-wal").exists() for file in files)
+        is_ros_1 = self.path.suffix == ".bag"
+        is_database = files and not is_ros_1 and (is_killed or not has_metadata)
+        try:
+            if is_database:
+                for file in files:
+                    self._read_sqlite(file)
+                return
+            with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
+                self._read_messages(bag)
+            self._ros_1_topics = set(self.topics) if is_ros_1 else set()
+        except Exception as error:  # the exceptions of the bags' storages have no common base
+            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
+
+    def _check_folder(self) -> None:
+        """Raise RecordingError for a folder that is no bag."""
         if (self.path / "meta" / "info.json").exists():
             raise RecordingError(
                 f"{self.path} is a data set of LeRobot, whose columns do not name hands and tool. "
@@ -214,32 +237,19 @@ class PoseRecording:
             raise RecordingError(
                 f"{self.path} is a folder without metadata.yaml: give its files, {self.path}/*.mcap"
             )
-        files = [self._existing()] if not self.path.is_dir() else sorted(self.path.glob("*.db3"))
-        for file in (*files, *self.path.glob("*.mcap")):
-            begin_of(file)
-        is_killed = any(Path(f"{file}-wal").exists() for file in files)
-        try:
-            is_ros_1 = self.path.suffix == ".bag"
-            if files and not is_ros_1 and (is_killed or not has_metadata):
-                for file in files:
-                    self._read_sqlite(file)
-                return
-            with (Ros1Reader if is_ros_1 else Ros2Reader)(self.path) as bag:
-                self.topics = {
-                    connection.topic: connection.msgtype for connection in bag.connections
-                }
-                self._ros_1_topics = set(self.topics) if is_ros_1 else set()
-                connections = [
-                    connection
-                    for connection in bag.connections
-                    if connection.msgtype in (*POSE_TYPES, JOINTS.type)
-                ]
-                for connection, logged_ns, data in (
-                    bag.messages(connections=connections) if connections else ()
-                ):
-                    self._raw.setdefault(connection.topic, []).append((logged_ns, bytes(data)))
-        except Exception as error:  # the exceptions of the bags' storages have no common base
-            raise RecordingError(f"{self.path} is not a bag that can be read: {error}.") from None
+
+    def _read_messages(self, bag: Any) -> None:
+        """Read the topics of an open bag, and the messages of poses and joints."""
+        self.topics = {connection.topic: connection.msgtype for connection in bag.connections}
+        connections = [
+            connection
+            for connection in bag.connections
+            if connection.msgtype in (*POSE_TYPES, JOINTS.type)
+        ]
+        for connection, logged_ns, data in (
+            bag.messages(connections=connections) if connections else ()
+        ):
+            self._raw.setdefault(connection.topic, []).append((logged_ns, bytes(data)))
 
     def _read_sqlite(self, file: Path) -> None:
         """Read a `.db3`, and what a recorder that was killed has left in its `-wal`."""
@@ -357,8 +367,7 @@ class PoseRecording:
             return None
         states = list(self._joint_states(topics[0])) if topics else []
         if part is not None:
-            parts = clock_parts(np.array([stamp_ns for _, stamp_ns, _ in states], np.int64))
-            states = [states[i] for i in parts[min(part, len(parts) - 1)]]
+            states = _part_of(states, part)
         closure_at = {
             logged_ns if logged else stamp_ns: position[0]
             for logged_ns, stamp_ns, position in states
@@ -369,21 +378,10 @@ class PoseRecording:
                 f"{len(states) - len(closure_at)} of {len(states)} states of the gripper have no "
                 "position"
             )
-        if not closure_at:
-            return None
-        state_ns = np.array(sorted(closure_at), np.int64)
-        times = (
-            (stamps - state_ns[0]).astype(np.float64),
-            (state_ns - state_ns[0]).astype(np.float64),
-        )
-        out: Vector = np.interp(*times, [closure_at[i] for i in state_ns.tolist()])
-        out.setflags(write=False)
-        return out
+        return _interpolated(closure_at, stamps) if closure_at else None
 
-    def _joint_states(
-        self, topic: str, names: tuple[str, ...] = ()
-    ) -> Iterator[tuple[int, int, tuple[float, ...]]]:
-        """Time of recording [ns], stamp [ns] and positions of each joint state.
+    def _joint_states(self, topic: str, names: tuple[str, ...] = ()) -> Iterator[StampedJoints]:
+        """Each joint state of a topic.
 
         With `names`, these joints only, which may be spread over several messages. Raises
         RecordingError.
@@ -424,6 +422,24 @@ class PoseRecording:
                 with contextlib.suppress(RecordingError):  # other topics may be readable
                     for part, (stamps, *_) in self.tracks(topic).items():
                         yield PoseTopic(topic, part), len(stamps)
+
+
+def _part_of(states: Sequence[StampedJoints], part: int) -> list[StampedJoints]:
+    """The states in one part of their messages, whose clock restarts, or else in the last part."""
+    parts = clock_parts(np.array([stamp_ns for _, stamp_ns, _ in states], np.int64))
+    return [states[i] for i in parts[min(part, len(parts) - 1)]]
+
+
+def _interpolated(closure_at: Mapping[int, float], stamps: NDArray[np.int64]) -> Vector:
+    """The closure (T,) at stamps (T,) [ns], read-only, from those at some stamps."""
+    state_ns = np.array(sorted(closure_at), np.int64)
+    times = (
+        (stamps - state_ns[0]).astype(np.float64),
+        (state_ns - state_ns[0]).astype(np.float64),
+    )
+    out: Vector = np.interp(*times, [closure_at[i] for i in state_ns.tolist()])
+    out.setflags(write=False)
+    return out
 
 
 def type_of(schema: Schema | None, channel: Channel, read: Sequence[str] = ("cdr",)) -> str:

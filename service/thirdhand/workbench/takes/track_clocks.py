@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.takes.track import Track, clock_parts
@@ -33,33 +34,45 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
     """
     if not all(len(track.poses) for track in tracks):
         return OneClock(list(tracks))
-    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
-    anew = list(dict.fromkeys(track.name for track in tracks if not _is_steady(track)))
-    is_apart = max(ahead_s) - min(ahead_s) > LARGEST_DELAY_S
-    if (anew or is_apart) and _are_usable(tracks):
-        clocks = ", ".join(
-            f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True)
-        )
-        why = f"stamps come from different clocks (relative to the recorder: {clocks})"
-        if anew:
-            why = f"the clock of {', '.join(anew)} restarts or was set"
+    why = _clocks_differ(tracks)
+    if why and _are_usable(tracks):
         logged = [track._replace(stamps_ns=track.logged_ns) for track in tracks]
         return OneClock(
             logged, logged=True, remark=f"{why}; the times of recording are used instead"
         )
     parts = [clock_parts(track.stamps_ns) for track in tracks]
-    counts = [len(track_parts) for track_parts in parts]
-    if max(counts) == 1:
+    if max(map(len, parts)) == 1:
         return OneClock(list(tracks))
-    part = 0  # in the first part, no clock has restarted
+    return _longest_part(tracks, parts)
+
+
+def _clocks_differ(tracks: Sequence[Track]) -> str:
+    """The reason why stamps are not of one clock; empty if they may be."""
+    anew = dict.fromkeys(track.name for track in tracks if not _is_steady(track))
+    if anew:
+        return f"the clock of {', '.join(anew)} restarts or was set"
+    ahead_s = [float(np.median(track.stamps_ns - track.logged_ns)) / 1e9 for track in tracks]
+    if max(ahead_s) - min(ahead_s) <= LARGEST_DELAY_S:
+        return ""
+    clocks = ", ".join(
+        f"{track.name} by {ahead:+.3f} s" for track, ahead in zip(tracks, ahead_s, strict=True)
+    )
+    return f"stamps come from different clocks (relative to the recorder: {clocks})"
+
+
+def _longest_part(tracks: Sequence[Track], parts: Sequence[Sequence[NDArray[np.intp]]]) -> OneClock:
+    """The longest of the parts without a restart that all tracks have, or else the first part, in
+    which no clock has restarted.
+    """
+    counts = [len(track_parts) for track_parts in parts]
+    part = 0
     if len(set(counts)) == 1:
-        part = int(
-            np.argmax([sum(len(track_parts[i]) for track_parts in parts) for i in range(counts[0])])
-        )
+        lengths = [sum(map(len, same_part)) for same_part in zip(*parts, strict=True)]
+        part = int(np.argmax(lengths))
     part_tracks = [
         track.at(track_parts[part]) for track, track_parts in zip(tracks, parts, strict=True)
     ]
-    left = sum(len(track.stamps_ns) for track in tracks) - sum(
+    omitted = sum(len(track.stamps_ns) for track in tracks) - sum(
         len(track.stamps_ns) for track in part_tracks
     )
     whose = ", ".join(
@@ -68,7 +81,7 @@ def by_one_clock(tracks: Sequence[Track]) -> OneClock:
     lasts_s = max(float(np.ptp(track.stamps_ns)) for track in part_tracks) / 1e9
     remark = (
         f"the clock of {whose} restarts, and the times of recording do too: part {part + 1} of "
-        f"{max(counts)} is used, which lasts {lasts_s:.1f} s; {left} poses are left out"
+        f"{max(counts)} is used, which lasts {lasts_s:.1f} s; {omitted} poses are left out"
     )
     return OneClock(part_tracks, part=part, remark=remark)
 
