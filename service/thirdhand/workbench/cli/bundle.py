@@ -49,16 +49,10 @@ def bundle(args: argparse.Namespace) -> int:
     texts = _texts(args, settings)
     folder = (settings.files.record if settings else "") or _recorded_into(texts["status.json"])
     candidates = named_after(args.cell, Path(folder)) if folder else []
-    after_s = time.time() - 60 * args.minutes
-    recordings = [file for file in candidates if file.stat().st_mtime > after_s] or candidates[-1:]
-
+    recordings = _newest(candidates, args.minutes)
     about = _contents(texts, recordings)
     if not candidates:
-        unnamed = (
-            f"neither a daemon that records nor {'[files] record' if settings else '--config'} "
-            "names their folder"
-        )
-        about += f"no recordings of cell {args.cell}: {f'in {folder}' if folder else unnamed}\n"
+        about += f"no recordings of cell {args.cell}: {_unfound(folder, settings)}\n"
     texts["README.txt"] = HEAD + about
     _write(path, {name: without_keys(text) for name, text in texts.items()}, recordings)
     print(f"{path}, {path.stat().st_size / MB:.1f} MB, holds\n{about}", end="")
@@ -88,6 +82,20 @@ def _recorded_into(status_text: str) -> str:
     with contextlib.suppress(msgspec.DecodeError, KeyError, TypeError):
         return str(Path(msgspec.json.decode(status_text)["scribe"]["recording"]).parent)
     return ""
+
+
+def _newest(recordings: Sequence[Path], minutes: float) -> Sequence[Path]:
+    """The recordings that were written in the last minutes, or else the last one."""
+    after_s = time.time() - 60 * minutes
+    return [file for file in recordings if file.stat().st_mtime > after_s] or recordings[-1:]
+
+
+def _unfound(folder: str, settings: Settings | None) -> str:
+    """Where no recordings were found."""
+    if folder:
+        return f"in {folder}"
+    origin = "[files] record" if settings else "--config"
+    return f"neither a daemon that records nor {origin} names their folder"
 
 
 def _contents(texts: Mapping[str, str], recordings: Sequence[Path]) -> str:
@@ -138,7 +146,7 @@ def _log(args: argparse.Namespace) -> str:
     return (done.stdout + done.stderr).decode(errors="replace")
 
 
-def _write(path: Path, texts: dict[str, str], recordings: list[Path]) -> None:
+def _write(path: Path, texts: dict[str, str], recordings: Sequence[Path]) -> None:
     """Write the archive whole or not at all; a recording that still grows is cut."""
     with whole(path) as part:
         private = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)

@@ -56,16 +56,17 @@ HINT_S = 5.0  # progress without a terminal is shown in this interval
 def calibrate(args: argparse.Namespace) -> int:
     """Calibrate, check, or both. Exit code 0; 1 if the check finds a hand too far away."""
     points = points_given(args)
-    file = Path(args.config) if args.config and args.config not in ARMS else None
+    file = _cell_file(args)
     only_check = args.check and not (args.held or points)
-    if file is not None and not only_check:
-        real_path(file)  # before the arm is led in vain
-    settings = cell_of(args.config) if args.config else None
-    if only_check and file is None:
+    if not only_check:
+        if file is not None:
+            real_path(file)  # before the arm is led in vain
+    elif file is None:
         raise UsageError(
             "--check compares with the last calibration of a cell: give its settings by --config "
             "FILE"
         )
+    settings = cell_of(args.config) if args.config else None
     if args.recording is not None:
         return _from_recording(settings, file, only_check, args)
     settings = settings or Settings()
@@ -74,6 +75,11 @@ def calibrate(args: argparse.Namespace) -> int:
         contextlib.closing(LiveLed(session, args.cell or settings.cell, settings)) as live,
     ):
         return _live(live, settings, file, points, only_check, args)
+
+
+def _cell_file(args: argparse.Namespace) -> Path | None:
+    """The file of the cell's settings; None for a shipped cell, or none."""
+    return Path(args.config) if args.config and args.config not in ARMS else None
 
 
 def _from_recording(

@@ -12,7 +12,7 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import zenoh
 
 from thirdhand.client import Client, Tracker, UnreachableError, no_room_to_brake, open_session
 from thirdhand.contract.explain import ExplainedError, in_words
-from thirdhand.contract.requests import Add, Status, decode_request
+from thirdhand.contract.requests import Add, Reply, Status, decode_request
 from thirdhand.daemon.launch import engine_of, launched, played
 from thirdhand.daemon.machine import LATE_LOOP_MS, MISSED_SHARE
 from thirdhand.process.child import python
@@ -61,29 +61,47 @@ class DemoError(ExplainedError):
 def demo(args: argparse.Namespace) -> int:
     """Run the demo, print its report and return its exit code."""
     page = web_address("--mouse", args.mouse) if args.mouse is not None else None
-    busy_rate_hz = SLOW_RATE_HZ if args.rate is None and args.arm in ARMS else args.rate
+    busy_rate_hz = _busy_rate_hz(args)
     rate_hz = busy_rate_hz if page or args.open else args.rate
     for left in reversed(range(DEMO_ATTEMPTS)):
         before = set(args.output.glob("*.mcap"))
+        is_last = page is not None or not left
         try:
             report = run(args, rate_hz, page)
         except UnreachableError as error:
-            if page or not left:
+            if is_last:
                 raise
             reason = in_words(error)
         else:
-            if page or report["success"] or report["missing"] or not report["busy"] or not left:
+            reason = _too_busy_for(report)
+            if is_last or not reason:
                 break
-            reason = f"the task failed on a machine that was too busy, {report['busy']}"
         rate_hz = busy_rate_hz
         say(f"{reason}: it is tried again" + f" at {rate_hz} Hz" * (rate_hz is not None))
-        aside = args.output / TOO_BUSY
-        aside.mkdir(exist_ok=True)
-        for recording in set(args.output.glob("*.mcap")) - before:
-            shutil.move(recording, aside)
+        _set_aside(args.output, before)
     report["rrd"] = _drawn(Path(report["recording"]))
     print(json.dumps(report, indent=2) if args.json else text(report))
     return exit_code(report)
+
+
+def _busy_rate_hz(args: argparse.Namespace) -> int | None:
+    """The rate on a machine that is too busy; None for that of the cell."""
+    rate_hz: int | None = args.rate
+    return SLOW_RATE_HZ if rate_hz is None and args.arm in ARMS else rate_hz
+
+
+def _set_aside(folder: Path, before: Set[Path]) -> None:
+    """Move the recordings that were not there before into a folder of their own."""
+    aside = folder / TOO_BUSY
+    aside.mkdir(exist_ok=True)
+    for recording in set(folder.glob("*.mcap")) - before:
+        shutil.move(recording, aside)
+
+
+def _too_busy_for(report: dict[str, Any]) -> str:
+    """The reason why a task that failed is tried again; empty if the machine is not the cause."""
+    is_valid = report["success"] or report["missing"] or not report["busy"]
+    return "" if is_valid else f"the task failed on a machine that was too busy, {report['busy']}"
 
 
 def _drawn(recording: Path) -> str | None:
@@ -127,11 +145,7 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
         with open_session(connect=[service.endpoint]) as session:
             client = Client(session)
             reply = client.add(add.points, tolerance=add.tolerance)
-            names = ", ".join(
-                f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)"
-                for point in reply.points or ()
-            )
-            say(f"taught while it runs, in force since tick {reply.tick}: {names}")
+            say(f"taught while it runs, in force since tick {reply.tick}: {_missed_by(reply)}")
             bench = [
                 "--engine",
                 engine,
@@ -158,6 +172,14 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
         if code != 0 and not missing:
             raise DemoError(f"the service ended with code {code}; its log is {service.log}")
     return _report(report, status) | {"missing": missing}
+
+
+def _missed_by(reply: Reply) -> str:
+    """The via-points in a reply, each with the distance by which the skill misses it."""
+    return ", ".join(
+        f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)"
+        for point in reply.points or ()
+    )
 
 
 @contextlib.contextmanager
@@ -306,21 +328,7 @@ def _percentiles(values: Any) -> dict[str, float]:
 
 def text(report: dict[str, Any]) -> str:
     """The report in text, with each cause of a failure once."""
-    lines = list[str]()
-    causes = list[str]()
-    for name, title in EVENT_TITLES.items():
-        event = report["events"][name]
-        if event["error_mm"] is None:
-            lines.append(f"  {title:<26} {'MISSED':>27}")
-            lines.append(f"      because {event['why']}")
-            continue
-        outcome = "reached" if event["reached"] else "MISSED"
-        lines.append(
-            f"  {title:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}"
-        )
-        if why := event.get("why"):
-            lines.append("      for the same reason" if why in causes else f"      because {why}")
-            causes.append(why)
+    lines, causes = _events(report["events"])
     busy = ", ".join(part for part in report["busy"].split(", ") if part not in " ".join(causes))
     latency = report["latency_ms"]
     late = report["lateness_us"]
@@ -345,6 +353,26 @@ def text(report: dict[str, Any]) -> str:
         else "The task failed: see the events marked MISSED.",
     ]
     return "\n".join(lines)
+
+
+def _events(events: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """The events in text, and the causes of those that were missed."""
+    lines = list[str]()
+    causes = list[str]()
+    for name, title in EVENT_TITLES.items():
+        event = events[name]
+        if event["error_mm"] is None:
+            lines.append(f"  {title:<26} {'MISSED':>27}")
+            lines.append(f"      because {event['why']}")
+            continue
+        outcome = "reached" if event["reached"] else "MISSED"
+        lines.append(
+            f"  {title:<26} {event['error_mm']:5.1f} mm  at {event['time_s']:4.1f} s   {outcome}"
+        )
+        if why := event.get("why"):
+            lines.append("      for the same reason" if why in causes else f"      because {why}")
+            causes.append(why)
+    return lines, causes
 
 
 def _shown(path: str) -> str:

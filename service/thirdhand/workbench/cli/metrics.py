@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from wsgiref.simple_server import WSGIServer
 
@@ -83,6 +83,28 @@ def exposed(statuses: Mapping[str, Status | None]) -> Iterable[Metric]:
     return families.values()
 
 
+def _codes(now: Status) -> Iterator[Figure]:
+    """Figures of all modes, reasons and flags: 1 for those that are present, or else 0."""
+    present: tuple[tuple[str, Sequence[str], Any], ...] = (
+        ("mode", [now.mode], Mode),
+        ("reason", [now.reason], Reason),
+        ("flag", now.flags, Flag),
+    )
+    for kind, words, codes in present:
+        for name in filter(None, map(word, codes)):
+            yield kind, f"1 for each {kind} that is present.", name in words, {kind: name}
+
+
+def _sources(now: Status) -> Iterator[Figure]:
+    """The rate and the age of each source."""
+    for name, source in now.sources.items():
+        labels = {"source": name}
+        about = "Messages of a source in the last second."
+        yield "source_rate_hertz", about, source.rate_hz, labels
+        age_s = None if source.age_ms is None else 1e-3 * source.age_ms
+        yield "source_age_seconds", "Age of a source's newest accepted sample.", age_s, labels
+
+
 def _figures(now: Status) -> Iterator[Figure]:
     """The figures of a status, with 0 for modes, reasons and flags that are not present."""
     yield (
@@ -91,13 +113,7 @@ def _figures(now: Status) -> Iterator[Figure]:
         1,
         {"version": now.version, "skill": now.skill},
     )
-    present: dict[str, tuple[Any, Any]] = {
-        "mode": ([now.mode], Mode),
-        "reason": ([now.reason], Reason),
-    }
-    for kind, (words, codes) in (present | {"flag": (now.flags, Flag)}).items():
-        for name in filter(None, map(word, codes)):
-            yield kind, f"1 for each {kind} that is present.", name in words, {kind: name}
+    yield from _codes(now)
     if now.segment:
         segment = dict(zip(("begin", "end"), now.segment, strict=False))
         yield (
@@ -119,20 +135,7 @@ def _figures(now: Status) -> Iterator[Figure]:
             yield f"{name[:-3]}_seconds", about, unit_s * value, {"percentile": percentile}
     for cause, count in now.rejected.items():
         yield "rejected_samples_total", "Rejected samples of all sources.", count, {"cause": cause}
-    for name, source in now.sources.items():
-        yield (
-            "source_rate_hertz",
-            "Messages of a source in the last second.",
-            source.rate_hz,
-            {"source": name},
-        )
-        age_s = None if source.age_ms is None else 1e-3 * source.age_ms
-        yield (
-            "source_age_seconds",
-            "Age of a source's newest accepted sample.",
-            age_s,
-            {"source": name},
-        )
+    yield from _sources(now)
     for process, memory_mb in now.memory_mb.items():
         yield "memory_bytes", "Resident memory of a process.", 1e6 * memory_mb, {"process": process}
     scribe = now.scribe

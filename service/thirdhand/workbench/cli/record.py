@@ -30,7 +30,7 @@ from thirdhand.workbench.takes.demonstration_files import (
     trim,
     uncut,
 )
-from thirdhand.workbench.trackers.capture import capture
+from thirdhand.workbench.trackers.capture import Capture, capture
 
 LONGEST_PERSON = 64  # [characters]
 
@@ -39,25 +39,14 @@ def record(args: argparse.Namespace) -> int:
     """Capture, show, trim, list or delete takes. Exit code 0; 1 if --list finds an unusable
     take.
     """
-    if args.list == (args.name is not None):
-        raise UsageError("either the name of a take or --list needed")
-    if args.name is not None:
-        try:
-            path_of(args.folder, args.name)
-        except DemonstrationNameError as error:
-            raise UsageError(str(error)) from None
+    _check_usage(args)
     settings = cell_of(str(args.config)) if args.config else None
     if args.plot is not None:
         check_writable(args.plot, ".png")
     if args.list:
         return _list(args.folder, settings)
     if args.delete:
-        path = existing_path(args.folder, args.name)
-        deleted = [path, *([uncut(path)] if uncut(path).exists() else [])]
-        for file in deleted:
-            file.unlink()
-        print(f"deleted: {', '.join(map(str, deleted))}")
-        return 0
+        return _delete(existing_path(args.folder, args.name))
     if args.trim is not None:
         start_s, end_s = args.trim
         if not 0 <= start_s < end_s:
@@ -73,6 +62,26 @@ def record(args: argparse.Namespace) -> int:
     if args.plot is not None:
         draw(take_summary, args.plot)
         print(f"{args.plot} drawn", file=sys.stderr)
+    return 0
+
+
+def _check_usage(args: argparse.Namespace) -> None:
+    """Raise UsageError unless either a valid name of a take or --list is given."""
+    if args.list == (args.name is not None):
+        raise UsageError("either the name of a take or --list needed")
+    if args.name is not None:
+        try:
+            path_of(args.folder, args.name)
+        except DemonstrationNameError as error:
+            raise UsageError(str(error)) from None
+
+
+def _delete(path: Path) -> int:
+    """Delete a take and its original; the exit code."""
+    deleted = [path, *([uncut(path)] if uncut(path).exists() else [])]
+    for file in deleted:
+        file.unlink()
+    print(f"deleted: {', '.join(map(str, deleted))}")
     return 0
 
 
@@ -141,6 +150,11 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     if sys.stderr.isatty():
         print(file=sys.stderr)
     captured.write(path, via_points)
+    _report_omitted(captured)
+
+
+def _report_omitted(captured: Capture) -> None:
+    """Print the numbers of messages that a take does not hold."""
     for key, count in captured.malformed.items():
         print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
     for key, count in captured.of_others.items():

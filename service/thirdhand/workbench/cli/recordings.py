@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 
@@ -22,14 +23,16 @@ from thirdhand.recordings.mcap_file import ends_early
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay as replayed
 from thirdhand.recordings.shipped import cell_of
+from thirdhand.settings.config import Settings
 from thirdhand.settings.whole_file import whole
+from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.residual_risk import LONGEST_NAME, OPTION
-from thirdhand.skills.skill_file import skill_in, unusable_name
+from thirdhand.skills.skill_file import StoredSkill, skill_in, unusable_name
 from thirdhand.skills.stored_demonstrations import stored_demonstrations
 from thirdhand.workbench.cli.many_files import of_each
 from thirdhand.workbench.learning.learn import learn as learned
 from thirdhand.workbench.learning.picture import draw
-from thirdhand.workbench.learning.records import Evidence
+from thirdhand.workbench.learning.records import Evidence, Figures
 from thirdhand.workbench.learning.table import table
 from thirdhand.workbench.learning.takes import check_count
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
@@ -128,44 +131,22 @@ def _replay_each(args: argparse.Namespace) -> int:
 
 def learn(args: argparse.Namespace) -> int:
     """Learn a skill; exit code 0 once it is written. An unsafe skill is not written."""
-    check_writable(args.output, ".npz")
-    if args.plot:
-        check_writable(args.plot, ".png")
     accepted_by = (args.accept_residual_risk or "").strip()
-    if len(accepted_by) > LONGEST_NAME:
-        raise UsageError(
-            f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted"
-        )
     name = args.output.stem if args.name is None else args.name
-    if lacking := unusable_name(name):
-        raise UsageError(f"--{lacking}")
+    _check_outputs(args, name, accepted_by)
+    names = [path.stem for path in args.demonstrations]
     if args.demonstrations[0].exists():  # else its reader reports the missing file
-        check_count([path.stem for path in args.demonstrations])
+        check_count(names)
     if refined := skill_in(args.refined) if args.refined else None:
         stored_demonstrations(refined)  # raises its errors before the new ones are read
     settings = cell_of(str(args.config)) if args.config else None
-    topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
-    via_points = via_points_in(args.via_points) if args.via_points else ()
-    demonstrations = []
-    for i, path in enumerate(args.demonstrations, start=1):
-        demonstration = read_demonstration(path, topics=topics, settings=settings, say=say)
-        count = len(demonstration.stamps_ns)
-        lasts_s = demonstration.period_s * count
-        print(
-            f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s",
-            file=sys.stderr,
-        )
-        demonstrations.append(
-            demonstration
-            if demonstration.via_points
-            else demonstration._replace(via_points=via_points)
-        )
+    demonstrations = _demonstrations(args, settings)
     evidence: list[Evidence] = []
     with steps("learning") as doing:
         skill = learned(
             demonstrations,
             name=name,
-            names=[path.stem for path in args.demonstrations],
+            names=names,
             delay_s=args.delay,
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
@@ -182,10 +163,50 @@ def learn(args: argparse.Namespace) -> int:
         raise ExplainedError(f"{args.output} was not written: {'; '.join(figures.unsafe)}")
     with whole(args.output) as part:
         part.write_bytes(skill.file)
+    _report_written(args.output, skill, figures)
+    return 0
+
+
+def _check_outputs(args: argparse.Namespace, name: str, accepted_by: str) -> None:
+    """Raise UsageError for files that cannot be written and names that cannot be used."""
+    check_writable(args.output, ".npz")
+    if args.plot:
+        check_writable(args.plot, ".png")
+    if len(accepted_by) > LONGEST_NAME:
+        raise UsageError(
+            f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted"
+        )
+    if lacking := unusable_name(name):
+        raise UsageError(f"--{lacking}")
+
+
+def _demonstrations(args: argparse.Namespace, settings: Settings | None) -> list[Demonstration]:
+    """The demonstrations in the files; those without via-points get the ones of the arguments."""
+    topics = {name: PoseTopic.parsed(text) for name in TRACK_NAMES if (text := getattr(args, name))}
+    via_points = via_points_in(args.via_points) if args.via_points else ()
+    demonstrations = []
+    for i, path in enumerate(args.demonstrations, start=1):
+        demonstration = read_demonstration(path, topics=topics, settings=settings, say=say)
+        count = len(demonstration.stamps_ns)
+        lasts_s = demonstration.period_s * count
+        print(
+            f"{i} of {len(args.demonstrations)}: {path}, {count} samples over {lasts_s:.1f} s",
+            file=sys.stderr,
+        )
+        demonstrations.append(
+            demonstration
+            if demonstration.via_points
+            else demonstration._replace(via_points=via_points)
+        )
+    return demonstrations
+
+
+def _report_written(path: Path, skill: StoredSkill, figures: Figures) -> None:
+    """Print the size of a skill in a file, its gate, and who accepts its residual risk."""
     primitive = skill.model.primitive
     over = " over a mean that is linear in the hands" * isinstance(primitive.prior_mean, AffineMean)
     print(
-        f"{args.output}: {len(primitive.inputs)} reference points{over}; it holds as "
+        f"{path}: {len(primitive.inputs)} reference points{over}; it holds as "
         f"far_from_demonstrations where {skill.model.measure} is above "
         f"{1000 * skill.threshold:.0f} mm"
     )
@@ -197,4 +218,3 @@ def learn(args: argparse.Namespace) -> int:
             f"again with {OPTION} NAME",
             file=sys.stderr,
         )
-    return 0

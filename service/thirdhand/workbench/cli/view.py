@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -124,21 +124,27 @@ def check_usage(args: argparse.Namespace) -> None:
     """Raise UsageError for invalid arguments, before anything is drawn."""
     if args.screenshot:
         check_writable(args.screenshot, ".png")
-    if args.time is not None and not (
-        args.screenshot and math.isfinite(args.time) and args.time >= 0
-    ):
-        raise UsageError(
-            f"--time {args.time:g}: a time [s] from 0 on, together with --screenshot, needed"
-        )
+    if args.time is not None:
+        is_time = math.isfinite(args.time) and args.time >= 0
+        if not (args.screenshot and is_time):
+            raise UsageError(
+                f"--time {args.time:g}: a time [s] from 0 on, together with --screenshot, needed"
+            )
     if "live" in args.files and len(args.files) > 1:
         raise UsageError(f"live and {len(args.files) - 1} files given; either live or files needed")
     if args.tab is not None and not args.screenshot:
         raise UsageError("--tab chooses the tab of a picture; --screenshot PNG needed with it")
-    if args.web is not None and args.screenshot:
+    if args.web is not None:
+        _check_web(args)
+
+
+def _check_web(args: argparse.Namespace) -> None:
+    """Raise UsageError for arguments that do not go with --web."""
+    if args.screenshot:
         raise UsageError(
             "--web and --screenshot given; one of them accepted: a page for browsers, or a picture"
         )
-    if args.web is not None and args.files != ["live"]:
+    if args.files != ["live"]:
         raise UsageError("--web shows a running daemon, not files: `thirdhand view live --web`")
 
 
@@ -230,10 +236,8 @@ def _draw(
     recording: Recording, viewer: Viewer, progress: Callable[[int], None]
 ) -> tuple[int, list[str]]:
     """Draw a whole recording. Returns the number of its ticks, and messages on missing parts."""
-    notes = recording.notes("requests", "log", OBJECTS_NOTE)
-    note = next(notes, None)
-    images = recording.images()
-    image = next(images, None)
+    notes = _Pending(recording.notes("requests", "log", OBJECTS_NOTE), viewer.note)
+    images = _Pending(recording.images(), viewer.image)
     count = 0
     time_ns = 0
     previous_tick = None
@@ -254,20 +258,29 @@ def _draw(
         viewer.add(step.frame, time_ns, step.timing, step.events)
         count += 1
         progress(count)
-        while note is not None and note[2] <= time_ns:
-            viewer.note(*note)
-            note = next(notes, None)
-        while image is not None and image[2] <= time_ns:
-            viewer.image(*image)
-            image = next(images, None)
-    while note is not None:
-        viewer.note(*note)
-        note = next(notes, None)
+        notes.draw_until(time_ns)
+        images.draw_until(time_ns)
+    notes.draw_until(math.inf)
     missing = [*map(str, gaps), *recording.unreported(gaps, last=previous_tick)]
     for text in missing[logged:]:
         viewer.log(text, "WARN", time_ns)
     viewer.close()
     return count, missing
+
+
+class _Pending:
+    """Rows of a recording, whose third value is their time [ns], that are not drawn yet."""
+
+    def __init__(self, rows: Iterator[tuple[Any, ...]], draw: Callable[..., None]) -> None:
+        self._rows = rows
+        self._draw = draw
+        self._next = next(rows, None)
+
+    def draw_until(self, time_ns: float) -> None:
+        """Draw the rows up to this time."""
+        while self._next is not None and self._next[2] <= time_ns:
+            self._draw(*self._next)
+            self._next = next(self._rows, None)
 
 
 def screenshot(
@@ -295,25 +308,7 @@ def screenshot(
             executable_path=str(rerun_program()),
         ) as client:
             client.open(str(source if live else Path(source).absolute()))
-            _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
-            extent = _extent(client)
-            if extent is None:
-                raise ViewerError(f"no picture of {source}: it has no data yet")
-            _select_tab(client, tab)
-            if time is None and live:
-                client.set_time(TIMELINE, play_state="following")
-                return _fresh(client, Path(png).absolute())
-            time_ns = (
-                moment(extent, time)
-                if time is not None or live
-                else last_followed(Path(source), extent[1])
-            )
-            client.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"), play_state="paused")
-            caption = (
-                f"{(time_ns - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
-            )
-            _settled(client, Path(png).absolute(), caption)
-            return None
+            return _take_picture(client, source, Path(png).absolute(), time, tab)
     except ViewerError:
         raise
     except TimeoutError as error:
@@ -322,6 +317,26 @@ def screenshot(
         ) from error
     except (RuntimeError, OSError) as error:
         raise ViewerError(f"no picture of {source}: {in_words(error)}") from error
+
+
+def _take_picture(
+    client: Any, source: str | Path, png: Path, time: float | None, tab: str
+) -> float | None:
+    """Take the picture of an open source, see `screenshot`."""
+    live = "://" in str(source)
+    _wait(lambda: _extent(client) is not None and (live or not client.get_state().loading))
+    extent = _extent(client)
+    if extent is None:
+        raise ViewerError(f"no picture of {source}: it has no data yet")
+    _select_tab(client, tab)
+    if time is None and live:
+        client.set_time(TIMELINE, play_state="following")
+        return _fresh(client, png)
+    time_ns = last_followed(Path(source), extent[1]) if time is None else moment(extent, time)
+    client.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"), play_state="paused")
+    caption = f"{(time_ns - extent[0]) / 1e9:.2f} s of {(extent[1] - extent[0]) / 1e9:.2f} s"
+    _settled(client, png, caption)
+    return None
 
 
 def moment(extent: tuple[int, int], time: float | None) -> int:

@@ -295,22 +295,12 @@ def trim(path: Path, start_s: float, end_s: float) -> str:
     joints = _count_joints(samples)
     original = uncut(path)
     existed = original.exists()
-    try:
-        with whole_file(path, joints=joints) as file:
-            for name, content in messages.metadata.items():
-                file.writer.add_metadata(name, content)
-            for name, data in messages.attachments.items():
-                file.attach(name, data, begin_ns)
-            for row in rows:
-                _put_trimmed(path, file, row, begin_ns, (start_s, end_s))
-            file.close()
-            _check_trimmed(path, file, lasts_s, (start_s, end_s))
-            if not existed:
-                path.replace(original)
-    except KeyError as error:
-        raise RecordingError(
-            f"{path}: a take has no messages of type {error}; it was not trimmed"
-        ) from None
+    with whole_file(path, joints=joints) as file:
+        _copy(messages, rows, file, begin_ns, (start_s, end_s))
+        file.close()
+        _check_trimmed(path, file, lasts_s, (start_s, end_s))
+        if not existed:
+            path.replace(original)
     cut = f"{lasts_s:.1f} s cut to {max(kept_s) - min(kept_s):.1f} s"
     return f"{cut}; the uncut take is {'still' if existed else 'kept as'} {original}"
 
@@ -323,19 +313,41 @@ def _count_joints(samples: Sequence[Found]) -> int:
     return 0
 
 
+def _copy(
+    messages: Messages,
+    rows: Sequence[Found],
+    file: McapFile,
+    begin_ns: int,
+    span_s: tuple[float, float],
+) -> None:
+    """Copy metadata, attachments and messages of a take, see `_put_trimmed`."""
+    for name, content in messages.metadata.items():
+        file.writer.add_metadata(name, content)
+    for name, data in messages.attachments.items():
+        file.attach(name, data, begin_ns)
+    for row in rows:
+        _put_trimmed(messages.path, file, row, begin_ns, span_s)
+
+
 def _put_trimmed(
     path: Path, file: McapFile, row: Found, begin_ns: int, span_s: tuple[float, float]
 ) -> None:
     """Write a message of a take, unless it is a sample outside a span of time [s] from its begin.
-    Raises RecordingError for one that is not of a take's encoding.
+    Raises RecordingError for one that a take does not have.
     """
     schema, channel, message = row
     if schema is None or channel.message_encoding != "cdr":
         raise RecordingError(f"{path}: {channel.topic} is no stream of a take; it was not trimmed")
     start_s, end_s = span_s
     at_s = (message.log_time - begin_ns) / 1e9
-    if schema.name not in SAMPLE_TYPES or start_s <= at_s <= end_s:
+    if schema.name in SAMPLE_TYPES and not start_s <= at_s <= end_s:
+        return
+    try:
         file.put(channel.topic, schema.name, message.data, message.log_time, message.sequence)
+    except KeyError as error:
+        raise RecordingError(
+            f"{path}: a take has no messages of type {error}; it was not trimmed"
+        ) from None
 
 
 def _check_trimmed(path: Path, file: McapFile, lasts_s: float, span_s: tuple[float, float]) -> None:

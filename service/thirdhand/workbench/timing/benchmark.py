@@ -8,6 +8,7 @@ import argparse
 import json
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ KERNEL = (
     ),
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
+SHARES = ("p50", "p99", "p99.9", "max")
 LOOP_KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
 # added to both medians of lateness, because the ratio of two small numbers means nothing
 NOTHING_US = 10.0
@@ -179,12 +181,16 @@ def _ratios(report: dict[str, Any]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in ratios.items()}
 
 
+def _row(label: str, values: Mapping[str, float], digits: int) -> str:
+    """A row of percentiles, below their names."""
+    return f"    {label:<34}" + "".join(f"{values[share]:9.{digits}f}" for share in SHARES)
+
+
 def text(report: dict[str, Any]) -> str:
     """The report for people to read."""
-    names = ("p50", "p99", "p99.9", "max")
     rows = [
         f"{report['rate_hz']} Hz on {report['cores']} cores "
-        f"{'':>18}{''.join(f'{name:>9}' for name in names)}"
+        f"{'':>18}{''.join(f'{name:>9}' for name in SHARES)}"
     ]
     for kind, label in LOOP_KINDS:
         loop = report[kind]
@@ -193,18 +199,15 @@ def text(report: dict[str, Any]) -> str:
             f"  {label:<11} {loop['missed']} of {loop['ticks']} deadlines missed ({share:.2f} %)"
         )
         for name, unit in (("lateness_us", "late µs"), ("work_us", "work µs")):
-            rows.append(f"    {unit:<34}" + "".join(f"{loop[name][share]:9.1f}" for share in names))
+            rows.append(_row(unit, loop[name], 1))
     whole = report["whole"]
     ratios = report["ratios"]
     for name, label in (
         ("latency_ms", "hand to command ms"),
         ("round_trip_ms", "there and back by Zenoh ms"),
     ):
-        rows.append(f"    {label:<34}" + "".join(f"{whole[name][share]:9.2f}" for share in names))
-    rows += [
-        f"    {f'of it, {name} µs':<34}" + "".join(f"{stage[share]:9.1f}" for share in names)
-        for name, stage in whole["stages_us"].items()
-    ]
+        rows.append(_row(label, whole[name], 2))
+    rows += [_row(f"of it, {name} µs", stage, 1) for name, stage in whole["stages_us"].items()]
     rows += [
         f"    {process:<12}{usage['memory_mb']:6.0f} MB, {usage['cpu_s']:5.1f} s of processor"
         for process, usage in whole["processes"].items()

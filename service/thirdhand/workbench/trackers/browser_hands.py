@@ -44,6 +44,7 @@ FULL = f"There are {MAX_PAGES} pages open already: close one of them."
 TAKEN = "Hands of another page are followed: end it there first, then start here."
 NOT_FOLLOWED = "resume was NOT carried out: the hands of this page are not followed."
 NO_TOKEN = "Open the address that `thirdhand hands` printed: with its token."
+Refusal = tuple[int, str]  # status of HTTP and reason with which a websocket is closed
 SILENT = f"This page has sent nothing for {PAGE_SILENCE_S:g} s."
 
 
@@ -115,26 +116,41 @@ class BrowserHands:
             except TimeoutError:
                 return await web_server.close(page, 408, SILENT)
             if message.type == WSMsgType.BINARY:
-                data: bytes = message.data
-                if is_ping(data):
-                    await page.send_bytes(pong(data, time.time_ns()))
-                    continue
-                try:
-                    hands = decode_hands(data, time.time_ns())
-                except WireError as error:
-                    return await web_server.close(page, 400, f"Refused: {error}")
-                if not self._publish(page, hands):
-                    return await web_server.close(page, 409, TAKEN)
+                refusal = await self._take_bytes(page, message.data)
             elif message.type == WSMsgType.TEXT:
-                is_order = message.data in ORDERS or message.data in BY_HANDS
-                if not is_order and not CORRECTION.fullmatch(message.data):
-                    needed = f"{' or '.join(ORDERS)}, or correct with undo or three numbers,"
-                    return await web_server.close(page, 400, f"Refused: {needed} needed as text")
-                orders = {name: order for name, order in orders.items() if not order.done()}
-                if not orders or (message.data.startswith("hold") and message.data not in orders):
-                    orders[message.data] = asyncio.create_task(self._order(page, message.data))
+                refusal = self._take_order(page, message.data, orders)
             else:
                 return None  # it left, or sent what is no message, for which aiohttp has closed it
+            if refusal is not None:
+                return await web_server.close(page, *refusal)
+
+    async def _take_bytes(self, page: web.WebSocketResponse, data: bytes) -> Refusal | None:
+        """Answer a ping, or publish hands; the refusal of others."""
+        if is_ping(data):
+            await page.send_bytes(pong(data, time.time_ns()))
+            return None
+        try:
+            hands = decode_hands(data, time.time_ns())
+        except WireError as error:
+            return 400, f"Refused: {error}"
+        return None if self._publish(page, hands) else (409, TAKEN)
+
+    def _take_order(
+        self, page: web.WebSocketResponse, order: str, orders: dict[str, asyncio.Task[None]]
+    ) -> Refusal | None:
+        """Begin an order, unless others of the page wait for their answers; the refusal of another
+        text.
+        """
+        is_order = order in ORDERS or order in BY_HANDS
+        if not is_order and not CORRECTION.fullmatch(order):
+            needed = f"{' or '.join(ORDERS)}, or correct with undo or three numbers,"
+            return 400, f"Refused: {needed} needed as text"
+        for name in [name for name, task in orders.items() if task.done()]:
+            del orders[name]
+        is_new_hold = order.startswith("hold") and order not in orders
+        if not orders or is_new_hold:
+            orders[order] = asyncio.create_task(self._order(page, order))
+        return None
 
     def _publish(self, page: web.WebSocketResponse, hands: PageHands) -> bool:
         """Publish a page's hands; False if those of another page are followed."""

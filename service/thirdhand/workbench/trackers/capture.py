@@ -360,46 +360,16 @@ def capture(
     """
     captured = Capture(session, cell, settings, conducts, person)
     others = Overheard(session, *OTHER_CELLS)
-    at_rest = (
-        f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for {rest_s:g} "
-        "s"
-    )
+    end = _End(until, rest_s, longest_s)
     try:
-        begun_s = time.monotonic()
         say(f"waiting for {', '.join(captured.missing)} of cell {cell}")
-        while captured.missing:
-            if time.monotonic() - begun_s > wait_s or is_ended():
-                meant = {channels.key(cell, key) for key in CAPTURED_KEYS}
-                elsewhere = [key for key in others.keys if key not in meant][:MAX_OTHER_KEYS]
-                instead = f"; received instead: {', '.join(elsewhere)}" if elsewhere else ""
-                raise CaptureError(captured.not_received(captured.missing, instead))
-            time.sleep(CAPTURE_POLL_S)
-            captured.collect()
+        _await_streams(captured, others, is_ended, wait_s)
         others.close()
         captured.check()
         captured.begin()
-        begun_s = time.monotonic()
-        shown_s = 0.0
-        say(f"recording{f'; it ends once {at_rest} after a motion' if until == 'rest' else ''}")
-        while not is_ended():
-            time.sleep(CAPTURE_POLL_S)
-            captured.collect()
-            lasts_s = time.monotonic() - begun_s
-            if lasts_s - shown_s > PROGRESS_S:
-                shown_s = lasts_s
-                counts = ", ".join(
-                    f"{key} {len(samples)}" for key, samples in captured.streams.items()
-                )
-                progress(f"{lasts_s:5.1f} s   {counts}")
-            if until == "rest" and captured.is_over(rest_s):
-                say(f"ended by rest: {at_rest}")
-                break
-            if lasts_s > longest_s:
-                say(f"ended after {longest_s:g} s")
-                break
-            if captured.silent_s > CAPTURE_SILENCE_S:
-                say(f"ended: no message arrived for {CAPTURE_SILENCE_S:g} s")
-                break
+        say(f"recording{f'; it ends once {end.at_rest} after a motion' if until == 'rest' else ''}")
+        if reason := _collect(captured, is_ended, end, progress):
+            say(reason)
     except KeyboardInterrupt:
         if captured.missing:
             raise
@@ -411,3 +381,68 @@ def capture(
         if before_s or behind_s:
             say(f"rest left out: {before_s:.1f} s before the motion, {behind_s:.1f} s after it")
     return captured
+
+
+class _End(NamedTuple):
+    """The conditions that end a capture, unless the operator does."""
+
+    until: Until
+    rest_s: float
+    longest_s: float
+
+    @property
+    def at_rest(self) -> str:
+        """The condition of rest in words."""
+        return (
+            f"hands and tool stay within {1000 * REST_M:g} mm (joints {REST_RAD:g} rad) for "
+            f"{self.rest_s:g} s"
+        )
+
+    def reason(self, captured: Capture, lasts_s: float) -> str:
+        """The reason why a capture ends after this time [s]; empty while it does not."""
+        if self.until == "rest" and captured.is_over(self.rest_s):
+            return f"ended by rest: {self.at_rest}"
+        if lasts_s > self.longest_s:
+            return f"ended after {self.longest_s:g} s"
+        if captured.silent_s > CAPTURE_SILENCE_S:
+            return f"ended: no message arrived for {CAPTURE_SILENCE_S:g} s"
+        return ""
+
+
+def _await_streams(
+    captured: Capture, others: Overheard, is_ended: Callable[[], bool], wait_s: float
+) -> None:
+    """Wait for the first messages of hands and tool. Raises CaptureError after `wait_s` [s], with
+    what arrived from other cells.
+    """
+    begun_s = time.monotonic()
+    while captured.missing:
+        if time.monotonic() - begun_s > wait_s or is_ended():
+            meant = {channels.key(captured.cell, key) for key in CAPTURED_KEYS}
+            elsewhere = [key for key in others.keys if key not in meant][:MAX_OTHER_KEYS]
+            instead = f"; received instead: {', '.join(elsewhere)}" if elsewhere else ""
+            raise CaptureError(captured.not_received(captured.missing, instead))
+        time.sleep(CAPTURE_POLL_S)
+        captured.collect()
+
+
+def _collect(
+    captured: Capture,
+    is_ended: Callable[[], bool],
+    end: _End,
+    progress: Callable[[str], None],
+) -> str:
+    """Collect messages until the end; its reason, or an empty text if the operator ends it."""
+    begun_s = time.monotonic()
+    shown_s = 0.0
+    while not is_ended():
+        time.sleep(CAPTURE_POLL_S)
+        captured.collect()
+        lasts_s = time.monotonic() - begun_s
+        if lasts_s - shown_s > PROGRESS_S:
+            shown_s = lasts_s
+            counts = ", ".join(f"{key} {len(samples)}" for key, samples in captured.streams.items())
+            progress(f"{lasts_s:5.1f} s   {counts}")
+        if reason := end.reason(captured, lasts_s):
+            return reason
+    return ""

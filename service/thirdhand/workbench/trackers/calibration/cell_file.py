@@ -75,28 +75,11 @@ def write(
     before = load(path)
     text = text_in(path)
     try:
-        document = tomlkit.parse(text)
-        section: Any = (
-            document["trackers"] if tracker else document.setdefault("hands", tomlkit.table())
-        )
-        section = section[tracker] if tracker else section
-        for name, value in values.items():
-            section[name] = value
-        changed = tomlkit.dumps(document)
-        if "\r\n" in text and text.count("\r\n") == text.count("\n"):
-            changed = changed.replace("\r\n", "\n").replace("\n", "\r\n")
+        changed = _changed(text, values, tracker)
     except (tomlkit.exceptions.TOMLKitError, TypeError) as error:
         raise CalibrationError(f"{path} cannot be changed: {error}. {by_hand}") from None
     after = parse(changed, origin=str(path), folder=path.parent)
-    fields = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
-    }
-    table: Any = before.trackers[tracker] if tracker else before.hands
-    replaced = msgspec.structs.replace(table, **fields)
-    changes = (
-        {"trackers": before.trackers | {tracker: replaced}} if tracker else {"hands": replaced}
-    )
-    if after != msgspec.structs.replace(before, **changes):
+    if after != _expected(before, values, tracker):
         raise CalibrationError(f"{path} cannot be changed without other settings. {by_hand}")
     backup = path.with_name(f"{path.name}.before-{datetime.now(UTC):%Y%m%d-%H%M%S-%f}")
     try:
@@ -111,6 +94,34 @@ def write(
     except OSError as error:
         raise CalibrationError(f"{in_words(error)}. {by_hand}") from None
     return backup
+
+
+def _changed(text: str, values: Mapping[str, Any], tracker: str) -> str:
+    """The text of a cell's settings with values of a tracker, and its ends of lines. Raises
+    TOMLKitError, TypeError.
+    """
+    document = tomlkit.parse(text)
+    section: Any = (
+        document["trackers"][tracker] if tracker else document.setdefault("hands", tomlkit.table())
+    )
+    for name, value in values.items():
+        section[name] = value
+    changed = tomlkit.dumps(document)
+    if "\r\n" in text and text.count("\r\n") == text.count("\n"):
+        return changed.replace("\r\n", "\n").replace("\n", "\r\n")
+    return changed
+
+
+def _expected(before: Settings, values: Mapping[str, Any], tracker: str) -> Settings:
+    """The settings with these values of a tracker, and all others as before."""
+    fields = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+    }
+    if not tracker:
+        hands = msgspec.structs.replace(before.hands, **fields)
+        return msgspec.structs.replace(before, hands=hands)
+    section = msgspec.structs.replace(before.trackers[tracker], **fields)
+    return msgspec.structs.replace(before, trackers=before.trackers | {tracker: section})
 
 
 def real_path(path: Path) -> Path:
