@@ -153,20 +153,15 @@ def run(args: argparse.Namespace, rate_hz: int | None, page: Address | None) -> 
                 str(service.config),
                 *(["--scene", *scene] if scene else []),
             ]
-            ends: list[
-                tuple[Status, int]
-            ] = []  # the service ends before the bench: an arm that disappears is a fault
+            # The service ends before the bench: an arm that disappears is a fault.
+            ends: list[tuple[Status, int]] = []
             play = functools.partial(
                 played,
                 service.endpoint,
                 *bench,
                 reported=lambda: ends.append((client.status(), service.stop())),
             )
-            if page:
-                report = _played_on_page(session, client, play, page, browser=args.open)
-            else:
-                with _live_view(session, client) if live else contextlib.nullcontext():
-                    report = json.loads(play(say=say))
+            report = _play(session, client, play, page, browser=args.open)
         ((status, code),) = ends
         missing = service.missing()
         if code != 0 and not missing:
@@ -180,6 +175,24 @@ def _missed_by(reply: Reply) -> str:
         f"{point.name} (missed by {1000 * point.missed_by_m:.1f} mm)"
         for point in reply.points or ()
     )
+
+
+def _play(
+    session: zenoh.Session,
+    client: Client,
+    play: Callable[..., str],
+    page: Address | None,
+    *,
+    browser: bool,
+) -> dict[str, Any]:
+    """The report of the bench, which `play` runs: with a person's hands on a page, if there is an
+    address for it, or else with the live view in a browser.
+    """
+    if page:
+        return _played_on_page(session, client, play, page, browser=browser)
+    with _live_view(session, client) if browser else contextlib.nullcontext():
+        report: dict[str, Any] = json.loads(play(say=say))
+    return report
 
 
 @contextlib.contextmanager

@@ -122,26 +122,31 @@ def _figures(now: Status) -> Iterator[Figure]:
             now.segment_belief,
             segment,
         )
-    for name in ("lateness_us", "work_us", "latency_ms"):
-        unit_s = 1e-3 if name.endswith("_ms") else 1e-6
-        values = getattr(now, name)
-        about = (
-            "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over "
-            "10 s."
-        )
-        for percentile, value in zip(
-            ("50", "99", "100"), msgspec.structs.astuple(values), strict=True
-        ):
-            yield f"{name[:-3]}_seconds", about, unit_s * value, {"percentile": percentile}
+    yield from _durations(now)
     for cause, count in now.rejected.items():
         yield "rejected_samples_total", "Rejected samples of all sources.", count, {"cause": cause}
     yield from _sources(now)
     for process, memory_mb in now.memory_mb.items():
         yield "memory_bytes", "Resident memory of a process.", 1e6 * memory_mb, {"process": process}
-    scribe = now.scribe
-    free_mb = scribe.get("free_mb")
-    mb_per_hour = scribe.get("mb_per_hour")
-    for name, about, value in (
+    for name, about, value in (*_of_loop(now), *_of_scribe(now.scribe)):
+        yield name, about, value, {}
+
+
+def _durations(now: Status) -> Iterator[Figure]:
+    """The percentiles of lateness, work and latency [s]."""
+    about = (
+        "Lateness of ticks, work in a tick, or latency from a hand's stamp to a command, over 10 s."
+    )
+    for name in ("lateness_us", "work_us", "latency_ms"):
+        unit_s = 1e-3 if name.endswith("_ms") else 1e-6
+        values = msgspec.structs.astuple(getattr(now, name))
+        for percentile, value in zip(("50", "99", "100"), values, strict=True):
+            yield f"{name[:-3]}_seconds", about, unit_s * value, {"percentile": percentile}
+
+
+def _of_loop(now: Status) -> tuple[tuple[str, str, float | None], ...]:
+    """Name, explanation and value of the loop's figures."""
+    return (
         ("ticks_total", "Ticks since the start, with missed ones.", now.tick + 1),
         ("missed_deadlines_total", "Deadlines that the loop skipped.", now.missed),
         ("rate_hertz", "Ticks per second since the start.", now.rate_hz),
@@ -159,6 +164,12 @@ def _figures(now: Status) -> Iterator[Figure]:
             "Probability that the tool is more than 10 cm off.",
             now.error_probability,
         ),
+    )
+
+
+def _of_scribe(scribe: Mapping[str, Any]) -> tuple[tuple[str, str, float | None], ...]:
+    """Name, explanation and value of the recorder's figures."""
+    return (
         ("recording", "1 while a recording is written.", scribe.get("state") == "recording"),
         ("lost_ticks_total", "Ticks that are not recorded.", scribe.get("lost", 0)),
         (
@@ -166,15 +177,10 @@ def _figures(now: Status) -> Iterator[Figure]:
             "Starts of the recorder after the first.",
             scribe.get("restarts", 0),
         ),
-        (
-            "disk_free_bytes",
-            "Free space where it records.",
-            None if free_mb is None else 1e6 * free_mb,
-        ),
-        (
-            "recording_bytes_per_hour",
-            "Recent growth.",
-            None if mb_per_hour is None else 1e6 * mb_per_hour,
-        ),
-    ):
-        yield name, about, value, {}
+        ("disk_free_bytes", "Free space where it records.", _bytes(scribe.get("free_mb"))),
+        ("recording_bytes_per_hour", "Recent growth.", _bytes(scribe.get("mb_per_hour"))),
+    )
+
+
+def _bytes(megabytes: float | None) -> float | None:
+    return None if megabytes is None else 1e6 * megabytes

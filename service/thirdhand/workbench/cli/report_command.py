@@ -65,8 +65,8 @@ def _check_outputs(args: argparse.Namespace) -> None:
 def _report_each(args: argparse.Namespace, reports: Sequence[Report]) -> None:
     """Print the reports and their comparison, and write the outputs."""
     console = plain_console()
-    for one in reports:
-        _print(console, one)
+    for report in reports:
+        _print(console, report)
     if len(reports) > 1:
         for table in comparison(reports):
             print_table(console, table)
@@ -74,7 +74,7 @@ def _report_each(args: argparse.Namespace, reports: Sequence[Report]) -> None:
         write_csv(reports, args.csv)
         _print_line(console, f"tables in {args.csv}")
     if args.lerobot:
-        episodes, rows = _write_lerobot(args, [one.columns for one in reports])
+        episodes, rows = _write_lerobot(args, [report.columns for report in reports])
         _print_line(console, f"data set {args.lerobot}: {episodes} episodes, {rows} rows")
     if args.html:
         _write_page(args.html, reports)

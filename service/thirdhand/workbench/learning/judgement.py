@@ -15,7 +15,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.core.skill.model import LEVELS, Regions
 from thirdhand.core.skill.skill import is_reachable
 from thirdhand.settings.config import Reach
-from thirdhand.workbench.learning.ambiguity import COMPARED, contradictions, lengths
+from thirdhand.workbench.learning.ambiguity import COMPARED, Contradictions, contradictions, lengths
 from thirdhand.workbench.learning.baselines import baselines, constant_errors
 from thirdhand.workbench.learning.records import (
     Figures,
@@ -64,14 +64,7 @@ def judged(
     timed = [result.timed or timed_errors(result) for result in held_out]
     checked = calibrated_without(timed, persons)
     rows, overall = _rows(held_out, fitted, checked, {**fitted.baselines, **baselines(takes)})
-    contradicting = contradictions(
-        held_out,
-        [take.position for take in takes],
-        [np.linalg.norm(result.errors, axis=1) for result in held_out],
-        lengths,
-        different=CONTRADICTION_M,
-        near_m=division.near_m,
-    )
+    contradicting = _contradictions(held_out, division)
     figures = Figures(
         demonstrations=rows,
         all=overall,
@@ -102,6 +95,18 @@ def judged(
     figures = _with_verdicts(figures, [*verdicts(subject), *pose.verdicts], remarks, accepted_by)
     inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
     return Judgement(figures, calibrated(timed, persons), inside)
+
+
+def _contradictions(held_out: Sequence[HeldOut], division: Division) -> Contradictions:
+    """The samples with the same hands and the tool elsewhere."""
+    return contradictions(
+        held_out,
+        [take.position for take in division.takes],
+        [np.linalg.norm(result.errors, axis=1) for result in held_out],
+        lengths,
+        different=CONTRADICTION_M,
+        near_m=division.near_m,
+    )
 
 
 def _rows(

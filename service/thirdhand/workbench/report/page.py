@@ -137,6 +137,44 @@ def _draw_modes(report: Report, modes: Axes, others: Sequence[Axes]) -> None:
         modes.plot([], [], color=colour, lw=6, label=str(mode.name).lower())
 
 
+def _draw_errors(report: Report, errors: Axes, doubt: Axes) -> None:
+    """Draw the tool's distance from its target and the gate's measure over time; and the
+    probability of a target that is off.
+    """
+    frames = report.columns.frames
+    times = report.columns.times
+    following = frames["mode"] == Mode.FOLLOW
+    lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
+    _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
+    measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
+    gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
+    _curve(errors, times, gate_m, OFF, " / ".join(measures))
+    errors.set(
+        ylabel="error, deviation [mm]",
+        yscale="log",
+        ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)),
+    )
+    errors.yaxis.set_major_formatter("{x:g}")
+
+    predicted = following | (frames["error_probability"] > 0)
+    probability = np.where(predicted, 100 * frames["error_probability"], np.nan)
+    _curve(doubt, times, probability, TARGET, "target off by more than 10 cm")
+    doubt.set(ylabel="probability [%]", ylim=(0, 100))
+
+
+def _draw_speeds(report: Report, axes: Axes) -> None:
+    """Draw the speeds of the hands and of the tool's setpoint over time."""
+    frames = report.columns.frames
+    times = report.columns.times
+    speeds = np.linalg.norm(frames["hand_velocities"], axis=2)
+    for side, colour, speed in zip(SIDES, (LEFT, RIGHT), speeds.T, strict=True):
+        _curve(axes, times, speed, colour, f"{side} hand")
+    setpoint_speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
+    _curve(axes, times, setpoint_speed, TOOL, "tool's setpoint")
+    axes.set(ylabel="speed [m/s]", ylim=(0, None))
+    _bounded(axes, speeds)
+
+
 def _draw_timing(report: Report, axes: Axes) -> None:
     """Draw the latency, the work and the lateness of ticks over time."""
     timing = report.columns.timing
@@ -173,33 +211,8 @@ def _over_time(report: Report) -> Figure:
     )
     near.set(ylabel="distance [cm]", ylim=(0, None))
 
-    following = frames["mode"] == Mode.FOLLOW
-    lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
-    _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
-    measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
-    gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
-    _curve(errors, times, gate_m, OFF, " / ".join(measures))
-    errors.set(
-        ylabel="error, deviation [mm]",
-        yscale="log",
-        ylim=(LEAST_MM, max(errors.get_ylim()[1], 10 * LEAST_MM)),
-    )
-    errors.yaxis.set_major_formatter("{x:g}")
-
-    predicted = following | (frames["error_probability"] > 0)
-    probability = np.where(predicted, 100 * frames["error_probability"], np.nan)
-    _curve(doubt, times, probability, TARGET, "target off by more than 10 cm")
-    doubt.set(ylabel="probability [%]", ylim=(0, 100))
-
-    for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
-        hand_speed = np.linalg.norm(frames["hand_velocities"][:, SIDES.index(side)], axis=1)
-        _curve(speed, times, hand_speed, colour, f"{side} hand")
-    _curve(
-        speed, times, np.linalg.norm(frames["setpoint_velocity"], axis=1), TOOL, "tool's setpoint"
-    )
-    speed.set(ylabel="speed [m/s]", ylim=(0, None))
-    _bounded(speed, np.linalg.norm(frames["hand_velocities"], axis=2))
-
+    _draw_errors(report, errors, doubt)
+    _draw_speeds(report, speed)
     if len(timing):
         _draw_timing(report, others[4])
     others[-1].set(xlabel="time since the first tick [s]")

@@ -40,8 +40,8 @@ Captured = dict[str, tuple[list[int], Vector]]
 
 
 class _Motive(NamedTuple):
-    """A take of Motive as text: its header, the numbers of the rows with the columns' axes and of
-    the first frame, and whether a comma separates decimals.
+    """A take of Motive as text: its rows, its header, the number of the row with the columns' axes,
+    below which the frames begin, and whether decimals have a comma.
     """
 
     path: Path
