@@ -149,7 +149,7 @@ class Columns:
         return since
 
 
-class _Reading:
+class _TickReading:
     """The ticks of a recording that were read, with whole frames of the newest BLOCK alone."""
 
     def __init__(self, recording: Recording) -> None:
@@ -211,7 +211,7 @@ class _Reading:
 
 def read(recording: Recording, *, progress: Callable[[int], None] = lambda ticks: None) -> Columns:
     """The columns of a recording. Raises RecordingError if it cannot be read."""
-    reading = _Reading(recording)
+    reading = _TickReading(recording)
     columns = reading.columns
     _take_skill(columns, recording.skill, 0)
     for step in recording.steps():

@@ -42,7 +42,7 @@ KERNEL = (
     ),
     ("/sys/kernel/realtime", "1", "a kernel with PREEMPT_RT would bound the lateness"),
 )
-SHARES = ("p50", "p99", "p99.9", "max")
+PERCENTILE_NAMES = ("p50", "p99", "p99.9", "max")
 LOOP_KINDS = (("empty", "empty loop"), ("core", "core alone"), ("whole", "whole"))
 # added to both medians of lateness, because the ratio of two small numbers means nothing
 NOTHING_US = 10.0
@@ -183,14 +183,16 @@ def _ratios(report: dict[str, Any]) -> dict[str, float]:
 
 def _row(label: str, values: Mapping[str, float], digits: int) -> str:
     """A row of percentiles, below their names."""
-    return f"    {label:<34}" + "".join(f"{values[share]:9.{digits}f}" for share in SHARES)
+    return f"    {label:<34}" + "".join(
+        f"{values[share]:9.{digits}f}" for share in PERCENTILE_NAMES
+    )
 
 
 def text(report: dict[str, Any]) -> str:
     """The report for people to read."""
     rows = [
         f"{report['rate_hz']} Hz on {report['cores']} cores "
-        f"{'':>18}{''.join(f'{name:>9}' for name in SHARES)}"
+        f"{'':>18}{''.join(f'{name:>9}' for name in PERCENTILE_NAMES)}"
     ]
     for kind, label in LOOP_KINDS:
         loop = report[kind]
