@@ -357,7 +357,7 @@ class _Run:
             self._bridge.publish_joints(observation)
             self._note_commands(commanded, now_s)
             self._publish(observation)
-            if self._is_ended(commanded, now_s):
+            if self._advance(commanded, now_s):
                 self._let_stop()
                 return
             if self._ready_s == math.inf and self._bench.back:
@@ -392,7 +392,7 @@ class _Run:
         if self._bench.tick % self._things_every == 0:
             self._bridge.publish_things(self._bench)
 
-    def _is_ended(self, commanded: bool, now_s: float) -> bool:
+    def _advance(self, commanded: bool, now_s: float) -> bool:
         """Go on with the run; true if it was the only one, and has ended."""
         if self._ready_s is None:
             self._wait_for_commands(commanded, now_s)

@@ -78,7 +78,7 @@ DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
 # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
-FOLLOWER_LABELS = {
+MOTION_LABELS = {
     "ours": "ours, by [tool] follow (ringed: the default)",
     "chase": "One-Euro filter, then Ruckig after the target",
     "servo": "as MoveIt Servo: Butterworth and Ruckig on the joints",
@@ -615,7 +615,7 @@ def _draw_followers(
     for family, (colour, marker) in styles.items():
         rows = {name: groups[group] for name, groups in table.items() if name.startswith(family)}
         points = sorted((f["jerk_ratio"], f["error_rms_mm"]) for f in rows.values())
-        label = FOLLOWER_LABELS.get(family, family)
+        label = MOTION_LABELS.get(family, family)
         panel.plot(
             *zip(*points, strict=True), color=colour, marker=marker, lw=1.2, ms=5, label=label
         )

@@ -29,7 +29,7 @@ from thirdhand_sim.world import World
 
 # deviations of hands and tracker, each axis
 TREMOR_M = 0.0015
-TRACKER_NOISE_M = 0.0005
+SESSION_NOISE_M = 0.0005
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M
+from thirdhand_sim.lab.rehearsal import SESSION_NOISE_M, TREMOR_M
 from thirdhand_sim.lab.results import Array
 from thirdhand_sim.scene import MOST_MOVED, Scene
 from thirdhand_sim.script import Clock, HandScript, ScriptPause
@@ -34,7 +34,7 @@ class Drawn(NamedTuple):
             pauses=self.pauses,
             offset_std=OFFSET_M,
             tremor_rms=TREMOR_M,
-            noise_std=TRACKER_NOISE_M,
+            noise_std=SESSION_NOISE_M,
         )
 
     @property

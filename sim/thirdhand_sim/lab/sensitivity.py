@@ -30,7 +30,7 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.open_loop import targets
 from thirdhand_sim.lab.people import moving_hands
 from thirdhand_sim.lab.people.moving_hands import Moving
-from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M, rehearse
+from thirdhand_sim.lab.rehearsal import SESSION_NOISE_M, TREMOR_M, rehearse
 from thirdhand_sim.lab.results import Options, Results, brief
 from thirdhand_sim.lab.rivals.followers import ours
 from thirdhand_sim.lab.workers import shared_out
@@ -168,7 +168,7 @@ def disturbed(tuning: Tuning, seed: int) -> SensitivityFigures:
 def beside_a_box(tuning: Tuning, seed: int) -> SensitivityFigures:
     """The nominal scene on the bench, with a box on the way to the handover."""
     hands_seed = TUNING_STREAMS["hands"].numbers[seed]
-    script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=TRACKER_NOISE_M)
+    script = HandScript(Scene(), seed=hands_seed, tremor_rms=TREMOR_M, noise_std=SESSION_NOISE_M)
     settings = msgspec.structs.replace(Settings(), obstacles=Obstacles(boxes=(BOX,)))
     skill_for = reached.ours(Scene())
     rehearsal = rehearse(

@@ -27,7 +27,7 @@ from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.reached import EVENTS, ours
-from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M, Rehearsed, rehearse
+from thirdhand_sim.lab.rehearsal import SESSION_NOISE_M, TREMOR_M, Rehearsed, rehearse
 from thirdhand_sim.lab.results import ADAPTED, OTHER, Array, Options, Results, brief, pyplot
 from thirdhand_sim.lab.scenes import OFFSET_M, Drawn, draw
 from thirdhand_sim.lab.workers import shared_out
@@ -91,7 +91,7 @@ class ThrustScript(HandScript):
             pauses=(*later, back),
             offset_std=OFFSET_M,
             tremor_rms=TREMOR_M,
-            noise_std=TRACKER_NOISE_M,
+            noise_std=SESSION_NOISE_M,
         )
 
     def truth(self, t: float) -> HandMotions:

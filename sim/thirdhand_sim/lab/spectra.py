@@ -13,8 +13,8 @@ from thirdhand_sim.lab.people.moving_hands import PERIOD_S
 from thirdhand_sim.lab.results import ADAPTED, OTHER, REFERENCE, TOOL_COLOUR, Array, Results, pyplot
 
 RIPPLE_HZ = (4.0, 13.0)
-BANDS = 3  # bands within RIPPLE_HZ
-EDGES_HZ = RIPPLE_HZ[0] * (RIPPLE_HZ[1] / RIPPLE_HZ[0]) ** (np.arange(-5, 7) / BANDS)
+RIPPLE_BANDS = 3  # bands within RIPPLE_HZ
+EDGES_HZ = RIPPLE_HZ[0] * (RIPPLE_HZ[1] / RIPPLE_HZ[0]) ** (np.arange(-5, 7) / RIPPLE_BANDS)
 MOVING_MPS = 0.05  # speed of a moving tool
 SPECTRUM_LABELS = {
     "truth": ("true hands, through the arm", REFERENCE, "--"),
@@ -42,7 +42,7 @@ def speeds(tool: Array, joints: Array) -> list[float]:
 def ripple(bands: list[float]) -> float:
     """The share of such speeds that lies in RIPPLE_HZ."""
     begin = int(np.argmin(abs(EDGES_HZ - RIPPLE_HZ[0]))) + 1
-    return float(np.linalg.norm(bands[begin : begin + BANDS]) / np.linalg.norm(bands))
+    return float(np.linalg.norm(bands[begin : begin + RIPPLE_BANDS]) / np.linalg.norm(bands))
 
 
 def draw(results: Results, by_follower: dict[str, list[float]]) -> None:

@@ -205,19 +205,18 @@ def joint_step(
         )
         solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
 
-    # If the joints cannot reach it soon, the turn is reduced, so that the position is kept. A
-    # mixture of two solutions need not keep the rows as well as the first one.
+    # If the joints cannot reach it soon, the turn is reduced, so that the position is kept. This
+    # mixes two solutions, and a mixture need not keep separation's rows.
     is_reachable = _can_have(arms, goals, velocity)
     scaled[3:] = 0.0
     wish[3:] = 0.0
-    if not is_reachable:
+    if not is_reachable and not is_constrained:
         without_turn = np.empty(joints)
         for j in range(joints):
             brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
             home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
         solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
-        if not is_constrained:
-            _turn_less(arms, goals, velocity, without_turn)
+        _turn_less(arms, goals, velocity, without_turn)
     excess = _excess(arms, velocity)
 
     # The accelerations, within their own limits.

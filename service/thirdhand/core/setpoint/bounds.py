@@ -243,7 +243,7 @@ def _fall_back(
     if over and under:  # the stop ends beyond both bounds
         over = setpoint[1, axis] > 0.0
         under = not over
-    frame = return_speed * (under - over)
+    frame = return_speed * (int(under) - int(over))
     stop = np.empty(6)
     fastest_stop(setpoint[1, axis] - frame, setpoint[2, axis], max_acceleration, max_jerk, dt, stop)
     out[0, axis] = setpoint[0, axis] + (stop[2] + frame * dt)

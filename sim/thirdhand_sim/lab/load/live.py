@@ -12,7 +12,7 @@ import msgspec
 from thirdhand.client import Client, open_session
 from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.daemon.launch import launched, played
-from thirdhand_sim.lab.rehearsal import TRACKER_NOISE_M, TREMOR_M
+from thirdhand_sim.lab.rehearsal import SESSION_NOISE_M, TREMOR_M
 from thirdhand_sim.lab.scenes import OFFSET_M, Drawn
 from thirdhand_sim.network import RunReport
 
@@ -62,7 +62,7 @@ def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = 
 def _arguments(drawn: Drawn, folder: Path) -> list[str]:
     """The bench's arguments for a scene, whose places go into a file in the folder."""
     arguments = ["--seed", str(drawn.seed), "--speed", str(drawn.speed)]
-    for name, value in (("offset", OFFSET_M), ("tremor", TREMOR_M), ("noise", TRACKER_NOISE_M)):
+    for name, value in (("offset", OFFSET_M), ("tremor", TREMOR_M), ("noise", SESSION_NOISE_M)):
         arguments += [f"--{name}-mm", str(1000 * value)]
     for pause in drawn.pauses:
         arguments += [
