@@ -234,8 +234,8 @@ def _from_above(report: Report) -> Figure:
         path = frames["hands"][frames["hand_ages"][:, number] >= 0, number]
         _path(axes, path, colour, f"{side} hand")
     _path(axes, frames["tool"][frames["commanded"] > 0], TOOL, "tool")
-    points = {point for _, skill in report.columns.skills for point in skill.via_points}
-    for point in sorted(points, key=lambda point: point.name):
+    points = [point for _, skill in report.columns.skills for point in skill.via_points]
+    for point in sorted(dict.fromkeys(points), key=lambda point: point.name):
         x, y, _ = point.tool
         axes.plot(x, y, "D", color=VIA_POINT, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
