@@ -212,16 +212,13 @@ def _run(args: argparse.Namespace, settings: Settings, scene: Scene, reach: Clie
         signals.append(number)
         stop.set()
 
-    dropout = None
-    if args.dropout:
-        dropout = Dropout(start_s=args.dropout[0], lasts_s=args.dropout[1], hand=args.dropout_hand)
     live = Live(
         cell=reach.cell,
         hands_hz=args.hands_rate,
         once=args.once,
         duration_s=args.seconds,
         wait_s=args.wait,
-        dropout=dropout,
+        dropout=args.dropout and Dropout(args.dropout[0], args.dropout[1], args.dropout_hand),
     )
     world = ObservedWorld if args.hands_only else world_of(args.engine)
     try:

@@ -60,7 +60,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     scene: Scene
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Dropout:
     """A time in the script [s] in which one hand is hidden."""
 

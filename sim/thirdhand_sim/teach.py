@@ -318,7 +318,7 @@ def _check(p: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     """End with bad usage if options are out of range or exclude each other."""
     if not 1 <= args.count <= 999:
         p.error(f"--count {args.count}: 1 to 999 accepted")
-    if args.seed is not None and args.seed < 0:
+    if (args.seed or 0) < 0:
         p.error(f"--seed {args.seed}: 0 or more accepted")
     if [args.live, args.output is not None, args.via_points is not None].count(True) != 1:
         p.error("exactly one of --output DIR, --live and --via-points FILE needed")
@@ -326,7 +326,9 @@ def _check(p: argparse.ArgumentParser, args: argparse.Namespace) -> None:
         p.error("--visits needs --live or --via-points, and --via-points needs --visits")
     if args.live and args.people:
         p.error("--people needs --output, not --live")
-    if not 0.05 <= args.speed <= 20 or (args.speed != 1 and not args.live):
+    fastest = 20 if args.live else 1
+    slowest = 0.05 if args.live else 1
+    if not slowest <= args.speed <= fastest:
         p.error(f"--speed {args.speed}: 0.05 to 20 accepted, with --live")
 
 

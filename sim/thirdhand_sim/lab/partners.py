@@ -450,6 +450,16 @@ def verdict(task: Mapping[str, Any], method: str) -> SetVerdict:
     )
 
 
+def _rows_of(sets: Mapping[str, Any]) -> list[tuple[str, Any, str]]:
+    """The rows of a panel: label, numbers of the set, and the setting's ending."""
+    rows = []
+    for name, task in sets.items():
+        endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
+        for ending in endings:
+            rows.append((name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending))
+    return rows
+
+
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
     """The figure of the experiment's numbers."""
     plt = pyplot()
@@ -458,13 +468,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
         ("recorded partners", numbers["recorded"]),
         ("made tasks, via-points given", numbers["made"]),
     ):
-        rows = []
-        for name, task in sets.items():
-            endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
-            rows += [
-                (name.replace("_", " ") + GIVEN * (ending != endings[0]), task, ending)
-                for ending in endings
-            ]
+        rows = _rows_of(sets)
         panels += [(title, rows)] if rows else []
     heights = [len(rows) for _, rows in panels]
     figure, axes = plt.subplots(

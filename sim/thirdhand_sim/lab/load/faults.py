@@ -235,21 +235,21 @@ def figures(
             "moves_again_ms": 1e3 * (event.moving_s - event.mended_s),
         }
     else:
-        gaps = np.diff([event.struck_s, *(command[0] for command in commands)])
-        before = np.diff(
-            [
-                command[0]
-                for command in cell.commands
-                if 0 < event.struck_s - command[0] < BEFORE_FAULT_S
-            ]
-        )
-        numbers |= {
-            "command_largest_gap_ms": 1e3 * float(gaps.max()),
-            "command_mean_gap_ms": 1e3 * float(gaps.mean()),
-            "command_mean_gap_before_ms": 1e3 * float(before.mean()),
-            "held_ms": period_ms * recorded.stopped(event.tick, commands[-1][1]),
-        }
+        numbers |= _gaps(cell, event, commands)
+        numbers["held_ms"] = period_ms * recorded.stopped(event.tick, commands[-1][1])
     return numbers
+
+
+def _gaps(cell: FaultyCell, event: FaultTimes, commands: list[Command]) -> dict[str, float]:
+    """The gaps [s] between commands, as figures in ms, while a fault lasts and before it."""
+    gaps = np.diff([event.struck_s, *(command[0] for command in commands)])
+    arrivals = np.array([command[0] for command in cell.commands])
+    is_before = (arrivals < event.struck_s) & (arrivals > event.struck_s - BEFORE_FAULT_S)
+    return {
+        "command_largest_gap_ms": 1e3 * float(gaps.max()),
+        "command_mean_gap_ms": 1e3 * float(gaps.mean()),
+        "command_mean_gap_before_ms": 1e3 * float(np.diff(arrivals[is_before]).mean()),
+    }
 
 
 def _commanded(told: list[Command], settings: Settings) -> float:

@@ -295,16 +295,13 @@ def read(path: Path, *, named: bool = False) -> Demonstration:
         raise ExperimentError(
             f"{path}: not a recording of hands and tool: {in_words(error, named=False)}"
         ) from None
-    conducts: Hands = (
-        "right" if np.isnan(left).all() else "left" if np.isnan(right).all() else "both"
-    )
-    left, right = (
-        (right, right)
-        if conducts == "right"
-        else (left, left)
-        if conducts == "left"
-        else (left, right)
-    )
+    conducts: Hands = "both"
+    if np.isnan(left).all():
+        conducts = "right"
+        left = right
+    elif np.isnan(right).all():
+        conducts = "left"
+        right = left
     if not all(np.isfinite(part).all() for part in (times, left, right, tool)):
         raise ExperimentError(
             f"{path}: holds numbers that are not finite, beside a hand that was not seen at all"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,27 +176,36 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     sets = gathered(results, options)
     for name, rows in sets.items():
         numbers[name] = {row.name: [_measured(row, case) for case in cases(row)] for row in rows}
-        flat = [entry for per in numbers[name].values() for entry in per]
-        numbers[f"{name}_summary"] = {
-            "largest_miss_at_desired_points_cm": max(entry["miss_cm"] for entry in flat),
-            "rms_deviation_elsewhere_cm": float(
-                np.sqrt(np.mean([entry["rms_elsewhere_cm"] ** 2 for entry in flat]))
-            ),
-            "largest_deviation_elsewhere_cm": max(entry["largest_elsewhere_cm"] for entry in flat),
-            "demonstrations_scatter_cm": float(
-                np.mean([row.demonstrations.std(axis=0).mean() for row in rows])
-            ),
-        }
+        numbers[f"{name}_summary"] = _summary(numbers[name].values(), rows)
         for row in rows:
-            path = f"/{name}/{row.name}"
-            strips = list(row.demonstrations * (1, -1))
-            lines = rr.LineStrips2D(strips, colors=[rgb(REFERENCE)], radii=[0.03])
-            stream.log(f"{path}/demonstrations", lines, static=True)
-            for number, case in enumerate(cases(row)):
-                record(stream, path, number, {"adapted": (by_kmp(row, case), ADAPTED)}, case)
+            _record_letter(stream, f"/{name}/{row.name}", row)
     stream.disconnect()
     _draw(results, {SETS[name]: rows for name, rows in sets.items()})
     return numbers
+
+
+def _summary(
+    measured: Iterable[list[dict[str, Any]]], letters: Sequence[Letter]
+) -> dict[str, float]:
+    """What holds for all letters of a set."""
+    entries = list(itertools.chain.from_iterable(measured))
+    rms_cm = np.array([entry["rms_elsewhere_cm"] for entry in entries])
+    scatter_cm = [letter.demonstrations.std(axis=0).mean() for letter in letters]
+    return {
+        "largest_miss_at_desired_points_cm": max(entry["miss_cm"] for entry in entries),
+        "rms_deviation_elsewhere_cm": float(np.sqrt(np.mean(rms_cm**2))),
+        "largest_deviation_elsewhere_cm": max(entry["largest_elsewhere_cm"] for entry in entries),
+        "demonstrations_scatter_cm": float(np.mean(scatter_cm)),
+    }
+
+
+def _record_letter(stream: rr.RecordingStream, path: str, letter: Letter) -> None:
+    """Draw a letter's demonstrations and what is made of it in each case."""
+    strips = list(letter.demonstrations * (1, -1))
+    lines = rr.LineStrips2D(strips, colors=[rgb(REFERENCE)], radii=[0.03])
+    stream.log(f"{path}/demonstrations", lines, static=True)
+    for number, case in enumerate(cases(letter)):
+        record(stream, path, number, {"adapted": (by_kmp(letter, case), ADAPTED)}, case)
 
 
 def _measured(letter: Letter, case: Case) -> dict[str, Any]:
