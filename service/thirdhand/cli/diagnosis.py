@@ -117,54 +117,67 @@ def _in_order_of_cause(
 ) -> Iterator[Finding]:
     before = seen[0]
     now = seen[-1]
+    yield _daemon(now, own_version)
+    if now.tick < 0:
+        yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
+        return
+    yield from _machine(before, now)
+
+    for name in now.sources:
+        yield from _source(before, now, name, published)
+    yield from _humble(published)
+    for name in now.streams:
+        yield from _rejected(before, now, name)
+
+    yield _driver(before, now)
+    yield from _drives(travels)
+    if "arm" in now.sources and now.command_heard:
+        yield _lag(lag_ms)
+    yield from _calibration(seen)
+    yield from _places(seen)
+    yield from _deviation(now)
+
+    yield _mode(now)
+    yield from _tool(seen)
+    yield from _limits(seen)
+    yield from _privileges_and_recording(now)
+    yield from _own_clock(now, own_ns)
+
+
+def _daemon(now: Status, own_version: str) -> Finding:
     listens = (
         f"listens on {', '.join(now.endpoints)}"
         if now.endpoints
         else "listens nowhere, it connects"
     )
-    actual = f"version {now.version}, {listens}"
-    expected = f"version {own_version}, as here"
-    yield judged(
+    return judged(
         now.version == own_version,
         "daemon",
-        actual,
-        expected,
+        f"version {now.version}, {listens}",
+        f"version {own_version}, as here",
         what_to_do(Condition.VERSIONS_DIFFER),
     )
-    if now.tick < 0:
-        yield wrong("loop", "no tick yet", "ticks", what_to_do(Condition.STARTING))
-        return
-    yield from _machine(before, now)
-    for name in now.sources:
-        yield from _source(before, now, name, published)
-    if of_humble := [key_expr for key_expr in published if key_expr.endswith(f"/{NO_TYPE_HASH}")][
-        :MOST_OTHER_KEYS
-    ]:
-        actual = f"Humble publishes {', '.join(of_humble)}"
-        advice = what_to_do(Condition.HUMBLE)
+
+
+def _humble(published: Sequence[str]) -> Iterator[Finding]:
+    """Keys that ROS 2 Humble publishes, which lack the hash of their type."""
+    keys = [key_expr for key_expr in published if key_expr.endswith(f"/{NO_TYPE_HASH}")]
+    if keys:
         yield Finding(
             "note",
             "ROS 2",
-            actual,
+            f"Humble publishes {', '.join(keys[:MOST_OTHER_KEYS])}",
             "keys with the hash of their type, as of Iron and later",
-            advice,
+            what_to_do(Condition.HUMBLE),
         )
-    for name in now.streams:
-        yield from _rejected(before, now, name)
-    yield _driver(before, now)
-    yield from _drives(travels)
-    if "arm" in now.sources and now.command_heard:
-        yield _lag(lag_ms)
-    yield from _hands_and_skill(seen)
-    yield _mode(now)
-    yield from _tool(seen)
-    yield from _limits(seen)
-    yield from _privileges_and_recording(now)
-    apart_s = (own_ns - now.time_ns) / 1e9
-    if abs(apart_s) > OWN_CLOCK_S:
-        actual = (
-            f"{lasting(1000 * abs(apart_s))} {'ahead of' if apart_s > 0 else 'behind'} the daemon's"
-        )
+
+
+def _own_clock(now: Status, own_ns: int) -> Iterator[Finding]:
+    """A clock of this machine that differs from the daemon's."""
+    ahead_s = (own_ns - now.time_ns) / 1e9
+    if abs(ahead_s) > OWN_CLOCK_S:
+        order = "ahead of" if ahead_s > 0 else "behind"
+        actual = f"{lasting(1000 * abs(ahead_s))} {order} the daemon's"
         advice = what_to_do(Condition.CLOCKS_DIFFER)
         yield Finding("note", "clock here", actual, f"within {OWN_CLOCK_S:g} s", advice)
 
@@ -250,101 +263,150 @@ def _tool(seen: Sequence[Status]) -> Iterator[Finding]:
 
 def _source(before: Status, now: Status, name: str, published: Sequence[str]) -> Iterator[Finding]:
     source = now.sources[name]
-    subject = SOURCE_NAMES[name]
+    if source.rate_hz:
+        yield from _arriving(before, now, name)
+    elif name in SIDES and name not in now.needed:
+        yield Finding("ok", SOURCE_NAMES[name], "nothing arrives; the skill does not need it")
+    else:
+        yield _silent(now, name, published)
+
+
+def _rates_hz(name: str) -> tuple[int, int]:
+    """Least and highest accepted rate [Hz] of a source."""
     least, most = map(int, re.findall(r"\d+", BY_KEY[KEYS[name]].rate))
-    expected = f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, " + (
+    return least, most
+
+
+def _expected(now: Status, name: str) -> str:
+    """The samples that are expected of a source, in words."""
+    least, most = _rates_hz(name)
+    content = (
         f"joints {', '.join(now.joints)}"
         if name == "arm"
         else f"frame {', '.join(repr(frame) for frame in now.frames if frame)} or none"
     )
-    if not source.rate_hz and name in SIDES and name not in now.needed:
-        yield Finding("ok", subject, "nothing arrives; the skill does not need it")
-        return
-    if not source.rate_hz:
-        actual = (
-            "nothing arrives"
-            if source.age_ms is None
-            else f"nothing arrived for {source.age_ms / 1000:.1f} s"
-        )
-        group = KEYS[name].rpartition("/")[0]
-        ours = {key(now.cell, wanted_key) for wanted_key in KEYS.values()}
-        ours |= {key_expr for key_expr in published if key_expr.endswith(NO_TYPE_HASH)}
-        others = [
-            key_expr for key_expr in published if f"/{group}/" in key_expr and key_expr not in ours
-        ][:MOST_OTHER_KEYS]
-        actual += f", but on {', '.join(others)}" if others else ""
-        advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)
-        advice += f" ({', '.join(now.endpoints)})" if now.endpoints else ""
-        rename = (
-            f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}; or "
-            if others
-            else ""
-        )
-        yield wrong(subject, actual, expected, rename + advice)
-        return
-    actual = f"{source.rate_hz:.0f} Hz, " + (
-        "none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old"
-    )
-    actual += f", {len(now.joints)} joints" if name == "arm" else f", frame {source.frame!r}"
-    is_fine = source.fresh and source.rate_hz >= LEAST_RATE_SHARE * least
-    advice = (
-        "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
-    )
+    return f"{least} to {most} Hz on {key(now.cell, KEYS[name])}, {content}"
+
+
+def _silent(now: Status, name: str, published: Sequence[str]) -> Finding:
+    """A source of which nothing arrives, and other keys on which it may be published."""
+    age_ms = now.sources[name].age_ms
+    actual = "nothing arrives" if age_ms is None else f"nothing arrived for {age_ms / 1000:.1f} s"
+    advice = what_to_do(Condition.JOINTS_SILENT if name == "arm" else Condition.HAND_SILENT)
+    if now.endpoints:
+        advice += f" ({', '.join(now.endpoints)})"
+
+    if similar_keys := _similar_keys(now, name, published):
+        actual += f", but on {', '.join(similar_keys)}"
+        rename = f"{what_to_do(Condition.KEY_MISSPELT)}, {key(now.cell, KEYS[name])}"
+        advice = f"{rename}; or {advice}"
+    return wrong(SOURCE_NAMES[name], actual, _expected(now, name), advice)
+
+
+def _similar_keys(now: Status, name: str, published: Sequence[str]) -> list[str]:
+    """Published keys of a source's group that are none of this cell's."""
+    group = KEYS[name].rpartition("/")[0]
+    own_keys = {key(now.cell, suffix) for suffix in KEYS.values()}
+    similar_keys = [
+        key_expr
+        for key_expr in published
+        if f"/{group}/" in key_expr
+        and key_expr not in own_keys
+        and not key_expr.endswith(NO_TYPE_HASH)
+    ]
+    return similar_keys[:MOST_OTHER_KEYS]
+
+
+def _arriving(before: Status, now: Status, name: str) -> Iterator[Finding]:
+    """The findings on a source of which samples arrive."""
+    source = now.sources[name]
     rejected = list(_rejected(before, now, name))
     yield from rejected
     if not source.fresh and any(finding.level == "wrong" for finding in rejected):
         return  # all of its samples are rejected; the reason is found above
-    yield judged(is_fine, subject, actual, expected, advice or what_to_do(Condition.RATE_LOW))
-    if source.clock_ms is not None and not AHEAD_MS <= source.clock_ms <= LATE_MS:
-        order = (
-            "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
-        )
-        actual = (
-            f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be "
-            "measured"
-        )
-        level = "note" if name == "arm" else "wrong"  # no latency is computed from the arm's stamps
-        advice = what_to_do(Condition.CLOCKS_DIFFER)
-        yield Finding(
-            level, f"{subject}'s clock", actual, f"less than {LATE_MS / 1000:g} s", advice
-        )
+
+    age = "none accepted" if source.age_ms is None else f"{source.age_ms:.0f} ms old"
+    content = f"{len(now.joints)} joints" if name == "arm" else f"frame {source.frame!r}"
+    least_hz, _ = _rates_hz(name)
+    advice = (
+        "" if source.fresh else _unit_advice(source) or source.advice or what_to_do(source.cause)
+    )
+    yield judged(
+        source.fresh and source.rate_hz >= LEAST_RATE_SHARE * least_hz,
+        SOURCE_NAMES[name],
+        f"{source.rate_hz:.0f} Hz, {age}, {content}",
+        _expected(now, name),
+        advice or what_to_do(Condition.RATE_LOW),
+    )
+    yield from _source_clock(source, name)
+
+
+def _source_clock(source: Source, name: str) -> Iterator[Finding]:
+    """A source whose clock differs from the daemon's."""
+    if source.clock_ms is None or AHEAD_MS <= source.clock_ms <= LATE_MS:
+        return
+    order = "before it arrives" if source.clock_ms > 0 else "after it arrives: its clock is ahead"
+    yield Finding(
+        "note" if name == "arm" else "wrong",  # no latency is computed from the arm's stamps
+        f"{SOURCE_NAMES[name]}'s clock",
+        f"a sample is stamped {lasting(abs(source.clock_ms))} {order}; no latency can be measured",
+        f"less than {LATE_MS / 1000:g} s",
+        what_to_do(Condition.CLOCKS_DIFFER),
+    )
 
 
 def _rejected(before: Status, now: Status, name: str) -> Iterator[Finding]:
     source = now.inputs[name]
     subject = input_name(name)
+    rates_hz = _rejection_rates_hz(before, now, name)
+    contradicting_hz = rates_hz.get("older", 0.0) + rates_hz.get("jumped", 0.0)
+    contested = max(source.contested, contradicting_hz / max(source.rate_hz, 1.0))
+    has_two_publishers = name == "arm" and contested > REJECTED_SHARE
+
+    for cause, rate_hz in rates_hz.items():
+        is_explained = has_two_publishers and cause in ("older", "jumped")
+        if rate_hz and not is_explained:
+            yield _rejection(source, subject, cause, rate_hz)
+    if has_two_publishers:
+        yield _two_publishers(now.cell, source, contested)
+    if source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM:
+        scatter = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis"
+        yield wrong(subject, scatter, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
+
+
+def _rejection_rates_hz(before: Status, now: Status, name: str) -> dict[str, float]:
+    """Rejected messages of an input per second [Hz], by cause."""
     seconds = max((now.time_ns - before.time_ns) / 1e9, 0.1)
     earlier = before.inputs.get(name, Source()).rejected
-    arriving_hz = max(source.rate_hz, 1.0)
-    rates = {
-        cause: (count - earlier.get(cause, 0)) / seconds for cause, count in source.rejected.items()
-    }
-    share = max(
-        source.contested, (rates.get("older", 0.0) + rates.get("jumped", 0.0)) / arriving_hz
+    counts = now.inputs[name].rejected
+    return {cause: (count - earlier.get(cause, 0)) / seconds for cause, count in counts.items()}
+
+
+def _rejection(source: Source, subject: str, cause: str, rate_hz: float) -> Finding:
+    """The finding on one cause of rejection; the newest one has its details."""
+    why = ""
+    advice = ""
+    if cause == source.cause:
+        why = f": {source.refused}" if source.refused else ""
+        advice = _unit_advice(source) or source.advice
+    level = "wrong" if rate_hz > REJECTED_SHARE * max(source.rate_hz, 1.0) else "note"
+    actual = f"{rate_hz:.0f} messages/s rejected as {cause}{why}"
+    return Finding(level, subject, actual, "none", advice or what_to_do(cause))
+
+
+def _two_publishers(cell: str, source: Source, contested: float) -> Finding:
+    """The finding on an arm with a share of contested states."""
+    subject = input_name("arm")
+    evidence = Evidence(
+        {"arm": msgspec.structs.replace(source, contested=contested)}, REJECTED_SHARE
     )
-    for cause, rate in rates.items():
-        # found below
-        if rate and not (name == "arm" and share > REJECTED_SHARE and cause in ("older", "jumped")):
-            why = f": {source.refused}" if cause == source.cause and source.refused else ""
-            level = "wrong" if rate > REJECTED_SHARE * arriving_hz else "note"
-            advice = (
-                _unit_advice(source) or source.advice if cause == source.cause else ""
-            ) or what_to_do(cause)
-            yield Finding(
-                level, subject, f"{rate:.0f} messages/s rejected as {cause}{why}", "none", advice
-            )
-    if share > REJECTED_SHARE and name == "arm":
-        evidence = Evidence(
-            {name: msgspec.structs.replace(source, contested=share)}, REJECTED_SHARE
-        )
-        explanation = explained(Reason.TWO_SOURCES, evidence)
-        expected = f"one publisher of {key(now.cell, KEYS[name])}"
-        yield wrong(
-            subject, explanation.why.removeprefix(f"{subject}, "), expected, explanation.what_to_do
-        )
-    if source.fresh and source.scatter_mm is not None and source.scatter_mm > SCATTER_MM:
-        found_mm = f"the samples scatter by {source.scatter_mm:.0f} mm on each axis"
-        yield wrong(subject, found_mm, f"at most {SCATTER_MM:.0f} mm", what_to_do(Condition.NOISY))
+    explanation = explained(Reason.TWO_SOURCES, evidence)
+    return wrong(
+        subject,
+        explanation.why.removeprefix(f"{subject}, "),
+        f"one publisher of {key(cell, KEYS['arm'])}",
+        explanation.what_to_do,
+    )
 
 
 def _unit_advice(source: Source) -> str:
@@ -363,15 +425,14 @@ def _driver(before: Status, now: Status) -> Finding:
     return judged(heard, "arm's driver", actual, "a driver", what_to_do(Condition.NO_DRIVER))
 
 
-def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
-    now = seen[-1]
-    boxes = seen[-1].demonstrated_m
-    below = {side: min(status.below_table_m.get(side, 0.0) for status in seen) for side in SIDES}
-    if max(below.values()) > MAX_BELOW_TABLE_M:
+def _calibration(seen: Sequence[Status]) -> Iterator[Finding]:
+    """Hands that are below the table top all the time."""
+    depths_m = {side: min(status.below_table_m.get(side, 0.0) for status in seen) for side in SIDES}
+    if max(depths_m.values()) > MAX_BELOW_TABLE_M:
         depths = " and ".join(
-            f"{SOURCE_NAMES[side]} {100 * depth:.0f} cm"
-            for side, depth in below.items()
-            if depth > MAX_BELOW_TABLE_M
+            f"{SOURCE_NAMES[side]} {100 * depth_m:.0f} cm"
+            for side, depth_m in depths_m.items()
+            if depth_m > MAX_BELOW_TABLE_M
         )
         yield wrong(
             "calibration",
@@ -379,43 +440,64 @@ def _hands_and_skill(seen: Sequence[Status]) -> Iterator[Finding]:
             "hands above the table",
             what_to_do(Condition.CALIBRATION_OFF),
         )
+
+
+def _places(seen: Sequence[Status]) -> Iterator[Finding]:
+    """Where the hands are, against where they were demonstrated."""
+    now = seen[-1]
+    boxes = now.demonstrated_m
     positions = {
         side: now.hands_m[side] for side in SIDES if side in boxes and now.sources[side].fresh
     }
     outside_m = {side: _outside(position_m, boxes[side]) for side, position_m in positions.items()}
-    crossed = [
-        _outside(position_m, boxes[other])
-        for side, position_m in positions.items()
-        if (other := SIDES[1 - SIDES.index(side)]) in boxes
-    ]
-    is_exchanged = len(outside_m) == len(SIDES) and max(crossed) < OUTSIDE_M < min(
-        outside_m.values()
-    )
+    is_elsewhere = any(distance_m > OUTSIDE_M for distance_m in outside_m.values())
+    if is_elsewhere and _is_y_up(seen):
+        yield _axes_exchanged()
+
+    is_exchanged = _are_exchanged(positions, boxes)
     advice = what_to_do(Condition.HANDS_EXCHANGED if is_exchanged else Condition.HAND_ELSEWHERE)
-    if outside_m and max(outside_m.values()) > OUTSIDE_M and _is_y_up(seen):
-        written = "[{}]".format(", ".join(f"{v:g}" for v in Y_UP))
-        yield wrong(
-            "tracker's axes",
-            "z of the hands is constant while y changes like a height",
-            "z up, as in frame base",
-            f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = {written}, with the position "
-            "of the tracker's origin in base [m] as its first three numbers",
-        )
     for side, position_m in positions.items():
-        actual = f"at {_point(position_m)} m, {outside_m[side]:.2f} m from where the skill knows it"
-        expected = " to ".join(map(_point, boxes[side])) + " m"
-        remedy = _unit_advice(now.sources[side]) or advice
         yield judged(
-            outside_m[side] <= OUTSIDE_M, f"{SOURCE_NAMES[side]}'s place", actual, expected, remedy
+            outside_m[side] <= OUTSIDE_M,
+            f"{SOURCE_NAMES[side]}'s place",
+            f"at {_point(position_m)} m, {outside_m[side]:.2f} m from where the skill knows it",
+            " to ".join(map(_point, boxes[side])) + " m",
+            _unit_advice(now.sources[side]) or advice,
         )
+
+
+def _are_exchanged(
+    positions: Mapping[str, Vector3], boxes: Mapping[str, tuple[Vector3, Vector3]]
+) -> bool:
+    """True if each hand is near the demonstrated box of the other one, and outside its own."""
+    if len(positions) < len(SIDES):
+        return False
+    left, right = SIDES
+    crossed_m = (_outside(positions[left], boxes[right]), _outside(positions[right], boxes[left]))
+    direct_m = (_outside(positions[left], boxes[left]), _outside(positions[right], boxes[right]))
+    return max(crossed_m) < OUTSIDE_M < min(direct_m)
+
+
+def _axes_exchanged() -> Finding:
+    """The finding on a tracker whose y points up."""
+    pose = ", ".join(f"{number:g}" for number in Y_UP)
+    return wrong(
+        "tracker's axes",
+        "z of the hands is constant while y changes like a height",
+        "z up, as in frame base",
+        f"{what_to_do(Condition.Y_UP)}: write base_from_tracker = [{pose}], with the position "
+        "of the tracker's origin in base [m] as its first three numbers",
+    )
+
+
+def _deviation(now: Status) -> Iterator[Finding]:
+    """Deviation of the hands from what the skill knows, if it is known."""
     if now.deviation_m is not None:
-        actual = f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows"
-        expected = f"up to {100 * now.threshold_m:.1f} cm"
         yield judged(
             now.deviation_m <= now.threshold_m,
             "skill",
-            actual,
-            expected,
+            f"hands deviate by {100 * now.deviation_m:.1f} cm from what it knows",
+            f"up to {100 * now.threshold_m:.1f} cm",
             what_to_do("far_from_demonstrations"),
         )
 

@@ -27,7 +27,7 @@ from thirdhand.contract.incidents import (
     word,
 )
 from thirdhand.contract.records import SIDES, Flag
-from thirdhand.contract.requests import Source, Status
+from thirdhand.contract.requests import Percentiles, Source, Status
 from thirdhand.process import interrupt
 
 POLL_S = 0.02
@@ -119,7 +119,7 @@ def line(now: Status) -> str:
     parts += [f"{side} {_where(now, side)}" for side in SIDES]
     parts.append(f"tool {_at(now.tool_m)}")
     if now.target_m is not None:
-        parts.append(f"target {_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm")
+        parts.append(f"target {_uncertain(now)}")
     parts.append(_nearest(now))
     return " | ".join(parts)
 
@@ -132,12 +132,41 @@ def rows(now: Status) -> dict[str, str]:
             "skill": now.skill,
             "listening": ", ".join(now.endpoints) or "no endpoint; it connects to others",
         }
-    scribe = now.scribe
-    granted = ("real time" if now.realtime else "ordinary: real time was not granted") + (
-        ", memory locked" if now.memory_locked else ", memory not locked"
-    )
-    rows_by_name = {
-        "mode": in_brief(now.mode, now.reason) + (f"  {', '.join(now.flags)}" if now.flags else ""),
+    texts = {
+        **_outcome(now),
+        "skill": f"{now.skill}; via-points: {', '.join(now.via_points) or 'none'}",
+        "residual risk": now.residual_risk,
+        "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
+        "scheduling": _scheduling(now),
+        "left hand": _where(now, "left"),
+        "right hand": _where(now, "right"),
+        "nearest": _nearest(now),
+        "arm": _arm(now),
+        "tool": _at(now.tool_m),
+        "target": _target(now),
+        "led by hand": "yes, as the arm's driver reports" if now.guided else "",
+        "offer": now.offer,
+        "segment": _segment(now),
+        "turned": _turned(now),
+        "tool's limits": "; ".join(
+            f"{where} {limits.text}" for where, limits in now.tool_limits.items()
+        ),
+        "limited by": now.binding,
+        "gripper": _gripper(now),
+        "rejected": _all_rejected(now),
+        **_recording(now.scribe),
+        "lateness": _durations(now.lateness_us, "µs", digits=1),
+        "work": _durations(now.work_us, "µs", digits=1),
+        "latency": _latency(now),
+    }
+    return {name: text for name, text in texts.items() if text}
+
+
+def _outcome(now: Status) -> dict[str, str]:
+    """Mode, causes and remedies, by name."""
+    flags = f"  {', '.join(now.flags)}" if now.flags else ""
+    return {
+        "mode": in_brief(now.mode, now.reason) + flags,
         "machine": f"too busy: {now.busy}" if now.busy else "",
         "why": now.because,
         "what to do": now.remedy,
@@ -146,54 +175,67 @@ def rows(now: Status) -> dict[str, str]:
             for flag in now.flags
             if flag != STUCK
         },
-        "skill": f"{now.skill}; via-points: {', '.join(now.via_points) or 'none'}",
-        "residual risk": now.residual_risk,
-        "loop": f"{now.rate_hz:.2f} Hz, tick {now.tick}, {now.missed} missed",
-        "scheduling": granted,
-        "left hand": _where(now, "left"),
-        "right hand": _where(now, "right"),
-        "nearest": _nearest(now),
-        "arm": _arm(now),
-        "tool": _at(now.tool_m),
-        "target": f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm, the tool is "
-        f"{1000 * math.dist(now.tool_m, now.target_m):.1f} mm from it{_doubt(now)}"
-        if now.tool_m is not None and now.target_m is not None
-        else "none: the skill needs "
-        f"{'both hands' if now.needed == SIDES else f'the {now.hands} hand'}",
-        "led by hand": "yes, as the arm's driver reports" if now.guided else "",
-        "offer": now.offer,
-        "segment": f"{' -> '.join(now.segment)}, {now.segment_belief:.0%} probable"
-        if now.segment
-        else "",
-        "turned": _turned(now),
-        "tool's limits": "; ".join(
-            f"{where} {limits.text}" for where, limits in now.tool_limits.items()
-        ),
-        "limited by": now.binding,
-        "gripper": now.gripper
-        + (f", predicted {now.closure:.0%} closed" if now.closure is not None else ""),
-        "rejected": "; ".join(
-            _rejected(name, source) for name, source in now.inputs.items() if source.rejected
-        )
-        or "none",
+    }
+
+
+def _scheduling(now: Status) -> str:
+    granted = "real time" if now.realtime else "ordinary: real time was not granted"
+    return f"{granted}, memory {'' if now.memory_locked else 'not '}locked"
+
+
+def _target(now: Status) -> str:
+    """Target, its uncertainty, and the distance of the tool from it."""
+    if now.tool_m is None or now.target_m is None:
+        hands = "both hands" if now.needed == SIDES else f"the {now.hands} hand"
+        return f"none: the skill needs {hands}"
+    off_mm = 1000 * math.dist(now.tool_m, now.target_m)
+    return f"{_uncertain(now)}, the tool is {off_mm:.1f} mm from it{_doubt(now)}"
+
+
+def _uncertain(now: Status) -> str:
+    """The target with its standard deviation."""
+    return f"{_at(now.target_m)} ± {1000 * (now.std_m or 0.0):.1f} mm"
+
+
+def _segment(now: Status) -> str:
+    return f"{' -> '.join(now.segment)}, {now.segment_belief:.0%} probable" if now.segment else ""
+
+
+def _gripper(now: Status) -> str:
+    predicted = "" if now.closure is None else f", predicted {now.closure:.0%} closed"
+    return now.gripper + predicted
+
+
+def _all_rejected(now: Status) -> str:
+    """Rejected messages of all inputs."""
+    texts = [_rejected(name, source) for name, source in now.inputs.items() if source.rejected]
+    return "; ".join(texts) or "none"
+
+
+def _recording(scribe: Mapping[str, Any]) -> dict[str, str]:
+    """The recording, its disk and its losses, by name."""
+    return {
         "recording": scribe.get("recording") or f"none ({scribe.get('state', 'off')})",
         "disk": disk(scribe) if scribe.get("free_mb") is not None else "",
         "lost": f"{scribe['lost']} ticks are not recorded" if scribe.get("lost") else "",
         "trouble": "; ".join(scribe.get("errors") or ()),
     }
-    for name in ("lateness_us", "work_us", "latency_ms"):
-        label, unit = name.rsplit("_", 1)
-        values = getattr(now, name)
-        digits = 1 if unit == "us" else 2
-        rows_by_name[label] = (
-            f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, max "
-            f"{values.max:.{digits}f} " + unit.replace("us", "µs")
-            if values.max
-            else "none yet"
-        )
+
+
+def _durations(values: Percentiles, unit: str, *, digits: int) -> str:
+    """Percentiles of a duration with its unit."""
+    if not values.max:
+        return "none yet"
+    return (
+        f"p50 {values.p50:.{digits}f}, p99 {values.p99:.{digits}f}, "
+        f"max {values.max:.{digits}f} {unit}"
+    )
+
+
+def _latency(now: Status) -> str:
     if clocks := differing_clocks(now):
-        rows_by_name["latency"] = f"unknown: {clocks}"
-    return {name: text for name, text in rows_by_name.items() if text}
+        return f"unknown: {clocks}"
+    return _durations(now.latency_ms, "ms", digits=2)
 
 
 def hours_until_full(scribe: Mapping[str, Any]) -> float | None:

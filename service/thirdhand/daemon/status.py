@@ -54,83 +54,122 @@ class CellStatus(NamedTuple):
     def status(self, **more: Any) -> Status:
         """The status; `more` are the fields that the core does not know."""
         frame = self.frame
-        sources = self.sources
         settings = self.settings
-        begun = int(frame["tick"]) >= 0
-        is_seen = frame["hand_ages"] >= 0
         skill = self.controller.skill
         mode, reason = outcome(frame)
-        flags = Flag(int(frame["flags"]))
-        seen_now = self.evidence()
-        why = explained(
-            Flag.STUCK if flags & Flag.STUCK else reason if begun else Reason.NONE, seen_now
-        )
-        faulty = [(key, stream) for key, stream in self.streams.items() if stream.cause]
-        because = [
-            f"what arrives on {key} is {stream.cause}: {stream.refused}" for key, stream in faulty
-        ]
-        low, high = skill.demonstrated
         return Status(
             cell=settings.cell,
             mode=word(mode),
-            reason=word(reason) if begun else "",
-            because="; ".join(filter(None, [why.why, *because])),
-            remedy="; ".join(
-                filter(
-                    None, dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)])
-                )
-            ),
-            flags=tuple(map(word, flags)),
+            reason=word(reason) if self._has_begun else "",
+            flags=tuple(map(word, self._flags)),
             tick=int(frame["tick"]),
             skill=skill.name,
             residual_risk=skill.residual_risk,
-            hands=("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
             via_points=tuple(point.name for point in skill.via_points),
-            rejected=_by_cause({**sources, **self.streams}),
-            sources=sources,
+            rejected=_by_cause({**self.sources, **self.streams}),
+            sources=self.sources,
             streams=dict(self.streams),
             frames=settings.tracker_frames,
             trackers={
-                frame: settings.hands_in(frame).base_from_tracker
-                for frame in (settings.hands.frame, *settings.trackers)
+                tracker_frame: settings.hands_in(tracker_frame).base_from_tracker
+                for tracker_frame in (settings.hands.frame, *settings.trackers)
             },
             joints=settings.joints.names,
-            hand_age_ms={side: age for side in SIDES if (age := sources[side].age_ms) is not None},
-            hand_distance_m=round(float(frame["hand_distance"]), 4),
-            hand_limit_m_s=round(float(frame["hand_limit"]), 4),
-            hands_m={side: _point(frame["hands"][i]) for i, side in enumerate(SIDES) if is_seen[i]},
-            below_table_m={
-                side: depth_m
-                for i, side in enumerate(SIDES)
-                if is_seen[i] and (depth_m := self._below_table_m(i))
-            },
-            demonstrated_m={
+            gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
+            guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
+            threshold_m=round(skill.threshold, 5),
+            offer=offer_of(skill),
+            **self._explanation(),
+            **self._hands(),
+            **self._demonstrated(),
+            **self._task(),
+            **(self._decided() if self._has_begun else {}),
+            **(self._prediction() if frame["covariance"].any() else {}),
+            **more,
+        )
+
+    @property
+    def _has_begun(self) -> bool:
+        """True once a tick was decided."""
+        return int(self.frame["tick"]) >= 0
+
+    @property
+    def _flags(self) -> Flag:
+        return Flag(int(self.frame["flags"]))
+
+    def _explanation(self) -> dict[str, Any]:
+        """The fields with causes and remedies, of the incident and of faulty streams."""
+        _, reason = outcome(self.frame)
+        incident = Flag.STUCK if self._flags & Flag.STUCK else reason
+        why = explained(incident if self._has_begun else Reason.NONE, self.evidence())
+
+        faulty = [(key, stream) for key, stream in self.streams.items() if stream.cause]
+        causes = [
+            why.why,
+            *(
+                f"what arrives on {key} is {stream.cause}: {stream.refused}"
+                for key, stream in faulty
+            ),
+        ]
+        remedies = dict.fromkeys([why.what_to_do, *(stream.advice for _, stream in faulty)])
+        return {
+            "because": "; ".join(filter(None, causes)),
+            "remedy": "; ".join(filter(None, remedies)),
+        }
+
+    def _hands(self) -> dict[str, Any]:
+        """The fields on the hands: ages [ms], and positions and distances [m]."""
+        frame = self.frame
+        visible = {side: i for i, side in enumerate(SIDES) if frame["hand_ages"][i] >= 0}
+        depths_m = {side: self._below_table_m(i) for side, i in visible.items()}
+        ages_ms = {side: self.sources[side].age_ms for side in SIDES}
+        return {
+            "hand_age_ms": {side: age for side, age in ages_ms.items() if age is not None},
+            "hand_distance_m": round(float(frame["hand_distance"]), 4),
+            "hand_limit_m_s": round(float(frame["hand_limit"]), 4),
+            "hands_m": {side: _point(frame["hands"][i]) for side, i in visible.items()},
+            "below_table_m": {side: depth_m for side, depth_m in depths_m.items() if depth_m},
+        }
+
+    def _demonstrated(self) -> dict[str, Any]:
+        """The fields on the hands as demonstrated: needed ones, their boxes and via-points [m]."""
+        skill = self.controller.skill
+        low, high = skill.demonstrated
+        return {
+            "hands": ("left", "right", "both")[2 if skill.conductor is None else skill.conductor],
+            "demonstrated_m": {
                 side: (_point(low[i]), _point(high[i]))
                 for i, side in enumerate(SIDES)
                 if skill.conductor in (None, i)
             },
-            hands_at_m={
+            "hands_at_m": {
                 name: (_point(hands[:3]), _point(hands[3:])) for name, hands in _hands_at(skill)
             },
-            tool_m=_point(frame["tool"]) if begun else None,
-            setpoint_m=_point(frame["setpoint"]) if begun else None,
-            **(self._prediction() if frame["covariance"].any() else {}),
-            gripper={OPEN: "open", CLOSED: "closed"}.get(int(frame["gripper"]), ""),
-            segment=skill.model.names[frame["segment"] : frame["segment"] + 2]
-            if frame["segment_belief"]
-            else (),
-            segment_belief=round(float(frame["segment_belief"]), 3),
-            task_clock_s=round(float(self.state["task_clock"][CLOCK_S]), 2)
-            if skill.model.clock and skill.model.clock.weight
+        }
+
+    def _task(self) -> dict[str, Any]:
+        """The fields on the progress of the task."""
+        frame = self.frame
+        model = self.controller.skill.model
+        segment = int(frame["segment"])
+        has_clock = model.clock and model.clock.weight
+        return {
+            "segment": model.names[segment : segment + 2] if frame["segment_belief"] else (),
+            "segment_belief": round(float(frame["segment_belief"]), 3),
+            "task_clock_s": round(float(self.state["task_clock"][CLOCK_S]), 2)
+            if has_clock
             else None,
-            threshold_m=round(skill.threshold, 5),
-            guided=bool(self.state["tick"] < self.state["guided_until_tick"]),
-            offer=offer_of(skill),
-            binding=next((name for name, _ in binding(settings, np.asarray(frame).reshape(1))), "")
-            if begun
-            else "",
-            **more,
-        )
+        }
+
+    def _decided(self) -> dict[str, Any]:
+        """The fields on the tool that the newest tick decided."""
+        frame = self.frame
+        limits = binding(self.settings, np.asarray(frame).reshape(1))
+        return {
+            "tool_m": _point(frame["tool"]),
+            "setpoint_m": _point(frame["setpoint"]),
+            "binding": next((name for name, _ in limits), ""),
+        }
 
     def _below_table_m(self, side: int) -> float:
         """Depth of a hand below the table top [m]; 0 above it and beside it."""

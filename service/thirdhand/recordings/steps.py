@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from mcap.records import Message
+
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import WireError
 from thirdhand.core.frame import (
@@ -94,78 +96,130 @@ def steps(messages: Messages, settings: Settings, *, outputs: bool, whole: bool)
     for ticks that do not fit their messages, and for frames and states of another version, none of
     which can be decoded.
     """
-    names = channels.keys_by_topic(settings.cell, REPLAYED)
-    joints = len(settings.joints.names)
-    layouts = {"frame": frame_layout(joints), "timing": TIMING, "state": state_layout(joints)}
-    step: dict[str, Any] | None = None
-    fault_count = 0
-    damage = ""
-    refused: set[str] = set()  # keys of which a message was not decoded
-    readable: set[str] = set()  # keys of which a message was decoded
+    assembly = _Assembly(messages, settings, outputs=outputs, whole=whole)
+    try:
+        yield from assembly.steps()
+    except WireError as error:
+        raise RecordingError(f"{messages.path}: after tick {assembly.tick}: {error}") from None
 
-    def finished() -> Iterator[Step]:
-        """The step in progress, unless a part of it is damaged or cut."""
+
+class _Assembly:
+    """Steps in the making, from the messages of a recording."""
+
+    def __init__(
+        self, messages: Messages, settings: Settings, *, outputs: bool, whole: bool
+    ) -> None:
+        joints = len(settings.joints.names)
+        self._layouts = {
+            "frame": frame_layout(joints),
+            "timing": TIMING,
+            "state": state_layout(joints),
+        }
+        replayed = REPLAYED if outputs else REPLAYED.difference(_RECORDS)
+        self._names = channels.keys_by_topic(settings.cell, replayed)
+        self._messages = messages
+        self._needs_frames = outputs and whole
+        self._step: dict[str, Any] | None = None
+        self._fault_count = 0  # faults of the file before the step
+        self._damage = ""  # before the next step
+        self._refused: set[str] = set()  # keys of which a message was not decoded
+        self._readable: set[str] = set()  # keys of which a message was decoded
+
+    @property
+    def tick(self) -> int | str:
+        """The index of the tick in progress, or `none`."""
+        return self._step["tick"] if self._step else "none"
+
+    @property
+    def _is_damaged(self) -> bool:
+        return len(self._messages.faults) > self._fault_count
+
+    def steps(self) -> Iterator[Step]:
+        """Every complete tick in order, and the initial state. Raises WireError."""
+        for _, channel, message in self._messages:
+            if self._is_damaged:
+                yield from self._interrupted()
+            name = self._names.get(channel.topic)
+            value = None if name is None else self._decoded(name, channel.topic, message)
+            if name is None or value is None:
+                continue
+
+            if name == "tick":
+                yield from self._finished()
+                self._begin(value, message.log_time)
+            elif self._step is not None:
+                self._add(name, value)
+            elif name == "state":
+                yield Step(int(value["tick"]), state=value, damage=self._damage)
+                self._damage = ""
+        yield from self._finished()
+
+    def _interrupted(self) -> Iterator[Step]:
+        """The step before a fault of the file; the damage is noted for the next one."""
+        yield from self._finished()
+        faults = self._messages.faults
+        self._damage = "; ".join(map(str, faults[self._fault_count :]))
+        self._step = None
+        self._fault_count = len(faults)
+
+    def _decoded(self, name: str, topic: str, message: Message) -> Any:
+        """The content of a message; None if it is damaged. Raises WireError for a record if no
+        record of its kind can be decoded.
+        """
+        try:
+            value = _value(name, message.data, self._layouts)
+        except WireError as error:
+            if name in self._refused - self._readable and name in _RECORDS:
+                raise
+            self._refused.add(name)
+            self._messages.refuse(topic, message, error)
+            if name != "tick":
+                self._step = None
+            return None
+        self._readable.add(name)
+        return value
+
+    def _begin(self, tick: Any, time_ns: int) -> None:
+        """Begin the step of a tick's message."""
+        index, kinds, lost, recorded_sum = tick
+        self._step = {
+            "tick": index,
+            "kinds": kinds,
+            "events": [],
+            "lost": lost,
+            "time_ns": time_ns,
+            "damage": self._damage,
+            "checksum": recorded_sum,
+        }
+        self._damage = ""
+
+    def _add(self, name: str, value: Any) -> None:
+        """Add a record, the skill in force or an event to the step in progress."""
+        assert self._step is not None
+        if name in _RECORDS:
+            self._step[name] = value
+        elif name == "skill_in_force":
+            self._step["skill"] = value
+        else:
+            self._step["events"].append((name, value))
+
+    def _finished(self) -> Iterator[Step]:
+        """The step in progress, unless a part of it is damaged or cut. Raises WireError."""
+        step = self._step
         if step is None:
             return
         numbers = step.pop("kinds")
-        came = [kind for kind, _ in step["events"]]
-        lacks_frame = outputs and whole and "frame" not in step and step["checksum"] is None
-        if len(messages.faults) > fault_count and (len(came) != len(numbers) or lacks_frame):
+        recorded = [kind for kind, _ in step["events"]]
+        lacks_frame = self._needs_frames and "frame" not in step and step["checksum"] is None
+        if self._is_damaged and (len(recorded) != len(numbers) or lacks_frame):
             return
         kinds = [_kind(number) for number in numbers]
-        if came != kinds or lacks_frame:
+        if recorded != kinds or lacks_frame:
             frame = "a" if "frame" in step else "no"
-            raise WireError(f"tick {step['tick']} lists {kinds}; {came} and {frame} frame follow")
+            raise WireError(
+                f"tick {step['tick']} lists {kinds}; {recorded} and {frame} frame follow"
+            )
         yield Step(**step | {"events": tuple(step["events"])})
-
-    try:
-        for _, channel, message in messages:
-            if len(messages.faults) > fault_count:
-                yield from finished()
-                damage = "; ".join(str(fault) for fault in messages.faults[fault_count:])
-                step = None
-                fault_count = len(messages.faults)
-            name = names.get(channel.topic)
-            if name is None or (name in _RECORDS and not outputs):
-                continue
-            try:
-                value = _value(name, message.data, layouts)
-            except WireError as error:
-                if name in refused - readable and name in _RECORDS:
-                    raise
-                refused.add(name)
-                messages.refuse(channel.topic, message, error)
-                step = step if name == "tick" else None
-                continue
-            readable.add(name)
-            if name == "tick":
-                yield from finished()
-                index, kinds, lost, recorded_sum = value
-                step = {
-                    "tick": index,
-                    "kinds": kinds,
-                    "events": [],
-                    "lost": lost,
-                    "time_ns": message.log_time,
-                }
-                step["damage"] = damage
-                step["checksum"] = recorded_sum
-                damage = ""
-            elif step is None:
-                if name == "state":
-                    yield Step(int(value["tick"]), state=value, damage=damage)
-                    damage = ""
-            elif name in _RECORDS:
-                step[name] = value
-            elif name == "skill_in_force":
-                step["skill"] = value
-            else:
-                step["events"].append((name, value))
-        yield from finished()
-    except WireError as error:
-        raise RecordingError(
-            f"{messages.path}: after tick {step['tick'] if step else 'none'}: {error}"
-        ) from None
 
 
 def _value(name: str, data: bytes, layouts: dict[str, Any]) -> Any:
