@@ -42,6 +42,20 @@ CLIENT_PROBLEMS = {  # by the alert of TLS that the server sends
     ),
     "CERTIFICATE_EXPIRED": "has expired by the clock there",
 }
+FIXED_SETTINGS: dict[str, Any] = {  # of Zenoh, for every session
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "connect/exit_on_failure": True,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
+    "listen/exit_on_failure": True,
+    "plugins_loading/enabled": False,
+    "namespace": None,  # the contract's keys are absolute
+    # [batches] A tick publishes up to four messages, each a batch of its own. With Zenoh's 2,
+    # `put` waits for the thread that sends, for 1 ms, and drops the message.
+    "transport/link/tx/queue/size/real_time": 16,
+    # it is not faster here, and it bypasses the bounds on messages
+    "transport/shared_memory/enabled": False,
+}
 Attempted = TypeVar("Attempted")
 
 
@@ -92,44 +106,24 @@ def open_session(
     The caller closes the session. Raises UnreachableError, and CertificateError at once if TLS
     fails for a certificate.
     """
-    for how, endpoint in [
-        *(("connect to", address) for address in connect),
-        *(("listen on", address) for address in listen),
-    ]:
-        if lacks := lacking(endpoint):
-            raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
+    _check_endpoints(connect, listen)
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
     if otherwise and not connect and not listen:
         connect = _endpoints_in(config) or otherwise
     folder = os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate
     role = ("router" if connect else "peer") if listen or not connect else "client"
     settings: dict[str, Any] = {
+        **FIXED_SETTINGS,
         "mode": json.loads(config.get_json("mode")) or role,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
         "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
-        "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
-        "listen/exit_on_failure": True,
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
-        "plugins_loading/enabled": False,
-        "namespace": None,  # the contract's keys are absolute
-        # [batches] A tick publishes up to four messages, each a batch of its own. With Zenoh's 2,
-        # `put` waits for the thread that sends, for 1 ms, and drops the message.
-        "transport/link/tx/queue/size/real_time": 16,
-        # it is not faster here, and it bypasses the bounds on messages
-        "transport/shared_memory/enabled": False,
         **_tls(folder),
         **(more or {}),
     }
-
-    if at_once and (failed := _failures(connect)):
-        raise UnreachableError(
-            _unreached(failed)
-            or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
-        )
+    if at_once:
+        _check_reachable(connect)
 
     def opened() -> zenoh.Session:
         try:
@@ -137,15 +131,35 @@ def open_session(
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
-            # else the file may have certificates of its own
-            ours = connect if folder or not zenoh_config else ()
-            if problem := next(
-                filter(None, (tls_problem(endpoint, folder) for endpoint in ours)), ""
-            ):
-                raise CertificateError(problem) from None
+            if folder or not zenoh_config:  # else the file may have certificates of its own
+                _check_certificates(connect, folder)
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
     return tried(opened, None if timeout_s is None and not listen else 0.0)
+
+
+def _check_endpoints(connect: Sequence[str], listen: Sequence[str]) -> None:
+    """Raise UnreachableError for an endpoint that is not valid."""
+    for how, endpoints_of_kind in (("connect to", connect), ("listen on", listen)):
+        for endpoint in endpoints_of_kind:
+            if lacks := lacking(endpoint):
+                raise UnreachableError(f"cannot {how} {endpoint}: {lacks}")
+
+
+def _check_reachable(connect: Sequence[str]) -> None:
+    """Raise UnreachableError if the system connects to none of these endpoints."""
+    if failed := _failures(connect):
+        raise UnreachableError(
+            _unreached(failed)
+            or f"nothing listens at {', '.join(connect)}: is a daemon or a router running there?"
+        )
+
+
+def _check_certificates(connect: Sequence[str], folder: str | Path | None) -> None:
+    """Raise CertificateError if TLS fails at one of these endpoints."""
+    for endpoint in connect:
+        if problem := tls_problem(endpoint, folder):
+            raise CertificateError(problem) from None
 
 
 def check_open(session: zenoh.Session) -> None:
@@ -193,18 +207,9 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
     """
     if (address := tcp_address(endpoint)) is None:
         return ""
-    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     is_plain = not endpoint.startswith("tls/")
     try:
-        if folder and not is_plain:
-            certificate, key, authority = (
-                Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY)
-            )
-            tls.load_verify_locations(authority)
-            tls.load_cert_chain(certificate, key)
-        else:
-            tls.check_hostname = False
-            tls.verify_mode = ssl.CERT_NONE
+        tls = _client_context(None if is_plain else folder)
         with (
             socket.create_connection(address, timeout=ATTEMPT_S) as plain,
             tls.wrap_socket(plain, server_hostname=address[0]) as secured,
@@ -219,18 +224,36 @@ def tls_problem(endpoint: str, folder: str | Path | None) -> str:
         words = SERVER_PROBLEMS.get(error.verify_code, f"is not from the authority in {folder}")
         return f"the certificate of the daemon or router at {endpoint} {words}"
     except ssl.SSLError as error:
-        if is_plain:
-            return ""
-        problem = CLIENT_PROBLEMS.get(str(error.reason).partition("ALERT_")[2], "")
-        if folder or not problem:
-            return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
-        return (
-            f"{endpoint} requires a certificate, and none was given: the folder of your role "
-            "needed, in $THIRDHAND_CERTIFICATE or in the file of client settings"
-        )
+        return "" if is_plain else _refusal(endpoint, folder, error)
     except OSError:
         pass
     return ""
+
+
+def _client_context(folder: str | Path | None) -> ssl.SSLContext:
+    """A client's TLS context with the certificate in a folder; without one, it verifies nothing."""
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    if folder:
+        certificate, key, authority = (
+            Path(folder).expanduser() / name for name in (CERTIFICATE, KEY, AUTHORITY)
+        )
+        tls.load_verify_locations(authority)
+        tls.load_cert_chain(certificate, key)
+    else:
+        tls.check_hostname = False
+        tls.verify_mode = ssl.CERT_NONE
+    return tls
+
+
+def _refusal(endpoint: str, folder: str | Path | None, error: ssl.SSLError) -> str:
+    """The reason why a server refuses a client's certificate, in words; empty for other errors."""
+    problem = CLIENT_PROBLEMS.get(str(error.reason).partition("ALERT_")[2], "")
+    if folder or not problem:
+        return problem and f"{endpoint} refuses the certificate in {folder}, which {problem}"
+    return (
+        f"{endpoint} requires a certificate, and none was given: the folder of your role "
+        "needed, in $THIRDHAND_CERTIFICATE or in the file of client settings"
+    )
 
 
 def tried(
@@ -258,10 +281,14 @@ def tried(
             if timeout_s is not None and waited_s >= timeout_s:
                 raise
             if not silent and waited_s > ATTEMPT_S / 2:
-                until = "until Ctrl-C" if timeout_s is None else f"up to {timeout_s:g} s"
-                print(f"waiting, {until}: {error}", file=sys.stderr, flush=True)
+                _report_waiting(error, timeout_s)
                 silent = True
             time.sleep(RETRY_S)
+
+
+def _report_waiting(error: UnreachableError, timeout_s: float | None) -> None:
+    until = "until Ctrl-C" if timeout_s is None else f"up to {timeout_s:g} s"
+    print(f"waiting, {until}: {error}", file=sys.stderr, flush=True)
 
 
 def _why_not(reason: str, connect: Sequence[str], listen: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ certificate allows each role what is listed here, and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
 from thirdhand.contract import channels, ros2
@@ -20,6 +20,11 @@ OBJECTS = ("objects",)
 TOPICS = (*ros2.HEARD, *ros2.SAID)
 # certificates of a role; access control compares whole names, so all are listed
 MOST_OF_A_ROLE = 99
+STATUS_OF_ALL = [channels.key("**", "status")]
+# messages with which a session notices others
+LIVELINESS_TOKENS = ["liveliness_token"]
+LIVELINESS_QUERIES = ["liveliness_query", "declare_liveliness_subscriber"]
+LIVELINESS = [*LIVELINESS_TOKENS, *LIVELINESS_QUERIES]
 
 
 class Role(NamedTuple):
@@ -83,90 +88,123 @@ def access_control(
     certificates with `revoked` names. The rights of a role hold in a ROS 2 domain too, for the
     cell's own topics and `more_topics`.
     """
-
-    def keys(suffixes: tuple[str, ...], *, topics: bool = False) -> list[str]:
-        expressions = [channels.key(cell, suffix) for suffix in suffixes]
-        if topics and ros2_domain is not None:
-            candidates = (channels.BY_KEY[suffix] for suffix in suffixes)
-            also = (ros2.of_channel(cell, channel) for channel in candidates if channel in TOPICS)
-            expressions += [ros2.key(ros2_domain, topic) for topic in also]
-            expressions += [
-                ros2.key(ros2_domain, topic) for topic in more_topics if topic.channel in suffixes
-            ]
-        return expressions
-
-    heard = keys(
-        tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out"),
-        topics=True,
-    )
-    asked = keys(tuple(channel.key for channel in channels.CHANNELS if channel.queryable))
-    rules: list[dict[str, Any]] = []
-
-    def allow(name: str, flow: str, messages: list[str], key_exprs: list[str]) -> str:
-        rule = {"id": f"{name} {flow}", "permission": "allow", "flows": [flow]}
-        rules.append(rule | {"messages": messages, "key_exprs": key_exprs})
-        return str(rule["id"])
-
-    def both(name: str, ingress: list[str], egress: list[str], key_exprs: list[str]) -> list[str]:
-        return [
-            allow(name, "ingress", ingress, key_exprs),
-            allow(name, "egress", egress, key_exprs),
-        ]
-
-    viewer_topics = {
-        ros2.key(ros2_domain or 0, topic): topic
-        for topic in more_topics
-        if topic.channel.startswith("/")
-    }
-    latched = [
-        key_expr
-        for key, topic in viewer_topics.items()
-        if topic.latched
-        for key_expr in (key, ros2.kept(key))
-    ]
-    hear = both("hear", ["declare_subscriber"], ["put"], [*heard, *viewer_topics])
-    record = both(
-        "record", ["declare_subscriber"], ["put"], keys((*HANDS, *ARM, *TOOL), topics=True)
-    )
-    ask = both("ask", ["query"], ["declare_queryable", "reply"], asked)
-
-    # All roles see the daemons of all cells, which may be connected to this one.
-    status = [channels.key("**", "status")]
-    present = [channels.PRESENCE_OF_ALL]
-    tokens = ["liveliness_token"]
-    queries = ["liveliness_query", "declare_liveliness_subscriber"]
-    if latched:
-        asking = [*queries, "query", "declare_subscriber"]
-        hear += both(
-            "hear what is latched", asking, [*tokens, "declare_queryable", "reply", "put"], latched
-        )
-    see = both("see", ["query"], ["declare_queryable", "reply"], status)
-    see += both("see who lives", queries, tokens, present)
-    alive = [*tokens, *queries]
-    answers = ["query", "reply", "declare_queryable"]
-    if ros2_domain is not None:
-        see += both("see topics", alive, alive, [ros2.all_tokens(ros2_domain)])
-    # daemons notice each other, and pass on to each other who asks for a status
-    neighbours = both("neighbours", alive, alive, present) + both(
-        "neighbours' status", answers, answers, status
-    )
-
-    allowed = {}
-    for name, role in ROLES.items():
-        allowed[name] = see + role.hears * hear + role.hears_inputs * record + role.asks * ask
-        allowed[name] += (name == ROUTER) * neighbours
-        if role.publishes:
-            published = keys(role.publishes, topics=True)
-            allowed[name] += both(f"{name} publish", ["put"], ["declare_subscriber"], published)
-    allowed[DAEMON] = neighbours
+    rules = _Rules(cell, ros2_domain, more_topics)
+    allowed = rules.by_role()
     valid = {role: [name for name in names(role) if name not in revoked] for role in allowed}
     granted = [role for role in allowed if valid[role]]  # an empty list would mean everybody
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
-            "rules": rules,
+            "rules": rules.rules,
             "subjects": [{"id": role, "cert_common_names": valid[role]} for role in granted],
             "policies": [{"subjects": [role], "rules": allowed[role]} for role in granted],
         }
     }
+
+
+class _Rules:
+    """Rules of Zenoh's access control for one cell. Each right is a list of their names."""
+
+    def __init__(
+        self, cell: str, ros2_domain: int | None, more_topics: Collection[ros2.Topic]
+    ) -> None:
+        self.rules: list[dict[str, Any]] = []
+        self._cell = cell
+        self._ros2_domain = ros2_domain
+        self._more_topics = more_topics
+
+    def by_role(self) -> dict[str, list[str]]:
+        """The names of the rules that each role has."""
+        hear = self._hear()
+        record = self._both(
+            "record", ["declare_subscriber"], ["put"], self._streams((*HANDS, *ARM, *TOOL))
+        )
+        requests = [channel.key for channel in channels.CHANNELS if channel.queryable]
+        ask = self._both("ask", ["query"], ["declare_queryable", "reply"], self._keys(requests))
+        hear += self._hear_latched()
+        see = self._see()
+        neighbours = self._neighbours()
+
+        allowed = {}
+        for name, role in ROLES.items():
+            allowed[name] = see + role.hears * hear + role.hears_inputs * record + role.asks * ask
+            allowed[name] += (name == ROUTER) * neighbours
+            if role.publishes:
+                published = self._streams(role.publishes)
+                allowed[name] += self._both(
+                    f"{name} publish", ["put"], ["declare_subscriber"], published
+                )
+        allowed[DAEMON] = neighbours
+        return allowed
+
+    def _both(
+        self, name: str, ingress: list[str], egress: list[str], key_exprs: list[str]
+    ) -> list[str]:
+        """The names of two new rules: these messages are allowed to come in and to go out."""
+        for flow, messages in (("ingress", ingress), ("egress", egress)):
+            rule = {"id": f"{name} {flow}", "permission": "allow", "flows": [flow]}
+            self.rules.append(rule | {"messages": messages, "key_exprs": key_exprs})
+        return [f"{name} ingress", f"{name} egress"]
+
+    def _keys(self, suffixes: Iterable[str]) -> list[str]:
+        return [channels.key(self._cell, suffix) for suffix in suffixes]
+
+    def _streams(self, suffixes: tuple[str, ...]) -> list[str]:
+        """The keys of streams, in the cell and in the ROS 2 domain."""
+        keys = self._keys(suffixes)
+        if self._ros2_domain is None:
+            return keys
+        candidates = (channels.BY_KEY[suffix] for suffix in suffixes)
+        topics = [
+            *(ros2.of_channel(self._cell, channel) for channel in candidates if channel in TOPICS),
+            *(topic for topic in self._more_topics if topic.channel in suffixes),
+        ]
+        return keys + [ros2.key(self._ros2_domain, topic) for topic in topics]
+
+    def _viewer_topics(self) -> dict[str, ros2.Topic]:
+        """The topics for viewers in the ROS 2 domain, by key."""
+        return {
+            ros2.key(self._ros2_domain or 0, topic): topic
+            for topic in self._more_topics
+            if topic.channel.startswith("/")
+        }
+
+    def _hear(self) -> list[str]:
+        """The right to receive all outputs."""
+        outputs = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
+        heard = [*self._streams(outputs), *self._viewer_topics()]
+        return self._both("hear", ["declare_subscriber"], ["put"], heard)
+
+    def _hear_latched(self) -> list[str]:
+        """The right to receive topics for viewers that were published earlier."""
+        latched = [
+            key_expr
+            for key, topic in self._viewer_topics().items()
+            if topic.latched
+            for key_expr in (key, ros2.kept(key))
+        ]
+        if not latched:
+            return []
+        asking = [*LIVELINESS_QUERIES, "query", "declare_subscriber"]
+        answers = [*LIVELINESS_TOKENS, "declare_queryable", "reply", "put"]
+        return self._both("hear what is latched", asking, answers, latched)
+
+    def _see(self) -> list[str]:
+        """The right to see the daemons of all cells, which may be connected to this one."""
+        see = self._both("see", ["query"], ["declare_queryable", "reply"], STATUS_OF_ALL)
+        see += self._both(
+            "see who lives", LIVELINESS_QUERIES, LIVELINESS_TOKENS, [channels.PRESENCE_OF_ALL]
+        )
+        if self._ros2_domain is not None:
+            tokens = [ros2.all_tokens(self._ros2_domain)]
+            see += self._both("see topics", LIVELINESS, LIVELINESS, tokens)
+        return see
+
+    def _neighbours(self) -> list[str]:
+        """The right to notice other daemons, and to pass on requests of their status."""
+        answers = ["query", "reply", "declare_queryable"]
+        return [
+            *self._both("neighbours", LIVELINESS, LIVELINESS, [channels.PRESENCE_OF_ALL]),
+            *self._both("neighbours' status", answers, answers, STATUS_OF_ALL),
+        ]

@@ -416,15 +416,8 @@ class Settings(Section, frozen=True):
 
     def _problems(self) -> Iterator[str]:
         """Contradictions between values that are valid on their own."""
-        unusable = {
-            path: value
-            for path, value in _numbers(msgspec.to_builtins(self), "$")
-            if value != 0.0
-            and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER  # also what is not finite
-        }
-        for path, value in unusable.items():
-            sizes = f"{SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
-            yield f"{path}: {value:g} given; a finite number, 0 or of a size from {sizes}, accepted"
+        unusable = list(self._unusable_numbers())
+        yield from unusable
         if {".", ".."} & set(self.cell.split("/")):
             yield f"$.cell: {self.cell!r} given; no . or .. between the slashes accepted"
         if (size := len(self.cell.encode())) > MAX_CELL_BYTES:
@@ -434,13 +427,38 @@ class Settings(Section, frozen=True):
             )
         if unusable:
             return
-        if self.network.ros2_domain is not None and not ros2.is_name(self.cell):
+        yield from self._problems_of_ros2()
+        yield from self._problems_of_trackers()
+        yield from self._problems_of_poses()
+        if not math.hypot(*self.people.toward_elbow) > 1e-6:
+            direction = list(self.people.toward_elbow)
+            yield f"$.people.toward_elbow: {direction} given; a direction needed"
+        yield from self._problems_of_speeds()
+        if self.reach.inner >= self.reach.outer:
+            yield (
+                f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = "
+                f"{self.reach.outer} needed"
+            )
+        yield from self._problems_of_joints()
+
+    def _unusable_numbers(self) -> Iterator[str]:
+        """Numbers that are not finite, too large or too small."""
+        for path, value in _numbers(msgspec.to_builtins(self), "$"):
+            if value != 0.0 and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER:
+                yield (
+                    f"{path}: {value:g} given; a finite number, 0 or of a size from "
+                    f"{SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}, accepted"
+                )
+
+    def _problems_of_ros2(self) -> Iterator[str]:
+        domain = self.network.ros2_domain
+        if domain is not None and not ros2.is_name(self.cell):
             yield (
                 f"$.cell: {self.cell!r} given; with $.network.ros2_domain names of letters, digits "
                 "and single _, none of them with a digit first, joined by slashes needed"
             )
         named = dict.fromkeys(topic.name for topic in ros2.of_settings(self.ros2))
-        if named and self.network.ros2_domain is None:
+        if named and domain is None:
             yield (
                 f"$.network.ros2_domain: none given; for {', '.join(named)} one from 0 to "
                 f"{ros2.LAST_DOMAIN} needed"
@@ -450,6 +468,8 @@ class Settings(Section, frozen=True):
                 f"$.ros2.joints: {list(self.ros2.joints)} given; those of $.joints.names needed, "
                 "in any order"
             )
+
+    def _problems_of_trackers(self) -> Iterator[str]:
         for name in self.trackers:
             if not re.fullmatch(r"[\w./-]{1,64}", name):
                 yield (
@@ -461,14 +481,18 @@ class Settings(Section, frozen=True):
                     f"$.trackers.{name}: the frame {name!r} given; another one than {BASE!r} and "
                     "$.hands.frame needed"
                 )
-        for path, pose in (
-            ("$.hands.base_from_tracker", self.hands.base_from_tracker),
-            *(
-                (f"$.trackers.{name}.base_from_tracker", tracker.base_from_tracker)
+
+    def _problems_of_poses(self) -> Iterator[str]:
+        """Problems of the poses of trackers and tool."""
+        poses = {
+            "$.hands.base_from_tracker": self.hands.base_from_tracker,
+            **{
+                f"$.trackers.{name}.base_from_tracker": tracker.base_from_tracker
                 for name, tracker in self.trackers.items()
-            ),
-            ("$.tool.plate_from_tool", self.tool.plate_from_tool),
-        ):
+            },
+            "$.tool.plate_from_tool": self.tool.plate_from_tool,
+        }
+        for path, pose in poses.items():
             norm = math.hypot(*pose[3:])
             if max(map(abs, pose[:3])) > FARTHEST_FRAME_M:
                 yield (
@@ -480,25 +504,20 @@ class Settings(Section, frozen=True):
                     f"{path}: quaternion {list(pose[3:])} has norm {norm:.4f}; norm 1 needed (x y "
                     "z w)"
                 )
-        if not math.hypot(*self.people.toward_elbow) > 1e-6:
-            direction = list(self.people.toward_elbow)
-            yield f"$.people.toward_elbow: {direction} given; a direction needed"
-        if self.tool.fault_speed < self.tool.max_speed:
+
+    def _problems_of_speeds(self) -> Iterator[str]:
+        """Speeds of the tool that contradict its largest speed."""
+        tool = self.tool
+        if tool.fault_speed < tool.max_speed:
             yield (
-                f"$.tool.fault_speed: {self.tool.fault_speed} given; "
-                f"at least $.tool.max_speed = {self.tool.max_speed} needed"
+                f"$.tool.fault_speed: {tool.fault_speed} given; "
+                f"at least $.tool.max_speed = {tool.max_speed} needed"
             )
-        if self.tool.engage_speed > max(self.tool.max_speed, ToolSettings().engage_speed):
+        if tool.engage_speed > max(tool.max_speed, ToolSettings().engage_speed):
             yield (
-                f"$.tool.engage_speed: {self.tool.engage_speed} given; "
-                f"at most $.tool.max_speed = {self.tool.max_speed} accepted"
+                f"$.tool.engage_speed: {tool.engage_speed} given; "
+                f"at most $.tool.max_speed = {tool.max_speed} accepted"
             )
-        if self.reach.inner >= self.reach.outer:
-            yield (
-                f"$.reach.inner: {self.reach.inner} given; less than $.reach.outer = "
-                f"{self.reach.outer} needed"
-            )
-        yield from self._problems_of_joints()
 
     def _problems_of_joints(self) -> Iterator[str]:
         count = len(self.joints.names)
@@ -508,28 +527,41 @@ class Settings(Section, frozen=True):
                 "needed"
             )
             return
+        uneven = list(self._uneven_fields())
+        yield from uneven
+        if not uneven:
+            yield from self._too_wide_limits()
+            yield from self._problems_of_ranges()
+
+    def _uneven_fields(self) -> Iterator[str]:
+        """Fields that do not have one value for each joint."""
+        count = len(self.joints.names)
         fields: dict[str, tuple[object, ...]] = {
             f"$.joints.{name}": getattr(self.joints, name) for name in LIMITS
         }
         fields |= {"$.arm.posture": self.arm.posture, "$.joints.kinds": self.joints.every_kind}
-        uneven = {path: values for path, values in fields.items() if len(values) != count}
-        for path, values in uneven.items():
-            quantity = "kinds" if path == "$.joints.kinds" else "numbers"
-            needed = f"{count} needed, one for each of $.joints.names"
-            yield f"{path}: {len(values)} {quantity}, {needed}"
-        if uneven:
-            return
+        for path, values in fields.items():
+            if len(values) != count:
+                quantity = "kinds" if path == "$.joints.kinds" else "numbers"
+                needed = f"{count} needed, one for each of $.joints.names"
+                yield f"{path}: {len(values)} {quantity}, {needed}"
+
+    def _too_wide_limits(self) -> Iterator[str]:
+        """Limits of the joints beyond the widest ones."""
         widest = self._widest()
         for name in LIMITS:
-            for i, (limit, bound) in enumerate(
-                zip(getattr(self.joints, name), widest[name], strict=True)
-            ):
+            limits = getattr(self.joints, name)
+            for i, (limit, bound) in enumerate(zip(limits, widest[name], strict=True)):
+                path = f"$.joints.{name}[{i}]"
                 if name == "lower" and limit < bound:
-                    yield f"$.joints.lower[{i}]: {limit} given; {bound} or more accepted"
+                    yield f"{path}: {limit} given; {bound} or more accepted"
                 if name == "upper" and limit > bound:
-                    yield f"$.joints.upper[{i}]: {limit} given; {bound} or less accepted"
+                    yield f"{path}: {limit} given; {bound} or less accepted"
                 if name not in ("lower", "upper") and not 0 < limit <= bound:
-                    yield f"$.joints.{name}[{i}]: {limit} given; above 0, up to {bound} accepted"
+                    yield f"{path}: {limit} given; above 0, up to {bound} accepted"
+
+    def _problems_of_ranges(self) -> Iterator[str]:
+        """Empty ranges of joints, and postures outside."""
         for i, (low, high, position) in enumerate(
             zip(self.joints.lower, self.joints.upper, self.arm.posture, strict=True)
         ):
