@@ -109,33 +109,43 @@ def open_session(
     _check_endpoints(connect, listen)
     config = _zenoh_config(zenoh_config or os.environ.get("THIRDHAND_ZENOH_CONFIG"))
     if otherwise and not connect and not listen:
-        connect = _endpoints_in(config) or otherwise
+        connect = _endpoints_in(config, otherwise)
     folder = os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate
-    role = ("router" if connect else "peer") if listen or not connect else "client"
-    settings: dict[str, Any] = {
-        **FIXED_SETTINGS,
-        "mode": json.loads(config.get_json("mode")) or role,
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
-        "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
-        "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
-        **_tls(folder),
-        **(more or {}),
-    }
+    settings = _settings(config, connect, listen, timeout_s) | _tls(folder) | dict(more or {})
     if at_once:
         _check_reachable(connect)
 
     def opened() -> zenoh.Session:
         try:
-            for name, value in settings.items():
-                config.insert_json5(name, json.dumps(value))
-            return zenoh.open(config)
+            return _opened(config, settings)
         except zenoh.ZError as error:
             if folder or not zenoh_config:  # else the file may have certificates of its own
                 _check_certificates(connect, folder)
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
     return tried(opened, None if timeout_s is None and not listen else 0.0)
+
+
+def _settings(
+    config: zenoh.Config, connect: Sequence[str], listen: Sequence[str], timeout_s: float | None
+) -> dict[str, Any]:
+    """Zenoh's settings for a session between these endpoints, by name."""
+    role = ("router" if connect else "peer") if listen or not connect else "client"
+    return {
+        **FIXED_SETTINGS,
+        "mode": json.loads(config.get_json("mode")) or role,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
+        "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
+    }
+
+
+def _opened(config: zenoh.Config, settings: Mapping[str, Any]) -> zenoh.Session:
+    """An open session with these settings. Raises zenoh.ZError."""
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return zenoh.open(config)
 
 
 def _check_endpoints(connect: Sequence[str], listen: Sequence[str]) -> None:
@@ -321,12 +331,14 @@ def _zenoh_config(path: str | Path | None) -> zenoh.Config:
         raise UnreachableError(f"cannot read the Zenoh configuration {path}: {reason}") from None
 
 
-def _endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
-    """The endpoints to connect to in a configuration, for every mode or for clients."""
+def _endpoints_in(config: zenoh.Config, otherwise: Sequence[str]) -> Sequence[str]:
+    """The endpoints to connect to in a configuration, for every mode or for clients; `otherwise`
+    without any.
+    """
     configured = json.loads(config.get_json("connect/endpoints"))
-    return tuple(
-        configured.get("client") or () if isinstance(configured, dict) else configured or ()
-    )
+    if isinstance(configured, dict):
+        configured = configured.get("client")
+    return tuple(configured or ()) or otherwise
 
 
 def _tls(folder: str | Path | None) -> dict[str, Any]:

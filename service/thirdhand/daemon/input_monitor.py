@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from statistics import median
+from typing import Any
 
 import msgspec
 
@@ -55,11 +56,39 @@ class _History:
     def __init__(self) -> None:
         self.counts: deque[tuple[float, int]] = deque()
         self.clocks: deque[tuple[float, float]] = deque()
-        self.seen: dict[str, int] = {}
+        self.counted: dict[str, int] = {}  # rejected messages at the last update, by cause
         self.logged: dict[str, int] = {}
         self.found: dict[str, Explanation] = {}  # of the newest rejected sample, by cause
         self.cause = ""
         self.refused_s = -math.inf
+
+    def update(self, arrivals: Arrivals, now_s: float) -> None:
+        """Note the number of messages, and the difference of clocks in a new one."""
+        is_new = self.counts and self.counts[-1][1] != arrivals.count
+        if is_new and arrivals.newest is not None:
+            self.clocks.append((now_s, (arrivals.at_ns - arrivals.newest.stamp_ns) / 1e6))
+        self.counts.append((now_s, arrivals.count))
+
+        while self.counts[0][0] < now_s - RATE_WINDOW_S - 0.05:
+            self.counts.popleft()
+        while self.clocks and self.clocks[0][0] < now_s - RATE_WINDOW_S:
+            self.clocks.popleft()
+
+    def rate_hz(self) -> float:
+        """Rate of the messages in the last second [Hz]."""
+        begin_s, before = self.counts[0]
+        now_s, count = self.counts[-1]
+        return round((count - before) / (now_s - begin_s), 1) if now_s > begin_s else 0.0
+
+    def clock_ms(self) -> float | None:
+        """Difference of the clocks [ms]; None without a message in the last second."""
+        return round(median(ms for _, ms in self.clocks), 1) if self.clocks else None
+
+    def newest(self, now_s: float) -> tuple[str, Explanation]:
+        """The newest rejection of the last second, by its cause and in words; empty: none."""
+        if now_s - self.refused_s > RATE_WINDOW_S:
+            return "", Explanation("", "")
+        return self.cause, self.found[self.cause]
 
 
 class InputMonitor:
@@ -92,87 +121,80 @@ class InputMonitor:
         """
         history = self._histories[name]
         arrivals = self.arrivals[self._keys[name]]
-        if (
-            history.counts
-            and history.counts[-1][1] != arrivals.count
-            and arrivals.newest is not None
-        ):
-            history.clocks.append((now_s, (arrivals.at_ns - arrivals.newest.stamp_ns) / 1e6))
-        history.counts.append((now_s, arrivals.count))
-        while history.counts[0][0] < now_s - RATE_WINDOW_S - 0.05:
-            history.counts.popleft()
-        while history.clocks and history.clocks[0][0] < now_s - RATE_WINDOW_S:
-            history.clocks.popleft()
-        since_s, before = history.counts[0]
-        counted = {
-            MALFORMED: arrivals.malformed,
-            FROZEN: arrivals.frozen,
-            OTHER_PUBLISHER: arrivals.others,
-        }
-        rejected = {cause: count for cause, count in counted.items() if count}
-        if intake is not None:
-            counts = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
-            rejected = {word(cause): int(n) for cause, n in counts if n} | rejected
-        for cause in (
-            cause for cause, count in rejected.items() if count != history.seen.get(cause)
-        ):
-            if cause in (FROZEN, OTHER_PUBLISHER):
-                history.found[cause] = explained(Condition[cause.upper()])
-            elif cause == MALFORMED or intake is None:
-                history.found[cause] = explained(
-                    Condition.MALFORMED, Evidence(mistake=arrivals.why)
-                )
-            else:
-                refused = intake.refused[name, Cause[cause.upper()]]
-                seen_of = evidence(refused, self._settings, arrivals)
-                history.found[cause] = explained(refused.cause, seen_of)
-            history.cause = cause
-            history.refused_s = now_s
-        history.seen = rejected
-        lately = now_s - history.refused_s <= RATE_WINDOW_S
-        newest = history.found[history.cause] if lately else None
+        history.update(arrivals, now_s)
+        rejected = _rejected(name, arrivals, intake)
+        for cause, count in rejected.items():
+            if count != history.counted.get(cause):
+                history.found[cause] = self._explained(name, cause, intake)
+                history.cause = cause
+                history.refused_s = now_s
+        history.counted = rejected
+
+        cause, explanation = history.newest(now_s)
         return Source(
-            rate_hz=round((arrivals.count - before) / (now_s - since_s), 1)
-            if now_s > since_s
-            else 0.0,
-            clock_ms=round(median(ms for _, ms in history.clocks), 1) if history.clocks else None,
+            rate_hz=history.rate_hz(),
+            clock_ms=history.clock_ms(),
             frame="" if arrivals.newest is None else arrivals.newest.frame_id[:LONGEST_NAME],
             rejected=rejected,
-            cause=history.cause if lately else "",
-            refused="" if newest is None else newest.why,
-            advice="" if newest is None else newest.what_to_do,
+            cause=cause,
+            refused=explanation.why,
+            advice=explanation.what_to_do,
         )
 
+    def _explained(self, name: str, cause: str, intake: Intake | None) -> Explanation:
+        """The newest rejection of a source for this cause, in words."""
+        arrivals = self.arrivals[self._keys[name]]
+        if cause in (FROZEN, OTHER_PUBLISHER):
+            return explained(Condition[cause.upper()])
+        if cause == MALFORMED or intake is None:
+            return explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
+        refused = intake.refused[name, Cause[cause.upper()]]
+        return explained(refused.cause, evidence(refused, self._settings, arrivals))
+
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
-        index = SOURCES.index(source)
-        arrivals = self.arrivals[self._keys[source]]
-        sample_tick = int(state["arm_tick"] if source == "arm" else state["hand_ticks"][index])
+        """Hand or arm at this moment: its stream, its age [ms], and what only its kind has."""
         settings = self._settings
+        is_arm = source == "arm"
+        index = SOURCES.index(source)
+        sample_tick = int(state["arm_tick"] if is_arm else state["hand_ticks"][index])
         age_ms = (
             None
             if sample_tick < 0
             else round((int(state["tick"]) - sample_tick) * settings.period_s * 1e3, 1)
         )
-        stale_ms = (
-            0.0 if source == "arm" else float(state["stale_ticks"][index]) * settings.period_s * 1e3
+        silent_ms = settings.arm.silent_ms if is_arm else self._stale_ms(state, index)
+        of_its_kind: dict[str, Any] = (
+            {"contested": round(float(state["arm_contested"]), 3)}
+            if is_arm
+            else self._hand(source, state)
         )
-        silent_ms = settings.arm.silent_ms if source == "arm" else stale_ms
-        late = None if source == "arm" else lateness_ms(state, index, settings.period_s)
         return msgspec.structs.replace(
             self._stream(source, now_s, controller.intake),
             age_ms=age_ms,
             fresh=age_ms is not None and age_ms < silent_ms,
-            late_ms=None if late is None else round(late[0], 1),
-            late_95_ms=None if late is None else round(late[1], 1),
-            contested=round(float(state["arm_contested"]), 3) if source == "arm" else 0.0,
-            scatter_mm=None
-            if source == "arm" or sample_tick < 0
-            else round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2),
-            unit=self._unit_of(arrivals.newest),
-            batches_ms=0.0
-            if source == "arm"
-            else round(arrivals.batches_ms(stale_ms or settings.hands.stale_ms), 1),
+            unit=self._unit_of(self.arrivals[self._keys[source]].newest),
+            **of_its_kind,
         )
+
+    def _stale_ms(self, state: Record, index: int) -> float:
+        """Age [ms] from which a hand is stale."""
+        return float(state["stale_ticks"][index]) * self._settings.period_s * 1e3
+
+    def _hand(self, side: str, state: Record) -> dict[str, Any]:
+        """Delays, scatter and batches of a hand's samples, by field of its source."""
+        index = SOURCES.index(side)
+        arrivals = self.arrivals[self._keys[side]]
+        stale_ms = self._stale_ms(state, index) or self._settings.hands.stale_ms
+        late_ms = lateness_ms(state, index, self._settings.period_s)
+        is_seen = int(state["hand_ticks"][index]) >= 0
+        return {
+            "late_ms": None if late_ms is None else round(late_ms[0], 1),
+            "late_95_ms": None if late_ms is None else round(late_ms[1], 1),
+            "scatter_mm": round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2)
+            if is_seen
+            else None,
+            "batches_ms": round(arrivals.batches_ms(stale_ms), 1),
+        }
 
     def _unit_of(self, newest: PoseStamped | JointState | None) -> str:
         """The unit in which a hand's position seems to be; empty if it is that of the settings."""
@@ -219,6 +241,21 @@ class InputMonitor:
             self._counted_s = now_s
 
 
+def _rejected(name: str, arrivals: Arrivals, intake: Intake | None) -> dict[str, int]:
+    """Rejected messages of a source by cause: first those that its samples have, then those of the
+    stream.
+    """
+    counts = {
+        MALFORMED: arrivals.malformed,
+        FROZEN: arrivals.frozen,
+        OTHER_PUBLISHER: arrivals.others,
+    }
+    if intake is not None:
+        of_samples = zip(Cause, intake.rejected[SOURCES.index(name)], strict=True)
+        counts = {word(cause): int(count) for cause, count in of_samples} | counts
+    return {cause: count for cause, count in counts.items() if count}
+
+
 def _too_far(sample: PoseStamped, settings: Settings) -> str:
     """Message about a position that is too far away, with the setting of its unit."""
     unit = settings.hands_in(sample.frame_id).unit
@@ -248,17 +285,21 @@ def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Eviden
     except WireError as error:
         return facts._replace(mistake=str(error))
     if cause is Cause.JUMPED:
-        joints = settings.joints
-        leaps = [*map(Jump, joints.names, refused.joints, position, joints.units)]
-        sizes = [
-            abs(_turned(leap, kind) / per_rad)
-            for leap, kind, per_rad in zip(leaps, joints.every_kind, joints.per_rad, strict=True)
-        ]
-        return facts._replace(jump=leaps[sizes.index(max(sizes))])
-    outside = [*_outside(settings.joints, position, velocity)]
+        return facts._replace(jump=_largest_jump(settings.joints, refused.joints, position))
+    outside = _outside(settings.joints, position, velocity)
     if cause is Cause.NOT_FINITE:
-        outside = [joint for joint in outside if not math.isfinite(joint.value)]
-    return facts._replace(outside=outside[0] if outside else None)
+        outside = (joint for joint in outside if not math.isfinite(joint.value))
+    return facts._replace(outside=next(outside, None))
+
+
+def _largest_jump(joints: JointSettings, before: Sequence[float], after: Sequence[float]) -> Jump:
+    """The joint that jumped farthest between two states, given their positions (J,) [rad]."""
+    jumps = [*map(Jump, joints.names, before, after, joints.units)]
+    sizes = [
+        abs(_turned(jump, kind) / per_rad)
+        for jump, kind, per_rad in zip(jumps, joints.every_kind, joints.per_rad, strict=True)
+    ]
+    return jumps[sizes.index(max(sizes))]
 
 
 def _turned(leap: Jump, kind: str) -> float:

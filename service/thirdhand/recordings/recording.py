@@ -158,38 +158,47 @@ class Recorder(McapFile):
         """
         if not self._begun:
             self._begin(time_ns)
-        put = self._put
         self._sequence = tick.index
         self.pending += 1
-        kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
-        checked = checksum(frame) if self._types and frame is not None else None
-        if frame is not None and not self._is_kept(frame, lost):
-            frame = None
-            if timing is not None and timing["lateness_us"] + timing["work_us"] < NOTED_US:
-                timing = None
-        put("tick", cdr.encode_tick(tick.index, kinds, lost, checked), time_ns)
-        for event in tick.inbox:
-            if event.kind == "skill":
-                self.skill = event.payload
-                put("skill", cdr.encode_skill(event.payload), time_ns)
-            else:
-                put(event.kind, event.payload, time_ns)
-        if frame is not None:
-            put("frame", encode(frame), time_ns)
-        if timing is not None:
-            put("timing", encode(timing), time_ns)
-        if state is not None and (lost or last or tick.index >= self._state_from):
+        recorded_sum = checksum(frame) if self._types and frame is not None else None
+        self._put_tick(tick, lost, recorded_sum, time_ns)
+
+        kept_frame = frame if frame is not None and self._is_kept(frame, lost) else None
+        if kept_frame is not None:
+            self._put("frame", encode(kept_frame), time_ns)
+        if timing is not None and (kept_frame is frame or _is_noted(timing)):
+            self._put("timing", encode(timing), time_ns)
+        is_due = lost or last or tick.index >= self._state_from
+        if state is not None and is_due:
             self._state_from = tick.index + self._state_every
-            put("state", encode(state), time_ns)
+            self._put("state", encode(state), time_ns)
+
         if skill is not None and skill != self.skill:
             self.skill = skill
-            put("skill_in_force", cdr.encode_skill(skill), time_ns)
-        for key, payload in outputs if tick.index % self._shown_every == 0 else ():
-            put(key, payload, time_ns)
-        if frame is not None and tick.index % self._tf_every == 0:
-            frames = [*self._frames.fixed, *self._frames.moving(frame, frame["joints"].tolist())]
-            put("/tf", cdr.encode_transforms(time_ns, frames), time_ns)
+            self._put("skill_in_force", cdr.encode_skill(skill), time_ns)
+        self._put_drawn(kept_frame, outputs, time_ns)
         self.part_ends()
+
+    def _put_tick(self, tick: Tick, lost: int, recorded_sum: int | None, time_ns: int) -> None:
+        """Write a tick's index, and its events."""
+        kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
+        self._put("tick", cdr.encode_tick(tick.index, kinds, lost, recorded_sum), time_ns)
+        for event in tick.inbox:
+            payload = event.payload
+            if event.kind == "skill":
+                self.skill = payload
+                payload = cdr.encode_skill(payload)
+            self._put(event.kind, payload, time_ns)
+
+    def _put_drawn(self, frame: Record | None, outputs: Outputs, time_ns: int) -> None:
+        """Write what other programs draw of a tick: its published messages, and transforms."""
+        index = self._sequence
+        if index % self._shown_every == 0:
+            for key, payload in outputs:
+                self._put(key, payload, time_ns)
+        if frame is not None and index % self._tf_every == 0:
+            frames = [*self._frames.fixed, *self._frames.moving(frame, frame["joints"].tolist())]
+            self._put("/tf", cdr.encode_transforms(time_ns, frames), time_ns)
 
     def _is_kept(self, frame: Record, lost: int) -> bool:
         """True if the frame is recorded as a whole."""
@@ -235,6 +244,11 @@ class Recorder(McapFile):
         super().close()
 
 
+def _is_noted(timing: Record) -> bool:
+    """True if a tick was so late, or took so long, that its timing is always recorded."""
+    return bool(timing["lateness_us"] + timing["work_us"] >= NOTED_US)
+
+
 def _summary_of(path: Path) -> Summary | None:
     """A file's summary; None if it is missing."""
     with path.open("rb") as stream, contextlib.suppress(McapError, struct.error, ValueError):
@@ -253,6 +267,34 @@ def _take_hint(path: Path) -> str:
     name = shlex.quote(path.stem)
     folder = shlex.quote(str(path.parent))
     return f"; it is a take: thirdhand record {name} --folder {folder} --show --plot {name}.png"
+
+
+def _is_cut(messages: Messages) -> bool:
+    return any(fault.cut for fault in messages.faults)
+
+
+def _lacks_parts(messages: Messages) -> bool:
+    """True if a needed attachment is missing. A damaged file needs no skill; one that is cut has no
+    ticks for a report.
+    """
+    needed = ["settings.json"]
+    if _is_cut(messages):
+        needed += ["skill.npz", "arm.urdf"]
+    elif not messages.faults:
+        needed += ["skill.npz"]
+    return any(name not in messages.attachments for name in needed)
+
+
+def _no_recording(path: Path, messages: Messages) -> str:
+    """The message about a file that lacks settings or skill."""
+    if _is_cut(messages):
+        return f"{path} is cut before its first message ({messages.faults[-1].why})"
+    if messages.faults:
+        return f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}"
+    return (
+        f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are "
+        "not attached" + _take_hint(path)
+    )
 
 
 class Recording:
@@ -287,24 +329,8 @@ class Recording:
         next(iter(messages), None)
         about = messages.metadata.get("thirdhand")
         parts = messages.attachments
-        is_cut = any(fault.cut for fault in messages.faults)
-        # of a file that is damaged; one that is cut has no ticks for a report
-        needed = ["settings.json"]
-        if is_cut or not messages.faults:
-            needed += ["skill.npz", *(["arm.urdf"] if is_cut else [])]
-        if about is None or any(name not in parts for name in needed):
-            if is_cut:
-                raise RecordingError(
-                    f"{path} is cut before its first message ({messages.faults[-1].why})"
-                )
-            if messages.faults:
-                raise RecordingError(
-                    f"{path} lacks its settings: {'; '.join(map(str, messages.faults))}"
-                )
-            raise RecordingError(
-                f"{path} is an MCAP file but not a recording of thirdhand: settings and skill are "
-                "not attached" + _take_hint(path)
-            )
+        if about is None or _lacks_parts(messages):
+            raise RecordingError(_no_recording(path, messages))
         if about.get("format") != FORMAT:
             raise RecordingError(
                 f"{path} has format {about.get('format')}; format {FORMAT} needed: was it made by "

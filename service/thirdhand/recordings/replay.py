@@ -5,7 +5,7 @@ frame with the recorded one.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from thirdhand.contract import channels
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import Event, Frame, Tick, differences, encode
+from thirdhand.core.frame import Event, Frame, Outputs, Record, Tick, differences, encode
 from thirdhand.recordings.mcap_file import RecordingError, machine
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.steps import Gap, Step, checksum
@@ -74,6 +74,17 @@ class Replay:
     def passes(self, *, exact: bool) -> bool:
         """True if the replay is exact, or within tolerance where that suffices."""
         return self.exact or (self.within_tolerance and not exact)
+
+    def count(self, tick: int, different: Mapping[str, float], *, is_same: bool) -> None:
+        """Count a tick with its differences, by field."""
+        self.ticks += 1
+        self.identical += is_same
+        if not is_same and not self.first_difference:
+            fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
+            self.first_difference = f"first difference at tick {tick}: {fields or 'its checksum'}"
+        for name, value in different.items():
+            size = value if np.isfinite(value) else np.inf
+            self.largest[name] = max(self.largest.get(name, 0.0), size)
 
     def text(self) -> str:
         """The result for people to read."""
@@ -291,41 +302,43 @@ class _Comparison:
     def compare(self, tick: Tick, frame: Frame) -> None:
         """Compare the newest tick's frame, and the state after it, with the recorded ones."""
         step = self.last
-        result = self.result
-        checksums = self.recording.checksums
         assert step is not None
-        different = {} if step.frame is None else differences(step.frame, frame)
-        state = (
-            self._controller.state
-            if step.state is not None or (checksums and step.frame is not None)
-            else None
-        )
-        if step.state is not None and state is not None:
-            different |= {
-                f"state.{name}": value for name, value in differences(step.state, state).items()
-            }
+        state = self._state_after(step)
+        different = _all_differences(step, frame, state)
         outputs = outgoing(frame, step.time_ns, self.recording.settings.joints.names)
-        is_same = not different and (
-            not checksums or checksums.get(tick.index) == checksum(frame, outputs, state)
-        )
-        is_same = is_same and step.checksum in (None, checksum(frame))
+        is_same = not different and self._matches_checksums(step, frame, outputs, state)
         if self.recorder:
             self.recorder.write(
                 tick, frame, time_ns=step.time_ns, timing=step.timing, state=state, outputs=outputs
             )
-        result.ticks += 1
-        result.identical += is_same
-        if not is_same and not result.first_difference:
-            fields = ", ".join(f"{name} by {value:.3g}" for name, value in different.items())
-            result.first_difference = (
-                f"first difference at tick {tick.index}: {fields or 'its checksum'}"
-            )
-        for name, value in different.items():
-            result.largest[name] = max(
-                result.largest.get(name, 0.0), value if np.isfinite(value) else np.inf
-            )
-        if self.progress is not None and result.ticks % 1000 == 0:
-            self.progress(result.ticks)
+
+        self.result.count(tick.index, different, is_same=is_same)
+        if self.progress is not None and self.result.ticks % 1000 == 0:
+            self.progress(self.result.ticks)
+
+    def _state_after(self, step: Step) -> Record | None:
+        """The controller's state, if the recording has the state after this step or its sum."""
+        has_sum = self.recording.checksums and step.frame is not None
+        return self._controller.state if step.state is not None or has_sum else None
+
+    def _matches_checksums(
+        self, step: Step, frame: Frame, outputs: Outputs, state: Record | None
+    ) -> bool:
+        """True unless a recorded checksum differs from that of this frame."""
+        checksums = self.recording.checksums
+        if checksums and checksums.get(step.tick) != checksum(frame, outputs, state):
+            return False
+        return step.checksum in (None, checksum(frame))
+
+
+def _all_differences(step: Step, frame: Frame, state: Record | None) -> dict[str, float]:
+    """The largest differences from the recorded frame, and from the recorded state, by field."""
+    different = {} if step.frame is None else differences(step.frame, frame)
+    if step.state is not None and state is not None:
+        different |= {
+            f"state.{name}": value for name, value in differences(step.state, state).items()
+        }
+    return different
 
 
 def ticks(recording: Recording) -> Iterator[Tick]:

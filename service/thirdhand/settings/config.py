@@ -665,13 +665,16 @@ def _make_paths_absolute(given: Any, folder: Path | None) -> None:
     """Make every path absolute, so that its meaning no longer depends on a folder. Raises
     SettingsError.
     """
+    sections = given if isinstance(given, dict) else {}
     for section, name in (*FROM_FOLDER, *FROM_HERE):
-        table = given.get(section) if isinstance(given, dict) else None
-        value = table.get(name) if isinstance(table, dict) else None
+        table = sections.get(section)
+        if not isinstance(table, dict):
+            continue
+        value = table.get(name)
         base = folder if folder is not None and (section, name) in FROM_FOLDER else Path()
-        if isinstance(table, dict) and isinstance(value, str):
+        if isinstance(value, str):
             table[name] = _absolute(value, base, f"[{section}] {name}")
-        elif isinstance(table, dict) and isinstance(value, list | tuple):
+        elif isinstance(value, list | tuple):
             table[name] = [
                 _absolute(entry, base, f"[{section}] {name}, entry {i + 1}")
                 if isinstance(entry, str)
