@@ -196,75 +196,26 @@ class Playback:
         """Queue a command; returns the reason if it is refused, else an empty text."""
         position = np.array(command.position)
         velocity = np.array(command.velocity)
-        arm_position = self._state[0]
         last = self._newest
-        if not position.shape == velocity.shape == arm_position.shape:
-            return f"{len(command.position)} joints, {len(arm_position)} needed"
-        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-            return "a joint that is not finite"
-        outside = np.maximum(
-            np.minimum(self._lower, arm_position) - position,
-            position - np.maximum(self._upper, arm_position),
-        )
-        if outside.max() > LIMIT_TOLERANCE:
-            return (
-                f"joint {outside.argmax() + 1} outside its limits: "
-                f"{position[outside.argmax()]:.3f} rad"
-            )
-        if (fast := np.abs(velocity) - self._max_velocity).max() > LIMIT_TOLERANCE:
-            return (
-                f"joint {fast.argmax() + 1} faster than its limit: {velocity[fast.argmax()]:.3f} "
-                "rad/s"
-            )
         tick = command.tick if command.tick >= 0 or last is None else last.tick + 1
         ticks = 0 if last is None else tick - last.tick
+        if reason := self._mistake(position, velocity):
+            return reason
+
         if last is None or max(self._now - self._heard, abs(ticks) * self.tick_s) > REJOIN_AFTER_S:
-            deviation_rad = (np.abs(position - arm_position) / np.array(self._limits.per_rad)).max()
-            if (
-                self._state[1:].any()
-                or deviation_rad > REJOIN_RAD
-                or np.abs(velocity).max() > REJOIN_RADPS
-            ):
-                return (
-                    f"a new sequence that does not begin where the arm stands: {deviation_rad:.3f} "
-                    "rad off, or moving"
-                )
-            self._knots.clear()
-            self._lengths_s.clear()
+            if reason := self._begin_sequence(position, velocity):
+                return reason
             time_s = self._now
         elif ticks <= 0:
             return ""  # a late or repeated command is ignored
         else:
-            lengths_s = self._lengths_s.copy()
-            since_s = (command.stamp_ns - self._newest_stamp_ns) * 1e-9
-            if TICK_RANGE_S[0] <= since_s / ticks <= TICK_RANGE_S[1]:
-                lengths_s.append(since_s / ticks)
-            if not (tick_s := _mean_length(lengths_s) if lengths_s else self.tick_s):
-                return (
-                    f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after "
-                    f"the command before, {1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a "
-                    "tick needed"
-                )
-            if (
-                np.abs(position - last.values[0])
-                > self._max_velocity * ticks * tick_s + LIMIT_TOLERANCE
-            ).any():
-                return "a jump from the command before"
-            self.tick_s = tick_s
-            self._lengths_s = lengths_s
-            time_s = last.time_s + tick_s * _steps(last, position, velocity, ticks, tick_s)
-        latest = self._now - time_s + MAX_DELAY_S
-        # the segment to this command is known only now, but was needed at its begin
-        if self._knots:
-            begins_s = self._knots[-1].time_s
-            # a single lost command does not increase the delay
-            if time_s - begins_s < 2.5 * self.tick_s:
-                begins_s = time_s - self.tick_s
-            needed = self._needed if self._paused else self._now - begins_s
-            self._needed = min(max(self._needed, needed), latest)
-            self._offset = min(self._offset, latest)
-        else:
-            self._needed = self._offset = self._now - time_s
+            if reason := self._measure_tick(last, position, command.stamp_ns, ticks):
+                return reason
+            time_s = last.time_s + self.tick_s * _steps(
+                last, position, velocity, ticks, self.tick_s
+            )
+
+        self._update_needed_delay(time_s)
         self._newest = Knot(tick, time_s, np.stack((position, velocity)))
         self._heard = self._now
         self._newest_stamp_ns = command.stamp_ns
@@ -273,6 +224,77 @@ class Playback:
             return reason
         self._knots.append(self._newest)
         return ""
+
+    def _mistake(self, position: Vector, velocity: Vector) -> str:
+        """The reason why no arm could follow these joints (J,) [rad, rad/s]; empty: it could."""
+        arm_position = self._state[0]
+        if not position.shape == velocity.shape == arm_position.shape:
+            return f"{len(position)} joints, {len(arm_position)} needed"
+        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+            return "a joint that is not finite"
+        outside = np.maximum(
+            np.minimum(self._lower, arm_position) - position,
+            position - np.maximum(self._upper, arm_position),
+        )
+        joint = outside.argmax()
+        if outside[joint] > LIMIT_TOLERANCE:
+            return f"joint {joint + 1} outside its limits: {position[joint]:.3f} rad"
+        fast = np.abs(velocity) - self._max_velocity
+        joint = fast.argmax()
+        if fast[joint] > LIMIT_TOLERANCE:
+            return f"joint {joint + 1} faster than its limit: {velocity[joint]:.3f} rad/s"
+        return ""
+
+    def _begin_sequence(self, position: Vector, velocity: Vector) -> str:
+        """Begin a new sequence of commands where the arm stands; else return the reason."""
+        deviations = np.abs(position - self._state[0]) / np.array(self._limits.per_rad)
+        is_moving = self._state[1:].any() or np.abs(velocity).max() > REJOIN_RADPS
+        if is_moving or deviations.max() > REJOIN_RAD:
+            return (
+                "a new sequence that does not begin where the arm stands: "
+                f"{deviations.max():.3f} rad off, or moving"
+            )
+        self._knots.clear()
+        self._lengths_s.clear()
+        return ""
+
+    def _measure_tick(self, last: Knot, position: Vector, stamp_ns: int, ticks: int) -> str:
+        """Measure the length of a tick by a command that is stamped `ticks` after the last one; if
+        it does not fit that one, return the reason.
+        """
+        lengths_s = self._lengths_s.copy()
+        since_s = (stamp_ns - self._newest_stamp_ns) * 1e-9
+        if TICK_RANGE_S[0] <= since_s / ticks <= TICK_RANGE_S[1]:
+            lengths_s.append(since_s / ticks)
+        tick_s = _mean_length(lengths_s) if lengths_s else self.tick_s
+        if not tick_s:
+            return (
+                f"no length of a tick: stamped {1000 * since_s:.3g} ms and {ticks} ticks after "
+                f"the command before, {1000 / RATES_HZ[1]:g} to {1000 / RATES_HZ[0]:g} ms a "
+                "tick needed"
+            )
+        range_rad = self._max_velocity * ticks * tick_s + LIMIT_TOLERANCE
+        if (np.abs(position - last.values[0]) > range_rad).any():
+            return "a jump from the command before"
+        self.tick_s = tick_s
+        self._lengths_s = lengths_s
+        return ""
+
+    def _update_needed_delay(self, time_s: float) -> None:
+        """Update the needed delay by a command for this time of the motion [s], which arrives now.
+        The segment to it is known only now, but was needed at its begin.
+        """
+        if not self._knots:
+            self._needed = self._offset = self._now - time_s
+            return
+        latest = self._now - time_s + MAX_DELAY_S
+        begins_s = self._knots[-1].time_s
+        # a single lost command does not increase the delay
+        if time_s - begins_s < 2.5 * self.tick_s:
+            begins_s = time_s - self.tick_s
+        needed = self._needed if self._paused else self._now - begins_s
+        self._needed = min(max(self._needed, needed), latest)
+        self._offset = min(self._offset, latest)
 
     def _wanted(self) -> Vector:
         """Target velocities (J,) [rad/s] for this period."""

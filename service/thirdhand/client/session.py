@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import zenoh
@@ -87,7 +88,7 @@ def open_session(
     timeout_s: float | None = 10.0,
     certificate: str | Path | None = None,
     zenoh_config: str | Path | None = None,
-    more: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] = MappingProxyType({}),
     at_once: bool = False,
 ) -> zenoh.Session:
     """An open Zenoh session between named endpoints; `more` has further settings of Zenoh.
@@ -111,7 +112,7 @@ def open_session(
     if otherwise and not connect and not listen:
         connect = _endpoints_in(config, otherwise)
     folder = os.environ.get("THIRDHAND_CERTIFICATE") if certificate is None else certificate
-    settings = _settings(config, connect, listen, timeout_s) | _tls(folder) | dict(more or {})
+    settings = _settings(config, connect, listen, timeout_s) | _tls(folder) | dict(more)
     if at_once:
         _check_reachable(connect)
 

@@ -160,16 +160,14 @@ class Recorder(McapFile):
             self._begin(time_ns)
         self._sequence = tick.index
         self.pending += 1
-        recorded_sum = checksum(frame) if self._types and frame is not None else None
-        self._put_tick(tick, lost, recorded_sum, time_ns)
+        self._put_tick(tick, frame, lost, time_ns)
 
-        kept_frame = frame if frame is not None and self._is_kept(frame, lost) else None
+        kept_frame = self._kept(frame, lost)
         if kept_frame is not None:
             self._put("frame", encode(kept_frame), time_ns)
         if timing is not None and (kept_frame is frame or _is_noted(timing)):
             self._put("timing", encode(timing), time_ns)
-        is_due = lost or last or tick.index >= self._state_from
-        if state is not None and is_due:
+        if state is not None and (lost or last or tick.index >= self._state_from):
             self._state_from = tick.index + self._state_every
             self._put("state", encode(state), time_ns)
 
@@ -179,8 +177,9 @@ class Recorder(McapFile):
         self._put_drawn(kept_frame, outputs, time_ns)
         self.part_ends()
 
-    def _put_tick(self, tick: Tick, lost: int, recorded_sum: int | None, time_ns: int) -> None:
-        """Write a tick's index, and its events."""
+    def _put_tick(self, tick: Tick, frame: Record | None, lost: int, time_ns: int) -> None:
+        """Write a tick's index, its events, and the checksum of its frame if some are left out."""
+        recorded_sum = checksum(frame) if self._types and frame is not None else None
         kinds = [channels.EVENT_NUMBERS[event.kind] for event in tick.inbox]
         self._put("tick", cdr.encode_tick(tick.index, kinds, lost, recorded_sum), time_ns)
         for event in tick.inbox:
@@ -200,13 +199,14 @@ class Recorder(McapFile):
             frames = [*self._frames.fixed, *self._frames.moving(frame, frame["joints"].tolist())]
             self._put("/tf", cdr.encode_transforms(time_ns, frames), time_ns)
 
-    def _is_kept(self, frame: Record, lost: int) -> bool:
-        """True if the frame is recorded as a whole."""
-        if self._every == 1:
-            return True
+    def _kept(self, frame: Record | None, lost: int) -> Record | None:
+        """The frame if it is recorded as a whole."""
+        if frame is None or self._every == 1:
+            return frame
         before = self._decided
         self._decided = tuple(int(frame[name]) for name in DECISIONS)
-        return bool(lost) or self._decided != before or int(frame["tick"]) % self._every == 0
+        is_due = int(frame["tick"]) % self._every == 0
+        return frame if lost or self._decided != before or is_due else None
 
     def note(self, key: str, text: str, time_ns: int) -> None:
         """Write a text under `<cell>/<key>`, like `status`, `requests` or `log`, or objects in JSON

@@ -46,63 +46,73 @@ def element_of(text: str | bytes) -> Element:
     Bytes are decoded by their XML declaration. Raises ValueError for text that is not XML, is
     nested too deeply, has too many elements, or holds xacro macros.
     """
-    builder = ElementTree.TreeBuilder()
     encoded = text if isinstance(text, bytes) else text.encode("utf-8", "replace")
-    parser = expat.ParserCreate(None if isinstance(text, bytes) else "utf-8")
-    parser.buffer_text = True
-    open_tags: list[str] = []
-    # elements; open elements inside one with a prefix
-    count = 0
-    foreign = 0
+    encoding = None if isinstance(text, bytes) else "utf-8"
+    try:
+        return _Reading(encoding).element(encoded)
+    except (expat.ExpatError, LookupError) as error:  # LookupError: an unknown encoding
+        raise ValueError(f"no XML: {error}") from None
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count, foreign
-        count += 1
-        open_tags.append(tag)
-        if len(open_tags) > MAX_DEPTH:
-            raise ValueError(
-                f"line {parser.CurrentLineNumber}: more than {MAX_DEPTH} elements in each other"
-            )
-        if count > MAX_ELEMENTS:
-            raise ValueError(f"line {parser.CurrentLineNumber}: more than {MAX_ELEMENTS} elements")
-        matters = len(open_tags) > 1 and open_tags[1] in ("link", "joint")
-        if tag.startswith("xacro:") or (
-            matters and any("${" in value or "$(" in value for value in attributes.values())
-        ):
-            raise ValueError(f"line {parser.CurrentLineNumber}: <{tag}>: {MACROS}")
-        if foreign or ":" in tag:
-            foreign += 1
+
+class _Reading:
+    """One pass over a document."""
+
+    def __init__(self, encoding: str | None) -> None:
+        self._builder = ElementTree.TreeBuilder()
+        self._open_tags: list[str] = []
+        self._count = 0  # elements
+        self._foreign_count = 0  # open elements with a prefix, and inside one
+        self._parser = expat.ParserCreate(encoding)
+        self._parser.buffer_text = True
+        self._parser.StartElementHandler = self._start
+        self._parser.EndElementHandler = self._end
+        self._parser.CharacterDataHandler = self._characters
+
+    def element(self, encoded: bytes) -> Element:
+        """The outermost element of the document. Raises ValueError and ExpatError."""
+        self._parser.Parse(encoded, True)
+        return self._builder.close()
+
+    def _error(self, problem: str) -> ValueError:
+        return ValueError(f"line {self._parser.CurrentLineNumber}: {problem}")
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        self._open_tags.append(tag)
+        if len(self._open_tags) > MAX_DEPTH:
+            raise self._error(f"more than {MAX_DEPTH} elements in each other")
+        if self._count > MAX_ELEMENTS:
+            raise self._error(f"more than {MAX_ELEMENTS} elements")
+        if self._is_macro(tag, attributes):
+            raise self._error(f"<{tag}>: {MACROS}")
+        if self._foreign_count or ":" in tag:
+            self._foreign_count += 1
             return
+
         plain = {name: value for name, value in attributes.items() if ":" not in name}
         if tag == "origin" and QUATERNION in plain:
             if "rpy" in plain:
-                raise ValueError(
-                    f"line {parser.CurrentLineNumber}: <origin> has rpy and {QUATERNION}; one "
-                    "needed"
-                )
+                raise self._error(f"<origin> has rpy and {QUATERNION}; one needed")
             plain["rpy"] = _rpy(Element(tag, {QUATERNION: plain.pop(QUATERNION)}))
-        builder.start(tag, plain)
+        self._builder.start(tag, plain)
 
-    def end(tag: str) -> None:
-        nonlocal foreign
-        open_tags.pop()
-        if foreign:
-            foreign -= 1
+    def _is_macro(self, tag: str, attributes: Mapping[str, str]) -> bool:
+        """True for an element of xacro, and for a link or joint with its expressions."""
+        is_part = len(self._open_tags) > 1 and self._open_tags[1] in ("link", "joint")
+        return tag.startswith("xacro:") or (
+            is_part and any("${" in value or "$(" in value for value in attributes.values())
+        )
+
+    def _end(self, tag: str) -> None:
+        self._open_tags.pop()
+        if self._foreign_count:
+            self._foreign_count -= 1
         else:
-            builder.end(tag)
+            self._builder.end(tag)
 
-    def characters(data: str) -> None:
-        if not foreign and open_tags:
-            builder.data(data)
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.CharacterDataHandler = characters
-    try:
-        parser.Parse(encoded, True)
-    except (expat.ExpatError, LookupError) as error:  # LookupError: an unknown encoding
-        raise ValueError(f"no XML: {error}") from None
-    return builder.close()
+    def _characters(self, data: str) -> None:
+        if not self._foreign_count and self._open_tags:
+            self._builder.data(data)
 
 
 def _rpy(origin: Element) -> str:

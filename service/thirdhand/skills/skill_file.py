@@ -222,30 +222,7 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
             )
         for fault in _spoilt(arrays):
             raise SkillError(f"{origin}: {fault}")
-        model = _model(arrays)
-        via_points = validated(msgspec.json.decode(str(arrays["via_points"])), tuple[ViaPoint, ...])
-        turn = _part(arrays, TURN)
-        gripper = _part(arrays, GRIPPER)
-        skill = StoredSkill(
-            name=printable(str(arrays["name"])),
-            model=model.from_arrays(arrays, via_points),
-            orientation=arrays["orientation"],
-            workspace=arrays["box"],
-            threshold=float(arrays["threshold"]),
-            learned_from=printable(str(arrays["learned_from"])),
-            components=int(arrays["components"]),
-            via_points=via_points,
-            tolerance=float(arrays["tolerance"]),
-            turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
-            gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
-            figures=str(arrays.get("figures", "")),
-            demonstrations=arrays[DEMONSTRATIONS].tobytes() if DEMONSTRATIONS in arrays else b"",
-            file=bytes(data),
-            digest=_digest(data),
-            conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
-            regions=_regions(arrays[REGIONS].tolist()) if REGIONS in arrays else NORMAL,
-            residual_risk=ResidualRisk.of(str(arrays.get("figures", ""))).accepted,
-        )
+        skill = _assembled(arrays, data)
         for fault in _faults(skill):
             raise SkillError(f"{origin}: {fault}")
     except SkillError:
@@ -257,6 +234,34 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
     except Exception as error:  # NumPy does not document what a damaged archive raises
         raise SkillError(f"{origin}: not a skill ({error})") from None
     return skill
+
+
+def _assembled(arrays: Mapping[str, NDArray[Any]], data: bytes) -> StoredSkill:
+    """The skill with these arrays, which are those of the file `data`."""
+    via_points = validated(msgspec.json.decode(str(arrays["via_points"])), tuple[ViaPoint, ...])
+    turn = _part(arrays, TURN)
+    gripper = _part(arrays, GRIPPER)
+    figures = str(arrays.get("figures", ""))
+    return StoredSkill(
+        name=printable(str(arrays["name"])),
+        model=_model(arrays).from_arrays(arrays, via_points),
+        orientation=arrays["orientation"],
+        workspace=arrays["box"],
+        threshold=float(arrays["threshold"]),
+        learned_from=printable(str(arrays["learned_from"])),
+        components=int(arrays["components"]),
+        via_points=via_points,
+        tolerance=float(arrays["tolerance"]),
+        turn=LearnedOrientation(from_arrays(turn), turn["auxiliary"]) if turn else None,
+        gripper=LearnedGripper(from_arrays(gripper)) if gripper else None,
+        figures=figures,
+        demonstrations=arrays[DEMONSTRATIONS].tobytes() if DEMONSTRATIONS in arrays else b"",
+        file=bytes(data),
+        digest=_digest(data),
+        conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
+        regions=_regions(arrays[REGIONS].tolist()) if REGIONS in arrays else NORMAL,
+        residual_risk=ResidualRisk.of(figures).accepted,
+    )
 
 
 def skill_in(path: Path) -> StoredSkill:
@@ -299,31 +304,18 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
         yield f"an array {name!r}, which no skill has"
     # An array that is missing is found missing later.
     model_arrays = [name for name in _model(arrays).ranges if name in arrays]
-    clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
     yield from _beyond(arrays, [*RANGES, *model_arrays], "")
     for prefix in (TURN, GRIPPER):
-        if part := _part(arrays, prefix):
-            yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
-            points = len(part["base_inputs"])
-            if points > MOST_POINTS:
-                yield f"{points} points of {prefix}, at most {MOST_POINTS} accepted"
-    for prefix in ("", TURN, GRIPPER):
-        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and (
-            prefix or _model(arrays) is not HandsKMP
-        ):
-            yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
+        yield from _spoilt_part(arrays, prefix)
+    yield from _varying_priors(arrays)
+
     if (side := arrays.get("conductor", np.array(0)).tolist()) not in (0, 1):
         yield f"conductor is {side!r}: 0 for the left hand or 1 for the right one accepted"
     if REGIONS in arrays:
         yield from _beyond(arrays, [REGIONS], "")
         yield from _no_regions(arrays[REGIONS])
-    for name in ("name", "learned_from"):
-        if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
-            yield f"{name} is no text of up to {LONGEST_TEXT} letters"
-    if DEMONSTRATIONS in arrays and arrays[DEMONSTRATIONS].dtype != np.uint8:
-        yield f"{DEMONSTRATIONS} has numbers of type {arrays[DEMONSTRATIONS].dtype}, bytes needed"
-    if "figures" in arrays and not _is_json(arrays["figures"]):
-        yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
+    yield from _spoilt_texts(arrays)
+
     if len(arrays["base_inputs"]) > MOST_POINTS:
         yield f"{len(arrays['base_inputs'])} reference points, at most {MOST_POINTS} accepted"
     if str(arrays["checksum"]) != checksum(arrays):
@@ -331,6 +323,37 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
             "it was changed since it was written (the checksum is another); learn it anew, or "
             "fetch it again"
         )
+
+
+def _spoilt_part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Iterator[str]:
+    """Faults of the arrays of the orientation or the gripper, if the skill has such."""
+    part = _part(arrays, prefix)
+    if not part:
+        return
+    clock = {"task_clock": arrays["task_clock"]} if "task_clock" in arrays else {}
+    yield from _beyond(part | clock, RANGES.keys() & part.keys(), prefix)
+    points = len(part["base_inputs"])
+    if points > MOST_POINTS:
+        yield f"{points} points of {prefix}, at most {MOST_POINTS} accepted"
+
+
+def _varying_priors(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
+    """Prior means that vary with the inputs where they must not."""
+    for prefix in ("", TURN, GRIPPER):
+        may_vary = not prefix and _model(arrays) is HandsKMP
+        if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and not may_vary:
+            yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
+
+
+def _spoilt_texts(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
+    """Faults of names, demonstrations and figures."""
+    for name in ("name", "learned_from"):
+        if arrays[name].dtype.kind != "U" or len(str(arrays[name])) > LONGEST_TEXT:
+            yield f"{name} is no text of up to {LONGEST_TEXT} letters"
+    if DEMONSTRATIONS in arrays and arrays[DEMONSTRATIONS].dtype != np.uint8:
+        yield f"{DEMONSTRATIONS} has numbers of type {arrays[DEMONSTRATIONS].dtype}, bytes needed"
+    if "figures" in arrays and not _is_json(arrays["figures"]):
+        yield f"figures is no JSON of up to {LONGEST_FIGURES} letters"
 
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:

@@ -8,8 +8,8 @@ such that a single outlier does not flatten the rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -130,92 +130,129 @@ def blueprint(
     """The blueprint of a live view, or of a file with a duration of `end_s` [s] and curves up to
     `tops`. `gate_m` is the deviation [m] above which the arm holds with the skill in force.
     """
-    views = plot_views(settings)
-    reached = dict(tops or {})
-    tops = {origin: HEADROOM * top for origin, top in reached.items()}
-    gate_mm = 1e3 * gate_m
-    most_mm = MAX_GATE_RATIO * reached.get("/deviation", views["/deviation"].high)
-    if gate_mm <= most_mm:
-        tops["/deviation"] = HEADROOM * max(gate_mm, reached.get("/deviation", 0.0))
-    left_out = ["- $origin/gate"] if most_mm < gate_mm < math.inf else []
-    relative = rrb.TimeRangeBoundary.cursor_relative
-    boundary, first_s, last_s = (
-        (relative, -WINDOW_S, 0.0)
-        if end_s is None
-        else (rrb.TimeRangeBoundary.absolute, 0.0, end_s)
-    )
-    whole_s = max(1.0, (last_s - first_s) / (1 - LEGEND_SHARE))
-    time_range, beside_numbers = (
-        rr.TimeRange(
-            start=boundary(seconds=first_s - share * whole_s),
-            end=boundary(seconds=first_s + whole_s),
-        )
-        for share in (0.0, NUMBERS_SHARE)
-    )
-    loaded = (
-        rrb.VisibleTimeRanges(
-            rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative())
-        )
-        if live
-        else None
+    plots = _Plots(settings, live=live, gate_m=gate_m, tops=tops or {}, end_s=end_s)
+    return SentBlueprint(
+        rrb.Tabs(
+            _task(plots, settings.recording.also),
+            _timing(plots),
+            _learning(plots),
+            active_tab=TABS.index(tab),
+        ),
+        rrb.TopPanel(state="hidden"),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIMELINE, play_state="following" if live else None
+        ),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
     )
 
-    def plot(origin: str, *, legend: bool = True) -> rrb.TimeSeriesView:
-        view = views[origin]
-        high = view.high if view.fixed else tops.get(origin, view.high)
+
+class _Plots:
+    """The views over time of one blueprint, with a common time axis."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        live: bool,
+        gate_m: float,
+        tops: Mapping[str, float],
+        end_s: float | None,
+    ) -> None:
+        self._views = plot_views(settings)
+        self._tops = {origin: HEADROOM * top for origin, top in tops.items()}
+        gate_mm = 1e3 * gate_m
+        most_mm = MAX_GATE_RATIO * tops.get("/deviation", self._views["/deviation"].high)
+        if gate_mm <= most_mm:
+            self._tops["/deviation"] = HEADROOM * max(gate_mm, tops.get("/deviation", 0.0))
+        self._left_out = {"/deviation": ["- $origin/gate"]} if most_mm < gate_mm < math.inf else {}
+        self._end_s = end_s
+        relative = rrb.TimeRangeBoundary.cursor_relative
+        visible = rr.VisibleTimeRange(TIMELINE, start=relative(seconds=-WINDOW_S), end=relative())
+        self._loaded = rrb.VisibleTimeRanges(visible) if live else None
+
+    def _time_axis(self, margin_share: float) -> rrb.TimeAxis:
+        """The time axis, which begins earlier by a share of its length."""
+        boundary: Any = rrb.TimeRangeBoundary.absolute
+        first_s = 0.0
+        last_s = self._end_s
+        if last_s is None:
+            boundary = rrb.TimeRangeBoundary.cursor_relative
+            first_s = -WINDOW_S
+            last_s = 0.0
+        whole_s = max(1.0, (last_s - first_s) / (1 - LEGEND_SHARE))
+        time_range = rr.TimeRange(
+            start=boundary(seconds=first_s - margin_share * whole_s),
+            end=boundary(seconds=first_s + whole_s),
+        )
+        return rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=time_range)
+
+    def curves(self, origin: str) -> rrb.TimeSeriesView:
+        """The view of the curves below a path."""
+        view = self._views[origin]
+        high = view.high if view.fixed else self._tops.get(origin, view.high)
         low = view.low if view.fixed or view.low >= 0 else -high
         return rrb.TimeSeriesView(
             origin=origin,
-            contents=["+ $origin/**", *(left_out if origin == "/deviation" else [])],
+            contents=["+ $origin/**", *self._left_out.get(origin, ())],
             name=view.title,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
-            axis_x=rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=time_range),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True),
+            axis_x=self._time_axis(0.0),
             axis_y=rrb.ScalarAxis(range=(low, high)),
-            time_ranges=loaded,
+            time_ranges=self._loaded,
         )
 
-    def modes() -> rrb.StateTimelineView:
-        axis = rrb.TimeAxis(link=components.LinkAxis.Independent, view_range=beside_numbers)
+    def tabs(self, *origins: str) -> rrb.Tabs:
+        """Views of curves of which the first is open."""
+        return rrb.Tabs(*map(self.curves, origins), active_tab=0)
+
+    def modes(self) -> rrb.StateTimelineView:
+        """The view of modes and reasons."""
         return rrb.StateTimelineView(
-            origin="/", contents=["/mode", "/reason"], name="Mode", time_view=axis
+            origin="/",
+            contents=["/mode", "/reason"],
+            name="Mode",
+            time_view=self._time_axis(NUMBERS_SHARE),
         )
 
+
+def _task(plots: _Plots, cameras: Sequence[str]) -> rrb.Horizontal:
     bench = rrb.Vertical(
         _scene("Bench", "+ /scene/**", "+ /arm/**", "+ /measured/**", "+ /skill/**"),
         _log(),
         row_shares=[4, 1],
     )
-    if cameras := settings.recording.also:
-        views_of = [rrb.Spatial2DView(origin=f"/cameras/{key}", name=key) for key in cameras]
-        bench = rrb.Vertical(bench, rrb.Horizontal(*views_of), row_shares=[3, 2])
+    if cameras:
+        pictures = [rrb.Spatial2DView(origin=f"/cameras/{key}", name=key) for key in cameras]
+        bench = rrb.Vertical(bench, rrb.Horizontal(*pictures), row_shares=[3, 2])
+    quantities = ("velocity", "position", "acceleration", "error")
     curves = rrb.Vertical(
-        rrb.Tabs(plot("/error"), plot("/turn"), plot("/gripper"), plot("/segment"), active_tab=0),
-        rrb.Tabs(plot("/deviation"), plot("/doubt"), active_tab=0),
-        rrb.Tabs(
-            plot("/speed"), plot("/separation/distance"), plot("/separation/limit"), active_tab=0
-        ),
-        rrb.Tabs(
-            *(
-                plot(f"/joints/{quantity}")
-                for quantity in ("velocity", "position", "acceleration", "error")
-            )
-        ),
-        modes(),  # below the curves, with the same time axis
+        plots.tabs("/error", "/turn", "/gripper", "/segment"),
+        plots.tabs("/deviation", "/doubt"),
+        plots.tabs("/speed", "/separation/distance", "/separation/limit"),
+        rrb.Tabs(*(plots.curves(f"/joints/{quantity}") for quantity in quantities)),
+        plots.modes(),  # below the curves, with the same time axis
         row_shares=[3, 3, 3, 5, 2.6],  # the legend of the joints has seven names
     )
-    task = rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
-    timing = rrb.Horizontal(
+    return rrb.Horizontal(bench, curves, column_shares=[1, 1], name="Task")
+
+
+def _timing(plots: _Plots) -> rrb.Horizontal:
+    return rrb.Horizontal(
+        rrb.Vertical(*map(plots.curves, ("/latency", "/timing/lateness", "/age")), _log()),
         rrb.Vertical(
-            *(plot(origin) for origin in ("/latency", "/timing/lateness", "/age")), _log()
-        ),
-        rrb.Vertical(
-            *(plot(origin) for origin in ("/timing/work", "/timing/stages")),
-            modes(),
+            *map(plots.curves, ("/timing/work", "/timing/stages")),
+            plots.modes(),
             row_shares=[4, 4, 2],
         ),
         name="Timing",
     )
-    learning = rrb.Horizontal(
+
+
+def _learning(plots: _Plots) -> rrb.Horizontal:
+    return rrb.Horizontal(
         _scene(
             "The learned skill, and taught via-points",
             "+ /skill/**",
@@ -225,23 +262,12 @@ def blueprint(
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="/about/skill", name="Skill"),
-            plot("/deviation"),
-            plot("/error"),
+            plots.curves("/deviation"),
+            plots.curves("/error"),
             row_shares=[3, 2, 2],
         ),
         column_shares=[3, 2],
         name="Learning",
-    )
-    return SentBlueprint(
-        rrb.Tabs(task, timing, learning, active_tab=TABS.index(tab)),
-        rrb.TopPanel(state="hidden"),
-        rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, play_state="following" if live else None
-        ),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
     )
 
 

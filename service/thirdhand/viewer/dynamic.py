@@ -5,6 +5,8 @@ Where frames are missing, curves are interrupted and trails begin anew.
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -40,6 +42,7 @@ BREAK_NS = 1000  # a curve ends this long after the last frame before a gap
 # interval at which live viewers get the mode again, as they connect late or skip frames
 REPEAT_S = 0.5
 Columns = Callable[..., rr.chunk.Chunk]
+Curve = Callable[..., Iterator[rr.chunk.Chunk]]
 
 
 class DrawnFrame(NamedTuple):
@@ -143,16 +146,7 @@ class DynamicScene:
         times = np.array([drawn.time_ns for drawn in batch], np.int64)
         ticks = frames["tick"]
         self.index(times[:1])
-
-        def columns(path: str, rows: Any, *parts: Any) -> rr.chunk.Chunk:
-            to_ns = LOG_NS if path == "/log" else 1
-            index = [
-                rr.TimeColumn("tick", sequence=ticks[rows]),
-                *self.index(times[rows], to_ns=to_ns),
-            ]
-            return rr.chunk.Chunk.from_columns(
-                path, index, [column for part in parts for column in part]
-            )
+        columns = functools.partial(self._columns, ticks, times)
 
         is_seen = frames["hand_ages"] >= 0
         is_repeated = self._live and ticks[-1] - self._mode_sent_tick > self._repeat_ticks
@@ -160,6 +154,7 @@ class DynamicScene:
             yield from self._unmeasured(times[:1])
         yield from self._curves(batch, frames, is_seen, columns)
         yield from self._modes(frames, columns)
+
         before = np.concatenate([[self._last_tick], ticks[:-1]])
         self._last_tick = int(ticks[-1])
         self._last_ns = int(times[-1])
@@ -169,6 +164,15 @@ class DynamicScene:
         corners = np.flatnonzero(ticks // self._trail_every != before // self._trail_every)
         if len(corners):
             yield from self._trail(frames, corners, columns)
+
+    def _columns(
+        self, ticks: NDArray[Any], times: NDArray[np.int64], path: str, rows: Any, *parts: Any
+    ) -> rr.chunk.Chunk:
+        """A chunk for these rows of a batch, given the ticks and times [ns] of all its rows."""
+        to_ns = LOG_NS if path == "/log" else 1
+        tick_column = rr.TimeColumn("tick", sequence=ticks[rows])
+        index = [tick_column, *self.index(times[rows], to_ns=to_ns)]
+        return rr.chunk.Chunk.from_columns(path, index, list(itertools.chain(*parts)))
 
     def _unmeasured(self, time_ns: NDArray[np.int64]) -> Iterator[rr.chunk.Chunk]:
         """The measured arm, too small to see: links without a pose are errors to the viewer."""
@@ -187,57 +191,74 @@ class DynamicScene:
         seen: NDArray[np.bool_],
         columns: Columns,
     ) -> Iterator[rr.chunk.Chunk]:
-        def scalars(
-            path: str, rows: Any, values: NDArray[Any], view: str = ""
-        ) -> Iterator[rr.chunk.Chunk]:
-            samples = values[rows]
-            if len(samples):
-                self.peaks.setdefault(view or path, []).append(
-                    float(np.nanmax(np.abs(samples), initial=0.0))
-                )
-                width = self._widths[path] = samples[0].size
-                yield columns(
-                    path,
-                    rows,
-                    rr.Scalars.columns(scalars=samples.ravel()).partition([width] * len(samples)),
-                )
+        scalars = functools.partial(self._scalars, columns)
+        yield from self._motion(frames, seen, scalars)
+        is_predicted = _predicted(frames, seen)
+        yield from self._target_errors(frames, is_predicted, scalars)
+        yield from self._task(frames, is_predicted, scalars)
+        yield from self._uncertainty(frames, is_predicted, scalars)
+        yield from self._joint_errors(batch, frames, scalars)
+        timed = [i for i, drawn in enumerate(batch) if drawn.timing is not None]
+        if timed:
+            timings = np.zeros(len(batch), TIMING)
+            timings[timed] = [batch[i].timing for i in timed]
+            yield from self._timings(timings, timed, scalars)
+            yield from self._missed_deadlines(frames, timings, timed[-1], columns)
+        ages_ms = np.where(seen, frames["hand_ages"] * self._period_ms, np.nan)
+        yield from scalars("/age", np.flatnonzero(seen.any(axis=1)), ages_ms)
 
+    def _scalars(
+        self, columns: Columns, path: str, rows: Any, values: NDArray[Any], view: str = ""
+    ) -> Iterator[rr.chunk.Chunk]:
+        """The chunk of a curve, or of several, in these rows; their peak counts for the view."""
+        samples = values[rows]
+        if len(samples):
+            peak = float(np.nanmax(np.abs(samples), initial=0.0))
+            self.peaks.setdefault(view or path, []).append(peak)
+            width = self._widths[path] = samples[0].size
+            lengths = [width] * len(samples)
+            yield columns(
+                path, rows, rr.Scalars.columns(scalars=samples.ravel()).partition(lengths)
+            )
+
+    def _motion(
+        self, frames: NDArray[Any], seen: NDArray[np.bool_], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Motion of joints, tool and hands, and the distance of the nearest hand."""
         every = slice(None)
         yield from scalars("/joints/position", every, frames["joints"])
         yield from scalars("/joints/velocity", every, frames["joint_velocities"])
         yield from scalars("/joints/acceleration", every, frames["joint_accelerations"])
-        yield from scalars(
-            "/speed/tool", every, np.linalg.norm(frames["setpoint_velocity"], axis=1), "/speed"
-        )
+        tool_speeds = np.linalg.norm(frames["setpoint_velocity"], axis=1)
+        yield from scalars("/speed/tool", every, tool_speeds, "/speed")
         for side, name in enumerate(SIDES):
             speeds = np.linalg.norm(frames["hand_velocities"][:, side], axis=1)
             yield from scalars(f"/speed/{name}", np.flatnonzero(seen[:, side]), speeds, "/speed")
         near = np.flatnonzero(seen.any(axis=1))
         yield from scalars("/separation/distance", near, frames["hand_distance"])
         yield from scalars("/separation/limit", near, frames["hand_limit"])
-        is_predicted = _predicted(frames, seen)
-        aimed = np.flatnonzero(is_predicted)
+
+    def _target_errors(
+        self, frames: NDArray[Any], is_predicted: NDArray[np.bool_], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Distance and angle of the tool from its target, while the arm follows."""
         following = is_predicted & (frames["mode"] == Mode.FOLLOW)
         off_mm = np.where(
             following, 1e3 * np.linalg.norm(frames["target"] - frames["tool"], axis=1), np.nan
         )
         gap_starts = ~following & np.concatenate([[self._followed], following[:-1]])
         self._followed = bool(following[-1])
-        yield from scalars(
-            "/error/target", np.flatnonzero(following | gap_starts), off_mm, "/error"
-        )
-        yield from scalars(
-            "/turn/target",
-            np.flatnonzero(following | gap_starts),
-            self._rotation_error(frames, following),
-            "/turn",
-        )
-        std_m, std_deg = (
-            standard_deviations(frames[name]) for name in ("covariance", "orientation_covariance")
-        )
-        yield from scalars(
-            "/turn/std", np.flatnonzero(is_predicted & (std_deg > 0)), np.degrees(std_deg), "/turn"
-        )
+        drawn = np.flatnonzero(following | gap_starts)
+        yield from scalars("/error/target", drawn, off_mm, "/error")
+        yield from scalars("/turn/target", drawn, self._rotation_error(frames, following), "/turn")
+        std_rad = standard_deviations(frames["orientation_covariance"])
+        uncertain = np.flatnonzero(is_predicted & (std_rad > 0))
+        yield from scalars("/turn/std", uncertain, np.degrees(std_rad), "/turn")
+
+    def _task(
+        self, frames: NDArray[Any], is_predicted: NDArray[np.bool_], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Segment of the task, and closure of the gripper."""
         segmented = np.flatnonzero(frames["segment_belief"] > 0)
         yield from scalars("/segment/number", segmented, frames["segment"] + 1.0)
         yield from scalars("/segment/probable", segmented, frames["segment_belief"])
@@ -248,59 +269,63 @@ class DynamicScene:
         is_commanded = gripping & (frames["gripper"] != UNKNOWN)
         closed = 100.0 * (frames["gripper"] == CLOSED)
         yield from scalars("/gripper/commanded", np.flatnonzero(is_commanded), closed, "/gripper")
-        yield from scalars(
-            "/deviation/target",
-            np.flatnonzero(is_predicted & (std_m > 0)),
-            1e3 * std_m,
-            "/deviation",
-        )
-        yield from scalars(
-            "/doubt/target",
-            np.flatnonzero(is_predicted),
-            100.0 * frames["error_probability"],
-            "/doubt",
-        )
+
+    def _uncertainty(
+        self, frames: NDArray[Any], is_predicted: NDArray[np.bool_], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Uncertainty of the target, and deviation of the hands with its gate."""
+        std_m = standard_deviations(frames["covariance"])
+        aimed = np.flatnonzero(is_predicted)
+        uncertain = np.flatnonzero(is_predicted & (std_m > 0))
+        yield from scalars("/deviation/target", uncertain, 1e3 * std_m, "/deviation")
+        yield from scalars("/doubt/target", aimed, 100.0 * frames["error_probability"], "/doubt")
         # a gate that compares something else
-        other = is_predicted & (np.abs(frames["gate_m"] - std_m) > SAME_M)
+        differs = is_predicted & (np.abs(frames["gate_m"] - std_m) > SAME_M)
         yield from scalars(
-            "/deviation/hands", np.flatnonzero(other), 1e3 * frames["gate_m"], "/deviation"
+            "/deviation/hands", np.flatnonzero(differs), 1e3 * frames["gate_m"], "/deviation"
         )
         if self._gate is not None and len(aimed):
-            yield from scalars(
-                "/deviation/gate", aimed[[0, -1]], np.full(len(batch), 1e3 * self._gate)
-            )
+            gates_mm = np.full(len(frames), 1e3 * self._gate)
+            yield from scalars("/deviation/gate", aimed[[0, -1]], gates_mm)
+
+    def _joint_errors(
+        self, batch: list[DrawnFrame], frames: NDArray[Any], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Largest difference between measured and commanded joints."""
         measured = [
             i
             for i, drawn in enumerate(batch)
             if drawn.measured is not None and frames["commanded"][i]
         ]
-        error_rad = np.zeros(len(batch))
-        error_rad[measured] = [
+        errors_rad = np.zeros(len(batch))
+        errors_rad[measured] = [
             np.abs(batch[i].measured - frames["joints"][i]).max() for i in measured
         ]
-        yield from scalars("/joints/error", measured, error_rad)
-        timed = [i for i, drawn in enumerate(batch) if drawn.timing is not None]
-        if timed:
-            timings = np.zeros(len(batch), TIMING)
-            timings[timed] = [batch[i].timing for i in timed]
-            yield from scalars("/timing/lateness", timed, timings["lateness_us"])
-            yield from scalars("/timing/work", timed, timings["work_us"])
-            yield from scalars(
-                "/timing/stages", timed, timings["stages_us"].reshape(-1, len(STAGES))
+        yield from scalars("/joints/error", measured, errors_rad)
+
+    def _timings(
+        self, timings: NDArray[Any], timed: list[int], scalars: Curve
+    ) -> Iterator[rr.chunk.Chunk]:
+        """Lateness, work and latency of the ticks with a timing."""
+        yield from scalars("/timing/lateness", timed, timings["lateness_us"])
+        yield from scalars("/timing/work", timed, timings["work_us"])
+        stages_us = timings["stages_us"].reshape(-1, len(STAGES))
+        yield from scalars("/timing/stages", timed, stages_us)
+        answered = np.flatnonzero(timings["latency_us"] > 0)
+        yield from scalars("/latency/hand", answered, timings["latency_us"] / 1e3, "/latency")
+
+    def _missed_deadlines(
+        self, frames: NDArray[Any], timings: NDArray[Any], newest: int, columns: Columns
+    ) -> Iterator[rr.chunk.Chunk]:
+        """A log line about deadlines that were missed since the last one, up to row `newest`."""
+        missed = int(timings["missed"][newest])
+        if missed > self._missed:
+            count = missed - self._missed
+            text = (
+                f"{count} deadline{'s' * (count > 1)} missed before tick {frames['tick'][newest]}"
             )
-            answered = np.flatnonzero(timings["latency_us"] > 0)
-            yield from scalars("/latency/hand", answered, timings["latency_us"] / 1e3, "/latency")
-            missed = int(timings["missed"][timed[-1]])
-            if missed > self._missed:
-                fresh = missed - self._missed
-                text = (
-                    f"{fresh} deadline{'s' * (fresh > 1)} missed before tick "
-                    f"{frames['tick'][timed[-1]]}"
-                )
-                yield columns("/log", [timed[-1]], rr.TextLog.columns(text=[text], level=["WARN"]))
-            self._missed = missed
-        ages = np.where(seen, frames["hand_ages"] * self._period_ms, np.nan)
-        yield from scalars("/age", np.flatnonzero(seen.any(axis=1)), ages)
+            yield columns("/log", [newest], rr.TextLog.columns(text=[text], level=["WARN"]))
+        self._missed = missed
 
     def _rotation_error(self, frames: NDArray[Any], following: NDArray[np.bool_]) -> NDArray[Any]:
         """Angle between tool and target (T,) [°], as `[tool] orientation` defines it; NaN while the
@@ -365,23 +390,7 @@ class DynamicScene:
         seen: NDArray[np.bool_],
         columns: Columns,
     ) -> Iterator[rr.chunk.Chunk]:
-        measured_rows = np.array([i for i in rows if batch[i].measured is not None], np.intp)
-        measured = [batch[i].measured for i in measured_rows]
-        for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
-            if joint is not None:
-                angles = frames["joints"][rows, number].tolist()
-                yield columns(
-                    f"/arm/joints/{number}",
-                    rows,
-                    joint.compute_transform_columns(angles, clamp=False),
-                )
-            if ghost is not None and len(measured_rows):
-                angles = [float(q[number]) for q in measured if q is not None]
-                yield columns(
-                    f"/measured/joints/{number}",
-                    measured_rows,
-                    ghost.compute_transform_columns(angles, clamp=False),
-                )
+        yield from self._links(batch, frames, rows, columns)
         tool = rr.Transform3D.columns(
             translation=frames["tool"][rows], quaternion=frames["tool_orientation"][rows]
         )
@@ -390,30 +399,37 @@ class DynamicScene:
             "/scene/setpoint", rows, rr.Points3D.columns(positions=frames["setpoint"][rows])
         )
         for side, name in enumerate(SIDES):
-            drawn_rows = rows[seen[rows, side]]
-            if len(drawn_rows):
-                yield columns(
-                    f"/scene/{name}_hand",
-                    drawn_rows,
-                    rr.Points3D.columns(positions=frames["hands"][drawn_rows, side]),
-                )
-        drawn_rows = rows[_predicted(frames, seen)[rows]]
-        if len(drawn_rows):
-            variances, axes = np.linalg.eigh(frames["covariance"][drawn_rows])
-            axes[:, :, 0] *= np.linalg.det(axes)[:, None]
-            half = np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3)
-            unsure = frames["flags"][drawn_rows] & int(Flag.UNSURE) > 0
-            colours = [palette.GATE if is_unsure else palette.TARGET for is_unsure in unsure]
-            orientations = Rotation.from_matrix(axes).as_quat()
-            centres = frames["target"][drawn_rows]
-            region = rr.Ellipsoids3D.columns(
-                half_sizes=half, centers=centres, quaternions=orientations, colors=colours
-            )
-            yield columns("/scene/target", drawn_rows, region)
+            seen_rows = rows[seen[rows, side]]
+            if len(seen_rows):
+                positions = rr.Points3D.columns(positions=frames["hands"][seen_rows, side])
+                yield columns(f"/scene/{name}_hand", seen_rows, positions)
+        predicted_rows = rows[_predicted(frames, seen)[rows]]
+        if len(predicted_rows):
+            yield columns("/scene/target", predicted_rows, _target_regions(frames[predicted_rows]))
         if len(near := rows[seen[rows].any(axis=1)]):
             lines, labels = zip(*(self._nearest(frames[i], seen[i]) for i in near), strict=True)
             strips = rr.LineStrips3D.columns(strips=lines, labels=labels)
             yield columns("/scene/nearest", near, strips)
+
+    def _links(
+        self,
+        batch: list[DrawnFrame],
+        frames: NDArray[Any],
+        rows: NDArray[np.intp],
+        columns: Columns,
+    ) -> Iterator[rr.chunk.Chunk]:
+        """The transforms of the arm's joints, as commanded and as measured."""
+        measured_rows = np.array([i for i in rows if batch[i].measured is not None], np.intp)
+        measured = [batch[i].measured for i in measured_rows]
+        for number, (joint, ghost) in enumerate(zip(self._joints, self._ghost, strict=True)):
+            if joint is not None:
+                angles = frames["joints"][rows, number].tolist()
+                transforms = joint.compute_transform_columns(angles, clamp=False)
+                yield columns(f"/arm/joints/{number}", rows, transforms)
+            if ghost is not None and len(measured_rows):
+                angles = [float(q[number]) for q in measured if q is not None]
+                transforms = ghost.compute_transform_columns(angles, clamp=False)
+                yield columns(f"/measured/joints/{number}", measured_rows, transforms)
 
     def _nearest(self, frame: Record, seen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], str]:
         """The line (2, 3) from the nearest hand to the arm, and its length as text; without a hand
@@ -470,6 +486,19 @@ class DynamicScene:
                 yield columns(
                     f"/scene/{name}_trail", drawn_rows, rr.LineStrips3D.columns(strips=strips)
                 )
+
+
+def _target_regions(frames: NDArray[Any]) -> rr.ComponentColumnList:
+    """The 95 % regions of the target in frames (T,), coloured by the flag `unsure`."""
+    variances, axes = np.linalg.eigh(frames["covariance"])
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]
+    unsure = frames["flags"] & int(Flag.UNSURE) > 0
+    return rr.Ellipsoids3D.columns(
+        half_sizes=np.clip(np.sqrt(REGION_95 * np.maximum(variances, 0.0)), 1e-4, 0.3),
+        centers=frames["target"],
+        quaternions=Rotation.from_matrix(axes).as_quat(),
+        colors=[palette.GATE if is_unsure else palette.TARGET for is_unsure in unsure],
+    )
 
 
 def _predicted(frames: NDArray[Any], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

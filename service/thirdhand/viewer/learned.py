@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import msgspec
@@ -154,7 +154,6 @@ def skill_chunks(skill: SkillContents, at: Column) -> Iterator[rr.chunk.Chunk]:
 
 def about(skill: SkillContents) -> str:
     """A description of the skill, as Markdown."""
-    rows = skill.figures.get("demonstrations", ())
     count = len(skill.demonstrations)
     lines = [f"# {as_markdown(skill.name or 'skill')}", ""]
     if len(skill.reference):
@@ -168,36 +167,40 @@ def about(skill: SkillContents) -> str:
         "The arm holds if the deviation from what the skill knows exceeds "
         f"{1000 * skill.threshold:.0f} mm."
     )
-    lines += ["", "## Via-points", ""]
-    if skill.via_points:
-        lines += [
-            "| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |",
-            "|---|---|---|---|",
-        ]
-        for point in skill.via_points:
-            position_text = ", ".join(f"{value:.3f}" for value in point.tool)
-            lines.append(
-                f"| {as_markdown(point.name)} | {position_text} | {1000 * point.radius:.0f} | "
-                f"{point.follow} |"
-            )
-    else:
-        lines.append("None.")
-    if rows:
-        lines += [
-            "",
-            "## Held-out errors",
-            "",
-            "| demonstration | error [mm] | worst [mm] | within the 95 % region [%] |",
-        ]
-        lines.append("|---|---|---|---|")
-        for row in rows:
-            cells = [
-                as_markdown(str(row.get("name"))),
-                *(f"{row.get(key, 0):.1f}" for key in ("error_mm", "worst_mm", "within_95")),
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-        lines += [f"- {as_markdown(text)}" for text in skill.figures.get("warnings", ())]
-        lines += [
-            f"- residual risk: {as_markdown(text)}" for text in skill.figures.get("residual", ())
-        ]
+    lines += ["", "## Via-points", "", *_via_point_lines(skill), *_error_lines(skill.figures)]
     return "\n".join(lines)
+
+
+def _via_point_lines(skill: SkillContents) -> Iterator[str]:
+    """The table of the via-points, line by line."""
+    if not skill.via_points:
+        yield "None."
+        return
+    yield "| via-point | tool x, y, z [m] | radius of the hands [mm] | moves with |"
+    yield "|---|---|---|---|"
+    for point in skill.via_points:
+        position_text = ", ".join(f"{value:.3f}" for value in point.tool)
+        yield (
+            f"| {as_markdown(point.name)} | {position_text} | {1000 * point.radius:.0f} | "
+            f"{point.follow} |"
+        )
+
+
+def _error_lines(figures: Mapping[str, Any]) -> Iterator[str]:
+    """The table of the held-out errors, with warnings and residual risk, line by line."""
+    rows = figures.get("demonstrations", ())
+    if not rows:
+        return
+    yield from ("", "## Held-out errors", "")
+    yield "| demonstration | error [mm] | worst [mm] | within the 95 % region [%] |"
+    yield "|---|---|---|---|"
+    for judged in rows:
+        cells = [
+            as_markdown(str(judged.get("name"))),
+            *(f"{judged.get(key, 0):.1f}" for key in ("error_mm", "worst_mm", "within_95")),
+        ]
+        yield f"| {' | '.join(cells)} |"
+    for text in figures.get("warnings", ()):
+        yield f"- {as_markdown(text)}"
+    for text in figures.get("residual", ()):
+        yield f"- residual risk: {as_markdown(text)}"

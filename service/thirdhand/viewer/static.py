@@ -8,9 +8,9 @@ from __future__ import annotations
 import itertools
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -99,15 +99,8 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     for link in robot.findall("link"):
         for part in (*link.findall("inertial"), *link.findall("collision")):
             link.remove(part)
-    packages = (
-        *settings.arm.packages,
-        *filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
-    )
-    packages += tuple(
-        f"{prefix}/share"
-        for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-        if prefix
-    )
+
+    packages = _packages(settings)
     lost = unfound(robot, origin, packages, "visual")
     cause = f"{lost}; ROS_PACKAGE_PATH names more" if lost else ""
     files: dict[ElementTree.Element, Path] = {}
@@ -118,15 +111,34 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
         except (OSError, UnusableError) as error:
             cause = cause or f"a visual mesh is not readable: {in_words(error)}"
     for link in robot.findall("link"):
-        for visual in link.findall("visual"):
-            for mesh in visual.iter("mesh"):
-                if mesh in files:
-                    mesh.set("filename", f"file://{files[mesh].absolute()}")
-                else:
-                    link.remove(visual)
-                    break
+        _set_mesh_files(link, files)
     ElementTree.ElementTree(robot).write(path, encoding="utf-8")
     return f"the arm is drawn by its capsules: {cause}" if cause else ""
+
+
+def _packages(settings: Settings) -> tuple[str, ...]:
+    """The folders of ROS packages, from the settings and the environment."""
+    environment = os.environ
+    ros_folders = environment.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
+    prefixes = environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return (
+        *settings.arm.packages,
+        *filter(None, ros_folders),
+        *(f"{prefix}/share" for prefix in filter(None, prefixes)),
+    )
+
+
+def _set_mesh_files(link: ElementTree.Element, files: Mapping[ElementTree.Element, Path]) -> None:
+    """Write full paths into a link's visual shapes; those with a mesh that is not in `files` are
+    removed.
+    """
+    for visual in link.findall("visual"):
+        meshes = list(visual.iter("mesh"))
+        if any(mesh not in files for mesh in meshes):
+            link.remove(visual)
+            continue
+        for mesh in meshes:
+            mesh.set("filename", f"file://{files[mesh].absolute()}")
 
 
 def log_static(stream: rr.RecordingStream, models: ArmModels, settings: Settings) -> None:
@@ -190,34 +202,31 @@ def _log_arm(
     ghost: bool,
 ) -> None:
     """Log the shapes of the arm: solid, or transparent as a ghost."""
-    fill = (
-        rr.components.FillMode.TransparentFillMajorWireframe
-        if ghost
-        else rr.components.FillMode.Solid
-    )
-    colour = palette.faint(palette.MEASURED, 0.35)
     for chunk in tree.stream(include_joint_transforms=False):
-        if (
-            "/collision_geometries/" in chunk.entity_path
-            or chunk.entity_path.partition(VISUAL)[2] in undrawn
-        ):
-            continue
-        stream.send_chunks(chunk)
-        names = chunk.to_record_batch().schema.names
-        for shape in _SHAPES:
-            if any(name.startswith(f"{shape.__name__}:") for name in names):
-                lines = "radii" if shape is rr.Boxes3D else "line_radii"
-                style: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
-                stream.log(
-                    chunk.entity_path, shape.from_fields(fill_mode=fill, **style), static=True
-                )
-        if ghost and any(name.startswith("Asset3D:") for name in names):
-            stream.log(chunk.entity_path, rr.Asset3D.from_fields(albedo_factor=colour), static=True)
+        is_collision = "/collision_geometries/" in chunk.entity_path
+        if not is_collision and chunk.entity_path.partition(VISUAL)[2] not in undrawn:
+            stream.send_chunks(chunk)
+            _log_style(stream, chunk, ghost=ghost)
     for joint in tree.joints():
         if joint.joint_type == "fixed":
             stream.log(
                 f"{path}/joints/{joint.child_link}", joint.compute_transform(0.0), static=True
             )
+
+
+def _log_style(stream: rr.RecordingStream, chunk: rr.chunk.Chunk, *, ghost: bool) -> None:
+    """Log fill and colour of the shapes in a chunk of the arm."""
+    fills = rr.components.FillMode
+    fill = fills.TransparentFillMajorWireframe if ghost else fills.Solid
+    colour = palette.faint(palette.MEASURED, 0.35)
+    kinds = {name.partition(":")[0] for name in chunk.to_record_batch().schema.names}
+    for shape in _SHAPES:
+        if shape.__name__ in kinds:
+            lines = "radii" if shape is rr.Boxes3D else "line_radii"
+            style: dict[str, Any] = {"colors": [colour], lines: [0.0005]} if ghost else {}
+            stream.log(chunk.entity_path, shape.from_fields(fill_mode=fill, **style), static=True)
+    if ghost and "Asset3D" in kinds:
+        stream.log(chunk.entity_path, rr.Asset3D.from_fields(albedo_factor=colour), static=True)
 
 
 def _log_capsules(
@@ -322,26 +331,29 @@ def reach_lines(reach: Reach) -> Iterator[NDArray[np.float64]]:
             yield points
 
 
-def _log_names(fix: Any, settings: Settings) -> None:
-    """Log names, units and colours of the curves, and labels and colours of the modes."""
+class _Curves(NamedTuple):
+    """Curves of one path: their names with units, and their colours, which repeat."""
+
+    path: str
+    names: Sequence[str]
+    colours: Sequence[palette.Colour]
+
+
+def _curves(settings: Settings) -> Iterator[_Curves]:
+    """All curves, by path."""
     joints = [
         name.rpartition("/")[2].removesuffix("_joint").replace("_", " ")
         for name in settings.joints.names
     ]
     units = settings.joints.units
-    series: list[tuple[str, list[str], tuple[palette.Colour, ...]]] = [
-        (
-            f"/joints/{quantity}",
-            [f"{joint} [{unit}{per}]" for joint, unit in zip(joints, units, strict=True)],
-            palette.BY_JOINT,
-        )
-        for quantity, per in (("position", ""), ("velocity", "/s"), ("acceleration", "/s²"))
-    ]
-    series += [
-        ("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.BY_JOINT),
-        ("/age", [f"{side} hand [ms]" for side in SIDES], (palette.LEFT, palette.RIGHT)),
-    ]
-    single = (
+    for quantity, per in (("position", ""), ("velocity", "/s"), ("acceleration", "/s²")):
+        names = [f"{joint} [{unit}{per}]" for joint, unit in zip(joints, units, strict=True)]
+        yield _Curves(f"/joints/{quantity}", names, palette.BY_JOINT)
+    yield _Curves("/timing/stages", [f"{stage} [µs]" for stage in STAGES], palette.BY_JOINT)
+    yield _Curves("/age", [f"{side} hand [ms]" for side in SIDES], (palette.LEFT, palette.RIGHT))
+
+    unit = "rad" if set(units) == {"rad"} else "rad or m"
+    for path, name, colour in (
         ("/error/target", "tool to target [mm]", palette.TOOL),
         ("/turn/target", "tool to target [°]", palette.TOOL),
         ("/turn/std", "target, 1 σ [°]", palette.TARGET),
@@ -358,36 +370,39 @@ def _log_names(fix: Any, settings: Settings) -> None:
         ("/speed/right", "right hand [m/s]", palette.RIGHT),
         ("/separation/distance", "distance [m]", palette.NEAREST),
         ("/separation/limit", "allowed [m/s]", palette.SKY),
-        (
-            "/joints/error",
-            "largest [rad]" if set(units) == {"rad"} else "largest [rad or m]",
-            palette.MEASURED,
-        ),
+        ("/joints/error", f"largest [{unit}]", palette.MEASURED),
         ("/latency/hand", "hand's stamp to command [ms]", palette.LATENCY),
         ("/timing/lateness", "late by [µs]", palette.LATENESS),
         ("/timing/work", "work [µs]", palette.WORK),
-    )
-    series += [(path, [name], (colour,)) for path, name, colour in single]
-    for path, names, colours in series:
-        coloured = list(itertools.islice(itertools.cycle(colours), len(names)))
+    ):
+        yield _Curves(path, [name], [colour])
+
+
+def _log_names(fix: Any, settings: Settings) -> None:
+    """Log names, units and colours of the curves, and labels and colours of the modes."""
+    for path, names, colours in _curves(settings):
         # how values that share one pixel column are drawn: of times and ages, the largest
         is_largest = path.startswith(("/timing", "/latency", "/age"))
-        policy = rr.components.AggregationPolicy.Max if is_largest else None
-        widths = [1.5] * len(names)
         fix(
             path,
-            rr.SeriesLines(names=names, colors=coloured, widths=widths, aggregation_policy=policy),
+            rr.SeriesLines(
+                names=names,
+                colors=list(itertools.islice(itertools.cycle(colours), len(names))),
+                widths=[1.5] * len(names),
+                aggregation_policy=rr.components.AggregationPolicy.Max if is_largest else None,
+            ),
         )
-    for path, members, colours_packed in (
+    for path, members, packed_colours in (
         ("/mode", Mode, [palette.packed(palette.BY_MODE[mode]) for mode in Mode]),
         ("/reason", Reason, [palette.packed(palette.GREY)] * len(Reason)),
     ):
-        names = [word(member) for member in members]
-        labels = [title(name) for name in names]
+        words = [word(member) for member in members]
         fix(
             path,
             rr.StateConfiguration(
-                values=names, labels=labels, colors=np.array(colours_packed, np.uint32)
+                values=words,
+                labels=[title(name) for name in words],
+                colors=np.array(packed_colours, np.uint32),
             ),
         )
     fix("/scene/banner", _board())

@@ -126,37 +126,43 @@ class Viewer:
         """
         for kind, payload in events:
             if kind == "joints/state":
-                with contextlib.suppress(WireError):
-                    self._position = measured(
-                        cdr.decode_joints(payload), self._settings.joints.names
-                    )[0]
+                self._measure(payload)
             elif kind == "skill":
                 self.learn(payload)
         if timing is not None:
             self._timing = timing if self._timing is None else _with_peaks(self._timing, timing)
         if frame is None:
             return
+
         tick = int(frame["tick"])
-        if not self._repeated_ns or (
-            self._live and tick - self._repeated_tick > self._repeat_ticks
-        ):
-            self._repeated_tick = tick
-            self._repeated_ns = time_ns
-            self._put_skill()
-            self._put_objects(time_ns)
+        self._repeat(tick, time_ns)
         while self._remarks:
             self.log(self._remarks.pop(0), "WARN", time_ns)
-        joints = self._settings.joints
         position = (
             None
             if self._position is None
-            else in_turn(joints, np.array(self._position), frame["joints"])
+            else in_turn(self._settings.joints, np.array(self._position), frame["joints"])
         )
         self._pending.append(DrawnFrame(frame, time_ns, self._timing, position, self._after_gap))
         self._timing = None
         self._after_gap = False
         if tick - int(self._pending[0].frame["tick"]) >= self._batch_ticks:
             self._send()
+
+    def _measure(self, joint_state: bytes) -> None:
+        """Take the joints of the arm from its state, if that can be decoded."""
+        with contextlib.suppress(WireError):
+            joints = cdr.decode_joints(joint_state)
+            self._position = measured(joints, self._settings.joints.names)[0]
+
+    def _repeat(self, tick: int, time_ns: int) -> None:
+        """Put skill and objects at the begin, and to live viewers every SCENE_REPEAT_S."""
+        is_due = self._live and tick - self._repeated_tick > self._repeat_ticks
+        if is_due or not self._repeated_ns:
+            self._repeated_tick = tick
+            self._repeated_ns = time_ns
+            self._put_skill()
+            self._put_objects(time_ns)
 
     def learn(self, skill: bytes) -> None:
         """Draw a skill's demonstrations and via-points from now on."""
