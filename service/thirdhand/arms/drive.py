@@ -80,47 +80,92 @@ def follow(
     playback = Playback(
         drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits
     )
-    passed_s = 0.0
-    told_s = 0.0
-    following = False
-    refused = 0
     with Follower(session, drive.limits.names, cell) as follower, drive:
-        while True:
-            measured = drive.read()
-            passed_s += measured.elapsed_s
-            if passed_s - told_s >= 0.9 * max(playback.tick_s, SHORTEST_TICK_S):
-                follower.tell(
-                    playback.in_turn(measured.position).tolist(), measured.velocity.tolist()
-                )
-                told_s = passed_s
-            stopping = stop.is_set()
-            moved = playback.step(
-                () if stopping else follower.commands(),
-                measured=measured.position if drive.takes_velocity else None,
-                elapsed_s=measured.elapsed_s,
+        driving = _Driving(drive, playback, follower, cell, wait_s, say)
+        while not driving.step(stop):
+            pass
+    return playback
+
+
+class _Driving:
+    """The periods of a drive, one after the other, and the messages about them."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        playback: Playback,
+        follower: Follower,
+        cell: str,
+        wait_s: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self._drive = drive
+        self._playback = playback
+        self._follower = follower
+        self._cell = cell
+        self._wait_s = wait_s  # a command must arrive within this time
+        self._say = say
+        self._passed_s = 0.0
+        self._published_s = 0.0  # time of the newest published joint state
+        self._following = False
+        self._refused = 0
+
+    def step(self, stop: threading.Event) -> bool:
+        """Drive the arm for one period; True once it stands after `stop`. Raises DriveError and
+        UnreachableError.
+        """
+        drive = self._drive
+        playback = self._playback
+        measured = drive.read()
+        self._passed_s += measured.elapsed_s
+        self._publish(measured)
+        stopping = stop.is_set()
+        moved = playback.step(
+            () if stopping else self._follower.commands(),
+            measured=measured.position if drive.takes_velocity else None,
+            elapsed_s=measured.elapsed_s,
+        )
+        drive.write(moved.position, moved.velocity)
+
+        stands = not moved.velocity.any()
+        if stopping and stands and not playback.following:
+            return True
+        self._report_following()
+        if stands and (reason := playback.too_slow):
+            raise DriveError(f"the daemon of cell {self._cell}: {reason}")
+        if playback.refused and not self._refused:
+            self._say(f"command refused: {playback.reason}")
+        self._refused = playback.refused
+        self._check_heard()
+        return False
+
+    def _publish(self, measured: Measured) -> None:
+        """Publish the joints about once a tick."""
+        interval_s = 0.9 * max(self._playback.tick_s, SHORTEST_TICK_S)
+        if self._passed_s - self._published_s >= interval_s:
+            position = self._playback.in_turn(measured.position).tolist()
+            self._follower.tell(position, measured.velocity.tolist())
+            self._published_s = self._passed_s
+
+    def _report_following(self) -> None:
+        """Report that the arm begins, or ends, to follow commands."""
+        if self._following != self._playback.following:
+            self._following = not self._following
+            self._wait_s = float("inf")
+            self._say(
+                "commands arrive, the arm follows"
+                if self._following
+                else "no commands arrive, the arm brakes"
             )
-            drive.write(moved.position, moved.velocity)
-            if stopping and not playback.following and not moved.velocity.any():
-                return playback
-            if following != playback.following:
-                following = not following
-                wait_s = float("inf")
-                say(
-                    "commands arrive, the arm follows"
-                    if following
-                    else "no commands arrive, the arm brakes"
-                )
-            if (reason := playback.too_slow) and not moved.velocity.any():
-                raise DriveError(f"the daemon of cell {cell}: {reason}")
-            if playback.refused and not refused:
-                say(f"command refused: {playback.reason}")
-            refused = playback.refused
-            if passed_s > wait_s:
-                others = f"; {follower.rejected} were for another arm: {follower.reason}" * (
-                    follower.rejected > 0
-                )
-                raise UnreachableError(
-                    f"no command arrived on {key(cell, 'joints/command')} within {wait_s:g} "
-                    f"s{others}: is the daemon running in this cell? `thirdhand doctor` shows what "
-                    "it waits for"
-                )
+
+    def _check_heard(self) -> None:
+        """Raise UnreachableError if no command arrived in time."""
+        if self._passed_s <= self._wait_s:
+            return
+        follower = self._follower
+        others = f"; {follower.rejected} were for another arm: {follower.reason}"
+        raise UnreachableError(
+            f"no command arrived on {key(self._cell, 'joints/command')} within "
+            f"{self._wait_s:g} s{others if follower.rejected else ''}: is the daemon running in "
+            "this cell? `thirdhand doctor` shows what it waits for"
+        )

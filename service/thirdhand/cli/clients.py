@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -31,18 +32,9 @@ def via_points(args: argparse.Namespace) -> int:
         client = Client(session, args.cell)
         before = client.ask("via_points", {"op": "list"})["points"] if args.action == "add" else []
         reply = client.ask("via_points", request)
+
     for point in reply["points"]:
-        tool = " ".join(f"{v:.3f}" for v in point["tool"])
-        missed = f"missed by {1000 * point['missed_by_m']:.1f} mm"
-        if point["missed_by_rad"] is not None:
-            missed += f", {math.degrees(point['missed_by_rad']):.1f}°"
-        if point["gripper"]:
-            missed += f", gripper {point['gripper']}"
-        if point["segment"]:
-            missed += f", in the segment from {point['segment']} on"
-        if point["corrections"]:
-            missed += f", corrected {point['corrections']} time{'s' * (point['corrections'] != 1)}"
-        print(f"{point['name']:<16} tool {tool}   {missed}")
+        print(_line(point))
     count = len(reply["points"])
     print(f"{count} via-point{'' if count == 1 else 's'} in force at tick {reply['tick']}")
     added = [point["name"] for point in request.get("points", ())]
@@ -53,15 +45,28 @@ def via_points(args: argparse.Namespace) -> int:
     return 0
 
 
+def _line(point: Mapping[str, Any]) -> str:
+    """A via-point in one line."""
+    tool = " ".join(f"{v:.3f}" for v in point["tool"])
+    parts = [f"missed by {1000 * point['missed_by_m']:.1f} mm"]
+    if point["missed_by_rad"] is not None:
+        parts.append(f"{math.degrees(point['missed_by_rad']):.1f}°")
+    if point["gripper"]:
+        parts.append(f"gripper {point['gripper']}")
+    if point["segment"]:
+        parts.append(f"in the segment from {point['segment']} on")
+    if point["corrections"]:
+        plural = "s" * (point["corrections"] != 1)
+        parts.append(f"corrected {point['corrections']} time{plural}")
+    return f"{point['name']:<16} tool {tool}   {', '.join(parts)}"
+
+
 def _add(args: argparse.Namespace) -> Any:
+    """The request that adds the via-points of a file, or the one of the options."""
     if args.file:
         return msgspec.to_builtins(added_in(args.file))
-    if args.here and args.name:
-        for name, position in still(args).items():
-            setattr(args, name, getattr(args, name) or position)
-    sides = [side for side in SIDES if getattr(args, side)]
-    if args.name and args.tool and len(sides) == 1 and ask(args, "status").get("hands") == sides[0]:
-        args.left = args.right = args.left or args.right  # the skill ignores the other hand
+    if args.name:
+        _complete(args)
     if not (args.name and args.left and args.right and args.tool):
         raise UsageError(
             "NAME with --here, or NAME with --left, --right and --tool, or --file needed; for a "
@@ -74,6 +79,18 @@ def _add(args: argparse.Namespace) -> Any:
         "points": [point],
         **({} if args.tolerance is None else {"tolerance": args.tolerance}),
     }
+
+
+def _complete(args: argparse.Namespace) -> None:
+    """Complete the positions: with --here by those of now, and for a skill of one hand by that of
+    the other hand, which the skill ignores.
+    """
+    if args.here:
+        for name, position in still(args).items():
+            setattr(args, name, getattr(args, name) or position)
+    sides = [side for side in SIDES if getattr(args, side)]
+    if args.tool and len(sides) == 1 and ask(args, "status").get("hands") == sides[0]:
+        args.left = args.right = args.left or args.right
 
 
 def segment(args: argparse.Namespace) -> int:

@@ -26,6 +26,7 @@ from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import Condition, what_to_do
 from thirdhand.contract.messages import WireError
 from thirdhand.contract.printable import printable_lines
+from thirdhand.contract.requests import Status
 from thirdhand.contract.ros2 import NO_TYPE_HASH
 from thirdhand.process import bytecode
 
@@ -61,45 +62,12 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
             unreachable(endpoint, str(error)) for endpoint in reaching(args).connect or [ENDPOINT]
         )
         return
-    with session, Overheard(session, *PUBLISHED) as published, contextlib.ExitStack() as closing:
+    travel = Travel()
+    with session, Overheard(session, *PUBLISHED) as published:
         try:
-            with contextlib.closing(statuses(session, args.cell)) as arriving:
-                history = [next(arriving)]
-                travel = Travel()
-                if history[
-                    0
-                ].command_heard:  # otherwise the daemon would take this subscriber for a driver
-                    closing.enter_context(travel.watching(session, args.cell))
-                end = time.monotonic() + args.seconds
-                while time.monotonic() < end:
-                    history.append(next(arriving))
-        except StartingError as error:
-            yield wrong(
-                "daemon", str(error), "a daemon that is ready", what_to_do(Condition.STARTING)
-            )
-            return
-        except UnreachableError as error:
-            cells = {
-                str(reply.ok.key_expr).split("/daemon/")[0]
-                for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
-                if reply.ok is not None
-            }
-            remedy = what_to_do(
-                Condition.NO_ANSWER
-                if args.cell in cells
-                else Condition.OTHER_CELL
-                if cells
-                else Condition.NO_DAEMON
-            )
-            yield wrong("daemon", str(error), f"a daemon of cell {args.cell}", remedy)
-            return
-        except RefusedError as error:
-            yield wrong(
-                "daemon",
-                str(error),
-                f"version {version('thirdhand')}",
-                what_to_do(Condition.VERSIONS_DIFFER),
-            )
+            history = _history(session, args, travel)
+        except (UnreachableError, RefusedError) as error:
+            yield _no_daemon(session, args.cell, error)
             return
     yield from findings(
         *history,
@@ -111,6 +79,52 @@ def _examined(args: argparse.Namespace) -> Iterator[Finding]:
     )
     if uncompiled := bytecode.missing():
         yield Finding("note", "bytecode", uncompiled)
+
+
+def _history(session: zenoh.Session, args: argparse.Namespace, travel: Travel) -> list[Status]:
+    """The statuses of the next seconds, in which the arm's `travel` is watched. Raises
+    UnreachableError and RefusedError.
+    """
+    with (
+        contextlib.ExitStack() as closing,
+        contextlib.closing(statuses(session, args.cell)) as arriving,
+    ):
+        history = [next(arriving)]
+        # otherwise the daemon would take this subscriber for a driver
+        if history[0].command_heard:
+            closing.enter_context(travel.watching(session, args.cell))
+        end_s = time.monotonic() + args.seconds
+        while time.monotonic() < end_s:
+            history.append(next(arriving))
+    return history
+
+
+def _no_daemon(
+    session: zenoh.Session, cell: str, error: UnreachableError | RefusedError
+) -> Finding:
+    """The finding on a daemon that gives no status."""
+    if isinstance(error, StartingError):
+        required = "a daemon that is ready"
+        condition = Condition.STARTING
+    elif isinstance(error, RefusedError):
+        required = f"version {version('thirdhand')}"
+        condition = Condition.VERSIONS_DIFFER
+    else:
+        required = f"a daemon of cell {cell}"
+        condition = _absence(session, cell)
+    return wrong("daemon", str(error), required, what_to_do(condition))
+
+
+def _absence(session: zenoh.Session, cell: str) -> Condition:
+    """The condition of a cell that does not answer, by the daemons that are alive."""
+    cells = {
+        str(reply.ok.key_expr).split("/daemon/")[0]
+        for reply in session.liveliness().get("**/daemon/*", timeout=CONNECT_TIMEOUT_S)
+        if reply.ok is not None
+    }
+    if cell in cells:
+        return Condition.NO_ANSWER
+    return Condition.OTHER_CELL if cells else Condition.NO_DAEMON
 
 
 class Travel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import gc
 import logging
 import os
@@ -62,14 +63,7 @@ def _run(args: argparse.Namespace) -> int:
     settings = settings_of(args)
     folder = Path(settings.files.record).expanduser() if settings.files.record else None
     if folder is not None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
-        except OSError as error:
-            reason = (
-                error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
-            )
-            raise OSError(f"cannot record in {folder}: {reason}") from None
+        _check_writable(folder)
     if args.live is not None:
         foreign_modules.require("rerun")
     if folder is not None or args.live is not None:
@@ -82,18 +76,6 @@ def _run(args: argparse.Namespace) -> int:
             from thirdhand.scribe.scribe import Scribe
 
         gc.freeze()  # no later collection visits what was imported
-
-        def announce(endpoints: Sequence[str]) -> None:
-            where = (
-                ", ".join(endpoints)
-                or f"nothing, connected to {', '.join(settings.network.connect)}"
-            )
-            line = f"listening on {where} as cell {settings.cell}"
-            try:
-                print(line, flush=True)
-            except OSError as error:  # the daemon runs on without a reader of its output
-                log.warning("%s (standard output: %s)", line, in_words(error))
-
         skill = skill_path(settings, args)
         scribe = Scribe(settings, folder=folder, live_port=args.live)
         missing = daemon.serve(
@@ -102,12 +84,32 @@ def _run(args: argparse.Namespace) -> int:
             skills=skill_file(settings).parent,
             scribe=scribe,
             start=start,
-            announce=announce,
+            announce=functools.partial(_announce, settings),
             hold=args.hold or settings.arm.start == "held",
         )
     logging.shutdown()
     # everything is closed; this does not wait for threads of libraries
     os._exit(1 if missing else 0)
+
+
+def _check_writable(folder: Path) -> None:
+    """Make the folder of the recordings. Raises OSError if no file can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        reason = error.strerror if folder.is_dir() or not folder.exists() else "it is not a folder"
+        raise OSError(f"cannot record in {folder}: {reason}") from None
+
+
+def _announce(settings: Settings, endpoints: Sequence[str]) -> None:
+    """Print where a daemon listens; it runs on without a reader of its output."""
+    where = ", ".join(endpoints) or f"nothing, connected to {', '.join(settings.network.connect)}"
+    line = f"listening on {where} as cell {settings.cell}"
+    try:
+        print(line, flush=True)
+    except OSError as error:
+        log.warning("%s (standard output: %s)", line, in_words(error))
 
 
 def settings_of(args: argparse.Namespace) -> Settings:

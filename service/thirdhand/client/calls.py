@@ -25,6 +25,7 @@ from thirdhand.contract.printable import printable_lines
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, Reply, Status, ViaPoint, ViaPointInForce
 
 ALIVE_QUERIES = 5
+OLD_REPLY = " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
 QUERIES = 2  # queries within the time of one request, if it may be repeated
 # a connection that broke returns within this time, unless the network or the daemon is down
 RECONNECTED_S = 2.0
@@ -146,12 +147,8 @@ class Client:
             raise RefusedError(f"the answer on {self._key(suffix)} is {error}") from None
 
     def _answer(self, suffix: str, request: Any) -> bytes:
-        payload = requests.encode_json({} if request is None else request)
-        if len(payload) > channels.LARGEST_REQUEST:
-            raise RefusedError(
-                f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"
-            )
-        acts = suffix != "status" and payload != LIST
+        payload = _encoded(request)
+        acts = _acts(suffix, payload)
         # a second hold changes nothing, and a lost one must not remain so
         may_repeat = not acts or suffix == "hold"
         queries_left = QUERIES if may_repeat else 1  # a query, or its answer, may be lost
@@ -165,20 +162,22 @@ class Client:
             if answer is not None:
                 return answer
             queries_left -= 1
-            is_absent = self._is_absent()
+            if self._is_absent():
+                raise self._silence(suffix, OLD_REPLY * is_stored)
             is_over = queries_left <= 0 and time.monotonic() > end_s
-            if is_absent or (is_sent and not may_repeat) or is_over:
-                break
+            if is_over or (is_sent and not may_repeat):
+                raise self._silence(suffix, may_have_acted=is_sent and acts)
+
+    def _silence(
+        self, suffix: str, remark: str = "", *, may_have_acted: bool = False
+    ) -> UnreachableError:
+        """The error for a request without an answer."""
         silent = f"nobody answers on {self._key(suffix)}: {why_silent(self._session, self._cell)}"
-        if is_sent and acts and not is_absent:
-            raise UncertainError(
+        if may_have_acted:
+            return UncertainError(
                 f"{silent}. The request may have been carried out: the status shows it"
             )
-        if is_stored and is_absent:
-            silent += (
-                " A Zenoh storage answered with an old reply, but no daemon of this cell is alive."
-            )
-        raise UnreachableError(silent)
+        return UnreachableError(silent + remark)
 
     def _asked(self, suffix: str, payload: bytes, timeout_s: float) -> tuple[bytes | None, bool]:
         """The answer of a live daemon to one query, None if there is none; True if a storage
@@ -236,3 +235,18 @@ class Client:
 
     def _key(self, suffix: str) -> str:
         return channels.key(self._cell, suffix)
+
+
+def _encoded(request: Any) -> bytes:
+    """A request in JSON. Raises RefusedError if it is too large."""
+    payload = requests.encode_json({} if request is None else request)
+    if len(payload) > channels.LARGEST_REQUEST:
+        raise RefusedError(
+            f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"
+        )
+    return payload
+
+
+def _acts(suffix: str, payload: bytes) -> bool:
+    """True for a request that may change something."""
+    return suffix != "status" and payload != LIST

@@ -346,20 +346,27 @@ def lacking(endpoint: str) -> str:
     """The problem with a Zenoh endpoint, in words; empty if it is valid."""
     protocol, slashes, address = _ENDPOINT.findall(endpoint)[0]
     host, _, port = re.sub("[?#].*", "", address).rpartition(":")
-    if protocol in _ON_IP and port.isdecimal() and int(port) > LAST_PORT:
+    is_on_ip = protocol in _ON_IP
+    if is_on_ip and port.isdecimal() and int(port) > LAST_PORT:
         return f"{endpoint!r} given; a port from 0 to {LAST_PORT} needed"
-    if protocol in _ON_IP and not is_host(host.strip("[]")):
+    if is_on_ip and not is_host(host.strip("[]")):
         return f"{endpoint!r} given; the name of a host or an IP address needed"
-    if slashes == "/" and address and (protocol not in _ON_IP or re.fullmatch(".+:.+", address)):
+    if slashes == "/" and address and (not is_on_ip or re.fullmatch(".+:.+", address)):
         return ""
+    proposal = _similar_endpoint(protocol if is_on_ip else "tcp", address)
+    return (
+        f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: "
+        f"{proposal} ?"
+    )
+
+
+def _similar_endpoint(protocol: str, address: str) -> str:
+    """A valid endpoint with a host or port from an address that may lack either."""
     host, _, port = address.rpartition(":")
     if not host and not port.isdecimal():
         host = port
         port = "7447"
-    meant = f"{protocol if protocol in _ON_IP else 'tcp'}/{host or '127.0.0.1'}:{port}"
-    return (
-        f"{endpoint!r} given; an endpoint of the form <protocol>/<address>:<port> needed: {meant} ?"
-    )
+    return f"{protocol}/{host or '127.0.0.1'}:{port}"
 
 
 def is_host(name: str) -> bool:

@@ -139,28 +139,9 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
     match reason:
         case Reason.NO_HANDS | Reason.STALE_HAND:
             finding = _unseen(seen)
-            closer = _rejected_remedy(seen, *SIDES)
-            if (
-                not closer
-                and reason is Reason.STALE_HAND
-                and any(_rate_too_low(seen, side) for side in SIDES)
-            ):
-                closer = what_to_do(Condition.HANDS_TOO_RARE)
-            elif not closer and any(hand.batches_ms for hand in _hands(seen)):
-                closer = what_to_do(Condition.DELAYED)
-        case Reason.FAR_FROM_DEMONSTRATIONS if unit := _unit_of_all(seen):
-            finding = (
-                f"the hands' positions look like {unit}, which is not the unit of their tracker in "
-                "the settings"
-            )
-            closer = unit_advice(unit)
-        case Reason.FAR_FROM_DEMONSTRATIONS if seen.gate_m is not None:
-            finding = "{} is {:.1f} cm; the hold ends below {:.1f}".format(
-                seen.measure, *(100 * value for value in seen.gate_m)
-            )
-            if jumping := [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]:
-                finding = f"the {' and the '.join(jumping)} jumped in the last second; {finding}"
-                closer = what_to_do(word(Cause.JUMPED))
+            closer = _unseen_remedy(reason, seen)
+        case Reason.FAR_FROM_DEMONSTRATIONS:
+            finding, closer = _far_from_demonstrations(seen)
         case Reason.TWO_SOURCES:
             finding = _contest(seen)
         case Reason.ARM_NOT_READY:
@@ -189,6 +170,36 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
         case Reason.CLUTCH:
             finding = seen.clutch
     return finding, closer
+
+
+def _unseen_remedy(reason: Reason, seen: Evidence) -> str:
+    """The remedy for hands that are not seen, if the figures show a closer cause; else empty."""
+    if remedy := _rejected_remedy(seen, *SIDES):
+        return remedy
+    if reason is Reason.STALE_HAND and any(_rate_too_low(seen, side) for side in SIDES):
+        return what_to_do(Condition.HANDS_TOO_RARE)
+    is_delayed = any(hand.batches_ms for hand in _hands(seen))
+    return what_to_do(Condition.DELAYED) if is_delayed else ""
+
+
+def _far_from_demonstrations(seen: Evidence) -> tuple[str, str]:
+    """The finding on hands far from the demonstrations, and its remedy if it has a closer cause."""
+    if unit := _unit_of_all(seen):
+        finding = (
+            f"the hands' positions look like {unit}, which is not the unit of their tracker in "
+            "the settings"
+        )
+        return finding, unit_advice(unit)
+    if seen.gate_m is None:
+        return "", ""
+    finding = "{} is {:.1f} cm; the hold ends below {:.1f}".format(
+        seen.measure, *(100 * value for value in seen.gate_m)
+    )
+    jumping = [SOURCE_NAMES[side] for side in SIDES if _jumps(seen, side)]
+    if not jumping:
+        return finding, ""
+    jumped = f"the {' and the '.join(jumping)} jumped in the last second"
+    return f"{jumped}; {finding}", what_to_do(word(Cause.JUMPED))
 
 
 def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:

@@ -110,24 +110,30 @@ def explained(error: Exception, given: Any, kind: Any) -> str:
         return f"$: {error}"
     unknown = re.match(r"(?s)Object contains unknown field `(.*)`", message)
     if unknown and isinstance(node, inspect.StructType):
-        field_names = _known(node)
-        problem = (
-            f"{path}: unknown field {_short(unknown[1])}; known are "
-            f"{', '.join(field_names) or 'none'}"
-        )
-        return problem + did_you_mean(unknown[1], field_names)
+        return f"{path}: {_unknown_field(unknown[1], node)}"
     if message.startswith("Object missing required field"):
         return f"{path}: {message.removeprefix('Object missing required ')} is missing"
-    if (
-        isinstance(error, msgspec.ValidationError)
-        and (needed := _needed(node, value, accepted))
-        and message.startswith(("Expected", "Invalid"))
-    ):
-        if isinstance(node, inspect.TupleType | inspect.VarTupleType) and isinstance(value, list):
-            counted = "numbers" if isinstance(node, inspect.TupleType) and not accepted else "given"
-            return f"{path}: {len(value) or 'none'} {counted}, {needed}"
-        return f"{path}: {_short(value)} given; {needed}"
+    is_of_value = isinstance(error, msgspec.ValidationError) and message.startswith(
+        ("Expected", "Invalid")
+    )
+    if is_of_value and (needed := _needed(node, value, accepted)):
+        return f"{path}: {_refused(node, value, accepted)} {needed}"
     return f"{path}: {message[:MAX_MESSAGE]}"
+
+
+def _unknown_field(name: str, node: inspect.StructType) -> str:
+    """The message about a field that a struct does not have."""
+    field_names = _known(node)
+    listing = ", ".join(field_names) or "none"
+    return f"unknown field {_short(name)}; known are {listing}{did_you_mean(name, field_names)}"
+
+
+def _refused(node: Any, value: Any, accepted: str) -> str:
+    """The refused value in words; of a list where a tuple is needed, only its length."""
+    if isinstance(node, inspect.TupleType | inspect.VarTupleType) and isinstance(value, list):
+        counted = "numbers" if isinstance(node, inspect.TupleType) and not accepted else "given"
+        return f"{len(value) or 'none'} {counted},"
+    return f"{_short(value)} given;"
 
 
 def did_you_mean(given: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
@@ -166,20 +172,11 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
     accepted = ""
     for field, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
         node = _chosen(node, value)
-        if isinstance(node, inspect.StructType) and field:
-            if field == node.tag_field:
-                return value.get(field), inspect.LiteralType((node.tag,)), ""
-            inner = {f.encode_name: f.type for f in node.fields}[field]
-        elif isinstance(node, inspect.UnionType) and field:
-            tags = tuple(t.tag for t in node.types if isinstance(t, inspect.StructType))
+        tags = _tags(node, field)
+        if tags is not None:
             return value.get(field), inspect.LiteralType(tags), ""
-        elif isinstance(node, inspect.TupleType):
-            inner = node.item_types[int(index)]
-        elif isinstance(node, inspect.VarTupleType | inspect.ListType):
-            inner = node.item_type
-        elif isinstance(node, inspect.DictType) and field:
-            inner = node.value_type
-        else:
+        inner = _inner(node, field, index)
+        if inner is None:
             return None, None, ""
         value = value[field] if field else value[int(index)]
         accepted = ""
@@ -188,6 +185,29 @@ def _at(path: str, value: Any, node: inspect.Type) -> tuple[Any, Any, str]:
             accepted = (node.extra or {}).get("accepted", "")
             node = node.type
     return value, _chosen(node, value), accepted
+
+
+def _tags(node: Any, field: str) -> tuple[Any, ...] | None:
+    """The tags that a field of tagged structs may have; None if it is not their tag."""
+    if isinstance(node, inspect.StructType) and field and field == node.tag_field:
+        return (node.tag,)
+    if isinstance(node, inspect.UnionType) and field:
+        return tuple(member.tag for member in node.types if isinstance(member, inspect.StructType))
+    return None
+
+
+def _inner(node: Any, field: str, index: str) -> Any:
+    """The type of a field or an entry; None if the type has no such part."""
+    match node:
+        case inspect.StructType() if field:
+            return {part.encode_name: part.type for part in node.fields}[field]
+        case inspect.TupleType():
+            return node.item_types[int(index)]
+        case inspect.VarTupleType() | inspect.ListType():
+            return node.item_type
+        case inspect.DictType() if field:
+            return node.value_type
+    return None
 
 
 def _chosen(node: Any, value: Any) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import word
+from thirdhand.contract.messages import Vector3
 from thirdhand.contract.records import Mode
 from thirdhand.contract.requests import (
     Add,
@@ -256,24 +257,12 @@ class Answers:
                 f"$.points: {total} via-points beside the task's, where one with a radius counts "
                 f"as 13; at most {MAX_VIA_POINTS} accepted"
             )
-        low, high = skill.workspace
         settings = self._cell.settings
         distances_m = self._beyond_m(settings, np.array([point.tool for point in added]))
         for i, (point, distance_m) in enumerate(zip(added, distances_m.tolist(), strict=True)):
             position = f"{at or f'$.points[{i}].tool'}: {list(point.tool)}"
-            if point.segment not in (None, *(begins := skill.model.names[:-1])):
-                listing = ", ".join(begins) or "none"
-                raise RequestError(
-                    f"$.points[{i}].segment: no segment begins at {point.segment!r}; segments "
-                    f"begin at: {listing}"
-                )
-            if not ((low <= point.tool) & (point.tool <= high)).all():
-                corners = " to ".join(
-                    f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high)
-                )
-                raise RequestError(
-                    f"{position} outside the skill's workspace, {corners} m accepted"
-                )
+            _check_segment(skill, point.segment, f"$.points[{i}].segment")
+            _check_workspace(skill, point.tool, position)
             if distance_m > 0.0:
                 raise RequestError(
                     f"{position} out of the arm's reach by {distance_m:.3f} m: {accepted(settings)}"
@@ -313,6 +302,26 @@ class Answers:
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
         remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
+
+
+def _check_segment(skill: StoredSkill, segment: str | None, path: str) -> None:
+    """Raise RequestError if no segment of the skill begins at this via-point; None: any segment."""
+    begins = skill.model.names[:-1]
+    if segment not in (None, *begins):
+        raise RequestError(
+            f"{path}: no segment begins at {segment!r}; segments begin at: "
+            f"{', '.join(begins) or 'none'}"
+        )
+
+
+def _check_workspace(skill: StoredSkill, tool: Vector3, position: str) -> None:
+    """Raise RequestError for a position of the tool [m] outside the skill's workspace."""
+    low, high = skill.workspace
+    if not ((low <= tool) & (tool <= high)).all():
+        corners = " to ".join(
+            f"({', '.join(f'{v:.2f}' for v in corner)})" for corner in (low, high)
+        )
+        raise RequestError(f"{position} outside the skill's workspace, {corners} m accepted")
 
 
 def _in_force_since(frame: Frame) -> Reply:

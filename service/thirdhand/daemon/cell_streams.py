@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from statistics import median
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import zenoh
@@ -193,6 +193,9 @@ class FrozenHand:
         return False
 
 
+Transforms: TypeAlias = tuple[dict[str, str], Any]  # channels by frame, and the subscriber
+
+
 class CellStreams:
     """A cell's subscribers and publishers, also in the ROS 2 domain if its settings name one.
 
@@ -215,42 +218,24 @@ class CellStreams:
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
         self._sole = {key: SolePublisher() for key in self._frozen}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
+
         inputs = [channel.key for channel in heard(settings)]
         keys = [(suffix, channels.key(cell, suffix)) for suffix in inputs]
-        frames = dict[str, dict[str, str]]()
+        topics: list[ros2.Topic] = []
+        self._transforms: list[Transforms] = []
         if domain is not None:
             topics = ros2.heard(cell, settings.ros2, inputs)
             keys += [
                 (topic.channel, ros2.key(domain, topic)) for topic in topics if not topic.frame
             ]
-            for transform_topic in (topic for topic in topics if topic.frame):
-                frames.setdefault(ros2.key(domain, transform_topic), {})[transform_topic.frame] = (
-                    transform_topic.channel
-                )
-            topics += [ros2.of_channel(cell, channel) for channel in ros2.SAID]
-            topics += [topic for topic in ros2.of_settings(settings.ros2) if not topic.heard]
+            self._transforms = _transforms(session, domain, topics)
         self._subscribers = [
             (suffix, session.declare_subscriber(key, RingChannel(_most(suffix))))
             for suffix, key in keys
         ]
-        remote = zenoh.Locality.REMOTE  # the cell may publish frames of its own on the same topic
-        self._transforms = [
-            (
-                by_frame,
-                session.declare_subscriber(
-                    key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote
-                ),
-            )
-            for key, by_frame in frames.items()
-        ]
-        self._publishers = {
-            channel.key: Publisher(
-                session, cell, channel.key, priority=zenoh.Priority.REAL_TIME
-            ).zenoh
-            for channel in channels.CHANNELS
-            if channel.direction == "out"
-        }
+        self._publishers = _publishers(session, cell)
         self._sent = Counter[str]()  # messages by channel
+        topics += _published_topics(settings)
         self._ros2 = (
             None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
         )
@@ -353,6 +338,39 @@ class CellStreams:
         """End the threads beside the loop."""
         if self._ros2 is not None:
             self._ros2.close()
+
+
+def _publishers(session: zenoh.Session, cell: str) -> dict[str, zenoh.Publisher]:
+    """The publishers of a cell's outputs, by channel."""
+    outputs = [channel.key for channel in channels.CHANNELS if channel.direction == "out"]
+    priority = zenoh.Priority.REAL_TIME
+    return {key: Publisher(session, cell, key, priority=priority).zenoh for key in outputs}
+
+
+def _transforms(
+    session: zenoh.Session, domain: int, topics: Iterable[ros2.Topic]
+) -> list[Transforms]:
+    """The subscribers of topics that carry transforms, each with the channels of its frames."""
+    channels_of: dict[str, dict[str, str]] = {}
+    for topic in topics:
+        if topic.frame:
+            channels_of.setdefault(ros2.key(domain, topic), {})[topic.frame] = topic.channel
+    remote = zenoh.Locality.REMOTE  # the cell may publish frames of its own on the same topic
+    return [
+        (
+            by_frame,
+            session.declare_subscriber(
+                key, RingChannel(MAX_TRANSFORM_MESSAGES), allowed_origin=remote
+            ),
+        )
+        for key, by_frame in channels_of.items()
+    ]
+
+
+def _published_topics(settings: Settings) -> list[ros2.Topic]:
+    """The topics on which a cell publishes in its ROS 2 domain."""
+    own_topics = [ros2.of_channel(settings.cell, channel) for channel in ros2.SAID]
+    return own_topics + [topic for topic in ros2.of_settings(settings.ros2) if not topic.heard]
 
 
 def heard(settings: Settings) -> list[channels.Channel]:

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import logging
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -101,23 +102,32 @@ class Daemon:
             )
         finally:
             self._brake()
-            cell.ended.set()
-            cell.start.systemd.notify("STOPPING=1", "STATUS=closing its files")
-            gc.unfreeze()
-            cell.newest_status.close()
-            self._status_thread.own_answers.close()
-            reporter.join(2)
-            self._queryables.close()
-            cell.streams.close()
-            cell.start.session.close()  # type: ignore[no-untyped-call]
-            missing = cell.scribe.close()
-            recording = cell.scribe.newest_recording
-            recording_text = (
-                f"its newest recording is {recording}" if recording else "it recorded nothing"
-            )
-            log.info("ended: the daemon of cell %s; %s", cell.settings.cell, recording_text)
-            if missing:
-                log.warning("%s", missing)
+            missing = self._close(reporter)
+        return missing
+
+    def _close(self, reporter: threading.Thread) -> str:
+        """End the threads, close everything, and return a message on ticks that were not recorded
+        (empty: none).
+        """
+        cell = self._cell
+        cell.ended.set()
+        cell.start.systemd.notify("STOPPING=1", "STATUS=closing its files")
+        gc.unfreeze()
+        cell.newest_status.close()
+        self._status_thread.own_answers.close()
+        reporter.join(2)
+        self._queryables.close()
+        cell.streams.close()
+        cell.start.session.close()  # type: ignore[no-untyped-call]
+        missing = cell.scribe.close()
+
+        recording = cell.scribe.newest_recording
+        recording_text = (
+            f"its newest recording is {recording}" if recording else "it recorded nothing"
+        )
+        log.info("ended: the daemon of cell %s; %s", cell.settings.cell, recording_text)
+        if missing:
+            log.warning("%s", missing)
         return missing
 
     def _fail_in_the_loop(self, what: str) -> None:

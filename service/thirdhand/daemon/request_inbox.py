@@ -139,20 +139,24 @@ class RequestInbox:
                 )
             self._holders.add(by)
         elif kind == "resume":
-            if holds < self.holds_received:
-                raise RequestError("a hold was received after this resume; resume again to end it")
-            if state["guided_tick"] == state["tick"] > 0:
-                raise RequestError(
-                    "the arm is led by hand, which no resume ends; end hand guiding, then resume"
-                )
-            was_led = state["operator_hold"] and state["guided_tick"] >= max(state["held_tick"], 1)
-            if by and (was_led or self._holders != {by}):
-                reason = (
-                    "somebody else holds the arm too"
-                    if by in self._holders
-                    else f"{by!r} does not hold the arm"
-                )
-                raise RequestError(
-                    f"$.by: {reason}; a resume without `by` needed, which ends all holds"
-                )
+            self._check_resume(by, holds, state)
             self._holders.clear()
+
+    def _check_resume(self, by: str, holds: int, state: Record) -> None:
+        """Raise RequestError for a resume that must not end the hold."""
+        if holds < self.holds_received:
+            raise RequestError("a hold was received after this resume; resume again to end it")
+        if state["guided_tick"] == state["tick"] > 0:
+            raise RequestError(
+                "the arm is led by hand, which no resume ends; end hand guiding, then resume"
+            )
+        was_led = state["operator_hold"] and state["guided_tick"] >= max(state["held_tick"], 1)
+        if by and (was_led or self._holders != {by}):
+            reason = (
+                "somebody else holds the arm too"
+                if by in self._holders
+                else f"{by!r} does not hold the arm"
+            )
+            raise RequestError(
+                f"$.by: {reason}; a resume without `by` needed, which ends all holds"
+            )

@@ -100,37 +100,43 @@ class SkillWorker:
         if not self._busy.acquire(timeout=max(0.0, end_s - time.monotonic())):
             raise SkillError(BUSY)
         try:
-            working = self.start()
-            progress = child.Progress(working)
-            try:
-                while not working.has_begun(WORKER_POLL_S):
-                    if working.returncode is not None or progress.is_hung(WORK_TIMEOUT_S):
-                        working.kill()
-                        raise EOFError
-                    if time.monotonic() > end_s:  # its imports continue for the next request
-                        raise SkillError(STILL_STARTING)
-                _send(working.socket, pickle.dumps((work, *arguments)))
-                poll = select.poll()
-                poll.register(working.socket, select.POLLIN)
-                while not poll.poll(1000 * WORKER_POLL_S):
-                    if progress.is_hung(HUNG_S, busy_s=math.inf):
-                        raise TimeoutError(f"made no progress for {HUNG_S:g} s")
-                    if time.monotonic() > end_s:
-                        raise TimeoutError("did not answer in time")
-                answer: Computed | str = _receive(working.socket)
-            except TimeoutError as error:
-                self._end()
-                raise SkillError(f"the skill worker {error}; nothing was changed") from None
-            except (OSError, EOFError):
-                self._end()
-                raise SkillError(
-                    "the skill worker ended while it worked; nothing was changed, try again"
-                ) from None
+            answer: Computed | str = self._answer(pickle.dumps((work, *arguments)), end_s)
+        except TimeoutError as error:
+            self._end()
+            raise SkillError(f"the skill worker {error}; nothing was changed") from None
+        except (OSError, EOFError):
+            self._end()
+            raise SkillError(
+                "the skill worker ended while it worked; nothing was changed, try again"
+            ) from None
         finally:
             self._busy.release()
         if isinstance(answer, str):
             raise SkillError(answer)
         return answer
+
+    def _answer(self, request: bytes, end_s: float) -> Any:
+        """The worker's answer to a request. Raises SkillError, TimeoutError after `end_s`
+        (time.monotonic() [s]), and OSError or EOFError if the process ends.
+        """
+        working = self.start()
+        progress = child.Progress(working)
+        while not working.has_begun(WORKER_POLL_S):
+            if working.returncode is not None or progress.is_hung(WORK_TIMEOUT_S):
+                working.kill()
+                raise EOFError
+            if time.monotonic() > end_s:  # its imports continue for the next request
+                raise SkillError(STILL_STARTING)
+
+        _send(working.socket, request)
+        poll = select.poll()
+        poll.register(working.socket, select.POLLIN)
+        while not poll.poll(1000 * WORKER_POLL_S):
+            if progress.is_hung(HUNG_S, busy_s=math.inf):
+                raise TimeoutError(f"made no progress for {HUNG_S:g} s")
+            if time.monotonic() > end_s:
+                raise TimeoutError("did not answer in time")
+        return _receive(working.socket)
 
     def close(self) -> None:
         """End the process, also while it works."""

@@ -7,11 +7,12 @@ import os
 import time
 from collections import deque
 from importlib.metadata import version
+from typing import Any
 
 from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import Condition, in_brief, in_full, what_to_do
-from thirdhand.contract.requests import Status, encode_json
-from thirdhand.core.frame import order
+from thirdhand.contract.requests import Percentiles, Source, Status, encode_json
+from thirdhand.core.frame import Frame, Record, order
 from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.clock import SystemClock
 from thirdhand.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
@@ -156,33 +157,13 @@ class StatusThread:
         now_s = time.monotonic()
         clock.between_ticks()
         frame, state = cell.moment()
-        sources = {}
-        for name, source in cell.inputs.update(cell.controller, state, now_s):
-            sources[name] = source
-            clock.between_ticks()
+        sources = self._sources(state, now_s)
         streams = cell.inputs.streams(now_s)
         clock.between_ticks()
-
         inside = self._measured_arm.inside(state)
-        windows = cell.times.windows
-        late_ms = windows["lateness_us"].largest(round(BUSY_WINDOW_S * cell.settings.rate_hz)) / 1e3
-        machine = self._machine
-        machine.update(
-            now_s,
-            tick=int(frame["tick"]),
-            missed=clock.missed,
-            late_ms=late_ms,
-            outcome=outcome(frame),
-        )
-        scribe = cell.scribe.status()
+        self._update_machine(frame, now_s)
 
-        percentiles = {}
-        for name, window in windows.items():
-            clock.between_ticks()
-            percentiles[name] = window.percentiles()
-        clock.between_ticks()
-
-        return CellStatus(
+        moment = CellStatus(
             frame,
             cell.controller,
             state,
@@ -190,22 +171,62 @@ class StatusThread:
             cell.settings,
             failure=cell.failure,
             inside=inside,
-            busy=machine.at_stop,
+            busy=self._machine.at_stop,
             clutch=cell.inputs.clutch(state),
             streams=streams,
-        ).status(
-            time_ns=time.time_ns(),
-            rate_hz=clock.rate_hz(),
-            missed=clock.missed,
-            **cell.granted._asdict(),
+        )
+        return moment.status(
+            **self._percentiles(),
+            **self._processes(),
             received={key: arrivals.count for key, arrivals in cell.inputs.arrivals.items()},
-            **percentiles,
-            scribe=scribe,
-            memory_mb=resident_mb(daemon=os.getpid(), scribe=scribe["pid"]),
             command_heard=cell.streams.is_followed,
-            busy=machine.at_stop or machine.now,
+            busy=self._machine.at_stop or self._machine.now,
             endpoints=cell.endpoints,
             version=self._version,
             tool_measured_m=self._measured_arm.position(state),
             tool_limits=self._skill_work.tool_limits(),
         )
+
+    def _sources(self, state: Record, now_s: float) -> dict[str, Source]:
+        """Hands and arm at this moment, by name; a tick may pass between any two."""
+        cell = self._cell
+        sources = {}
+        for name, source in cell.inputs.update(cell.controller, state, now_s):
+            sources[name] = source
+            cell.clock.between_ticks()
+        return sources
+
+    def _update_machine(self, frame: Frame, now_s: float) -> None:
+        """Judge by the newest ticks if the machine is busy."""
+        cell = self._cell
+        window_ticks = round(BUSY_WINDOW_S * cell.settings.rate_hz)
+        self._machine.update(
+            now_s,
+            tick=int(frame["tick"]),
+            missed=cell.clock.missed,
+            late_ms=cell.times.windows["lateness_us"].largest(window_ticks) / 1e3,
+            outcome=outcome(frame),
+        )
+
+    def _processes(self) -> dict[str, Any]:
+        """The fields on the loop and the scribe."""
+        cell = self._cell
+        scribe = cell.scribe.status()
+        return {
+            "time_ns": time.time_ns(),
+            "rate_hz": cell.clock.rate_hz(),
+            "missed": cell.clock.missed,
+            **cell.granted._asdict(),
+            "scribe": scribe,
+            "memory_mb": resident_mb(daemon=os.getpid(), scribe=scribe["pid"]),
+        }
+
+    def _percentiles(self) -> dict[str, Percentiles]:
+        """Percentiles of lateness, work and latency, by field; a tick may pass between any two."""
+        clock = self._cell.clock
+        percentiles = {}
+        for name, window in self._cell.times.windows.items():
+            clock.between_ticks()
+            percentiles[name] = window.percentiles()
+        clock.between_ticks()
+        return percentiles

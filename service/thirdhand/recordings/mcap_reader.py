@@ -211,17 +211,16 @@ class _Reading:
                 raise ValueError("an attachment's checksum is wrong")
             return [Attachment.read(stream)]
         if opcode == Opcode.DATA_END:
-            recorded = DataEnd.read(stream).data_section_crc
-            if recorded and self._checksum is not None and recorded != self._checksum:
-                why = (
-                    "the checksum over all data is wrong, and those of chunks and attachments are "
-                    "right"
-                )
-                self._faults.append(FileFault(False, 0, self._stream.tell(), why))
-            return []
-        if opcode not in _NAMING:
-            return []
-        return [_NAMING[opcode].read(stream)]
+            self._verify_data(DataEnd.read(stream).data_section_crc)
+        return [_NAMING[opcode].read(stream)] if opcode in _NAMING else []
+
+    def _verify_data(self, recorded: int) -> None:
+        """Note a fault if the recorded checksum over all data is wrong; 0: none is recorded."""
+        if recorded and self._checksum is not None and recorded != self._checksum:
+            why = (
+                "the checksum over all data is wrong, and those of chunks and attachments are right"
+            )
+            self._faults.append(FileFault(False, 0, self._stream.tell(), why))
 
     def _resume_at(self, at: int, end: int | None) -> int | None:
         """The byte at which reading continues after a broken record: its end if a record begins

@@ -103,9 +103,7 @@ class RecordingPaths:
         ages_s = _ages_s([changed for *_, changed in recordings], longest_gap_s)
         removed: list[Path] = []
         for (path, size, _), age_s in zip(recordings, ages_s, strict=True):
-            too_old = files.keep_hours and age_s > files.keep_hours * 3600
-            too_much = files.keep_mb and total > files.keep_mb * MB
-            if (too_old or too_much) and path != writing:
+            if path != writing and self._is_beyond(age_s, total):
                 with contextlib.suppress(OSError):
                     path.unlink()
                     total -= size
@@ -113,6 +111,13 @@ class RecordingPaths:
         is_limited = files.keep_mb and self._folder is not None
         self.keep_mb_left = max(0.0, files.keep_mb - total / MB) if is_limited else None
         return removed
+
+    def _is_beyond(self, age_s: float, total: int) -> bool:
+        """True if a recording of this age [s] is too old, or all `total` bytes are too many."""
+        files = self._settings.files
+        too_old = files.keep_hours and age_s > files.keep_hours * 3600
+        too_much = files.keep_mb and total > files.keep_mb * MB
+        return bool(too_old or too_much)
 
     def _recordings(self) -> list[tuple[Path, int, float]]:
         """This cell's recordings in order, with size [bytes] and time of change [s]."""

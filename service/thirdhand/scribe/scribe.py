@@ -293,22 +293,7 @@ class Scribe:
         if running is not None and progress is not None:
             progress.report()
             running.send_signal(signal.SIGCONT)  # it may have been stopped
-            end = time.monotonic() + timeout_s
-            is_shut = False
-            while running.poll() is None:
-                self._listen()  # else reports fill the socket, and the last one is left out
-                self._drain()
-                if not is_shut and not self._queue:
-                    is_shut = True
-                    with contextlib.suppress(OSError):
-                        # a forked process may still hold this end
-                        running.socket.shutdown(socket.SHUT_WR)
-                if time.monotonic() > end or progress.is_hung(self._ready_s):
-                    self._errors.append("the scribe did not end in time: its last data are lost")
-                    running.kill()
-                    running.wait(timeout_s)
-                    break
-                time.sleep(0.005)
+            self._await_end(running, progress, timeout_s)
             self._listen()
             last = self._report
             self._socket = None
@@ -316,18 +301,40 @@ class Scribe:
             self._report = msgspec.structs.replace(last, lost=0)
             self._child = None
             running.socket.close()
-            for _, fd in self._memory.values():
-                os.close(fd)
-            self._memory = {}
-            self._lost = self._lost + len(self._queue)
-            self._queue = deque()
-            self._most = 0
-        lost = (
-            self._lost + self._lost_before
-            if self._folder is not None or self._recording is not None
-            else 0
-        )
+            self._release()
+        is_recorded = self._folder is not None or self._recording is not None
+        lost = self._lost + self._lost_before if is_recorded else 0
         return f"{lost} of {self._sent + self._lost} {NOT_RECORDED}" if lost else ""
+
+    def _await_end(self, running: child.Child, progress: child.Progress, timeout_s: float) -> None:
+        """Send what is queued, and wait until the process has ended. It is killed if it hangs, or
+        after `timeout_s` [s].
+        """
+        end_s = time.monotonic() + timeout_s
+        is_shut = False
+        while running.poll() is None:
+            self._listen()  # else reports fill the socket, and the last one is left out
+            self._drain()
+            if not is_shut and not self._queue:
+                is_shut = True
+                with contextlib.suppress(OSError):
+                    # a forked process may still hold this end
+                    running.socket.shutdown(socket.SHUT_WR)
+            if time.monotonic() > end_s or progress.is_hung(self._ready_s):
+                self._errors.append("the scribe did not end in time: its last data are lost")
+                running.kill()
+                running.wait(timeout_s)
+                break
+            time.sleep(0.005)
+
+    def _release(self) -> None:
+        """Close the memory of the skills, and count the ticks that are still queued as lost."""
+        for _, fd in self._memory.values():
+            os.close(fd)
+        self._memory = {}
+        self._lost = self._lost + len(self._queue)
+        self._queue = deque()
+        self._most = 0
 
     def _spawn(self, skill: bytes | None, state: Record | None) -> None:
         """Start a process and send it its setup."""

@@ -171,33 +171,44 @@ class Segments:
 
     def write(self, received: TickMessage) -> int:
         """Write a tick, and return the number of lost ticks before it that are marked with it."""
-        self._skill = next(
-            (event.payload for event in reversed(received.tick.inbox) if event.kind == "skill"),
-            self._skill,
-        )
-        self._skill = received.skill or self._skill
+        events = reversed(received.tick.inbox)
+        adopted = next((event.payload for event in events if event.kind == "skill"), self._skill)
+        self._skill = received.skill or adopted
         now = time.monotonic()
-        may_begin = received.state is not None and self._skill is not None
-        if may_begin and self._recorder is None and now - self._tried > REOPEN_S and self._wanted:
+        if self._recorder is None and self._may_begin(received, now):
             self._recorder = self._opened(None)
         if self._recorder is None:
-            if self._wanted:
-                self.lost += 1
-                self._unmarked += 1 + received.lost
-            else:
-                self._kept += 1  # only a live view is required
-            return 0 if self._wanted else received.lost
+            return self._skip(received.lost)
+
         missing = received.lost + self._unmarked
         self._marked += missing
         self._marked_pending += missing
         self._unmarked = 0
         is_last = received.state is not None and self._due(now)
         self._safely(lambda recorder: _write_tick(recorder, received, missing, is_last))
-        if self._recorder is not None and not self._recorder.pending:
+        if self._recorder is None:
+            return missing
+        if not self._recorder.pending:
             self._marked_pending = 0
-        if self._recorder is not None and received.state is not None and is_last:
+        if is_last and received.state is not None:
             self._next(received.state)
         return missing
+
+    def _may_begin(self, received: TickMessage, now: float) -> bool:
+        """True if a recording can begin with this tick, and was not tried lately."""
+        can_begin = received.state is not None and self._skill is not None
+        return can_begin and self._wanted and now - self._tried > REOPEN_S
+
+    def _skip(self, lost: int) -> int:
+        """Count a tick that is not recorded after `lost` ones, and return the number of those that
+        need no mark.
+        """
+        if self._wanted:
+            self.lost += 1
+            self._unmarked += 1 + lost
+            return 0
+        self._kept += 1  # only a live view is required
+        return lost
 
     def _due(self, now: float) -> bool:
         files = self._settings.files

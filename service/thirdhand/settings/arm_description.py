@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from thirdhand.contract.explain import in_words
 from thirdhand.settings.file_content import SettingsError, UnusableError, content
 from thirdhand.settings.robot_xml import readable
-from thirdhand.settings.urdf import Shape, Urdf, UrdfError
+from thirdhand.settings.urdf import Shape, Urdf, UrdfError, UrdfJoint
 
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 ANY_REACH = {"inner": 1e-6, "outer": 3.0}  # [m] assumed before the kinematics are known
 MAX_URDF_BYTES = 20_000_000  # a humanoid's URDF has 0.1 MB
 
@@ -88,24 +90,35 @@ def completed(given: dict[str, Any], urdf: Urdf) -> dict[str, Any]:
             f"{', '.join(urdf.leaves)}"
         )
     moving = urdf.movable(str(arm["plate"]))
-    joints.setdefault("names", [joint.name for joint in moving])
-    joints.setdefault("kinds", [joint.kind for joint in moving])
-    for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
-        if all(math.isfinite(getattr(joint, name)) for joint in moving):
-            joints.setdefault(name, [getattr(joint, name) for joint in moving])
-    required = (
-        ("joints", joints, "velocity"),
-        ("joints", joints, "acceleration"),
-        ("joints", joints, "jerk"),
-        ("arm", arm, "posture"),
-    )
-    if missing := [f"[{path}] {name}" for path, section, name in required if name not in section]:
+    for name, values in _of_urdf(moving).items():
+        joints.setdefault(name, values)
+    required = {
+        "[joints] velocity": "velocity" in joints,
+        "[joints] acceleration": "acceleration" in joints,
+        "[joints] jerk": "jerk" in joints,
+        "[arm] posture": "posture" in arm,
+    }
+    if not all(required.values()):
         needed = (
             f"missing; the URDF does not define it, {len(moving)} numbers needed, one for each "
             "joint"
         )
+        missing = [path for path, is_given in required.items() if not is_given]
         raise SettingsError("\n".join(f"{path}: {needed}" for path in missing))
     return {**given, "arm": arm, "joints": joints, "reach": {**ANY_REACH, **reach}}
+
+
+def _of_urdf(moving: Sequence[UrdfJoint]) -> dict[str, list[Any]]:
+    """The settings of joints that a URDF defines: names, kinds, and the limits of all or none."""
+    joints: dict[str, list[Any]] = {
+        "names": [joint.name for joint in moving],
+        "kinds": [joint.kind for joint in moving],
+    }
+    for name in LIMITS:
+        limits = [getattr(joint, name) for joint in moving]
+        if all(map(math.isfinite, limits)):
+            joints[name] = limits
+    return joints
 
 
 def check(joints: Limits, urdf: Urdf, plate: str) -> None:
@@ -113,19 +126,7 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
     than the arm. Raises SettingsError.
     """
     moving = urdf.movable(plate)
-    reach = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))
-    reach += sum(
-        max(abs(joint.lower), abs(joint.upper)) for joint in moving if joint.kind == "prismatic"
-    )
-    for shape in urdf.shapes:
-        if (size := extent(shape)) > reach:
-            raise SettingsError(
-                f"[arm] urdf: the {shape.kind} of link {shape.link!r} is {size:.3g} m long, and "
-                f"the arm {reach:.3g} m; "
-                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 '
-                '0.001 0.001"; '
-                "tables and walls belong into [table] and [obstacles]"
-            )
+    _check_shapes(urdf, plate)
     names = tuple(joint.name for joint in moving)
     if joints.names != names:
         raise SettingsError(
@@ -137,21 +138,41 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
         raise SettingsError(
             f"[joints] kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed"
         )
-    wide = []
-    for i, joint in enumerate(moving):
-        for name, low, high in (
-            ("lower", joint.lower, math.inf),
-            ("upper", -math.inf, joint.upper),
-            ("velocity", 0, joint.velocity),
-            ("acceleration", 0, joint.acceleration),
-            ("jerk", 0, joint.jerk),
-        ):
-            value = getattr(joints, name)[i]
-            if not low <= value <= high:
-                accepted = f"{low} or more" if name == "lower" else f"up to {high}"
-                where = f"[joints] {name}, entry {i + 1}"
-                wide.append(
-                    f"{where}: {value} given; {accepted} accepted by the URDF of {joint.name}"
-                )
+    wide = [
+        f"[joints] {name}, entry {i + 1}: {problem}"
+        for i, joint in enumerate(moving)
+        for name in LIMITS
+        if (problem := _excess(joint, name, getattr(joints, name)[i]))
+    ]
     if wide:
         raise SettingsError("\n".join(wide))
+
+
+def _check_shapes(urdf: Urdf, plate: str) -> None:
+    """Reject shapes longer than the arm. Raises SettingsError."""
+    reach_m = sum(math.hypot(*joint.translation) for joint in urdf.chain(plate))
+    reach_m += sum(
+        max(abs(joint.lower), abs(joint.upper))
+        for joint in urdf.movable(plate)
+        if joint.kind == "prismatic"
+    )
+    for shape in urdf.shapes:
+        if (size_m := extent(shape)) > reach_m:
+            raise SettingsError(
+                f"[arm] urdf: the {shape.kind} of link {shape.link!r} is {size_m:.3g} m long, and "
+                f"the arm {reach_m:.3g} m; "
+                'no shape longer than the arm accepted. A mesh in millimetres needs scale="0.001 '
+                '0.001 0.001"; '
+                "tables and walls belong into [table] and [obstacles]"
+            )
+
+
+def _excess(joint: UrdfJoint, name: str, value: float) -> str:
+    """The message about a limit that is wider than the URDF's; empty if it is not."""
+    bound = getattr(joint, name)
+    low = {"lower": bound, "upper": -math.inf}.get(name, 0.0)
+    high = math.inf if name == "lower" else bound
+    if low <= value <= high:
+        return ""
+    accepted = f"{low} or more" if name == "lower" else f"up to {high}"
+    return f"{value} given; {accepted} accepted by the URDF of {joint.name}"

@@ -17,7 +17,7 @@ from thirdhand.contract import ros2
 from thirdhand.contract.channels import CellName
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.messages import BASE
-from thirdhand.settings.arm_description import check, completed, description
+from thirdhand.settings.arm_description import LIMITS, check, completed, description
 from thirdhand.settings.file_content import (
     SettingsError,
     UnreadableError,
@@ -58,7 +58,6 @@ SMALLEST_NUMBER = 1e-9
 LARGEST_NUMBER = 1e9
 FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
 LEAST_OUTER_M = 0.01  # an arm that moves its tool by less is none
-LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 PRISMATIC_M = 0.5
 

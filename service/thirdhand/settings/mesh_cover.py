@@ -10,7 +10,7 @@ import hashlib
 import io
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
@@ -116,14 +116,7 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
     """A message on the meshes of a kind (collision or visual) that are not found: their names, the
     searched folders, and how to add a folder. Empty if all are found or covered.
     """
-    lost: dict[str, str] = {}  # link by name of the file
-    for link in robot.iter("link"):
-        for mesh in (element for shape in link.iter(kind) for element in shape.iter("mesh")):
-            name = mesh.get("filename", "")
-            if COVER not in mesh.attrib and not any(
-                candidate.is_file() for candidate in _candidates(name, urdf, packages)
-            ):
-                lost.setdefault(name, link.get("name", ""))
+    lost = _lost(robot, urdf, packages, kind)
     if not lost:
         return ""
     name, link_name = next(iter(lost.items()))
@@ -144,27 +137,45 @@ def unfound(robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], k
     )
 
 
+def _lost(
+    robot: ElementTree.Element, urdf: Path, packages: tuple[str, ...], kind: str
+) -> dict[str, str]:
+    """The link of each mesh of a kind that is neither found nor covered, by the mesh's name."""
+    links: dict[str, str] = {}
+    for link in robot.iter("link"):
+        for mesh in (element for shape in link.iter(kind) for element in shape.iter("mesh")):
+            name = mesh.get("filename", "")
+            files = [] if COVER in mesh.attrib else _candidates(name, urdf, packages)
+            if files and not any(file.is_file() for file in files):
+                links.setdefault(name, link.get("name", ""))
+    return links
+
+
 def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     """The paths at which the file of a mesh may be."""
-    scheme, _, path = name.rpartition("://")
-    path = name.removeprefix("file:") if name.startswith("file:/") and not scheme else path
-    path = (
-        path.removeprefix("localhost")
-        if path.startswith("localhost/") and scheme == "file"
-        else path
-    )
     # of the URDF, and of a link's target
     folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))
-    if scheme not in ("package", "model"):
-        return [
-            folder / file for file in dict.fromkeys((path, unquote(path))) for folder in folders
-        ]
+    scheme, _, path = name.rpartition("://")
+    if scheme in ("package", "model"):
+        return _in_packages(path, folders, packages)
+    if not scheme:
+        path = name.removeprefix("file:") if name.startswith("file:/") else name
+    elif scheme == "file" and path.startswith("localhost/"):
+        path = path.removeprefix("localhost")
+    files = dict.fromkeys((path, unquote(path)))
+    return [folder / file for file in files for folder in folders]
+
+
+def _in_packages(path: str, folders: Iterable[Path], packages: tuple[str, ...]) -> list[Path]:
+    """The paths at which a package's file may be: the package is a folder above the URDF, or lies
+    in one, or in one of `packages`.
+    """
     package, _, inside = path.partition("/")
-    named = [Path(root).expanduser() for root in packages]
     above = dict.fromkeys(parent for folder in folders for parent in (folder, *folder.parents))
+    roots = [*above, *(Path(root).expanduser() for root in packages)]
     return [
-        *(folder / inside for folder in (*above, *named) if folder.name == package),
-        *(folder / package / inside for folder in (*above, *named)),
+        *(folder / inside for folder in roots if folder.name == package),
+        *(folder / package / inside for folder in roots),
     ]
 
 

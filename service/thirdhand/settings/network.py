@@ -86,28 +86,9 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         )
 
     def __post_init__(self) -> None:
-        endpoints = {"listen": self.listen, "connect": self.connect}
-        for name, endpoint in (
-            (f"{key}[{i}]", entry)
-            for key, entries in endpoints.items()
-            for i, entry in enumerate(entries)
-        ):
-            if lacks := lacking(endpoint):
-                raise ValueError(f"$.network.{name}: {lacks}")
-            if self.certificate and not endpoint.startswith("tls/"):
-                raise ValueError(
-                    f"$.network.{name}: {endpoint} given; with a certificate tls/... needed"
-                )
-            if not self.certificate and endpoint.startswith("tls/"):
-                raise ValueError(
-                    f"$.network.certificate: none given; for {endpoint} the folder of one needed"
-                )
-            if not (self.certificate or self.allow_insecure or is_local(endpoint)):
-                raise ValueError(
-                    f"$.network.{name}: {endpoint} given; other machines could move the arm: an "
-                    "address like 127.0.0.1, or certificate = ... with tls/..., or else "
-                    "allow_insecure = true needed"
-                )
+        for name, endpoints in (("listen", self.listen), ("connect", self.connect)):
+            for i, endpoint in enumerate(endpoints):
+                self._check_endpoint(f"{name}[{i}]", endpoint)
         if self.revoked and not self.certificate:
             raise ValueError(
                 "$.network.revoked: given without $.network.certificate, without which no client "
@@ -120,6 +101,26 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
                     f"{', '.join((*ROLES, DAEMON))}, or one of these with a number, like "
                     f"{names('tracker')[1]}"
                 )
+
+    def _check_endpoint(self, name: str, endpoint: str) -> None:
+        """Raise ValueError for an endpoint that is not valid, or not safe."""
+        is_tls = endpoint.startswith("tls/")
+        if lacks := lacking(endpoint):
+            raise ValueError(f"$.network.{name}: {lacks}")
+        if self.certificate and not is_tls:
+            raise ValueError(
+                f"$.network.{name}: {endpoint} given; with a certificate tls/... needed"
+            )
+        if is_tls and not self.certificate:
+            raise ValueError(
+                f"$.network.certificate: none given; for {endpoint} the folder of one needed"
+            )
+        if not (self.certificate or self.allow_insecure or is_local(endpoint)):
+            raise ValueError(
+                f"$.network.{name}: {endpoint} given; other machines could move the arm: an "
+                "address like 127.0.0.1, or certificate = ... with tls/..., or else "
+                "allow_insecure = true needed"
+            )
 
 
 class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

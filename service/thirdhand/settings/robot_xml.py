@@ -49,13 +49,13 @@ def element_of(text: str | bytes) -> Element:
     encoded = text if isinstance(text, bytes) else text.encode("utf-8", "replace")
     encoding = None if isinstance(text, bytes) else "utf-8"
     try:
-        return _Reading(encoding).element(encoded)
+        return _ElementReader(encoding).element(encoded)
     except (expat.ExpatError, LookupError) as error:  # LookupError: an unknown encoding
         raise ValueError(f"no XML: {error}") from None
 
 
-class _Reading:
-    """One pass over a document."""
+class _ElementReader:
+    """Builds the elements of one document."""
 
     def __init__(self, encoding: str | None) -> None:
         self._builder = ElementTree.TreeBuilder()

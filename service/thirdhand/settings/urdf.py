@@ -69,29 +69,24 @@ class Urdf:
         self.origin = origin
         try:
             self._robot = element_of(text)
-            links = [link.get("name", "") for link in self._robot.findall("link")]
             self.joints = tuple(_joint(element) for element in self._robot.findall("joint"))
-            if self._robot.tag != "robot" or not self.joints:
-                raise ValueError("a <robot> with joints needed")
-            if (version := self._robot.get("version", "1.0")) not in VERSIONS:
-                raise ValueError(f"version {version!r}; {', '.join(VERSIONS)} accepted")
+            self._check_version()
+            links = [link.get("name", "") for link in self._robot.findall("link")]
             self.root = root_of(links, self.joints)
             check_numbers(self._robot)
-            self.shapes = tuple(
-                _shape(link.get("name", ""), collision)
-                for link in self._robot.findall("link")
-                for collision in link.findall("collision")
-            )
-            if len(self.shapes) > MAX_SHAPES:
-                raise ValueError(
-                    f"{len(self.shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links "
-                    "fewer"
-                )
+            self.shapes = _shapes(self._robot)
         except ValueError as error:
             raise UrdfError(f"{origin}: not a robot description: {error}") from None
         self._above = {joint.child: joint for joint in self.joints}
         parents = {joint.parent for joint in self.joints}
         self.leaves = tuple(joint.child for joint in self.joints if joint.child not in parents)
+
+    def _check_version(self) -> None:
+        """Raise ValueError if this is no robot, or in a version that is not supported."""
+        if self._robot.tag != "robot" or not self.joints:
+            raise ValueError("a <robot> with joints needed")
+        if (version := self._robot.get("version", "1.0")) not in VERSIONS:
+            raise ValueError(f"version {version!r}; {', '.join(VERSIONS)} accepted")
 
     def chain(self, tip: str) -> tuple[UrdfJoint, ...]:
         """The joints from the root to link `tip`, in order. Raises UrdfError."""
@@ -148,6 +143,20 @@ class Urdf:
     def transforms(self, positions: Mapping[str, float]) -> list[Transform]:
         """Poses of links in their parent links, for joint positions by name [rad, m], else 0."""
         return [_moved(joint, positions.get(joint.name, 0.0)) for joint in self.joints]
+
+
+def _shapes(robot: Element) -> tuple[Shape, ...]:
+    """The collision shapes of a robot. Raises ValueError for more than MAX_SHAPES."""
+    shapes = tuple(
+        _shape(link.get("name", ""), collision)
+        for link in robot.findall("link")
+        for collision in link.findall("collision")
+    )
+    if len(shapes) > MAX_SHAPES:
+        raise ValueError(
+            f"{len(shapes)} collision shapes; up to {MAX_SHAPES} accepted: give links fewer"
+        )
+    return shapes
 
 
 def _moved(joint: UrdfJoint, position: float) -> Transform:

@@ -66,24 +66,15 @@ def correction_at(
     names = skill.model.names
     end = _end_of(skill, hands, segment) if names else ""
     name_of_segment = None if end or not names else names[segment]
-    if end:
-        replaced = [point for point in skill.via_points if point.name == end]
-    else:
-        earlier = [
-            p
-            for p in skill.via_points
-            if _NUMBERED.fullmatch(p.name) and p.segment == name_of_segment
-        ]
-        replaced = [
-            point for point in earlier if _apart_m(skill, hands, _hands(point)) < PATH_END_M
-        ]
-    numbers = [
-        int(found[1]) for point in skill.via_points if (found := _NUMBERED.fullmatch(point.name))
-    ]
+    replaced = (
+        [point for point in skill.via_points if point.name == end]
+        if end
+        else _corrections_near(skill, hands, name_of_segment)
+    )
     before = replaced[-1] if end and replaced else ViaPoint(end, left, right, _point(tool))
     point = msgspec.structs.replace(
         before,
-        name=end or f"correction-{1 + max(numbers, default=0)}",
+        name=end or _new_name(skill),
         left=left,
         right=right,
         tool=_point(tool),
@@ -92,6 +83,24 @@ def correction_at(
         corrections=1 + max((point.corrections for point in replaced), default=0),
     )
     return Correcting(point, tuple(replaced))
+
+
+def _corrections_near(skill: Skill, hands: Vector, segment: str | None) -> list[ViaPoint]:
+    """Earlier corrections in a segment at hands nearer than PATH_END_M to these (6,) [m]."""
+    return [
+        point
+        for point in skill.via_points
+        if _NUMBERED.fullmatch(point.name)
+        and point.segment == segment
+        and _apart_m(skill, hands, _hands(point)) < PATH_END_M
+    ]
+
+
+def _new_name(skill: Skill) -> str:
+    """A name for the next correction, with a number above all others."""
+    matches = [_NUMBERED.fullmatch(point.name) for point in skill.via_points]
+    numbers = [int(match[1]) for match in matches if match]
+    return f"correction-{1 + max(numbers, default=0)}"
 
 
 def off_m(skill: Skill, correcting: Correcting) -> float:

@@ -152,26 +152,27 @@ def check(demonstration: Demonstration) -> None:
         raise SkillError(f"a demonstration of {counts}: as many of each needed")
     hands = demonstration.hands
     tool = demonstration.tool
-    period_s = demonstration.period_s
     if not (np.isfinite(hands).all() and np.isfinite(tool).all()):
         raise SkillError("a demonstration holds numbers that are not finite")
-    if len(hands) < LEAST_SAMPLES or period_s <= 0 or period_s > LONGEST_PERIOD_S:
+    is_timed = 0 < demonstration.period_s <= LONGEST_PERIOD_S
+    if len(hands) < LEAST_SAMPLES or not is_timed:
         raise SkillError(f"a demonstration of {len(hands)} samples is too short to learn from")
     if (farthest := max(np.abs(hands).max(), np.abs(tool[:, :3]).max())) > FARTHEST_M:
         raise SkillError(f"a demonstration goes {farthest:.0f} m away: is it in metres?")
     if (np.abs(np.linalg.norm(tool[:, 3:], axis=1) - 1) > NORM_TOLERANCE).any():
         raise SkillError("a demonstration's tool orientations are not quaternions of norm 1")
-    closure = demonstration.gripper
-    if closure is not None and (
-        closure.shape != demonstration.stamps_ns.shape or not np.isfinite(closure).all()
-    ):
+    if demonstration.gripper is not None:
+        _check_gripper(demonstration.gripper, len(hands))
+
+
+def _check_gripper(closure: NDArray[np.float64], count: int) -> None:
+    """Raise SkillError unless the closure has `count` numbers from 0 to 1."""
+    if closure.shape != (count,) or not np.isfinite(closure).all():
         raise SkillError(
             f"a demonstration's gripper has shape {closure.shape}: one finite number a sample "
             "needed"
         )
-    if closure is not None and (
-        closure.min() < -CLOSURE_MARGIN or closure.max() > 1.0 + CLOSURE_MARGIN
-    ):
+    if closure.min() < -CLOSURE_MARGIN or closure.max() > 1.0 + CLOSURE_MARGIN:
         raise SkillError(
             f"a demonstration's gripper goes from {closure.min():g} to {closure.max():g}: 0 (open) "
             "to 1 (closed) needed"
