@@ -217,7 +217,7 @@ with open_session(connect=[endpoint]) as session:
     while True:
         for hand in hands:
             pose = PoseStamped(time.time_ns(), "base", (0.98, 0.3, 0.06), (0.0, 0.0, 0.0, 1.0))
-                        hand.put(cdr.encode_pose(pose))
+            hand.put(cdr.encode_pose(pose))
         sent += 1
         time.sleep(max(0.0, begin + sent / 5000 - time.monotonic()))
 """

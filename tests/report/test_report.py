@@ -452,8 +452,8 @@ def test_ages_of_hands_advance_between_recorded_frames(golden: Path, tmp_path: P
     ages = columns.frames["hand_ages"]
     true_ages = whole.frames["hand_ages"]
     assert np.array_equal(ages < 0, true_ages < 0)
-    off = ages - true_ages
-    assert off.min() >= 0
-    assert off.max() < 20  # a frame is recorded every 20 ticks
+    errors = ages - true_ages
+    assert errors.min() >= 0
+    assert errors.max() < 20  # a frame is recorded every 20 ticks
     stale = whole.frames["stale_ticks"]
     assert np.array_equal(ages < stale, true_ages < stale)
