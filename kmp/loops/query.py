@@ -157,7 +157,7 @@ def _packed(query: Query, solution: Dense) -> Array:
 
 
 @compiled
-def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> bool:
+def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> bool:  # noqa: C901, PLR0912 - one algorithm
     """Write L^-1 to `out` (N A, N A), of the Cholesky factor L L^T = K (x) I + noise; true if the
     matrix is positive definite.
 
@@ -204,7 +204,7 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
 
 
 @compiled
-def _motion(
+def _motion(  # noqa: C901, PLR0912, PLR0915 - one nest of loops
     moving: Array,
     rows: Array,
     along: Array,
@@ -285,7 +285,7 @@ def _motion(
 
 
 @compiled
-def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:
+def _posterior(values: Array, columns: Array, roots: Array, out: Array) -> bool:  # noqa: C901, PLR0912 - one nest of loops
     """Write I - k (K + lambda_c Sigma)^-1 k^T to `out` (O, O); true if it is positive definite.
 
     By the roots (O, R O) = (L^-1 (k^T (x) I))^T, which must be 0 at first.

@@ -403,7 +403,7 @@ def _order(count: int, random: np.random.Generator) -> list[tuple[int, bool]]:
     return order
 
 
-def _legs(
+def _legs(  # noqa: C901, PLR0912 - a case for each kind
     task: Plan, scene: TaskScene, who: Person, order: Sequence[tuple[int, bool]], key: Sequence[int]
 ) -> tuple[tuple[Leg, ...], tuple[Leg, ...]]:
     """The legs of both hands from segment to segment; each hand waits for the other, except for the

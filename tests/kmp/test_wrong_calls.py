@@ -332,7 +332,7 @@ def wrong_arrays(array):
     return wrong, [*other, *huge]
 
 
-def wrong_values(name, right):
+def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
     """What is wrong for an argument like this, and what may be right."""
     if name in {"seed", "random_state"}:
         return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]

@@ -56,7 +56,7 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 
 @pytest.mark.timeout(900)
 @pytest.mark.thorough
-def test_correction_from_end_to_end(tmp_path: Path) -> None:
+def test_correction_from_end_to_end(tmp_path: Path) -> None:  # noqa: PLR0915 - one session
     """A correction moves the tool to where it was led, and undoing it moves it back."""
     settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
     records = tmp_path / "records"

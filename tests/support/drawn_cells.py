@@ -30,7 +30,7 @@ def cell_with(arm: str) -> Settings:
     return shipped(arm)
 
 
-def drawn_cell(random: np.random.Generator, arm: str) -> Settings:
+def drawn_cell(random: np.random.Generator, arm: str) -> Settings:  # noqa: C901, PLR0912 - a draw for each option
     """A cell with this arm, in which each group of settings is changed with some probability."""
     cell = cell_with(arm)
 

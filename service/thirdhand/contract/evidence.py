@@ -132,7 +132,7 @@ def explained(member: Member, seen: Evidence = NOTHING) -> Explanation:
     return Explanation(why, remedy)
 
 
-def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:
+def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:  # noqa: C901, PLR0912 - a case for each reason
     """The finding and its remedy if the figures show a closer cause; empty otherwise."""
     finding = ""
     closer = ""
@@ -202,7 +202,7 @@ def _far_from_demonstrations(seen: Evidence) -> tuple[str, str]:
     return f"{jumped}; {finding}", what_to_do(word(Cause.JUMPED))
 
 
-def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:
+def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # noqa: C901, PLR0912 - a case for each cause
     """The rejected sample, and what to do if the figures show a closer cause; empty otherwise."""
     if seen.sample is None:
         return seen.mistake, ""

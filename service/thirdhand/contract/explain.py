@@ -229,7 +229,7 @@ def _chosen(node: Any, value: Any) -> Any:
     return node
 
 
-def _needed(node: Any, value: Any, accepted: str) -> str:
+def _needed(node: Any, value: Any, accepted: str) -> str:  # noqa: C901 - a case for each type
     """The values that a type accepts, in words."""
     if accepted:
         return f"{accepted} accepted"

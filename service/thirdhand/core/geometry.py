@@ -197,7 +197,7 @@ CAPSULE = np.dtype(
 
 
 @compiled
-def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
+def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:  # noqa: C901, PLR0912 - one nest of loops
     """Write into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m].
 
     The capsules are ordered by link.
@@ -268,7 +268,7 @@ def _unit(share: float) -> float:
 
 
 @compiled
-def between_segments(one: Vector, other: Vector, near: Vector) -> float:
+def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa: C901, PLR0912 - a case for each side
     """Distance [m] between two segments (2, 3), and their nearest points and normal.
 
     After Ericson, Real-Time Collision Detection, 5.1.9. If the segments intersect, the normal

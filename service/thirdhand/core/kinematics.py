@@ -86,7 +86,7 @@ def tool_speeds(
 
 
 @compiled
-def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:
+def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa: PLR0915 - one algorithm
     """Speed of the tool [m/s] at joint velocities dq (J,), after displacements `way` (J,) [rad, m].
 
     It is exact, by the product of exponentials. A revolute joint i is a screw with axis w and

@@ -15,7 +15,7 @@ BRAKE_SHARE_HALVINGS = 40  # bisection steps for the share of an axis
 
 
 @compiled
-def fastest_stop(
+def fastest_stop(  # noqa: C901, PLR0912, PLR0915 - a case for each phase
     velocity: float,
     acceleration: float,
     max_acceleration: float,

@@ -228,7 +228,7 @@ def keep_under(
 
 
 @compiled
-def _solve_with_rows(
+def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
     tasks: Vector,
     wanted: Vector,
     posture: Vector,

@@ -79,7 +79,7 @@ def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremo
 
 
 @compiled
-def move_on(
+def move_on(  # noqa: C901, PLR0912 - one nest of loops
     mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float
 ) -> None:
     """Prediction of one filter: m = F m, P = F P Fᵀ + Q, in place.
@@ -241,7 +241,7 @@ def _switched(
 
 
 @compiled
-def _mix(
+def _mix(  # noqa: C901, PLR0912 - one nest of loops
     parameters: Records,
     means: Vector,
     covariances: Vector,

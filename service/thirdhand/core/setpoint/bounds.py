@@ -150,7 +150,7 @@ def broken_bound(
 
 
 @compiled
-def take_safe(
+def take_safe(  # noqa: C901, PLR0912 - a case for each bound
     setpoint: Vector,
     ahead: Vector,
     parameters: Records,

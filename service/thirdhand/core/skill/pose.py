@@ -111,7 +111,7 @@ _NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be compute
 
 
 @compiled
-def _turned(
+def _turned(  # noqa: C901, PLR0912 - one nest of loops
     zeta: Vector,
     rate: Vector,
     covariance: Vector,

@@ -127,7 +127,7 @@ def _opened(file: bytes) -> Image.Image | None:
         return None
 
 
-def write_videos(
+def write_videos(  # noqa: C901 - one pass over a video
     episodes: Sequence[CameraRows], path_of: Callable[[str], Path], *, fps: int
 ) -> dict[str, tuple[dict[str, Any], list[Any]]]:
     """Write a video of each camera that all recordings have, reading each recording once.
