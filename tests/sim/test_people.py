@@ -161,7 +161,7 @@ def test_each_method_had_as_many_candidates() -> None:
 def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reduced comparison keeps the order that is stable."""
     pytest.importorskip("matplotlib")
-    for table, value in (("PEOPLE", 3), ("SCENES", 2), ("BREAKING_SCENES", 2)):
+    for table, value in (("PEOPLE_OF_GROUP", 3), ("SCENES_OF_GROUP", 2), ("BREAKING_SCENES", 2)):
         monkeypatch.setattr(
             f"thirdhand_sim.lab.people.comparison.{table}", {"tuning": value, "test": value}
         )
