@@ -42,7 +42,7 @@ def test_few_functions_are_excepted_from_the_limit_of_branches() -> None:
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*.py")
         for line in path.read_text(encoding="utf-8").splitlines()
-        if re.search("# noqa: .*(C901|PLR0912|PLR0915)", line)
+        if re.search("# noqa: (C901|PLR09)", line)
     ]
     assert 10 < len(marks) <= 25
     assert [mark for mark in marks if " - " not in mark] == []

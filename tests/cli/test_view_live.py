@@ -19,7 +19,7 @@ from PIL import Image
 from support import chromium
 from support.cell import Daemon, Tracker, serving
 from support.cell_commands import started
-from thirdhand.workbench.cli.live_page import UNKNOWN
+from thirdhand.workbench.cli.live_page import NO_SUCH_PAGE
 
 TIMEOUT_S = 90
 
@@ -104,7 +104,7 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
         ("DELETE", "/status"),
     ):
         expected = 405 if path in ("/hold", "/status") else 404
-        assert page.ask(method, path, X_Thirdhand_Token=token) == (expected, UNKNOWN)
+        assert page.ask(method, path, X_Thirdhand_Token=token) == (expected, NO_SUCH_PAGE)
     assert page.ask("POST", "/hold", bytes(10_000), X_Thirdhand_Token=token)[0] == 413
     assert page.daemon.client.ask("status")["mode"] == "follow"
     code, text = page.ask("POST", "/hold", X_Thirdhand_Token=token)

@@ -19,7 +19,12 @@ from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import TimedErrors
-from thirdhand.workbench.learning.regions import BLOCKS, blocks_of, calibrated, calibrated_without
+from thirdhand.workbench.learning.regions import (
+    REGION_BLOCKS,
+    blocks_of,
+    calibrated,
+    calibrated_without,
+)
 
 
 def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
@@ -82,7 +87,7 @@ def test_own_region_has_no_part_in_judgement() -> None:
     rng = np.random.default_rng(2)
     usual = [apart(rng) for _ in range(12)]
     spoilt = [*usual[:4], apart(rng, times=30.0), *usual[5:]]
-    assert [len(block) for block in blocks_of(np.arange(12))] == [2] * BLOCKS
+    assert [len(block) for block in blocks_of(np.arange(12))] == [2] * REGION_BLOCKS
     together = np.arange(len(usual))
     before = calibrated_without(usual, together)
     after = calibrated_without(spoilt, together)

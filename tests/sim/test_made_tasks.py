@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thirdhand.settings.config import Reach
-from thirdhand.workbench.learning.division import FOLLOW, off_via_point
+from thirdhand.workbench.learning.division import FOLLOWED_HAND, off_via_point
 from thirdhand_sim.made_tasks import TAKE_HZ, TASK_KINDS, run, takes
 
 pytestmark = pytest.mark.thorough
@@ -42,7 +42,9 @@ def test_hands_and_tool_move_as_people_do(kind: str) -> None:
         assert np.abs(np.linalg.norm(np.stack(take[1:4])[..., 3:], axis=-1) - 1.0).max() < 1e-9
         for i in trial.order:
             assert (
-                off_via_point(take, take.via_points[i], FOLLOW[take.via_points[i].follow]).min()
+                off_via_point(
+                    take, take.via_points[i], FOLLOWED_HAND[take.via_points[i].follow]
+                ).min()
                 < 0.02
             )
         reach = Reach()

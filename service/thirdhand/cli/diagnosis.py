@@ -36,7 +36,7 @@ SCATTER_MM = 8.0  # a tracker that sees a hand well scatters less, on each axis
 MOST_OTHER_KEYS = 4  # keys that are named
 FREE_MB = 2000.0  # least free space
 DISK_LASTS_H = 1.0  # least time until the disk is full
-MISSED_SHARE = 0.01  # largest share of missed deadlines
+MAX_MISSED_SHARE = 0.01  # largest share of missed deadlines
 LATE_US = 1000.0  # largest 99th percentile of the lateness, unless half a period is longer
 # a hand that is farther below the table top shows that the calibration is off
 MAX_BELOW_TABLE_M = 0.03
@@ -531,8 +531,8 @@ def _machine(before: Status, now: Status) -> Iterator[Finding]:
         "(p99)"
     )
     most_us = max(LATE_US, 0.5e6 / max(now.rate_hz, 1.0))  # half of a period
-    expected = f"less than {MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
-    is_fine = missed <= MISSED_SHARE * ticks and late_us <= most_us
+    expected = f"less than {MAX_MISSED_SHARE:.0%} missed, and {most_us:.0f} µs"
+    is_fine = missed <= MAX_MISSED_SHARE * ticks and late_us <= most_us
     yield judged(is_fine, "loop", actual, expected, what_to_do(Condition.MACHINE_BUSY))
 
 

@@ -34,11 +34,11 @@ POLL_S = 0.02
 LINE_S = 0.5  # interval of the lines of --watch
 SILENT_S = 2.0  # a daemon without a status for this time does not answer
 # a sample's stamp beyond these shows that clocks differ
-LATE_MS = 1000.0
+SHOWN_LATE_MS = 1000.0
 AHEAD_MS = -5.0
 NOTHING_DECIDED = "starting: nothing has been decided yet"
 MODE_STYLES = {"follow": "green", "hold": "yellow", "fault": "bold red"}
-STUCK = word(Flag.STUCK)  # its explanation is already in `because`
+STUCK_WORD = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
@@ -173,7 +173,7 @@ def _outcome(now: Status) -> dict[str, str]:
         **{
             flag: f"{what_happened(flag)}. What to do: {what_to_do(flag)}"
             for flag in now.flags
-            if flag != STUCK
+            if flag != STUCK_WORD
         },
     }
 
@@ -284,7 +284,7 @@ def differing_clocks(now: Status) -> str:
     phrases = []
     for side in SIDES:
         apart_ms = getattr(now.sources.get(side), "clock_ms", None)
-        if apart_ms is not None and not AHEAD_MS <= apart_ms <= LATE_MS:
+        if apart_ms is not None and not AHEAD_MS <= apart_ms <= SHOWN_LATE_MS:
             difference = f"{lasting(abs(apart_ms))} {'ahead of' if apart_ms < 0 else 'behind'}"
             phrases.append(f"the {SOURCE_NAMES[side]}'s stamps are {difference} the daemon's clock")
     return ", ".join(phrases)

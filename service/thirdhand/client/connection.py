@@ -36,7 +36,7 @@ from thirdhand.contract.messages import (
     Vector3,
     finite,
 )
-from thirdhand.contract.requests import ANSWER_TIMEOUT_S, NORM_TOLERANCE, Reply, ViaPoint
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply, ViaPoint
 
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
 FORMS = {  # by the largest count of numbers
@@ -274,7 +274,7 @@ def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
     turned = numbers[3:]
     if not turned:
         return position, UNTURNED
-    if abs((norm := math.hypot(*turned)) - 1.0) > NORM_TOLERANCE:
+    if abs((norm := math.hypot(*turned)) - 1.0) > REQUEST_NORM_TOLERANCE:
         raise ValueError(
             f"{what}: quaternion {list(turned)} has norm {norm:.4g}; 1 needed (x y z w)"
         )

@@ -16,7 +16,7 @@ NUMBERS = {shape: number for number, shape in SHAPES.items()}
 LARGEST = 16_384  # bytes
 MOST_OBJECTS = 32
 LARGEST_M = 10.0
-LONGEST_NAME = 64
+LONGEST_MARKER = 64
 _ADD = 0  # the action that adds or changes a marker; others remove it
 _KIND = struct.Struct("<iii")
 _COLOUR = struct.Struct("<4f")
@@ -108,14 +108,15 @@ def _checked(one: SceneObject) -> SceneObject:
         or min(one.size) <= 0
     ):
         raise WireError(
-            f"object {one.name[:LONGEST_NAME]!r}: a position or size beyond {LARGEST_M:g} m, or no "
+            f"object {one.name[:LONGEST_MARKER]!r}: a position or size beyond {LARGEST_M:g} m, or "
+            "no "
             "size"
         )
     if not abs(math.hypot(*one.orientation) - 1.0) < 1e-2:
-        raise WireError(f"object {one.name[:LONGEST_NAME]!r}: a quaternion of norm 1 needed")
-    if not 0 < len(one.name) <= LONGEST_NAME:
+        raise WireError(f"object {one.name[:LONGEST_MARKER]!r}: a quaternion of norm 1 needed")
+    if not 0 < len(one.name) <= LONGEST_MARKER:
         raise WireError(
-            f"an object with a name of {len(one.name)} letters, 1 to {LONGEST_NAME} accepted"
+            f"an object with a name of {len(one.name)} letters, 1 to {LONGEST_MARKER} accepted"
         )
     if not all(0.0 <= value <= 1.0 for value in one.colour):
         raise WireError(

@@ -17,7 +17,7 @@ _NAMES = {"accepted": "1 to 64 letters, digits, spaces and . _ -"}
 _NO_NAME = {"accepted": "a name of up to 64 letters, digits, spaces and . _ -"}
 ANSWER_TIMEOUT_S = 30.0  # every request is answered within this time of its arrival
 STARTING = "starting: "  # begins every answer of a daemon that is not ready yet
-NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
+REQUEST_NORM_TOLERANCE = 1e-3  # accepted difference of a quaternion's norm from 1
 MAX_REACH_M = 0.4  # hands farther away than this are not examined for the reach of a correction
 TOLERANCE_M = 0.05  # by default, a via-point replaces reference points nearer than this
 Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 10 m"})]
@@ -57,7 +57,7 @@ class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if (
             self.orientation is not None
-            and abs(math.hypot(*self.orientation) - 1.0) > NORM_TOLERANCE
+            and abs(math.hypot(*self.orientation) - 1.0) > REQUEST_NORM_TOLERANCE
         ):
             norm = math.hypot(*self.orientation)
             raise ValueError(

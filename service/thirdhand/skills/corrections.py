@@ -22,9 +22,9 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.tuning import PATH_END_M
 from thirdhand.core.skill.via_points import rest_of
 from thirdhand.skills.skill_file import SkillError, StoredSkill
-from thirdhand.skills.via_points import MAX_GAIN, NOTED_M, adapted
+from thirdhand.skills.via_points import MAX_GAIN, REPORTED_M, adapted
 
-LEAST_CORRECTION_M = NOTED_M  # a tool that is off by less is where the skill has it
+LEAST_CORRECTION_M = REPORTED_M  # a tool that is off by less is where the skill has it
 OFFERED_AFTER = 3  # corrections at the same hands after which a demonstration is proposed
 REACH_STEP_M = 0.02  # distance between the hands at which a correction's effect is examined
 _NUMBERED = re.compile(r"correction-(\d+)")

@@ -25,7 +25,7 @@ STD_CLOSURE = 0.02
 # largest turn between via-points: hands that tremble by 1 mm turn the tool by 2°
 STEEPEST_RAD_PER_M = 40.0
 NEAR_RAD = math.radians(1.0)  # orientations this near to each other never contradict each other
-NEAR_M = 0.01  # a gripper cannot be open and closed at hands this near to each other
+SAME_HANDS_NEAR_M = 0.01  # a gripper cannot be open and closed at hands this near to each other
 NOTED_RAD = math.radians(2.0)  # orientations missed by more are reported
 CLOSURES = {"open": 0.0, "closed": 1.0}
 
@@ -96,9 +96,10 @@ def check_turns(owners: Sequence[ViaPoint], inputs: Vector) -> None:
                 raise SkillError(
                     f"{pair} and their tools turned by {by:.0f}°; up to {to:.0f}° accepted"
                 )
-        if {first.gripper, other.gripper} == {"open", "closed"} and distance_m < NEAR_M:
+        if {first.gripper, other.gripper} == {"open", "closed"} and distance_m < SAME_HANDS_NEAR_M:
             raise SkillError(
-                f"{pair}, with the gripper open at one and closed at the other; {NEAR_M} m needed"
+                f"{pair}, with the gripper open at one and closed at the other; "
+                f"{SAME_HANDS_NEAR_M} m needed"
             )
 
 

@@ -9,7 +9,7 @@ import msgspec
 from thirdhand.contract.printable import printable
 
 OPTION = "--accept-residual-risk"  # of `thirdhand learn`
-LONGEST_NAME = 64  # [characters] of the person who accepts
+LONGEST_ACCEPTER = 64  # [characters] of the person who accepts
 
 
 class ResidualRisk(msgspec.Struct, frozen=True):

@@ -38,8 +38,8 @@ from thirdhand.skills.residual_risk import ResidualRisk
 LONGEST_SKILL_NAME = 128  # [characters]
 SKILL_FORMAT = 6
 # prefixes of the arrays of their primitives
-TURN = "turn."
-GRIPPER = "gripper."
+TURN_PREFIX = "turn."
+GRIPPER_PREFIX = "gripper."
 # [B] unpacked, and in how many arrays; a skill has below a hundred
 LARGEST_FILE = 100_000_000
 MOST_ARRAYS = 500
@@ -106,10 +106,10 @@ KNOWN = {
     *OTHERS,
     "replaced",
     "task_clock",
-    *(prefix + name for prefix in (TURN, GRIPPER) for name in PRIMITIVE),
-    TURN + "auxiliary",
+    *(prefix + name for prefix in (TURN_PREFIX, GRIPPER_PREFIX) for name in PRIMITIVE),
+    TURN_PREFIX + "auxiliary",
 }
-MARGIN_M = 0.25  # a prediction at a learned input may leave the box by this distance
+WORKSPACE_MARGIN_M = 0.25  # a prediction at a learned input may leave the box by this distance
 # [m/m] largest derivative of the tool's position; also of zeta [rad/m] and of the closure [1/m]
 STEEPEST = 1000.0
 FARTHEST_TURN = (
@@ -178,11 +178,14 @@ def with_file(skill: StoredSkill) -> StoredSkill:
         arrays[DEMONSTRATIONS] = np.frombuffer(skill.demonstrations, np.uint8)
     arrays |= skill.model.own_arrays()
     if skill.turn:
-        arrays |= {TURN + name: array for name, array in to_arrays(skill.turn.primitive).items()}
-        arrays[TURN + "auxiliary"] = skill.turn.auxiliary
+        arrays |= {
+            TURN_PREFIX + name: array for name, array in to_arrays(skill.turn.primitive).items()
+        }
+        arrays[TURN_PREFIX + "auxiliary"] = skill.turn.auxiliary
     if skill.gripper:
         arrays |= {
-            GRIPPER + name: array for name, array in to_arrays(skill.gripper.primitive).items()
+            GRIPPER_PREFIX + name: array
+            for name, array in to_arrays(skill.gripper.primitive).items()
         }
     np.savez(out, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
     return replace(skill, file=out.getvalue(), digest=_digest(out.getvalue()))
@@ -239,8 +242,8 @@ def decoded(data: bytes, *, origin: str) -> StoredSkill:
 def _assembled(arrays: Mapping[str, NDArray[Any]], data: bytes) -> StoredSkill:
     """The skill with these arrays, which are those of the file `data`."""
     via_points = validated(msgspec.json.decode(str(arrays["via_points"])), tuple[ViaPoint, ...])
-    turn = _part(arrays, TURN)
-    gripper = _part(arrays, GRIPPER)
+    turn = _part(arrays, TURN_PREFIX)
+    gripper = _part(arrays, GRIPPER_PREFIX)
     figures = str(arrays.get("figures", ""))
     return StoredSkill(
         name=printable(str(arrays["name"])),
@@ -305,7 +308,7 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     # An array that is missing is found missing later.
     model_arrays = [name for name in _model(arrays).ranges if name in arrays]
     yield from _beyond(arrays, [*RANGES, *model_arrays], "")
-    for prefix in (TURN, GRIPPER):
+    for prefix in (TURN_PREFIX, GRIPPER_PREFIX):
         yield from _spoilt_part(arrays, prefix)
     yield from _varying_priors(arrays)
 
@@ -339,7 +342,7 @@ def _spoilt_part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Iterator[st
 
 def _varying_priors(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Prior means that vary with the inputs where they must not."""
-    for prefix in ("", TURN, GRIPPER):
+    for prefix in ("", TURN_PREFIX, GRIPPER_PREFIX):
         may_vary = not prefix and _model(arrays) is HandsKMP
         if np.ndim(arrays.get(prefix + "prior_mean", 0.0)) > 1 and not may_vary:
             yield f"{prefix}prior_mean goes with the inputs, and a constant one is needed there"
@@ -422,15 +425,15 @@ def _faults(skill: Skill) -> Iterator[str]:
     corners = skill.workspace
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         yield f"box is {corners.tolist()}, lower and upper corner needed"
-    auxiliary = {TURN + "auxiliary": skill.turn.auxiliary} if skill.turn else {}
+    auxiliary = {TURN_PREFIX + "auxiliary": skill.turn.auxiliary} if skill.turn else {}
     for name, quaternion in ({"orientation": skill.orientation} | auxiliary).items():
         if quaternion.shape != (4,) or not abs(np.linalg.norm(quaternion) - 1) < 1e-6:
             yield f"{name} is {quaternion.tolist()}, a quaternion x y z w of norm 1 needed"
     yield from _tried(skill)
     if skill.turn:
-        yield from _tried_beside(skill, skill.turn.primitive, TURN, outputs=3)
+        yield from _tried_beside(skill, skill.turn.primitive, TURN_PREFIX, outputs=3)
     if skill.gripper:
-        yield from _tried_beside(skill, skill.gripper.primitive, GRIPPER, outputs=1)
+        yield from _tried_beside(skill, skill.gripper.primitive, GRIPPER_PREFIX, outputs=1)
 
 
 def _tried_beside(skill: Skill, primitive: KMP, name: str, *, outputs: int) -> Iterator[str]:
@@ -466,11 +469,12 @@ def _tried(skill: Skill) -> Iterator[str]:
     low, high = skill.workspace
     for where, positions in tried:
         beyond = np.maximum(np.maximum(low - positions, positions - high), 0.0).max(axis=1)
-        if not (np.isfinite(positions).all() and beyond.max() <= MARGIN_M):
+        if not (np.isfinite(positions).all() and beyond.max() <= WORKSPACE_MARGIN_M):
             worst = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
             yield (
                 f"with the hands at {np.round(where[worst], 3).tolist()}, where it was learned, "
-                f"the tool is at {positions[worst].tolist()}; its box and {MARGIN_M} m around it "
+                f"the tool is at {positions[worst].tolist()}; its box and {WORKSPACE_MARGIN_M} m "
+                "around it "
                 "accepted"
             )
     primitive = skill.model.primitive

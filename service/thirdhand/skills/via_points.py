@@ -29,7 +29,7 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill, with_file
 MAX_GAIN = 4.0
 NEAR_M = 0.001  # tools this near to each other never contradict each other
 DEVIATIONS = 3.0  # nor do tools within this multiple of their standard deviations
-NOTED_M = 0.005  # via-points missed or moved by more are reported
+REPORTED_M = 0.005  # via-points missed or moved by more are reported
 
 
 def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: float) -> StoredSkill:
@@ -139,7 +139,7 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
         "demonstrated or taught near it says otherwise. A smaller std makes it count more; a "
         "greater tolerance removes what was shown there"
         for point in in_force(after)
-        if point.missed_by_m > NOTED_M
+        if point.missed_by_m > REPORTED_M
     ]
     out += [
         f"the orientation of via-point {point.name!r} is missed by "
@@ -150,7 +150,7 @@ def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
     ]
     for point in set(before.via_points) & set(after.via_points):
         moved_m = math.dist(tool_at(before, point), tool_at(after, point))
-        if moved_m > NOTED_M:
+        if moved_m > REPORTED_M:
             out.append(f"via-point {point.name!r} is moved by {1000 * moved_m:.0f} mm by this")
     return tuple(sorted(out))
 

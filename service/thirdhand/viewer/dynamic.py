@@ -30,7 +30,7 @@ from thirdhand.viewer.blueprint import TIMELINE
 from thirdhand.viewer.static import ArmModels
 
 SCENE_HZ = 100
-TRAIL_S = 3.0
+SHOWN_TRAIL_S = 3.0
 TRAIL_HZ = 20
 TRAIL_BREAK_M = 0.15  # a longer step between two corners of a trail is not a motion of the hand
 NEAREST_SHOWN_M = 0.5  # a nearer hand is connected with the arm by a line
@@ -80,7 +80,7 @@ class DynamicScene:
         self._direction = settings.tool.orientation == "direction"
         self._stale_ticks = settings.ticks_in(settings.hands.stale_ms / 1000)
         self._trails: dict[str, deque[NDArray[np.float32]]] = {
-            name: deque(maxlen=round(TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
+            name: deque(maxlen=round(SHOWN_TRAIL_S * TRAIL_HZ)) for name in (*SIDES, "tool")
         }
         self._body = models.body
         people = settings.people

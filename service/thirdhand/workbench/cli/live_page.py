@@ -34,7 +34,7 @@ from thirdhand.workbench.trackers.web_server import HTML, INLINE, JSON, WebServe
 STARTING_POLL_S = 0.2
 START_S = 15.0  # the viewer's server starts within this time
 PAGE = Path(__file__).with_name("live.html")
-UNKNOWN = "There is no such page. The page of this cell is at /."
+NO_SUCH_PAGE = "There is no such page. The page of this cell is at /."
 
 
 class LivePage:
@@ -51,7 +51,7 @@ class LivePage:
             web.get("/status", self._status),
             web.post(f"/{{order:{'|'.join(ORDERS)}}}", self._order),
         ]
-        self.server = WebServer(routes, unknown=UNKNOWN)
+        self.server = WebServer(routes, unknown=NO_SUCH_PAGE)
 
     async def _front(self, _: web.Request) -> web.Response:
         text = filled(

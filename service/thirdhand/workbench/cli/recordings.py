@@ -26,7 +26,7 @@ from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings
 from thirdhand.settings.whole_file import whole
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.skills.residual_risk import LONGEST_NAME, OPTION
+from thirdhand.skills.residual_risk import LONGEST_ACCEPTER, OPTION
 from thirdhand.skills.skill_file import StoredSkill, skill_in, unusable_name
 from thirdhand.skills.stored_demonstrations import stored_demonstrations
 from thirdhand.workbench.cli.many_files import of_each
@@ -172,9 +172,9 @@ def _check_outputs(args: argparse.Namespace, name: str, accepted_by: str) -> Non
     check_writable(args.output, ".npz")
     if args.plot:
         check_writable(args.plot, ".png")
-    if len(accepted_by) > LONGEST_NAME:
+    if len(accepted_by) > LONGEST_ACCEPTER:
         raise UsageError(
-            f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_NAME} accepted"
+            f"{OPTION}: a name of {len(accepted_by)} characters; up to {LONGEST_ACCEPTER} accepted"
         )
     if lacking := unusable_name(name):
         raise UsageError(f"--{lacking}")

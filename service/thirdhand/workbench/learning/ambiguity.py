@@ -14,15 +14,15 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.records import HeldOut
 
 COMPARED = 100  # samples of a take that are compared with those of all takes
-ROWS = 256  # samples that are compared with all others at once, which bounds the memory
+COMPARED_AT_ONCE = 256  # samples that are compared with all others at once, which bounds the memory
 # hands up to this distance are the same if predictions cannot tell their tools apart either
 ALIKE_M = 0.02
 # hands up to this distance are the same with any tracker, as nobody holds still any better
-SAME_M = 0.003
+SAME_HANDS_M = 0.003
 # two measurements of the same hands are nearer than 7 standard deviations in 99.9 % of all cases
-NOISES = 7.0
-WINDOW_S = 0.1  # hands move along a parabola in windows of this length
-LEAST_SAMPLES = 7  # samples of a window
+NOISE_RATIO = 7.0
+PARABOLA_S = 0.1  # hands move along a parabola in windows of this length
+WINDOW_SAMPLES = 7  # samples of a window
 
 
 class Contradictions(NamedTuple):
@@ -38,7 +38,7 @@ def same_hands_m(demonstrations: Iterable[Demonstration]) -> float:
     """The distance of hands (6) [m] below which the tracker cannot tell them apart:
     NOISES times its noise, from SAME_M to ALIKE_M.
     """
-    return float(np.clip(NOISES * tracker_noise_m(demonstrations), SAME_M, ALIKE_M))
+    return float(np.clip(NOISE_RATIO * tracker_noise_m(demonstrations), SAME_HANDS_M, ALIKE_M))
 
 
 def tracker_noise_m(demonstrations: Iterable[Demonstration]) -> float:
@@ -49,7 +49,7 @@ def tracker_noise_m(demonstrations: Iterable[Demonstration]) -> float:
     variances = [np.zeros(0)]
     for demonstration in demonstrations:
         hands = demonstration.hands
-        count = max(LEAST_SAMPLES, round(WINDOW_S / demonstration.period_s))
+        count = max(WINDOW_SAMPLES, round(PARABOLA_S / demonstration.period_s))
         parts = hands[: len(hands) // count * count].reshape(-1, count, 6)
         parabolas, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 3))
         left = parts - parabolas @ (parabolas.T @ parts)
@@ -91,8 +91,8 @@ def contradictions(
     worst = -1.0
     pair = (0, 0)
     count = 0
-    for first in range(0, len(known_m), ROWS):
-        rows = slice(first, first + ROWS)
+    for first in range(0, len(known_m), COMPARED_AT_ONCE):
+        rows = slice(first, first + COMPARED_AT_ONCE)
         hands = squares[rows, None] + squares - 2 * known_m[rows] @ known_m.T
         is_alike = (hands < near_m**2) | (
             (hands < ALIKE_M**2) & (errors[rows] > different / 2)[:, None]

@@ -33,7 +33,7 @@ from thirdhand.skills.skill_file import SkillError
 
 SMOOTHED_S = 0.28  # width of the window that smooths hands and tool
 # positions of a hand that are this near to each other in all demonstrations are the same
-SAME_M = 0.05
+SAME_VIA_POINT_M = 0.05
 OFF_M = 0.06  # unit of the distances d_i
 FARTHEST = 25.0  # d_i² / OFF_M² is limited to this value
 DIRECTED = 2.0  # gain of moving along the path
@@ -45,7 +45,7 @@ NEAR = 0.15  # shares that differ by less are near to each other
 FAR_M = 0.10  # a via-point is refused if the tool never came nearer than this
 # of a sample far from a via-point: a via-point that no sample is near has the mean lever
 LEAST_WEIGHT = 1e-6
-FOLLOW = {"none": NONE, "left": LEFT, "right": RIGHT}
+FOLLOWED_HAND = {"none": NONE, "left": LEFT, "right": RIGHT}
 
 
 def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
@@ -75,7 +75,7 @@ def task_of(demonstrations: Sequence[Demonstration]) -> tuple[Task | None, str]:
     return Task(
         names,
         corners,
-        np.array([FOLLOW[p.follow] for p in ordered(demonstrations[0].via_points, names)]),
+        np.array([FOLLOWED_HAND[p.follow] for p in ordered(demonstrations[0].via_points, names)]),
     ), ""
 
 
@@ -86,7 +86,9 @@ def _corners(at: Vector) -> Indices:
     out: list[int] = []
     for i in range(at.shape[1]):
         alike = [
-            out[j] for j in range(i) if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_M
+            out[j]
+            for j in range(i)
+            if np.linalg.norm(at[:, i] - at[:, j], axis=1).max() <= SAME_VIA_POINT_M
         ]
         out.append(alike[0] if alike else max(out, default=-1) + 1)
     return np.array(out, np.int64)
@@ -219,7 +221,7 @@ class Divided:
         begins = segments["tool"][labels]
         way_m = segments["tool_way"][labels]
         square = (way_m**2).sum(axis=1)
-        goes = square > SAME_M**2
+        goes = square > SAME_VIA_POINT_M**2
         share = np.where(
             goes,
             ((tool - begins) * way_m).sum(axis=1) / np.where(goes, square, 1.0),
@@ -334,7 +336,7 @@ def _divided(
         position_m = points[:, None, first : first + 3]
         velocity = velocities[:, first : first + 3]
         square = (way_m**2).sum(axis=1)
-        moves = square > SAME_M**2
+        moves = square > SAME_VIA_POINT_M**2
         along = (((position_m - begins) * way_m).sum(axis=2) / np.where(moves, square, 1.0)).clip(
             0.0, 1.0
         ) * moves

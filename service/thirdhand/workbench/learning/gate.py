@@ -23,8 +23,8 @@ HELD_OUT_TIMES = 2.0  # the gate is at most this multiple of the largest held-ou
 CEILING_M = 0.15
 # twice the standard deviation of the noisiest tracker, whose noise must not look like a detour
 FLOOR_M = 0.02
-MISSED_SHARE = 0.05  # this share of the wrong samples may pass
-HOLD_SHARE = 0.02  # a gate that does not separate both holds at most this share of the time
+PASSED_SHARE = 0.05  # this share of the wrong samples may pass
+MAX_HOLD_SHARE = 0.02  # a gate that does not separate both holds at most this share of the time
 BESIDE_M = 0.3  # wrong samples are displaced by this distance along each axis, in either direction
 WRONG_SAMPLES = 50  # samples of a take from which wrong ones are made
 
@@ -52,11 +52,11 @@ def gate_between(
     *,
     ceiling: float,
     floor: float = 0.0,
-    hold_share: float = HOLD_SHARE,
+    hold_share: float = MAX_HOLD_SHARE,
 ) -> Gate:
     """The gate between the values [m] of held-out takes (T,) and of each kind of wrong samples."""
     most = float(held_out.max())
-    least = min(float(np.quantile(values, MISSED_SHARE)) for values in wrong)
+    least = min(float(np.quantile(values, PASSED_SHARE)) for values in wrong)
     if least > most:
         threshold = min(float(np.sqrt(most * least)), HELD_OUT_TIMES * most)
     else:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TOOL, TARGET, OFF, GATE = map(
+TOOL_INK, TARGET_INK, OFF_INK, GATE_INK = map(
     palette.written, (palette.TOOL, palette.TARGET, palette.OFF, palette.GATE)
 )
 GREYS = {"wrong: swapped": "0.7", "wrong: both beside": "0.5", "wrong: one beside": "0.3"}
@@ -78,8 +78,8 @@ def _draw_from_above(held_out: Sequence[HeldOut], axes: Axes) -> None:
         tool = result.take.position
         predicted = tool - result.errors
         for path, colour, label in (
-            (tool, TOOL, "demonstrated"),
-            (predicted, TARGET, "predicted from the others"),
+            (tool, TOOL_INK, "demonstrated"),
+            (predicted, TARGET_INK, "predicted from the others"),
         ):
             axes.plot(path[:, 0], path[:, 1], color=colour, lw=1, label=None if i else label)
     axes.set_aspect("equal", adjustable="datalim")
@@ -96,12 +96,14 @@ def _draw_errors(held_out: Sequence[HeldOut], axes: Axes) -> None:
     axes.plot(
         grid,
         1000 * np.sqrt((lengths**2).mean(axis=0)),
-        color=TOOL,
+        color=TOOL_INK,
         lw=2,
         label="root mean square of all",
     )
     expected_mm = 1000 * np.sqrt((expected**2).mean(axis=0))
-    axes.plot(grid, expected_mm, color=TARGET, ls="--", lw=2, label="expected before calibration")
+    axes.plot(
+        grid, expected_mm, color=TARGET_INK, ls="--", lw=2, label="expected before calibration"
+    )
     axes.set(
         title="error of the predicted tool",
         xlabel="share of the demonstration's time",
@@ -116,7 +118,12 @@ def _draw_regions(evidence: Evidence, axes: Axes) -> None:
     axes.plot((0, 100), (0, 100), color="0.6", lw=1, label="exact")
     inside = 100 * evidence.inside
     axes.plot(
-        100 * np.array(LEVELS), inside, "o-", color=TARGET, ms=4, label="held-out demonstrations"
+        100 * np.array(LEVELS),
+        inside,
+        "o-",
+        color=TARGET_INK,
+        ms=4,
+        label="held-out demonstrations",
     )
     axes.set(title="share of the samples inside each predicted region")
     axes.set(xlabel="the region should contain [%]", ylabel="samples inside [%]")
@@ -131,7 +138,7 @@ def _draw_gate(evidence: Evidence, axes: Axes) -> None:
     skill = evidence.skill
     held_out = evidence.held_out
     hands = np.concatenate([every_few(result.take.hands) for result in held_out])
-    curves = {"held-out hands": (np.concatenate([result.gate_m for result in held_out]), OFF)}
+    curves = {"held-out hands": (np.concatenate([result.gate_m for result in held_out]), OFF_INK)}
     for (name, colour), wrong in zip(GREYS.items(), nonsense(hands), strict=True):
         curves[name] = skill.model.gates_m(wrong), colour
     for name, (values, colour) in curves.items():
@@ -140,7 +147,7 @@ def _draw_gate(evidence: Evidence, axes: Axes) -> None:
         )
     axes.axvline(
         1000 * skill.threshold,
-        color=GATE,
+        color=GATE_INK,
         ls="--",
         lw=1,
         label=f"gate, {1000 * skill.threshold:.0f} mm",
@@ -188,9 +195,9 @@ def _draw_segments(evidence: Evidence, axes: Axes) -> None:
         labelled.add(k)
     off_mm = 1000 * np.linalg.norm(result.errors, axis=1)
     predicted_mm = 1000 * _deviation(result)
-    axes.plot(times, off_mm, color=TOOL, lw=2, label="error of the predicted tool")
+    axes.plot(times, off_mm, color=TOOL_INK, lw=2, label="error of the predicted tool")
     axes.plot(
-        times, predicted_mm, color=TARGET, ls="--", lw=1.5, label="expected before calibration"
+        times, predicted_mm, color=TARGET_INK, ls="--", lw=1.5, label="expected before calibration"
     )
     # the first predictions are uncertain
     highest_mm = max(float(off_mm.max()), float(np.percentile(predicted_mm, 98)))

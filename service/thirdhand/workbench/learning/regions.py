@@ -43,8 +43,8 @@ from thirdhand.workbench.learning.records import HeldOut, Take, TimedErrors, per
 
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
 # takes that follow each other, often of one person or hour, are held out in so many blocks at most
-BLOCKS = 6
-SAMPLES = 150  # samples of a take that are judged, at most
+REGION_BLOCKS = 6
+JUDGED_SAMPLES = 150  # samples of a take that are judged, at most
 # Candidates for the timing's standard deviation. A larger one explains few large errors by making
 # all motion uncertain.
 TIMINGS_S = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
@@ -62,12 +62,12 @@ LOCAL_ERRORS_RETAINED = 300
 LEAST_RETAINED = 4  # errors of a demonstration
 
 
-def blocks_of(persons: NDArray[np.intp], most: int = BLOCKS) -> list[list[int]]:
+def blocks_of(persons: NDArray[np.intp], most: int = REGION_BLOCKS) -> list[list[int]]:
     """The numbers of the takes that are held out at once, by the takes' persons (H,), in at most
     `most` blocks, or BLOCKS.
     """
     numbers = np.unique(persons)
-    blocks = np.array_split(numbers, max(1, min(BLOCKS, most, len(numbers))))
+    blocks = np.array_split(numbers, max(1, min(REGION_BLOCKS, most, len(numbers))))
     return [np.flatnonzero(np.isin(persons, block)).tolist() for block in blocks if len(block)]
 
 
@@ -183,7 +183,7 @@ def calibrated_without(
 
 
 def _rows(count: int) -> NDArray[np.intp]:
-    return np.linspace(0, count - 1, min(SAMPLES, count)).round().astype(np.intp)
+    return np.linspace(0, count - 1, min(JUDGED_SAMPLES, count)).round().astype(np.intp)
 
 
 def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:

@@ -25,7 +25,7 @@ from thirdhand.workbench.learning.ambiguity import same_hands_m
 from thirdhand.workbench.learning.methods import Method, method_of
 from thirdhand.workbench.learning.methods.segmented import Segmented
 from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Take
-from thirdhand.workbench.learning.regions import BLOCKS
+from thirdhand.workbench.learning.regions import REGION_BLOCKS
 
 LEAST_COMPARED = 4  # takes: among fewer, none counts as standing out
 STANDS_OUT_TIMES = 4.0
@@ -243,7 +243,7 @@ def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> l
     person_of = persons(demonstrations)
     count = max(person_of, default=-1) + 1
     number_of = list(range(count))
-    if count > BLOCKS:
+    if count > REGION_BLOCKS:
         means_m = np.zeros((count, 3))
         for person in range(count):
             theirs = [
@@ -255,7 +255,7 @@ def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> l
                 [demonstration.tool[:, :3].mean(axis=0) for demonstration in theirs], axis=0
             )
         along = np.argsort(means_m[:, means_m.var(axis=0).argmax()], kind="stable").tolist()
-        dealt = sorted(range(count), key=lambda rank: (rank % BLOCKS, rank))
+        dealt = sorted(range(count), key=lambda rank: (rank % REGION_BLOCKS, rank))
         for number, rank in enumerate(dealt):
             number_of[along[rank]] = number
     return [

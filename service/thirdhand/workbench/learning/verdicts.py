@@ -27,11 +27,11 @@ RESIDUAL_MM = 100.0
 # [%] of the tool's variance: if the hands explain less, the mean position predicts nearly as well
 EXPLAINED = 50.0
 # [%] limits of the samples that contradict others
-AMBIGUOUS = 1.0
+MAX_AMBIGUOUS = 1.0
 AMBIGUOUS_RESIDUAL = 10.0
 AMBIGUOUS_UNSAFE = 20.0
 BEYOND_UNSAFE = 20.0  # [%] limit of the tool's path that is out of reach
-HELD = 5.0  # [%] limit of the time that the gate holds in demonstrations
+MAX_HELD = 5.0  # [%] limit of the time that the gate holds in demonstrations
 # [%] limits of the wrong samples that the gate must hold
 CAUGHT = 95.0
 CAUGHT_RESIDUAL = 50.0
@@ -200,7 +200,7 @@ RULES = (
         of="demonstrations",
     ),
     Rule(
-        lambda s: s.figures.ambiguous > AMBIGUOUS,
+        lambda s: s.figures.ambiguous > MAX_AMBIGUOUS,
         "{s.figures.ambiguous:.0f} % of the samples contradict others, up to "
         f"{AMBIGUOUS_RESIDUAL:.0f} % accepted: {{s.contradiction}}",
         severity=_of_contradictions,
@@ -216,7 +216,7 @@ RULES = (
         "longer one (--config)",
     ),
     Rule(
-        lambda s: s.all.held > HELD,
+        lambda s: s.all.held > MAX_HELD,
         "the gate holds {s.all.held:.0f} % of what was demonstrated, and cannot be higher: {cause}",
     ),
     Rule(

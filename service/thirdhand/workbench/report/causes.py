@@ -16,7 +16,7 @@ from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.report.columns import Columns
 
 BEFORE_S = 1.0  # what happened in this time before a fault is listed
-LATE_US = 1000.0  # a tick that began later than this is listed
+LISTED_LATE_US = 1000.0  # a tick that began later than this is listed
 
 
 def why(columns: Columns, begin: int, end: int) -> Explanation:
@@ -94,7 +94,7 @@ def _late(columns: Columns, first: int, last: int) -> Iterator[str]:
         return
     missed = int(timing["missed"][-1] - timing["missed"][0])
     late_us = float(timing["lateness_us"].max())
-    if missed or late_us >= LATE_US:
+    if missed or late_us >= LISTED_LATE_US:
         yield (
             f"in the second before: {missed} missed deadlines, ticks up to {late_us / 1e3:.1f} "
             "ms late"

@@ -23,7 +23,7 @@ from thirdhand.workbench.report.camera_video import CameraRows, write_videos
 from thirdhand.workbench.report.columns import Columns, runs
 
 FEATURES = ("observation.state", "observation.environment_state", "action")
-HANDS = [f"{side}_{axis}" for side in ("left", "right") for axis in "xyz"]
+HAND_FEATURES = [f"{side}_{axis}" for side in ("left", "right") for axis in "xyz"]
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
@@ -69,7 +69,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             measured_joints = in_turn(joint_settings, measured_joints, frames["joints"][rows])
             values = (
                 measured_joints,
-                frames["hands"][rows].reshape(-1, len(HANDS)),
+                frames["hands"][rows].reshape(-1, len(HAND_FEATURES)),
                 frames["joints"][rows],
             )
             part: Episode = {
@@ -98,7 +98,7 @@ class _DataSet(NamedTuple):
 
     def info(self, columns: Episode) -> dict[str, Any]:
         """The description of the data set with these columns."""
-        names = dict(zip(FEATURES, (self.joints, HANDS, self.joints), strict=True))
+        names = dict(zip(FEATURES, (self.joints, HAND_FEATURES, self.joints), strict=True))
         features = {
             name: {
                 "dtype": str(column.dtype),

@@ -19,11 +19,15 @@ from thirdhand.settings import palette
 from thirdhand.workbench.report.report import Report
 from thirdhand.workbench.report.tables import Table, comparison, names_of, summary, tables
 
-LEFT, RIGHT, TOOL, TARGET = map(
+LEFT_PEN, RIGHT_PEN, TOOL_PEN, TARGET_PEN = map(
     palette.written, (palette.LEFT, palette.RIGHT, palette.TOOL, palette.TARGET)
 )
-NEAREST, OFF, VIA_POINT = map(palette.written, (palette.NEAREST, palette.OFF, palette.VIA_POINT))
-LATENCY, WORK, LATENESS = map(palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS))
+NEAREST_PEN, OFF_PEN, VIA_POINT_PEN = map(
+    palette.written, (palette.NEAREST, palette.OFF, palette.VIA_POINT)
+)
+LATENCY_PEN, WORK_PEN, LATENESS_PEN = map(
+    palette.written, (palette.LATENCY, palette.WORK, palette.LATENESS)
+)
 MODE_COLOURS = {mode: palette.written(colour) for mode, colour in palette.BY_MODE.items()}
 LETTER_SHARE = 0.011  # width of a letter / width of a plot
 POINTS = 1500  # most points of a curve
@@ -145,10 +149,10 @@ def _draw_errors(report: Report, errors: Axes, doubt: Axes) -> None:
     times = report.columns.times
     following = frames["mode"] == Mode.FOLLOW
     lag = 1000 * np.linalg.norm(frames["tool"] - frames["target"], axis=1)
-    _curve(errors, times, np.where(following, lag, np.nan), TOOL, "tool from its target")
+    _curve(errors, times, np.where(following, lag, np.nan), TOOL_PEN, "tool from its target")
     measures = dict.fromkeys(skill.model.measure for _, skill in report.columns.skills)
     gate_m = np.where(frames["gate_m"] > 0, 1000 * frames["gate_m"], np.nan)
-    _curve(errors, times, gate_m, OFF, " / ".join(measures))
+    _curve(errors, times, gate_m, OFF_PEN, " / ".join(measures))
     errors.set(
         ylabel="error, deviation [mm]",
         yscale="log",
@@ -158,7 +162,7 @@ def _draw_errors(report: Report, errors: Axes, doubt: Axes) -> None:
 
     predicted = following | (frames["error_probability"] > 0)
     probability = np.where(predicted, 100 * frames["error_probability"], np.nan)
-    _curve(doubt, times, probability, TARGET, "target off by more than 10 cm")
+    _curve(doubt, times, probability, TARGET_PEN, "target off by more than 10 cm")
     doubt.set(ylabel="probability [%]", ylim=(0, 100))
 
 
@@ -167,10 +171,10 @@ def _draw_speeds(report: Report, axes: Axes) -> None:
     frames = report.columns.frames
     times = report.columns.times
     speeds = np.linalg.norm(frames["hand_velocities"], axis=2)
-    for side, colour, speed in zip(SIDES, (LEFT, RIGHT), speeds.T, strict=True):
+    for side, colour, speed in zip(SIDES, (LEFT_PEN, RIGHT_PEN), speeds.T, strict=True):
         _curve(axes, times, speed, colour, f"{side} hand")
     setpoint_speed = np.linalg.norm(frames["setpoint_velocity"], axis=1)
-    _curve(axes, times, setpoint_speed, TOOL, "tool's setpoint")
+    _curve(axes, times, setpoint_speed, TOOL_PEN, "tool's setpoint")
     axes.set(ylabel="speed [m/s]", ylim=(0, None))
     _bounded(axes, speeds)
 
@@ -180,9 +184,9 @@ def _draw_timing(report: Report, axes: Axes) -> None:
     timing = report.columns.timing
     tick_s = (timing["tick"] - report.columns.frames["tick"][0]) * report.columns.period_s
     for name, colour, label in (
-        ("latency_us", LATENCY, "hand stamped to command published"),
-        ("work_us", WORK, "work of a tick"),
-        ("lateness_us", LATENESS, "later than its deadline"),
+        ("latency_us", LATENCY_PEN, "hand stamped to command published"),
+        ("work_us", WORK_PEN, "work of a tick"),
+        ("lateness_us", LATENESS_PEN, "later than its deadline"),
     ):
         durations_us = np.where(timing[name] >= LEAST_US, timing[name], np.nan)
         axes.plot(*thinned(tick_s, durations_us), ".", color=colour, ms=2, label=label)
@@ -206,7 +210,7 @@ def _over_time(report: Report) -> Figure:
         near,
         times,
         np.where(is_seen, 100 * frames["hand_distance"], np.nan),
-        NEAREST,
+        NEAREST_PEN,
         "nearest hand to the arm",
     )
     near.set(ylabel="distance [cm]", ylim=(0, None))
@@ -229,17 +233,17 @@ def _from_above(report: Report) -> Figure:
     frames = report.columns.frames
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.subplots()
-    for side, colour in zip(SIDES, (LEFT, RIGHT), strict=True):
+    for side, colour in zip(SIDES, (LEFT_PEN, RIGHT_PEN), strict=True):
         number = SIDES.index(side)
         path = frames["hands"][frames["hand_ages"][:, number] >= 0, number]
         _path(axes, path, colour, f"{side} hand")
-    _path(axes, frames["tool"][frames["commanded"] > 0], TOOL, "tool")
+    _path(axes, frames["tool"][frames["commanded"] > 0], TOOL_PEN, "tool")
     points = [point for _, skill in report.columns.skills for point in skill.via_points]
     for point in sorted(dict.fromkeys(points), key=lambda point: point.name):
         x, y, _ = point.tool
-        axes.plot(x, y, "D", color=VIA_POINT, ms=5)
+        axes.plot(x, y, "D", color=VIA_POINT_PEN, ms=5)
         axes.annotate(point.name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
-    axes.plot(0, 0, "s", color=VIA_POINT, ms=10)
+    axes.plot(0, 0, "s", color=VIA_POINT_PEN, ms=10)
     axes.annotate(
         "arm", (0, 0), xytext=(9, -4), textcoords="offset points", fontsize=8, color="0.4"
     )

@@ -12,9 +12,9 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.workbench.report.columns import Columns, runs
 
 # hands visit a via-point if nearer than this, or than its radius, to where it was taught
-NEAR_M = 0.03
+VISIT_M = 0.03
 PAUSE_S = 0.3  # hands that leave for a shorter time have not left
-LEAST_S = 0.1  # a shorter visit does not count
+LEAST_VISIT_S = 0.1  # a shorter visit does not count
 SETTLED_S = 0.1  # the tool's final distance is averaged over this time at the end of a visit
 
 
@@ -96,9 +96,9 @@ def _visits(
         side = ("left", "right").index(point.follow)
         target_m = target_m + hands[:, side] - taught[side]
     error_m = np.linalg.norm(frames["tool"] - target_m, axis=1)
-    is_near = _closed(away <= max(NEAR_M, point.radius), round(PAUSE_S / period_s))
+    is_near = _closed(away <= max(VISIT_M, point.radius), round(PAUSE_S / period_s))
     visits = []
-    least = round(LEAST_S / period_s)
+    least = round(LEAST_VISIT_S / period_s)
     settled = max(1, round(SETTLED_S / period_s))
     for begin, end in runs(is_near):
         if is_near[begin] and end - begin >= least:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.division import FAR_M, FOLLOW, off_via_point
+from thirdhand.workbench.learning.division import FAR_M, FOLLOWED_HAND, off_via_point
 
 REST_M = 0.015  # noise and tremor move hands and tool by up to this at rest
 DWELL_S = 0.5  # a shorter rest is a pause in a motion
@@ -20,7 +20,7 @@ def remarks_on_via_points(demonstration: Demonstration) -> list[str]:
     if not points:
         return []
     distances_m = np.array(
-        [off_via_point(demonstration, point, FOLLOW[point.follow]) for point in points]
+        [off_via_point(demonstration, point, FOLLOWED_HAND[point.follow]) for point in points]
     )
     remarks = [
         f"via-point {point.name!r} was never reached: the tool's smallest distance was "

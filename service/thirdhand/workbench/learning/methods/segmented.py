@@ -84,7 +84,7 @@ from thirdhand.workbench.learning.records import (
 from thirdhand.workbench.learning.regions import LEAST_BLOCKS, blocks_of, unknown_std
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
-LEAST_SAMPLES = 10  # samples of a demonstration that are learned from
+LEAST_HELD_OUT_SAMPLES = 10  # samples of a demonstration that are learned from
 ERRORS_RETAINED = 600  # errors of all demonstrations that the skill keeps
 # delays and inputs are compared with about this number of samples of a demonstration
 SAMPLES_TRIED = 200
@@ -119,7 +119,7 @@ class Hyperparameters(NamedTuple):
 
 # candidates
 ELLS = (4.0, 2.0, 8.0, 16.0)
-NOISES = (0.1, 0.03, 0.3)
+TRIED_NOISES = (0.1, 0.03, 0.3)
 
 
 class Samples(NamedTuple):
@@ -140,7 +140,7 @@ class Samples(NamedTuple):
     def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
         """The samples of demonstrations, of which the first `new` are new, without a clock."""
         count = len(encoded[0].segments)
-        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_SAMPLES)
+        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_HELD_OUT_SAMPLES)
         sampled_rows = [
             demo.rows(row_count) for demo, row_count in zip(encoded, counts, strict=True)
         ]
@@ -169,7 +169,9 @@ class Samples(NamedTuple):
         errors_m = {
             Hyperparameters(ell, noise, weight): rms(errors)
             for ell in ELLS
-            for noise, errors in zip(NOISES, self.held_out(ell, NOISES, weight), strict=True)
+            for noise, errors in zip(
+                TRIED_NOISES, self.held_out(ell, TRIED_NOISES, weight), strict=True
+            )
         }
         return min(errors_m, key=errors_m.__getitem__)
 
@@ -742,7 +744,7 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
         return {}
 
     def error_m(samples: Samples) -> float:
-        return min(map(rms, samples.held_out(best.parameters.ell, NOISES, 1.0, block_of)))
+        return min(map(rms, samples.held_out(best.parameters.ell, TRIED_NOISES, 1.0, block_of)))
 
     tempos = [Tempo.of(take.demonstration) for take in taught.new]
     limit_m = clock_limit_m(error_m(best.samples))
