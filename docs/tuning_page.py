@@ -23,23 +23,19 @@ HEAD = """# Tuned numbers
 
 <!-- Written by `python docs/tuning_page.py` from service/thirdhand/core/*/tuning.py: change it there. -->
 
-The core has {count} tuned numbers, in the file `tuning.py` of each stage. Numbers that follow from
-the settings, from the arm or from other numbers are not among them.
-
-The range and the effects of more and less are what we expect. The last three columns are measured,
-at half and at twice the number: `python -m thirdhand_sim.lab sensitivity` compares short sessions
-with those at the tuned value.
+The core has {count} tuned numbers, in the file `tuning.py` of each stage. The columns range, more
+and less state what we expect. The last three columns are measured in short sessions, at half and at
+twice the number:
 
 * *Motion*: change of the error and of the jerk of a tool that follows moving hands [%].
 * *Stops*: change of the overshoot of sudden stops [mm], seen by trackers of 100, 30 and 15 Hz.
-* *Largest other*: the figure of another session that changes most in relation to its noise, which
-  is its standard deviation over other seeds. A change below the noise says little. The change of a
-  figure that is the same for all seeds counts as one noise.
+* *Largest other*: the figure of another session that changes most in relation to its noise, the
+  standard deviation over other seeds. A change below the noise says little.
 
-The numbers of the skill are constants, because skills are learned with them. They are not measured.
+The numbers of the skill are not measured, because skills are learned with them.
 {state}
-The sessions are short. A number that does not matter there may still matter in a rare situation:
-look for tests of it before you remove it.
+A number without effect in these sessions may matter in a rare situation: look for its tests before
+you remove it.
 """
 
 
