@@ -23,12 +23,10 @@ HEAD = """# Settings
 
 <!-- Written by `python docs/settings_page.py` from service/thirdhand/settings/config.py: change it there. -->
 
-This page lists every setting of a cell, with its default and the values that are accepted. Write
-the settings that you want to change into a TOML file, and start the daemon with it: `thirdhand
-serve --config cell.toml`. Each heading below is a table of that file. Settings that the file does
-not name keep their defaults. Options of `thirdhand serve` override the file.
-
-Several cells may share [one file](network.md#one-file-for-many-cells).
+Write the settings that you want to change into a TOML file, and start the daemon with it:
+`thirdhand serve --config cell.toml`. Each heading below is a table of that file. Options of
+`thirdhand serve` override it. Several cells may share [one
+file](network.md#one-file-for-many-cells).
 
 ```toml
 cell = "hall/bench-1"
@@ -42,8 +40,7 @@ base_from_tracker = [0.80, 0.0, 0.02, 0.0, 0.0, 1.0, 0.0]
 max_speed = 0.5
 ```
 
-The whole file is checked before anything starts. A mistake is printed with its place and the values
-that would have been accepted.
+The file is checked before anything starts.
 
 * Units are part of the name (`_ms`, `_hz`, `_mb`) or stand in brackets in the last column.
 * Positions are in frame `base`, unless the last column names another frame.
