@@ -19,10 +19,8 @@ HEAD = """# The command line
 
 <!-- Written by `python docs/command_line_page.py` from service/thirdhand/command_line.py: change it there. -->
 
-Every command of `thirdhand`, with all its options. `thirdhand COMMAND --help` prints the same text.
-
-Errors go to standard error. The exit code is 0 after success, 1 after a failure and 2 after bad
-usage. Ctrl-C ends a command with the exit code 130.
+`thirdhand COMMAND --help` prints the same text. [Incidents](incidents.md#exit-codes) lists the exit
+codes.
 
 | to | commands |
 |---|---|
