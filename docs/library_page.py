@@ -20,23 +20,21 @@ LIBRARY = """# The library `kmp`
 
 <!-- Written by `python docs/library_page.py` from the docstrings in kmp/: change it there. -->
 
-This page lists every function and class of `kmp`. All names are those of `import kmp`, except where
-a heading names a module. The [tutorial of kmp](../kmp/README.md) shows how they work together. If
-you know pbdlib, gmr or movement_primitives, [this page](coming-from.md) compares them with `kmp`.
+All names are those of `import kmp`, except where a heading names a module. Start with the [tutorial
+of kmp](../kmp/README.md). [Another page](coming-from.md) compares pbdlib, gmr and
+movement_primitives with `kmp`.
 
 Letters: N reference points, M queries, V via-points, T samples, I inputs, O outputs. Values are
 immutable. A wrong argument raises a ValueError that names it.
 
 ![A primitive over time: its mean, regions of 1 and 2 standard deviations, and a via-point](kmp-over-time.png)
 
-The picture shows a primitive with two outputs. The mean passes through the via-point, and the
-regions are narrow where the demonstrations agree. The tutorial of kmp draws it step by step."""
+The mean passes through the via-point. The regions are narrow where the demonstrations agree."""
 CLIENT = """# The Python client
 
 <!-- Written by `python docs/library_page.py` from the docstrings in service/thirdhand/client: change it there. -->
 
-This page lists what a program in Python needs to talk to a running daemon. Most programs need only
-a connection:
+A Python program talks to a running daemon through a connection:
 
 ```python
 import thirdhand
@@ -48,9 +46,8 @@ with thirdhand.connect() as cell:  # address, cell and certificate as for the co
         print(pose.position)
 ```
 
-All names are those of `import thirdhand`; the project itself has the same names in
-`thirdhand.client`. The programs in [examples](../examples) use them, and [the wire](wire.md)
-describes the messages behind them.
+All names are those of `import thirdhand`. The programs in [examples](../examples) use them. [The
+wire](wire.md) describes the messages behind them.
 
 Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
 radians, or in metres if they slide.
