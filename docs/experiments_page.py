@@ -113,10 +113,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
             row[f"largest_miss_of_{point}_cm"] for row in rows for point in ("start", "via", "end")
         )
 
-    def share(value: float) -> str:
-        """A share of the scenes, in words."""
-        return f"in {100 * value:.0f} %" if value else "never"
-
     def commit(name: str) -> str:
         return str(results[name].get("commit", "an unknown commit"))
 
@@ -138,7 +134,6 @@ def templates(results: Mapping[str, dict[str, Any]], here: Mapping[str, str]) ->
     found.globals |= {name.replace("-", "_"): result for name, result in results.items()}
     found.globals |= {
         "table_miss": table_miss,
-        "share": share,
         "version": version,
         "stale": stale_line,
         "late_ms": round(1000 * MOST_LATE_S),
