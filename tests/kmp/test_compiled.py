@@ -59,7 +59,7 @@ compiled(operations)(a, b, random.normal(size=(20, 20)), out)
 print(out.tobytes().hex())
 s = random.normal(size=(37, 3))
 reference = Gaussians(s, [np.eye(3)] * 37)
-    query = KMP.fit(s, reference, kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
+query = KMP.fit(s, reference, kernel=GaussianKernel(0.5), lambda_mean=1.0).inner.query
 from kmp.loops.query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))
