@@ -18,8 +18,10 @@ from thirdhand.core.vectors import norm
 # figures of a step: nearest_m, speed_limit, setpoint_share
 NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)
 
-Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records]
-"""States, heres, parameters, capsules, contacts and constraints of a step."""
+Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records, Vector]
+"""States, heres, parameters, capsules, contacts and constraints of a step; and `near` (9,) [m]: the
+nearest points of the two things at hand, and the unit normal between them.
+"""
 
 Approach: TypeAlias = tuple[bool, Vector, float, float, float, float]
 """A hand: is its velocity known; velocity; faster_by, nearer_by, contact_speed, braked."""
@@ -85,7 +87,7 @@ def step(
 
     Only constraints that the joints can violate are kept.
     """
-    scene = (states, heres, parameters, capsules, contacts, constraints)
+    scene = (states, heres, parameters, capsules, contacts, constraints, np.empty(9))
     config = parameters[0]
     placed = np.empty((2, len(capsules), 2, 3))  # ends of the capsules: now, and at a later time
     place(heres[0].joints, config.frames, config.axes, capsules, placed[0])
@@ -115,7 +117,7 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
 
     `placed` (2, C, 2, 3) [m] has the capsules' ends now, and is filled for a later time.
     """
-    states, heres, parameters, capsules, contacts, _ = scene
+    states, heres, parameters, capsules, contacts, _, _ = scene
     state = states[0]
     config = parameters[0]
     posture = heres[0]
@@ -139,8 +141,8 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
         _move_hand(states, parameters, side, ahead_s, forearm, velocity)
         braked = config.brake[PEOPLE] * max(ahead_s - config.brake_ramp_s, 0.0)
         approach = (is_known, velocity, faster_by, nearer_by, contact_speed, braked)
-        for capsule in range(config.first, len(capsules)):
-            count = _keep_part(scene, capsule, k > 0, forearm, approach, count, placed, figures)
+        parts = placed[1] if k > 0 else placed[0]
+        count = _keep_parts(scene, k > 0, forearm, approach, count, parts, placed[0], figures)
     return count
 
 
@@ -191,52 +193,57 @@ def _move_hand(
 
 
 @compiled
-def _keep_part(
+def _keep_parts(
     scene: Scene,
-    capsule: int,
     is_later: bool,
     forearm: Vector,
     approach: Approach,
     count: int,
-    placed: Vector,
+    parts: Vector,
+    parts_now: Vector,
     figures: Vector,
 ) -> int:
-    """Write the constraint of one part near a hand; return the number of all constraints."""
-    states, heres, parameters, capsules, _, constraints = scene
+    """Write the constraints of the parts near a hand; return the number of all constraints.
+
+    `parts` and `parts_now` (C, 2, 3) [m] have the capsules' ends at the time of the forearm (2, 3),
+    and now.
+    """
+    states, heres, parameters, capsules, _, constraints, near = scene
     is_known, velocity, faster_by, nearer_by, contact_speed, braked = approach
     config = parameters[0]
-    part = capsules[capsule]
-    is_tool = part.link == len(heres[0].joints)
-    near = np.empty(9)
-    parts = placed[1] if is_later else placed[0]
-    distance = between_segments(parts[capsule], forearm, near) - part.radius - config.hand_radius
-    if not is_later:
-        figures[NEAREST] = min(figures[NEAREST], distance)
-    distance -= nearer_by
+    for capsule in range(config.first, len(capsules)):
+        part = capsules[capsule]
+        is_tool = part.link == len(heres[0].joints)
+        distance = between_segments(parts[capsule], forearm, near) - part.radius
+        distance -= config.hand_radius
+        if not is_later:
+            figures[NEAREST] = min(figures[NEAREST], distance)
+        distance -= nearer_by
 
-    # The speed of the hand toward the part, and the speed that the rule allows the part.
-    coming = config.unknown_speed
-    if is_known:
-        coming = max(-_along(near, velocity), 0.0) + faster_by
-    least = contact_speed if is_tool else 0.0
-    allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
-    if not is_later:
-        figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
-    planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
-    if planned >= part.max_speed:
-        return count
+        # The speed of the hand toward the part, and the speed that the rule allows the part.
+        coming = config.unknown_speed
+        if is_known:
+            coming = max(-_along(near, velocity), 0.0) + faster_by
+        least = contact_speed if is_tool else 0.0
+        if not is_later:
+            allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
+            figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
+        planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+        if planned >= part.max_speed:
+            continue
 
-    constraint = constraints[count]
-    constraint.planned = planned
-    constraint.allowed = allowed + braked + config.slip_speed_mps
-    if is_later:
-        carry_back(near, parts[capsule], placed[0, capsule])
-    _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-    if is_tool:
-        figures[SETPOINT_SHARE] = min(
-            figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1])
-        )
-    return count + _may_pass(constraints, count, planned, config.max_velocity)
+        constraint = constraints[count]
+        constraint.planned = planned
+        allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
+        constraint.allowed = allowed + braked + config.slip_speed_mps
+        if is_later:
+            carry_back(near, parts[capsule], parts_now[capsule])
+        _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+        if is_tool:
+            share = _share(near, planned, states[0].setpoint[1])
+            figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], share)
+        count += _may_pass(constraints, count, planned, config.max_velocity)
+    return count
 
 
 @compiled
@@ -246,9 +253,8 @@ def _keep_from_boxes(
     """Write the constraints of the boxes (B, ...), after the first `count`; return the number of
     all. `placed` (C, 2, 3) [m] has the capsules' ends.
     """
-    states, heres, parameters, capsules, _, constraints = scene
+    states, heres, parameters, capsules, _, constraints, near = scene
     config = parameters[0]
-    near = np.empty(9)
     for capsule in range(config.first, len(capsules)):
         part = capsules[capsule]
         for box in range(len(boxes)):
@@ -275,8 +281,7 @@ def _keep_from_itself(scene: Scene, pairs: Vector, count: int, placed: Vector) -
     """Write the constraints of pairs (P, 2) of parts, after the first `count`; return the number of
     all. `placed` (C, 2, 3) [m] has the capsules' ends.
     """
-    _, heres, parameters, capsules, _, constraints = scene
-    near = np.empty(9)
+    _, heres, parameters, capsules, _, constraints, near = scene
     for pair in range(len(pairs)):
         first = capsules[pairs[pair, 0]]
         second = capsules[pairs[pair, 1]]
