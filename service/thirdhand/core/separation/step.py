@@ -91,7 +91,10 @@ def step(
     config = parameters[0]
     placed = np.empty((2, len(capsules), 2, 3))  # ends of the capsules: now, and at a later time
     place(heres[0].joints, config.frames, config.axes, capsules, placed[0])
-    figures = np.array([FARTHEST_REPORTED_M, _fastest(capsules), 1.0])
+    figures = np.empty(3)
+    figures[NEAREST] = FARTHEST_REPORTED_M
+    figures[SPEED_LIMIT] = _fastest(capsules)
+    figures[SETPOINT_SHARE] = 1.0
 
     count = 0
     for side in range(2):
