@@ -8,6 +8,7 @@ targets and near singular postures the arm slows down without chatter.
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from thirdhand.core.vectors import dot, norm, square
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
 SEPARATED = 4  # flag of a step: separation changed the velocities
+
+Programme: TypeAlias = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
+"""T, (v; l R^T w), h, bounds on x, rows and their limits, as of `joint_step`."""
 
 
 @compiled
@@ -176,7 +180,6 @@ def joint_step(
     """
     arm = arms[0]
     posture = heres[0]
-    goal = goals[0]
     task_count, joints = posture.tasks.shape
 
     # The programme: what the tool shall do, what the joints can do, and what separation allows.
@@ -211,27 +214,47 @@ def joint_step(
     scaled[3:] = 0.0
     wish[3:] = 0.0
     if not is_reachable and not is_constrained:
-        without_turn = np.empty(joints)
-        for j in range(joints):
-            brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
-            home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
-        solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
-        _turn_less(arms, goals, velocity, without_turn)
+        _reduce_turn(arms, goals, (scaled, wish, home, bounds, rows, limits), damping, velocity)
     excess = _excess(arms, velocity)
 
-    # The accelerations, within their own limits.
-    wish[:3] = goal.acceleration
-    home[:] = 0.0
-    for j in range(joints):
-        bounds[1, j] = arm.acceleration[j] / arm.scale[j]
-        bounds[0, j] = -bounds[1, j]
-    solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
+    _accelerate(arms, goals, (scaled, wish, home, bounds, rows, limits), damping, out[1])
 
     for j in range(joints):
         speed = 0.0 if math.isnan(excess) else velocity[j] * arm.scale[j] / max(excess, 1.0)
         velocity[j] = np.rint(speed * ROUND_TO) / ROUND_TO
         out[1, j] = np.rint(out[1, j] * arm.scale[j] * ROUND_TO) / ROUND_TO
     return flags | SPEED if excess > 1.0 + ROUNDING else flags
+
+
+@compiled
+def _reduce_turn(
+    arms: Records, goals: Records, programme: Programme, damping: float, velocity: Vector
+) -> None:
+    """Move the velocities (J,) toward those without a turn, in which idle joints brake."""
+    scaled, wish, home, bounds, rows, limits = programme
+    arm = arms[0]
+    goal = goals[0]
+    without_turn = np.empty(len(home))
+    for j in range(len(home)):
+        brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
+        home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
+    solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
+    _turn_less(arms, goals, velocity, without_turn)
+
+
+@compiled
+def _accelerate(
+    arms: Records, goals: Records, programme: Programme, damping: float, acceleration: Vector
+) -> None:
+    """Write the accelerations (J,) of `joint_step`, divided by `scale`, within their own limits."""
+    scaled, wish, home, bounds, rows, limits = programme
+    arm = arms[0]
+    wish[:3] = goals[0].acceleration
+    home[:] = 0.0
+    for j in range(len(home)):
+        bounds[1, j] = arm.acceleration[j] / arm.scale[j]
+        bounds[0, j] = -bounds[1, j]
+    solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], acceleration)
 
 
 @compiled

@@ -299,6 +299,28 @@ def _jump(
 
 
 @compiled
+def _judge_hand(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    side: int,
+    stamp_ns: int,
+    position: Vector,
+    fresh: bool,
+) -> tuple[int, int, int, bool, int]:
+    """Cause for which a hand's well-formed sample (3,) [m] is rejected, or -1; its order and tick,
+    as of `_in_time`; and `_jump`.
+    """
+    cause, order, made = _in_time(states, parameters, side, stamp_ns, position, fresh)
+    if cause >= 0:
+        return cause, order, made, False, 0
+    jumped, wrong = _jump(states, parameters, models, side, order, made, position, fresh)
+    if jumped and (order > 0 or not is_confirmed(states, parameters, side, position)):
+        cause = SWAPPED if states[0].jump_is_swap[side] else JUMPED
+    return cause, order, made, jumped, wrong
+
+
+@compiled
 def take_hand(
     states: Records,
     parameters: Records,
@@ -329,11 +351,9 @@ def take_hand(
     wrong = 0
     cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
-        cause, order, made_tick = _in_time(states, parameters, side, stamp_ns, in_base, fresh)
-    if cause < 0:
-        jumped, wrong = _jump(states, parameters, models, side, order, made_tick, in_base, fresh)
-        if jumped and (order > 0 or not is_confirmed(states, parameters, side, in_base)):
-            cause = SWAPPED if state.jump_is_swap[side] else JUMPED
+        cause, order, made_tick, jumped, wrong = _judge_hand(
+            states, parameters, models, side, stamp_ns, in_base, fresh
+        )
     if cause >= 0:
         state.rejected[cause] += 1
         return cause
