@@ -94,10 +94,11 @@ CLIENT_GROUPS = {
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of thirdhand.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
 INSIDE = {"to_plot", "inner"}
+# values that a caller receives and does not construct
 RETURNED = {
     *("KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"),
     *("Command", "Cell", "ViaPointInForce", "Reply"),
-}  # values that a caller receives and does not construct
+}
 
 
 def pages() -> dict[Path, str]:

@@ -248,9 +248,7 @@ def test_a_process_of_a_cell_imports_what_it_needs(
 
 
 @pytest.mark.parametrize("path", ENTRY_POINTS, ids=named)
-def test_entry_points_ask_for_one_blas_thread_first(
-    path: Path,
-) -> None:
+def test_entry_points_ask_for_one_blas_thread_first(path: Path) -> None:
     """An entry point asks for one blas thread before all but the standard library."""
     imports = (
         node

@@ -74,9 +74,7 @@ def test_tracker_follower_teacher_and_watcher_work_together(
     assert np.abs(ended["follower"]).max() > 0.1
 
 
-def test_mathematics_alone_goes_through_the_point(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_mathematics_alone_goes_through_the_point(capsys: pytest.CaptureFixture[str]) -> None:
     """The mathematics alone goes through the point it was given."""
     adapted = example("kmp_alone").main()
     assert np.allclose(adapted.mean(np.array([[1.0]])), [[0.20, 0.10]], atol=2e-3)

@@ -23,9 +23,7 @@ def program() -> str:
     return str(programs[0])
 
 
-def test_program_runs_as_it_stands_by_the_client_alone(
-    tmp_path: Path,
-) -> None:
+def test_program_runs_as_it_stands_by_the_client_alone(tmp_path: Path) -> None:
     """The program runs as it stands by the client alone and the service follows its hands."""
     assert len([line for line in program().splitlines() if line]) <= 10
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")

@@ -75,9 +75,7 @@ def test_nothing_in_it_needs_the_lab(wheel: Path) -> None:
     assert [name for name, text in texts.items() if lab.search(text)] == []
 
 
-def test_page_of_the_package_has_the_readmes_text(
-    wheel: Path,
-) -> None:
+def test_page_of_the_package_has_the_readmes_text(wheel: Path) -> None:
     """Its page has the readmes text without pictures and links of the repository."""
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(

@@ -416,10 +416,11 @@ class Conditioned(Expansion):
         penalty = self.hyperparameters.lambda_covariance
         columns = self._added_columns
         system = self._covariance_system
+        # (M, C, V C)
         residual = (
             rows[:, :, z.shape[1] * self.base.features.kernel.channels :]
             - z.transpose(0, 2, 1) @ self._z[:, :columns]
-        )  # (M, C, V C)
+        )
         cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
         split = cross.reshape(m, c, d, -1, d)
         for i in range(d):

@@ -74,9 +74,10 @@ class MujocoWorld(World):
         joints = [model.joint(name) for name in settings.joints.names]
         self._joints = np.array([joint.qposadr[0] for joint in joints])
         self._motors = np.array([joint.dofadr[0] for joint in joints])
+        # [N m]
         self._efforts = np.array(
             [model.jnt_actfrcrange[joint.id, 1] or UNLIMITED for joint in joints]
-        )  # [N m]
+        )
         self._inertia = np.empty((model.nv, model.nv))
         self._tool = model.body(settings.arm.plate).id
         self._mocap = {name: int(model.body(name).mocapid[0]) for name in bodies}

@@ -149,9 +149,7 @@ fault_error_rad = 0.5
 
 
 @pytest.mark.thorough
-def test_arm_rests_when_its_daemon_is_killed(
-    tmp_path: Path,
-) -> None:
+def test_arm_rests_when_its_daemon_is_killed(tmp_path: Path) -> None:
     """A daemon killed in motion leaves an arm at rest that follows the next."""
     killed_and_started_again(tmp_path, "simulated", PATIENT)
 

@@ -22,9 +22,8 @@ from thirdhand.settings.config import JointSettings
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()
 STRONG = JointSettings(velocity=(2.0,) * 7, acceleration=(30.0,) * 7, jerk=(4000.0,) * 7)
-WEAK = JointSettings(
-    acceleration=(4.0,) * 7, jerk=(60.0,) * 7
-)  # cannot follow all that is commanded
+# cannot follow all that is commanded
+WEAK = JointSettings(acceleration=(4.0,) * 7, jerk=(60.0,) * 7)
 DRIVES = {"as commanded": COMMANDED, "stronger": STRONG, "weaker": WEAK}
 AT = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])
 LOWER = np.array(COMMANDED.lower)
@@ -325,19 +324,16 @@ def test_commands_of_any_rate_are_played_back_at_their_own_pace(
     written = play(playback, arriving, 4.0, period)
     assert playback.tick_s == pytest.approx(1 / rate_hz, rel=1e-3)
     assert playback.refused == 0
-    assert farthest_rad(written, arriving, period) < 0.4 * (
-        2 / rate_hz + 2 * period
-    )  # at 0.38 rad/s
+    # at 0.38 rad/s
+    assert farthest_rad(written, arriving, period) < 0.4 * (2 / rate_hz + 2 * period)
 
 
 @pytest.mark.parametrize(
     ("since", "stamped"),
     [
         (800, lambda stamp_ns, k: stamp_ns + 3_600_000_000_000),
-        (
-            800,
-            lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799),
-        ),  # creeps until time has caught up
+        # creeps until time has caught up
+        (800, lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799)),
         (0, lambda stamp_ns, k: stamp_ns + 20_000 * (k % 7)),
     ],
     ids=["set ahead", "set back", "trembles"],

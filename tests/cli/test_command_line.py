@@ -64,9 +64,7 @@ def test_incomplete_endpoint_is_explained(given: str, meant: str, command: tuple
 # --- exit codes, as docs/incidents.md promises them -----------------------------------------------
 
 
-def test_exit_codes_of_bad_configurations(
-    tmp_path: Path,
-) -> None:
+def test_exit_codes_of_bad_configurations(tmp_path: Path) -> None:
     """A configuration that cannot be meant is 2 and one that cannot be read is 1."""
     config = tmp_path / "cell.toml"
     takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
@@ -197,9 +195,7 @@ def test_refusals_have_their_exit_code_and_write_nothing(
     assert sorted(folder.rglob("*")) == before
 
 
-def test_view_without_a_screen_is_refused_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_view_without_a_screen_is_refused_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """A view without a screen is refused before anything is drawn."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -255,9 +251,7 @@ def test_silence_is_reported_and_waited_for() -> None:
 
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
-def test_publishers_wait_for_a_daemon(
-    command: tuple[str, ...],
-) -> None:
+def test_publishers_wait_for_a_daemon(command: tuple[str, ...]) -> None:
     """What publishes waits for a daemon until it is interrupted."""
     with started(*command, *NOBODY) as process:
         assert process.stderr.readline().startswith(

@@ -59,9 +59,7 @@ def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
 
 @timed
 @pytest.mark.timeout(330)
-def test_task_succeeds_in_new_places_and_replays(
-    tmp_path: Path,
-) -> None:
+def test_task_succeeds_in_new_places_and_replays(tmp_path: Path) -> None:
     """The task succeeds in new places and its recording replays identically."""
     (tmp_path / "scene.toml").write_text(SCENE)
     report = demonstrated(

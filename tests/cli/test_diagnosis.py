@@ -344,9 +344,7 @@ def test_the_lag_of_the_arm_is_reported_with_what_to_do(
     ],
     ids=["silent", "error", "nothing comes", "clock", "ahead"],
 )
-def test_busy_machine_is_named_before_arm_and_network(
-    changed: dict[str, Any],
-) -> None:
+def test_busy_machine_is_named_before_arm_and_network(changed: dict[str, Any]) -> None:
     """A machine that is too busy is named before arm network and clock."""
     words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
     first, *others = wrongs(diagnosed(busy=words, **changed))

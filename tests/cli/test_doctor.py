@@ -188,9 +188,7 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
     assert "give the name of the cell by --cell" in output
 
 
-def test_silent_daemon_is_distinguished_from_none(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_silent_daemon_is_distinguished_from_none(capsys: pytest.CaptureFixture[str]) -> None:
     """A daemon that is there but does not answer is told from none."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = occupy(near, "lab")

@@ -10,9 +10,7 @@ from support.cell import serving, thirdhand
 from support.cell_commands import python
 
 
-def test_each_line_of_a_json_log_is_an_object(
-    tmp_path: Path,
-) -> None:
+def test_each_line_of_a_json_log_is_an_object(tmp_path: Path) -> None:
     """Each line of a json log is an object also the last before a failure."""
     with serving(tmp_path, "--joints", "assumed", "--log", "json") as daemon:
         daemon.client.ask("hold")

@@ -214,9 +214,7 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
     assert done.stdout.count(f"{tmp_path} cannot be written by user") == 2, done.stdout
 
 
-def test_check_beside_the_running_daemon(
-    tmp_path: Path,
-) -> None:
+def test_check_beside_the_running_daemon(tmp_path: Path) -> None:
     """Beside the running daemon its own port is fine and a fault has an exit code."""
     listen = f"tcp/127.0.0.1:{free_port()}"
     network = f"[network]\nlisten = ['{listen}']\n"

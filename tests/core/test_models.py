@@ -20,10 +20,11 @@ from thirdhand_sim.scene import Scene
 FILES = {"HandsKMP": "experiments/as-paper.npz", "SegmentedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])
 H = 0.02
+# files lack them
 LATER = {
     "HandsKMP": {"error_inputs", "error_samples", "error_unknown_std"},
     "SegmentedKMP": {"levers"},
-}  # files lack them
+}
 
 
 @pytest.fixture(params=MODELS, ids=lambda model: model.__name__)

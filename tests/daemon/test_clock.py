@@ -198,9 +198,7 @@ def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
     assert len(prepared) == 1
 
 
-def test_work_beside_the_loop_is_done_while_it_sleeps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_work_beside_the_loop_is_done_while_it_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Work beside the loop is done while the loop sleeps for long enough."""
     monkeypatch.setattr(clock_module, "NO_TICK_S", 60.0)
     clock = FakeClock()

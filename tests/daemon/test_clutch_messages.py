@@ -46,9 +46,7 @@ def is_following(status: dict[str, Any]) -> bool:
 
 
 @pytest.mark.timeout(120)
-def test_arm_holds_in_the_tick_of_a_release(
-    tmp_path: Path,
-) -> None:
+def test_arm_holds_in_the_tick_of_a_release(tmp_path: Path) -> None:
     """The arm holds in the tick in which a release arrives and after a silence."""
     records = tmp_path / "records"
     with (

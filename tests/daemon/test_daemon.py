@@ -164,9 +164,7 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
         assert daemon.end() == 0
 
 
-def test_request_to_many_keys_is_refused(
-    shared_daemon: Any,
-) -> None:
+def test_request_to_many_keys_is_refused(shared_daemon: Any) -> None:
     """A request to many keys at once is refused by all but the status."""
     shared_daemon.client.ask("hold")
     replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))

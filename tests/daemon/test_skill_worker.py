@@ -141,9 +141,7 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(
         worker.close()
 
 
-def test_time_of_a_request_counts_from_its_arrival(
-    skill_worker: SkillWorker,
-) -> None:
+def test_time_of_a_request_counts_from_its_arrival(skill_worker: SkillWorker) -> None:
     """The time of a request counts from its arrival and not from its turn."""
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 

@@ -62,9 +62,7 @@ def test_starting_daemon_answers_with_its_progress(
         assert not isinstance(ended.value, StartingError)
 
 
-def test_start_with_progress_is_waited_for_longer(
-    started: tuple[Startup, str],
-) -> None:
+def test_start_with_progress_is_waited_for_longer(started: tuple[Startup, str]) -> None:
     """A start that gets further is waited for longer than one that does not."""
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:

@@ -205,9 +205,7 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
         assert daemon.end() == 0
 
 
-def test_killed_skill_worker_changes_nothing(
-    tmp_path: Path,
-) -> None:
+def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
     """A killed workshop changes nothing and a killed daemon leaves no child."""
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:

@@ -47,9 +47,7 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
     ]
 
 
-def test_step_after_a_gap_brings_state_and_skill(
-    tmp_path: Path,
-) -> None:
+def test_step_after_a_gap_brings_state_and_skill(tmp_path: Path) -> None:
     """After a gap the next step says how many are missing and brings state and skill."""
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):

@@ -244,9 +244,7 @@ def test_streams_are_found_by_name_and_brought_to_base(tmp_path: Path) -> None:
         )
 
 
-def test_tool_is_found_from_joint_states(
-    tmp_path: Path,
-) -> None:
+def test_tool_is_found_from_joint_states(tmp_path: Path) -> None:
     """The tool is found from joint states and clocks that differ do not count."""
     settings = Settings()
     begin_ns = STAMPS[0]

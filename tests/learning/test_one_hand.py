@@ -191,9 +191,7 @@ def modes(
     return list(zip(records["mode"].tolist(), records["reason"].tolist(), strict=True))
 
 
-def test_served_without_absent_hand(
-    skill: StoredSkill,
-) -> None:
+def test_served_without_absent_hand(skill: StoredSkill) -> None:
     """A skill runs without a hand that was never seen or has disappeared, but waits for one that
     vanishes.
     """

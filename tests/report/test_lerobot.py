@@ -246,12 +246,7 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
         assert loaded[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
-def recorded(
-    path: Path,
-    skill: StoredSkill,
-    inputs: list[Tick],
-    urdf: str = URDF,
-) -> Path:
+def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
     """A recording of an arm that tells nothing of its joints."""
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(

@@ -141,9 +141,7 @@ def session(golden: Path) -> Report:
     return reported(golden)
 
 
-def test_stop_distance_is_compared_with_people(
-    golden: Path,
-) -> None:
+def test_stop_distance_is_compared_with_people(golden: Path) -> None:
     """The distance of a stop is that of the measured tool and is compared with people."""
     columns = read(Recording.open(golden))
     report = Report(columns)
@@ -221,9 +219,7 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
     assert session.approach.distance_m == frames["hand_distance"][is_hand_seen].min()
 
 
-def test_via_points_are_met_while_the_hands_are_there(
-    session: Report,
-) -> None:
+def test_via_points_are_met_while_the_hands_are_there(session: Report) -> None:
     """Via points are met while the hands are there and told apart by when they were taught."""
     by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}

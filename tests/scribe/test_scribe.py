@@ -118,9 +118,7 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
     assert len(list(recording.steps())) == 201
 
 
-def test_stopped_process_costs_ticks_but_no_time(
-    tmp_path: Path,
-) -> None:
+def test_stopped_process_costs_ticks_but_no_time(tmp_path: Path) -> None:
     """A stopped process costs ticks but no time and the recording tells of the gap."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         pid = writer.status()["pid"]
@@ -161,9 +159,7 @@ def test_stopped_process_costs_ticks_but_no_time(
     )
 
 
-def test_killed_process_is_replaced_with_a_new_recording(
-    tmp_path: Path,
-) -> None:
+def test_killed_process_is_replaced_with_a_new_recording(tmp_path: Path) -> None:
     """A killed process is started anew with a recording that stands alone."""
     with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as writer:
         tell(writer, 20)

@@ -64,9 +64,7 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
     return sorted(folder.glob("*.mcap"))
 
 
-def test_recordings_rotate_without_losing_a_tick(
-    rotated: list[Path],
-) -> None:
+def test_recordings_rotate_without_losing_a_tick(rotated: list[Path]) -> None:
     """Recordings rotate without losing a tick and each replays by itself."""
     assert len(rotated) >= 3
     steps = [step for path in rotated for step in Recording.open(path).steps()]
@@ -94,9 +92,7 @@ def with_limits(**limits: float) -> Settings:
     return msgspec.structs.replace(CELL, files=Files(**limits))
 
 
-def test_oldest_recordings_of_the_cell_make_room(
-    tmp_path: Path,
-) -> None:
+def test_oldest_recordings_of_the_cell_make_room(tmp_path: Path) -> None:
     """The oldest of this cells recordings make room and nothing else does."""
     settings = with_limits()
     current = RecordingPaths(settings, str(tmp_path), None).next()
@@ -291,9 +287,7 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> No
         assert [r.truncated for r in result] == [True, False]
 
 
-def test_removed_folder_is_made_again(
-    tmp_path: Path,
-) -> None:
+def test_removed_folder_is_made_again(tmp_path: Path) -> None:
     """A folder that is removed is made again and what was in it counts as lost."""
     folder = tmp_path / "records"
     with session(folder=folder) as sender:

@@ -239,9 +239,7 @@ def test_an_endpoint_is_local_where_no_other_machine_reaches_it(endpoint: str, l
     assert is_local(endpoint) == local
 
 
-def test_endpoint_of_the_command_line_goes_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_endpoint_of_the_command_line_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """An endpoint of the command line or the environment is used before that of the settings."""
     settings = Settings(network=Network(listen=("tcp/127.0.0.1:1",)))
     args = argparse.Namespace(connect=None, cell=None)
@@ -452,9 +450,7 @@ network.listen = ["tcp/127.0.0.1:7448"]
 """
 
 
-def test_file_of_several_cells_holds_shared_and_own_values(
-    tmp_path: Path,
-) -> None:
+def test_file_of_several_cells_holds_shared_and_own_values(tmp_path: Path) -> None:
     """A file of several cells holds what they share and what each has of its own."""
     path = tmp_path / "lab.toml"
     path.write_text(LAB, encoding="utf-8")

@@ -60,9 +60,7 @@ def box(x: float, y: float, z: float) -> Points:
         float, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-1.0, 1.0, width=32)
     )
 )
-def test_every_point_is_inside_a_capsule(
-    points: Points,
-) -> None:
+def test_every_point_is_inside_a_capsule(points: Points) -> None:
     """Flat ones, and one alone, too."""
     capsule = np.array(capsule_around(points))
     ends = capsule[:6].reshape(2, 3)

@@ -98,9 +98,7 @@ CHAIN = '<robot name="r"><link name="l0"/>{}</robot>'.format(
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
     | st.just((0, 1, 0, 1))
 )
-def test_newer_urdfs_are_read_as_by_every_reader(
-    quaternion: tuple[float, ...],
-) -> None:
+def test_newer_urdfs_are_read_as_by_every_reader(quaternion: tuple[float, ...]) -> None:
     """Quaternions limits and rates of newer urdfs are those of every reader."""
     turn = np.array(quaternion) / np.linalg.norm(quaternion)
     origin = f'<origin xyz="1 0 0" quat_xyzw="{" ".join(map(repr, turn.tolist()))}"/><axis'

@@ -267,9 +267,7 @@ def network() -> Iterator[tuple[zenoh.Session, str]]:
         yield session, endpoints(session)[0]
 
 
-def test_run_on_network_reports_latency(
-    network: tuple[zenoh.Session, str],
-) -> None:
+def test_run_on_network_reports_latency(network: tuple[zenoh.Session, str]) -> None:
     """A run on the network reports events and latency and leaves a hidden hand out."""
     listening, endpoint = network
     service = Service(listening, "lab/bench")

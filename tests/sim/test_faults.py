@@ -69,9 +69,7 @@ def test_cut_network_leaves_no_arm_in_motion(suffered: dict[str, Any], name: str
     assert fault["lost_ticks"] == 0
 
 
-def test_killed_service_leaves_no_arm_in_motion(
-    suffered: dict[str, Any],
-) -> None:
+def test_killed_service_leaves_no_arm_in_motion(suffered: dict[str, Any]) -> None:
     """A service that is killed leaves no arm in motion and its recording whole."""
     fault = suffered["faults"]["service killed"]
     assert fault["travelled_mm"] < BRAKE_MM
@@ -89,9 +87,7 @@ def test_killed_router_stops_the_arm(suffered: dict[str, Any]) -> None:
     assert fault["moves_again_ms"] > 0
 
 
-def test_killed_scribe_costs_ticks_and_no_motion(
-    suffered: dict[str, Any],
-) -> None:
+def test_killed_scribe_costs_ticks_and_no_motion(suffered: dict[str, Any]) -> None:
     """A scribe that is killed costs ticks of the recording and no motion."""
     fault = suffered["faults"]["scribe killed"]
     assert fault["lost_ticks"] > 0

@@ -184,9 +184,7 @@ def test_refusals_have_a_reason() -> None:
         asyncio.run(scenario())
 
 
-def test_hands_pass_to_another_page(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_hands_pass_to_another_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hands pass to another page once the first has left or is silent."""
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)

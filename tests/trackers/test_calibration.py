@@ -674,9 +674,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     )
 
 
-def test_frame_of_the_hand_names_the_calibrated_table(
-    tmp_path: Path,
-) -> None:
+def test_frame_of_the_hand_names_the_calibrated_table(tmp_path: Path) -> None:
     """The frame of the hand names the table that is calibrated and checked."""
     cell = tmp_path / "cell.toml"
     led = str(tmp_path / "led.mcap")

@@ -223,9 +223,7 @@ def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Pa
 
 
 @pytest.mark.thorough
-def test_daemon_follows_hands_until_they_are_raised(
-    tmp_path: Path,
-) -> None:
+def test_daemon_follows_hands_until_they_are_raised(tmp_path: Path) -> None:
     """A daemon follows hands until they are raised and again once they pinch there."""
     at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up

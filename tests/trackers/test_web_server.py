@@ -103,9 +103,7 @@ def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
         asyncio.run(scenario())
 
 
-def test_hold_is_carried_out_beside_another_answer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_hold_is_carried_out_beside_another_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hold is carried out while a page waits for another answer."""
     orders: list[str] = []
     slow = threading.Event()

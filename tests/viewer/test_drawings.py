@@ -27,9 +27,7 @@ from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
-def test_picture_is_of_the_last_followed_moment(
-    tmp_path: Path,
-) -> None:
+def test_picture_is_of_the_last_followed_moment(tmp_path: Path) -> None:
     """A picture without a time is of the last moment at which the arm followed."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:

@@ -102,9 +102,7 @@ def stopped(url: str, file: Path) -> Iterator[None]:
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still written
-def test_memory_is_bounded_beside_stopped_viewers(
-    tmp_path: Path,
-) -> None:
+def test_memory_is_bounded_beside_stopped_viewers(tmp_path: Path) -> None:
     """Memory stays within a bound beside viewers that stopped and later ones see what is new."""
     fed = Fed()
     fed.feed(4.0)

@@ -107,9 +107,7 @@ def test_every_curve_names_its_unit(tmp_path: Path) -> None:
     assert all(re.search(r" \[(mm|ms|µs|m/s|m|rad|rad/s|rad/s²|°|%|1)\]$", name) for name in labels)
 
 
-def test_trail_begins_anew_where_the_hand_reappears(
-    tmp_path: Path,
-) -> None:
+def test_trail_begins_anew_where_the_hand_reappears(tmp_path: Path) -> None:
     """A trail begins where the hand was first seen and anew where it is seen again."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:
@@ -208,9 +206,7 @@ def test_orientation_and_gripper_are_drawn(tmp_path: Path, skill: Skill) -> None
     assert curves["/gripper/commanded"] == pytest.approx([100.0] * 100)
 
 
-def test_undrawable_skill_spares_the_scene(
-    tmp_path: Path,
-) -> None:
+def test_undrawable_skill_spares_the_scene(tmp_path: Path) -> None:
     """A skill of which nothing can be drawn is named in the log and spares the scene."""
     rows = viewed(tmp_path / "a.rrd", 30, skill=b"nonsense")
     assert len(values(rows["/joints/position"], "tick")) == 30
@@ -340,9 +336,7 @@ def test_what_cannot_be_shown_is_said_in_words(
     assert len(stderr.splitlines()) == 1
 
 
-def test_unmeasured_arm_is_drawn_too_small_to_see(
-    tmp_path: Path,
-) -> None:
+def test_unmeasured_arm_is_drawn_too_small_to_see(tmp_path: Path) -> None:
     """Every link of an arm that is not measured yet is somewhere and too small to see."""
 
     def change(_: Viewer, k: int, frame: Record) -> list[tuple[str, bytes]]:

@@ -127,9 +127,7 @@ def test_curves_are_interrupted_where_frames_are_missing(
     ) == bool(lost)
 
 
-def test_unreadable_recording_leaves_no_part_of_a_drawing(
-    tmp_path: Path,
-) -> None:
+def test_unreadable_recording_leaves_no_part_of_a_drawing(tmp_path: Path) -> None:
     """A recording that cannot be read to its end leaves no part of a drawing."""
     path = tmp_path / "a.mcap"
     with Recorder(path, settings=Settings(), skill=SKILL) as recorder:

@@ -310,7 +310,7 @@ def _jumps(seen: Evidence, side: str) -> bool:
 
 
 def _contest(seen: Evidence) -> str:
-    """How many of the arm's states contradict each other."""
+    """The share of the arm's states that contradict each other, in words."""
     if (arm := seen.sources.get("arm")) is None:
         return ""
     when = "in the last second" if arm.rate_hz else "before it ended"

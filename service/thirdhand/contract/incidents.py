@@ -51,7 +51,7 @@ class Incident(NamedTuple):
 Member: TypeAlias = Mode | Reason | Flag | Cause | Condition
 
 
-# by what a person notices, in the order of docs/incidents.md
+# They are sorted by what a person notices, as in docs/incidents.md.
 INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
     "The mode of the arm": (
         Incident(

@@ -222,7 +222,7 @@ class Daemon:
         pack(tick, frame, timing, state=None, lost=0, with_skill=False, outputs=outputs)
 
     def _messages(self, frame: Frame) -> tuple[bytes, Outputs]:
-        """What is published for a frame: an attachment, and the messages by channel."""
+        """The attachment and the messages, by channel, that are published for a frame."""
         attachment = Attachment(int(frame["tick"]), time.time_ns(), int(frame["hand_stamp_ns"]))
         outputs = outgoing(frame, self._cell.clock.stamp_ns, self._cell.settings.joints.names)
         return cdr.encode_attachment(attachment), outputs

@@ -110,9 +110,10 @@ def launched(
     config = folder / "cell.toml"
     log = folder / "service.log"
     base_settings = settings or Settings()
+    # nobody resumes
     followed = msgspec.structs.replace(
         base_settings, arm=msgspec.structs.replace(base_settings.arm, start="follow")
-    )  # nobody resumes
+    )
     files = {"state": folder / "state", "record": record}
     config.write_text(
         "# A cell with a free port and its own files.\n"

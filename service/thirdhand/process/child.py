@@ -271,9 +271,8 @@ def _serve(control: socket.socket) -> None:
             with socket.socket(fileno=descriptors[0]) as channel:
                 try:
                     between = os.fork()
-                except (
-                    OSError
-                ):  # no process or memory is left: the socket closes, which the caller sees
+                except OSError:
+                    # No process or memory is left: the socket closes, which the caller sees.
                     traceback.print_exc()
                     continue
                 if between == 0:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from thirdhand.settings import palette
 from thirdhand.settings.urdf import Urdf
 
+# frame, colour, radius [m]
 MARKERS = (
     ("left_hand", palette.LEFT, 0.03),
     ("right_hand", palette.RIGHT, 0.03),
     ("target", palette.TARGET, 0.015),
     ("setpoint", palette.TOOL, 0.01),
-)  # frame, colour, radius [m]
+)
 
 
 def with_markers(urdf: str) -> str:

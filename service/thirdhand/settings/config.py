@@ -88,15 +88,8 @@ class HandSettings(Section, frozen=True):
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
     # of left-handed axes (Unity), z is reversed first
     axes: Literal["right-handed", "left-handed"] = "right-handed"
-    base_from_tracker: Pose = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )  # pose of the tracker's frame, after unit and axes
+    # pose of the tracker's frame, after unit and axes
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     # the arm holds after this time without a sample
     stale_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
     # delays raise `stale_ms` up to this; 0: never
@@ -124,29 +117,15 @@ class TrackerSettings(Section, frozen=True):
     unit: Literal["m", "cm", "mm"] = "m"  # unit of the tracker's positions
     # of left-handed axes (Unity), z is reversed first
     axes: Literal["right-handed", "left-handed"] = "right-handed"
-    base_from_tracker: Pose = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )  # pose of the tracker's frame, after the unit
+    # pose of the tracker's frame, after the unit
+    base_from_tracker: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class ToolSettings(Section, frozen=True):
     """The tool: its pose on the tool plate, and its limits of motion."""
 
-    plate_from_tool: Pose = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )  # pose of the tool in the frame of the plate
+    # pose of the tool in the frame of the plate
+    plate_from_tool: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     # [m/s] largest speed of the setpoint
     max_speed: Annotated[float, msgspec.Meta(gt=0, le=0.8)] = 0.8
     # [m/s] until the tool reaches its target; 0: off
@@ -223,15 +202,8 @@ class ArmSettings(Section, frozen=True):
     source: Literal["state", "assumed"] = "state"
     # "held": after every start the arm holds until `thirdhand resume`
     start: Literal["follow", "held"] = "follow"
-    posture: PerJoint = (
-        0.1761,
-        0.8604,
-        -0.5,
-        2.5414,
-        -0.4273,
-        -1.0823,
-        0.0,
-    )  # [rad] preferred; start if assumed
+    # [rad] preferred; start if assumed
+    posture: PerJoint = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)
     link_radius: Positive = 0.07  # [m] radius of links without a collision shape
     # largest difference between measured and commanded joint position
     fault_error_rad: Positive = 0.1
@@ -729,10 +701,8 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
 
     Raises SettingsError if the arm reaches too small a share of it.
     """
-    from thirdhand.settings.reachable import (
-        Shell,
-        workspace_of,
-    )  # its import is slow, and few arms need it
+    # its import is slow, and few arms need it
+    from thirdhand.settings.reachable import Shell, workspace_of
 
     workspace = workspace_of(
         urdf.chain(settings.arm.plate),

@@ -58,9 +58,8 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     With a certificate all endpoints are TLS, and each role has its own rights.
     """
 
-    listen: tuple[str, ...] = (
-        ENDPOINT,
-    )  # endpoints on which the daemon listens; port 0: a free one
+    # endpoints on which the daemon listens; port 0: a free one
+    listen: tuple[str, ...] = (ENDPOINT,)
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
     # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
     certificate: str = ""
@@ -136,10 +135,8 @@ class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     joints: tuple[
         str, ...
     ] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
-    hands: HandSources = (
-        "",
-        "",
-    )  # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
+    # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
+    hands: HandSources = ("", "")
     tool: FrameSource = ""  # the tool in demonstrations, as such a frame
     # /tf: setpoint, target and hands ten times a second; fixed frames on the same name with _static
     tf: Topic = ""

@@ -112,9 +112,8 @@ KNOWN = {
 WORKSPACE_MARGIN_M = 0.25  # a prediction at a learned input may leave the box by this distance
 # [m/m] largest derivative of the tool's position; also of zeta [rad/m] and of the closure [1/m]
 STEEPEST = 1000.0
-FARTHEST_TURN = (
-    2.0 * np.pi
-)  # [rad] largest zeta of an orientation, half its angle; also largest closure
+# [rad] largest zeta of an orientation, half its angle; also largest closure
+FARTHEST_TURN = 2.0 * np.pi
 
 
 class SkillError(ExplainedError, ValueError):
@@ -128,12 +127,10 @@ class SkillError(ExplainedError, ValueError):
 class StoredSkill(Skill):
     """A skill with its figures and its file, which the loop does not need."""
 
-    figures: str = field(
-        default="", repr=False
-    )  # JSON of `Figures`; empty if the skill was not judged
-    demonstrations: bytes = field(
-        default=b"", repr=False
-    )  # see `stored_demonstrations`; empty: not in the file
+    # JSON of `Figures`; empty if the skill was not judged
+    figures: str = field(default="", repr=False)
+    # see `stored_demonstrations`; empty: not in the file
+    demonstrations: bytes = field(default=b"", repr=False)
     file: bytes = field(default=b"", repr=False)  # bytes as stored and recorded
 
     @cached_property
@@ -361,9 +358,8 @@ def _spoilt_texts(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
 
 def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: str) -> Iterator[str]:
     """Faults of arrays with numbers out of their ranges. The last input may be a clock's."""
-    is_timed = bool(
-        (arrays.get("task_clock", np.zeros(2))[1:2] > 0.0).any()
-    )  # the clock has a weight
+    # the clock has a weight
+    is_timed = bool((arrays.get("task_clock", np.zeros(2))[1:2] > 0.0).any())
     for name in names:
         array = arrays[name]
         low, high, unit = ALL_RANGES[name]

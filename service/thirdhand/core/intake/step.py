@@ -273,9 +273,10 @@ def _jump(
     position: Vector,
     fresh: bool,
 ) -> tuple[bool, int]:
-    """Whether a hand's sample (3,) [m], number `order` among the retained ones and made in tick
-    `made`, has jumped; and the number of samples before it that were wrong, if it continues the
-    ones before those.
+    """True if a hand's sample has jumped, and the number of wrong samples before it.
+
+    The sample at `position` (3,) [m] was made in tick `made`, and has number `order` among the
+    retained ones. The samples before it were wrong if it continues the ones before those.
     """
     state = states[0]
     config = parameters[0]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from thirdhand.contract.records import PER_JOINT, Field
 
-STATE = (
-    Field("joints", "float64", (3, PER_JOINT)),
-)  # commanded position, velocity, acceleration; by joint
+# commanded position, velocity, acceleration; by joint
+STATE = (Field("joints", "float64", (3, PER_JOINT)),)
 FRAME = (
     Field("tool", "float64", (3,)),  # position of the tool at the commanded joints [m]
     Field("tool_orientation", "float64", (4,)),  # orientation of the tool at the commanded joints

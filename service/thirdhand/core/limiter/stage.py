@@ -167,11 +167,8 @@ class Limiter:
         self._input.min_acceleration = (-most - ramp).tolist()
         try:
             self._ruckig.calculate(self._input, self._trajectory)
-        except (
-            ruckig.RuckigError,
-            ValueError,
-        ):  # ValueError: a result code that the Python binding lacks
-            return
+        except (ruckig.RuckigError, ValueError):
+            return  # ValueError: a result code that the Python binding lacks
         chased = np.array(self._trajectory.at_time(dt))
         chased[0] += dt * (velocity + 0.5 * dt * ramp)
         chased[1] += velocity + dt * ramp

@@ -248,7 +248,7 @@ def _barriers(
 
 @compiled
 def _joint_limit(costs: Vector, along: Vector) -> float:
-    """What the joints allow the tool along a direction (3,), by the costs of one derivative."""
+    """The limit of the joints for one derivative of the tool's motion along a direction (3,)."""
     return 1.0 / max(_largest(costs, along), 1e-9)
 
 

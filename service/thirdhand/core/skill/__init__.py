@@ -23,22 +23,17 @@ STATE = (
     Field("trail", "float64", (3,)),  # lowpass of the predicted positions [m]
     Field("trail_tick", "int64"),  # tick of the newest prediction in `trail`
     Field("sure_tick", "int64"),  # the last tick at which the segment of the task was unambiguous
-    Field(
-        "skill", "uint8", (16,)
-    ),  # digest of the skill in force; a recording has the skill itself elsewhere
-    Field(
-        "memory", "float64", (ORDER, 2, 3)
-    ),  # cascaded filters of the left and the right hand's position [m]
-    Field(
-        "memory_ticks", "int64", (2,)
-    ),  # tick at which each hand entered `memory` last; -1: not yet
-    Field(
-        "segment_belief", "float64", (64,)
-    ),  # probability of each segment of the task; zeros: not yet known
+    # digest of the skill in force; a recording has the skill itself elsewhere
+    Field("skill", "uint8", (16,)),
+    # cascaded filters of the left and the right hand's position [m]
+    Field("memory", "float64", (ORDER, 2, 3)),
+    # tick at which each hand entered `memory` last; -1: not yet
+    Field("memory_ticks", "int64", (2,)),
+    # probability of each segment of the task; zeros: not yet known
+    Field("segment_belief", "float64", (64,)),
     Field("turns", "float64", (TURNS, 2, 9)),  # cascaded filters of the hands' rotation matrices
-    Field(
-        "task_clock", "float64", (12,)
-    ),  # seconds since the hands began task or segment; see `task_clock.count`
+    # seconds since the hands began task or segment; see `task_clock.count`
+    Field("task_clock", "float64", (12,)),
     Field("unprimed_belief", "float64", (64,)),  # belief in each segment if none is the first
 )
 FRAME = (
@@ -49,17 +44,13 @@ FRAME = (
     Field("gate_m", "float64"),  # distance that is compared with the skill's threshold [m]
     Field("orientation", "float64", (4,)),  # of the target, quaternion x y z w
     Field("turning", "float64", (3,)),  # angular velocity of the target [rad/s]
-    Field(
-        "orientation_covariance", "float64", (3, 3)
-    ),  # of small rotations [rad²]; 0 if no orientation was learned
-    Field(
-        "closure", "float64"
-    ),  # predicted closure of the gripper, 0 to 1; -1: the skill has no gripper
-    Field(
-        "segment", "int64"
-    ),  # the most probable segment of the task; -1: not yet known, or the task has none
+    # of small rotations [rad²]; 0 if no orientation was learned
+    Field("orientation_covariance", "float64", (3, 3)),
+    # predicted closure of the gripper, 0 to 1; -1: the skill has no gripper
+    Field("closure", "float64"),
+    # the most probable segment of the task; -1: not yet known, or the task has none
+    Field("segment", "int64"),
     Field("segment_belief", "float64"),  # probability of that segment
-    Field(
-        "error_probability", "float64"
-    ),  # probability that the tool is more than 10 cm from where it belongs
+    # probability that the tool is more than 10 cm from where it belongs
+    Field("error_probability", "float64"),
 )

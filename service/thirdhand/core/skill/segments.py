@@ -64,32 +64,20 @@ SEGMENT = np.dtype(
         ("begins", np.float64, (2, 3)),  # [m] each hand's first via-point
         # [m] each hand's path, from the first via-point to the second one
         ("way", np.float64, (2, 3)),
-        (
-            "square",
-            np.float64,
-            (2,),
-        ),  # [m²] squared length of the path; STAYS for a hand that rests
+        # [m²] squared length of the path; STAYS for a hand that rests
+        ("square", np.float64, (2,)),
         ("off", np.float64, (2,)),  # [m] each hand's distance from its path, root mean square
         ("tool", np.float64, (3,)),  # [m] the tool's first via-point
         ("tool_way", np.float64, (3,)),  # [m] the tool's path
         ("leads", np.int64),  # hand whose share alone counts in this segment; NONE: both count
-        (
-            "follow",
-            np.int64,
-            (2,),
-        ),  # hand that the tool follows at the begin and at the end of the segment
+        # hand that the tool follows at the begin and at the end of the segment
+        ("follow", np.int64, (2,)),
         ("levers", np.float64, (2, 3)),  # [m] the tool there, in the frame of that hand
         ("turned", np.int64),  # 1: the tool turns with the hands that it follows, by these levers
-        (
-            "scatter",
-            np.float64,
-            (2, 3, 3),
-        ),  # [m²] covariance of the tool's via-points at begin and end; 0: known
-        (
-            "pulled",
-            np.int64,
-            (2,),
-        ),  # first row of the pulls of this segment alone, and the row after the last one
+        # [m²] covariance of the tool's via-points at begin and end; 0: known
+        ("scatter", np.float64, (2, 3, 3)),
+        # first row of the pulls of this segment alone, and the row after the last one
+        ("pulled", np.int64, (2,)),
         ("sharpness", np.float64),  # [1/m²] sharpness of these pulls
     ]
 )
@@ -98,14 +86,10 @@ PLACED = np.dtype(
     [
         ("scale", np.float64),  # scale of the kernel exp(-scale |difference|²)
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
-        (
-            "clock_weight",
-            np.float64,
-        ),  # as an input, a second in the segment counts as this share of it; 0: no clock
-        (
-            "unknown_std",
-            np.float64,
-        ),  # [m] that of the tool where no demonstration was; 0: as at the nearest ones
+        # as an input, a second in the segment counts as this share of it; 0: no clock
+        ("clock_weight", np.float64),
+        # [m] that of the tool where no demonstration was; 0: as at the nearest ones
+        ("unknown_std", np.float64),
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
         ("pulls", np.int64),  # number of pulls that act in all segments; they are the first rows
     ]

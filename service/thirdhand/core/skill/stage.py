@@ -121,12 +121,13 @@ class SkillStage:
         error_m = 0.0
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
+            # need not be computed
             earlier = (
                 prediction.covariance,
                 prediction.turn.covariance,
                 prediction.closure,
                 prediction.gate_m,
-            )  # need not be computed
+            )
             deviation = deviation_m(states, rules, unseen)
             error_m = off_m(
                 lambda hands: self.skill.predicted(hands, earlier).position,

@@ -75,12 +75,8 @@ def _torque_share(text: str, moving: Sequence[UrdfJoint], acceleration: Vector) 
         inertia = pin.crba(model, data, neutral)
         gravity = np.abs(pin.computeGeneralizedGravity(model, data, neutral))
         efforts = np.array(model.effortLimit)[numbers]
-    except (
-        ValueError,
-        IndexError,
-        RuntimeError,
-    ):  # Pinocchio rejects masses that other readers accept
-        return None
+    except (ValueError, IndexError, RuntimeError):
+        return None  # Pinocchio rejects masses that other readers accept
     inertia = np.triu(inertia) + np.triu(inertia, 1).T
     needed = np.abs(inertia[np.ix_(numbers, numbers)]) @ acceleration
     if not (efforts > 0.0).all() or not (needed > 0.0).any() or not np.isfinite(efforts).all():

@@ -27,12 +27,7 @@ from thirdhand.recordings.recording import DECISIONS, Recording
 from thirdhand.recordings.steps import Gap, Step
 from thirdhand.skills.skill_file import SkillError, decoded
 
-KEPT = (
-    "tick",
-    "hands",
-    "hand_velocities",
-    "target",
-    "gate_m",
+MOTION = (
     "setpoint",
     "setpoint_velocity",
     "setpoint_acceleration",
@@ -40,6 +35,14 @@ KEPT = (
     "joints",
     "joint_velocities",
     "joint_accelerations",
+)
+KEPT = (
+    "tick",
+    "hands",
+    "hand_velocities",
+    "target",
+    "gate_m",
+    *MOTION,
     "hand_distance",
     "hand_limit",
     "hand_ages",
@@ -53,15 +56,6 @@ KEPT = (
     "segment_belief",
     "error_probability",
     "closure",
-)
-MOTION = (
-    "setpoint",
-    "setpoint_velocity",
-    "setpoint_acceleration",
-    "tool",
-    "joints",
-    "joint_velocities",
-    "joint_accelerations",
 )
 BLOCK = 4096  # ticks whose whole frames are held in memory
 

@@ -50,10 +50,11 @@ PEOPLE_SHOWING = len(PEOPLE_SEEDS.learned["people"].numbers)
 PEOPLE_OF_GROUP: dict[Group, int] = {
     group: len(part["people"].numbers) for group, part in STREAMS_OF_GROUP.items()
 }
+# scenes of a person, half with each sigma
 SCENES_OF_GROUP: dict[Group, int] = {
     "tuning": 2,
     "test": 4,
-}  # scenes of a person, half with each sigma
+}
 SIGMAS_M = (0.005, 0.010)
 BREAKING_SCENES: dict[Group, int] = {
     group: len(part["breaking"].numbers) for group, part in STREAMS_OF_GROUP.items()

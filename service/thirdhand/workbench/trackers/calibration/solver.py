@@ -127,9 +127,10 @@ def coverage(tool: Vector, turn: Vector) -> Coverage:
     turned = np.linalg.svd((rotations.mean().inv() * rotations).as_rotvec(), compute_uv=False)
     share = EXTENT_DEVIATIONS / math.sqrt(len(tool))
     narrow = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
+    # -0.0 becomes 0.0
     return Coverage(
         np.asarray(share * stretch), np.asarray(narrow.round(1) + 0.0), np.asarray(share * turned)
-    )  # -0.0 becomes 0.0
+    )
 
 
 def bench_corners(settings: Settings) -> Vector:
