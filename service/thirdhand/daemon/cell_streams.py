@@ -248,7 +248,8 @@ class CellStreams:
         for suffix, source in self._subscribers:
             arrived: list[Event] = []
             for sample in _waiting(source, _most(suffix)):
-                if (event := self._decoded(suffix, sample.payload, identity(sample))) is not None:
+                publisher = identity(sample) if suffix in self._sole else ""
+                if (event := self._decoded(suffix, sample.payload, publisher)) is not None:
                     arrived.append(event)
             events += arrived[-1:] if suffix == ARM_STATE else arrived
         for by_frame, source in self._transforms:

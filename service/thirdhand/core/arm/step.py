@@ -8,7 +8,6 @@ targets and near singular postures the arm slows down without chatter.
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,6 @@ from thirdhand.core.vectors import dot, norm, square
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit
 SEPARATED = 4  # flag of a step: separation changed the velocities
-
-Programme: TypeAlias = tuple[Vector, Vector, Vector, Vector, Vector, Vector]
-"""T, (v; l R^T w), h, bounds on x, rows and their limits, as of `joint_step`."""
 
 
 @compiled
@@ -214,10 +210,14 @@ def joint_step(
     scaled[3:] = 0.0
     wish[3:] = 0.0
     if not is_reachable and not is_constrained:
-        _reduce_turn(arms, goals, (scaled, wish, home, bounds, rows, limits), damping, velocity)
+        without_turn = np.empty(joints)
+        _brake_idle(arms, goals, home)
+        solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
+        _turn_less(arms, goals, velocity, without_turn)
     excess = _excess(arms, velocity)
 
-    _accelerate(arms, goals, (scaled, wish, home, bounds, rows, limits), damping, out[1])
+    _wish_acceleration(arms, goals, wish, home, bounds)
+    solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
 
     for j in range(joints):
         speed = 0.0 if math.isnan(excess) else velocity[j] * arm.scale[j] / max(excess, 1.0)
@@ -227,34 +227,28 @@ def joint_step(
 
 
 @compiled
-def _reduce_turn(
-    arms: Records, goals: Records, programme: Programme, damping: float, velocity: Vector
-) -> None:
-    """Move the velocities (J,) toward those without a turn, in which idle joints brake."""
-    scaled, wish, home, bounds, rows, limits = programme
+def _brake_idle(arms: Records, goals: Records, home: Vector) -> None:
+    """Write the velocities (J,) of joints that brake, divided by `scale`."""
     arm = arms[0]
     goal = goals[0]
-    without_turn = np.empty(len(home))
     for j in range(len(home)):
         brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
         home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
-    solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
-    _turn_less(arms, goals, velocity, without_turn)
 
 
 @compiled
-def _accelerate(
-    arms: Records, goals: Records, programme: Programme, damping: float, acceleration: Vector
+def _wish_acceleration(
+    arms: Records, goals: Records, wish: Vector, home: Vector, bounds: Vector
 ) -> None:
-    """Write the accelerations (J,) of `joint_step`, divided by `scale`, within their own limits."""
-    scaled, wish, home, bounds, rows, limits = programme
+    """Write what `joint_step` asks of the accelerations: the goal's, none of the joints', and their
+    limits, divided by `scale`.
+    """
     arm = arms[0]
     wish[:3] = goals[0].acceleration
     home[:] = 0.0
     for j in range(len(home)):
         bounds[1, j] = arm.acceleration[j] / arm.scale[j]
         bounds[0, j] = -bounds[1, j]
-    solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], acceleration)
 
 
 @compiled

@@ -162,7 +162,11 @@ def _is_velocity_known(states: Records, parameters: Records, side: int) -> bool:
 
 @compiled
 def _while_unseen(states: Records, parameters: Records, side: int) -> tuple[float, float]:
-    """How much faster [m/s] and nearer [m] a hand may be: w, and hand_doubt_m + w (t - w / 2g)."""
+    """The speed [m/s] that an unseen hand may have gained, and the distance [m] it may be nearer.
+
+    These are w and hand_doubt_m + w (t - w / 2g), with the hand's largest acceleration g, the time
+    t unseen and w = g t, at most the unknown speed.
+    """
     state = states[0]
     config = parameters[0]
     age_s = (state.tick - state.hand_ticks[side]) * config.period_s
@@ -228,16 +232,17 @@ def _keep_parts(
         if is_known:
             coming = max(-_along(near, velocity), 0.0) + faster_by
         least = contact_speed if is_tool else 0.0
-        if not is_later:
-            allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
-            figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
         planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+        if is_later and planned >= part.max_speed:
+            continue
+        allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
+        if not is_later:
+            figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
         if planned >= part.max_speed:
             continue
 
         constraint = constraints[count]
         constraint.planned = planned
-        allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
         constraint.allowed = allowed + braked + config.slip_speed_mps
         if is_later:
             carry_back(near, parts[capsule], parts_now[capsule])
