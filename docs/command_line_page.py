@@ -19,8 +19,7 @@ HEAD = """# The command line
 
 <!-- Written by `python docs/command_line_page.py` from service/thirdhand/command_line.py: change it there. -->
 
-`thirdhand COMMAND --help` prints the same text. [Incidents](incidents.md#exit-codes) lists the exit
-codes.
+`thirdhand COMMAND --help` prints the same. [Incidents](incidents.md#exit-codes) lists exit codes.
 
 | to | commands |
 |---|---|
@@ -28,9 +27,8 @@ codes.
 SHARED = """
 ## Reach the daemon
 
-Commands that talk to a daemon accept these options. Each value is taken from the option, else from
-the environment variable, else from the file `~/.config/thirdhand/client.toml`
-([networks](network.md#set-the-address-once)).
+Each value is taken from the option, else from the environment variable, else from
+`~/.config/thirdhand/client.toml` ([networks](network.md#set-the-address-once)).
 
 """
 
@@ -80,7 +78,7 @@ def _command(name: str, parser: argparse.ArgumentParser, heading: str) -> Iterat
     if own:
         yield f"\n{_table(own)}"
     if reach:
-        yield "\nIt also accepts the options to [reach the daemon](#reach-the-daemon).\n"
+        yield "\nAlso: [options to reach the daemon](#reach-the-daemon).\n"
     if example := re.sub(r"^examples?:\n", "", parser.epilog or ""):
         yield f"\n```console\n{textwrap.dedent(example).strip()}\n```\n"
     for word, found in below.items():

@@ -25,11 +25,10 @@ of kmp](../kmp/README.md). [Another page](coming-from.md) compares pbdlib, gmr a
 movement_primitives with `kmp`.
 
 Letters: N reference points, M queries, V via-points, T samples, I inputs, O outputs. Values are
-immutable. A wrong argument raises a ValueError that names it.
+immutable. A wrong argument, like a wrong shape or a number that is not finite, raises a ValueError
+that names it.
 
-![A primitive over time: its mean, regions of 1 and 2 standard deviations, and a via-point](kmp-over-time.png)
-
-The mean passes through the via-point. The regions are narrow where the demonstrations agree."""
+![A primitive over time: its mean, regions of 1 and 2 standard deviations, and a via-point](kmp-over-time.png)"""
 CLIENT = """# The Python client
 
 <!-- Written by `python docs/library_page.py` from the docstrings in service/thirdhand/client: change it there. -->
@@ -46,16 +45,13 @@ with thirdhand.connect() as cell:  # address, cell and certificate as for the co
         print(pose.position)
 ```
 
-All names are those of `import thirdhand`. The programs in [examples](../examples) use them. [The
-wire](wire.md) describes the messages behind them.
+All names are those of `import thirdhand`. The programs in [examples](../examples) use them.
 
-Positions are in metres and in frame `base`. Orientations are quaternions x y z w. Joints are in
-radians, or in metres if they slide.
+Positions are in metres and in [frame `base`](frames.md). Orientations are quaternions x y z w.
+Joints are in radians, or in metres if they slide.
 
-A program on another machine needs only the client: `pip install .` in a clone installs it, for
-Python 3.11 or later on Linux, macOS and Windows, with `eclipse-zenoh` and `msgspec`.
-
-![The frames of a cell: base, plate, tool, tracker and both hands](frames.png)"""
+`pip install .` in a clone installs the client alone, for Python 3.11 or later on Linux, macOS and
+Windows, with `eclipse-zenoh` and `msgspec`."""
 KMP_GROUPS = {
     "Learn": (
         "learn",
@@ -94,6 +90,14 @@ CLIENT_GROUPS = {
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of thirdhand.contract.requests
 WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
 INSIDE = {"to_plot", "inner"}
+SAME = {"LocalKMP.plot": "KMP.plot"}  # members with the docstring of another one
+# errors of wrong shapes and of numbers that are not finite, or those of another member
+PLAIN_ERROR = re.compile(
+    r"\s+Raises\s+ValueError\s+(?:"
+    r"if\s+(?:(?:the|a)\s+shape\s+differs|(?:the\s+)?shapes\s+(?:do\s+not\s+agree|differ)"
+    r"|O\s+differs|[FI]\s+or\s+O\s+differs)(?:\s+or\s+a\s+number\s+is\s+not\s+finite)?"
+    r"|as\s+(?:`[\w.]+`|that|the\s+constructor)(?:\s+and\s+`[\w.]+`)?(?:\s+do(?:es)?)?)\.(?=\s|$)"
+)
 # values that a caller receives and does not construct
 RETURNED = {
     *("KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"),
@@ -141,7 +145,7 @@ def _described(name: str, value: Any) -> Iterator[str]:
     yield f"### {name}"
     if name not in RETURNED and not raised:
         yield _signature(name, value)
-    yield inspect.cleandoc(value.__doc__ or "")
+    yield _text(value)
     if not inspect.isclass(value) or raised or name in WITHOUT_METHODS:
         return
     for part, member in inspect.getmembers(value):
@@ -160,7 +164,13 @@ def _described(name: str, value: Any) -> Iterator[str]:
         ):
             continue
         yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
-        yield inspect.cleandoc(member.__doc__)
+        same = SAME.get(f"{name}.{part}")
+        yield f"As `{same}`." if same else _text(member)
+
+
+def _text(value: Any) -> str:
+    """A docstring without the errors that the head of the page names for all."""
+    return PLAIN_ERROR.sub("", inspect.cleandoc(value.__doc__ or ""))
 
 
 def _is_inherited(value: type, part: str) -> bool:

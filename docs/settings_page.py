@@ -24,9 +24,8 @@ HEAD = """# Settings
 <!-- Written by `python docs/settings_page.py` from service/thirdhand/settings/config.py: change it there. -->
 
 Write the settings that you want to change into a TOML file, and start the daemon with it:
-`thirdhand serve --config cell.toml`. Each heading below is a table of that file. Options of
-`thirdhand serve` override it. Several cells may share [one
-file](network.md#one-file-for-many-cells).
+`thirdhand serve --config cell.toml`. Options of `thirdhand serve` override the file. Several cells
+may share [one file](network.md#one-file-for-many-cells).
 
 ```toml
 cell = "hall/bench-1"
@@ -39,8 +38,6 @@ base_from_tracker = [0.80, 0.0, 0.02, 0.0, 0.0, 1.0, 0.0]
 [tool]
 max_speed = 0.5
 ```
-
-The file is checked before anything starts.
 
 * Units are part of the name (`_ms`, `_hz`, `_mb`) or stand in brackets in the last column.
 * Positions are in frame `base`, unless the last column names another frame.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,18 +24,18 @@ HEAD = """# Tuned numbers
 <!-- Written by `python docs/tuning_page.py` from service/thirdhand/core/*/tuning.py: change it there. -->
 
 The core has {count} tuned numbers, in the file `tuning.py` of each stage. The columns range, more
-and less state what we expect. The last three columns are measured in short sessions, at half and at
-twice the number:
+and less state what we expect. The last three columns are measured in short sessions, at half (×0.5)
+and at twice the number (×2). A change of 0 is left out.
 
 * *Motion*: change of the error and of the jerk of a tool that follows moving hands [%].
 * *Stops*: change of the overshoot of sudden stops [mm], seen by trackers of 100, 30 and 15 Hz.
-* *Largest other*: the figure of another session that changes most in relation to its noise, the
-  standard deviation over other seeds. A change below the noise says little.
+* *Largest other*: the figure of another session that changes most, if that is more than its noise,
+  the standard deviation over other seeds; in brackets as a multiple of the noise.
 
 The numbers of the skill are not measured, because skills are learned with them.
 {state}
-A number without effect in these sessions may matter in a rare situation: look for its tests before
-you remove it.
+A number without effect here may matter in a rare situation: look for its tests before you remove
+it.
 """
 
 
@@ -102,13 +102,8 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
             number.meaning,
             number.more,
             number.less,
-            _both(
-                effects,
-                lambda effect: ", ".join(f"{change:+.1f}" for change in effect["moving_percent"]),
-            ),
-            _both(
-                effects, lambda effect: ", ".join(f"{change:+.1f}" for change in effect["stops_mm"])
-            ),
+            _both(effects, lambda effect: _changes(effect["moving_percent"])),
+            _both(effects, lambda effect: _changes(effect["stops_mm"])),
             _both(effects, _largest),
         )
         escaped = [cell.replace("|", chr(92) + "|") for cell in cells[: len(titles)]]
@@ -116,17 +111,20 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
 
 
 def _both(effects: Mapping[str, Any], text: Any) -> str:
-    """The texts of the effects of half and twice a number."""
-    return "; ".join(
-        f"×{factor}: {effect.get('fails') or text(effect)}" for factor, effect in effects.items()
-    )
+    """The texts of the effects of half and twice a number, without those that are empty."""
+    texts = {factor: effect.get("fails") or text(effect) for factor, effect in effects.items()}
+    return "; ".join(f"×{factor}: {said}" for factor, said in texts.items() if said)
+
+
+def _changes(changes: Sequence[float]) -> str:
+    """Changes of some figures with one digit after the point; empty if all are 0."""
+    texts = [f"{round(change, 1) + 0.0:+.1f}" for change in changes]
+    return ", ".join(texts) if any(map(float, texts)) else ""
 
 
 def _largest(effect: Mapping[str, Any]) -> str:
-    """The largest change of another figure than those of motion and stops."""
-    if not effect["noises"]:
-        return "nothing changes"
-    return f"{effect['largest']}, {effect['noises']:.1f} times the noise"
+    """The largest change of another figure than those of motion and stops; empty within noise."""
+    return f"{effect['largest']} ({effect['noises']:.1f})" if effect["noises"] > 1.0 else ""
 
 
 def _value(value: Any) -> str:
