@@ -98,7 +98,7 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
         cells = (
             f"`{number.name}`",
             _value(number.value),
-            f"{number.low:g} to {number.high:g}",
+            f"{number.low:g}–{number.high:g}",
             number.meaning,
             number.more,
             number.less,
