@@ -187,10 +187,7 @@ def joint_step(
     flags = _bound_joints(arms, heres, scaled, home, bounds)
     rows = np.empty((count, joints))
     limits = np.empty(count)
-    for k in range(count):
-        limits[k] = constraints[k].planned
-        for j in range(joints):
-            rows[k, j] = constraints[k].row[j] * arm.scale[j]
+    _separate(arms, constraints, rows, limits)
 
     velocity = out[0]
     is_constrained = solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
@@ -224,6 +221,15 @@ def joint_step(
         velocity[j] = np.rint(speed * ROUND_TO) / ROUND_TO
         out[1, j] = np.rint(out[1, j] * arm.scale[j] * ROUND_TO) / ROUND_TO
     return flags | SPEED if excess > 1.0 + ROUNDING else flags
+
+
+@compiled
+def _separate(arms: Records, constraints: Records, rows: Vector, limits: Vector) -> None:
+    """Write the `rows` (K, J) of K constraints, times `scale`, and their `limits` (K,) [m/s]."""
+    for k in range(len(rows)):
+        limits[k] = constraints[k].planned
+        for j in range(rows.shape[1]):
+            rows[k, j] = constraints[k].row[j] * arms[0].scale[j]
 
 
 @compiled
