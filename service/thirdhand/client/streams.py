@@ -101,10 +101,11 @@ class Publisher:
             **more,
         )
         self.key = str(self.zenoh.key_expr)
+        self._id = self.zenoh.id
 
     def put(self, message: bytes) -> None:
         """Publish a message. Raises UnreachableError if another thread closes the session."""
-        source = zenoh.SourceInfo(self.zenoh.id, self._number % channels.MESSAGE_NUMBERS)
+        source = zenoh.SourceInfo(self._id, self._number % channels.MESSAGE_NUMBERS)
         self._number += 1
         try:
             self.zenoh.put(message, source_info=source)

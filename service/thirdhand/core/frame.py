@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -116,6 +117,7 @@ TIMING_FIELDS = (
     Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
+_TIMING = struct.Struct(f"<3q3f{len(STAGES)}f")  # as TIMING
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +170,8 @@ def timed(
     stages_us: Sequence[float],
 ) -> Record:
     """Timing record of these values, which are its fields."""
-    fields = (tick, time_ns, missed, lateness_us, work_us, latency_us, stages_us)
-    record: Record = np.array([fields], TIMING)[0]
+    fields = _TIMING.pack(tick, time_ns, missed, lateness_us, work_us, latency_us, *stages_us)
+    record: Record = np.frombuffer(fields, TIMING)[0]
     return record
 
 

@@ -234,6 +234,7 @@ class CellStreams:
             for suffix, key in keys
         ]
         self._publishers = _publishers(session, cell)
+        self._ids = {key: publisher.id for key, publisher in self._publishers.items()}
         self._sent = Counter[str]()  # messages by channel
         topics += _published_topics(settings)
         self._ros2 = (
@@ -316,10 +317,10 @@ class CellStreams:
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""
-        publisher = self._publishers[suffix]
-        source = zenoh.SourceInfo(publisher.id, self._sent[suffix] % channels.MESSAGE_NUMBERS)
+        number = self._sent[suffix] % channels.MESSAGE_NUMBERS
         self._sent[suffix] += 1
-        publisher.put(payload, attachment=attachment, source_info=source)
+        source = zenoh.SourceInfo(self._ids[suffix], number)
+        self._publishers[suffix].put(payload, attachment=attachment, source_info=source)
         if self._ros2 is not None:
             self._ros2.publish(suffix, payload)
 

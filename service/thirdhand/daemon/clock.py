@@ -32,6 +32,7 @@ _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Li
 FIFO_PRIORITY = 80  # priority of the loop
 BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
 MAX_LATENCY_MS = 1000.0  # a longer latency shows that the clocks differ
+_PLACE_OF_STAGE = {stage: place for place, stage in enumerate(STAGES)}
 
 
 class Deadlines:
@@ -224,34 +225,30 @@ class Window:
 
 class TickTimes:
     """Lateness and work of the ticks of the last 10 s, the latency of the hands in them, and the
-    times at which the stages of the present tick ended. `begin`, `lap` and `end` are for the loop.
+    durations of the stages of the present tick. `begin`, `lap` and `end` are for the loop.
     """
 
     def __init__(self, rate_hz: int) -> None:
         self.windows = {
             name: Window(10 * rate_hz) for name in ("lateness_us", "work_us", "latency_ms")
         }
-        self._late_ns = self._began_ns = 0
-        self._laps: list[tuple[str, int]] = []
+        self._late_ns = self._began_ns = self._lap_ns = 0
+        self._stages_us = [0.0] * len(STAGES)
 
     def begin(self, late_ns: int) -> None:
         """Note that a tick begins, this late [ns]."""
         self._late_ns = late_ns
-        self._began_ns = time.perf_counter_ns()
-        self._laps = []
+        self._began_ns = self._lap_ns = time.perf_counter_ns()
+        self._stages_us = [0.0] * len(STAGES)
 
     def lap(self, stage: str) -> None:
         """Note that a stage of the tick ends."""
-        self._laps.append((stage, time.perf_counter_ns()))
+        now_ns = time.perf_counter_ns()
+        self._stages_us[_PLACE_OF_STAGE[stage]] = (now_ns - self._lap_ns) / 1e3
+        self._lap_ns = now_ns
 
     def end(self, frame: Frame, clock: Deadlines) -> Record:
         """The timing of the tick that decided this frame, as it is recorded."""
-        stages_us = dict.fromkeys(STAGES, 0.0)
-        before_ns = self._began_ns
-        for stage, at_ns in self._laps:
-            stages_us[stage] = (at_ns - before_ns) / 1e3
-            before_ns = at_ns
-
         latency_ms = 0.0
         if 0 in frame["hand_ages"].tolist():
             since_stamp_ms = (time.time_ns() - int(frame["hand_stamp_ns"])) / 1e6
@@ -271,5 +268,5 @@ class TickTimes:
             late_us,
             work_us,
             1e3 * latency_ms,
-            [*stages_us.values()],
+            self._stages_us,
         )
