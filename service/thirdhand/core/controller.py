@@ -109,7 +109,8 @@ class Controller:
         tuning: Tuning = TUNING,
     ) -> None:
         self._state = copied(start_state(settings, skill, tuning) if state is None else state)
-        self._memory = as_array(self._state)  # reads a number in a third of the time
+        # the same memory as an array: a number is read from it in a third of the time
+        self._memory = as_array(self._state)
         self._bytes = self._memory.view(np.uint8)
         self._layout = frame_layout(len(settings.joints.names))
         self.intake = Intake(settings, tuning=tuning)
@@ -120,6 +121,8 @@ class Controller:
         self._arm = Arm(settings, urdf, tuning=tuning)
         self._setpoint = SetpointStage(settings, self._arm, tuning=tuning)
         self._limiter = LimiterStage(settings, self._arm, tuning=tuning)
+        # capsules exceed the meshes in them by about this: an arm that is less deep in a thing, by
+        # its capsules, may be clear of it
         self._capsule_excess_m = tuning.separation.planned_margin_m
         self._gone_ticks = math.ceil(GONE_S / settings.period_s)
         stages = (
@@ -167,28 +170,32 @@ class Controller:
         frame = RECORDS(1, self._layout, bytearray(self._layout.itemsize))[0]
         conditions = self._take_in(tick, frame)
         lap("intake")
+
         conditions |= self._alone(frame)
-        unseen = UNSEEN.index(side) if (side := conditions & EITHER_UNSEEN) else None
-        request = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
-        if request is not None:
+        unseen = UNSEEN.index(flag) if (flag := conditions & EITHER_UNSEEN) else None
+        wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
+        if wanted is not None:
             conditions |= (
-                SEGMENT_AMBIGUOUS * request.is_ambiguous
-                | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
+                SEGMENT_AMBIGUOUS * wanted.is_ambiguous
+                | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
             )
         lap("skill")
-        kinematics = self._decide(
-            frame, conditions, math.nan if request is None else request.gate_m
-        )
+
+        kinematics = self._decide(frame, conditions, math.nan if wanted is None else wanted.gate_m)
         lap("decision")
+
         self._separation.step(state, frame, kinematics.record)
         lap("separation")
-        if request is None:
+
+        if wanted is None:
             self._hold(frame, lap)
             self._skill.nothing(state, frame)
         elif self._memory["mode"][0] != FOLLOW:
             self._hold(frame, lap)
         else:
-            self._follow(frame, request, kinematics, lap)
+            self._follow(frame, wanted, kinematics, lap)
+
+        # An array of bytes is read-only.
         unchanging: Frame = np.frombuffer(as_array(frame).tobytes(), self._layout)[0]
         return unchanging
 
@@ -237,6 +244,7 @@ class Controller:
         state = self._state
         kinematics = self._at()
         threshold = self.skill.threshold
+        # Separation keeps a ready arm out of things, so only another one may be inside of one.
         if self._memory["arm_ready"][0] != READY:
             joints = state["joints"][0] if state["arm_ready"] else state["measured"]
             conditions |= ARM_INSIDE * (
@@ -253,24 +261,25 @@ class Controller:
             self._setpoint.begin(state, frame, kinematics)
         return kinematics
 
-    def _follow(self, frame: Frame, wanted: Wanted, here: Kinematics, lap: Lap) -> None:
+    def _follow(self, frame: Frame, wanted: Wanted, kinematics: Kinematics, lap: Lap) -> None:
         """Advance setpoint and joints by one period. A setpoint outside its bounds, or a tool that
         cannot be slowed down enough, is a fault.
         """
         state = self._state
         separation = self._separation
-        met = self._setpoint.step(
-            state, frame, wanted, here, self.skill.workspace, separation.setpoint_share
+        limitation = self._setpoint.step(
+            state, frame, wanted, kinematics, self.skill.workspace, separation.setpoint_share
         )
-        if met == BROKEN:
+        if limitation == BROKEN:
             self.decision.fail(state, frame, Reason.SETPOINT)
         lap("setpoint")
-        solution = self._arm.follow(state, here, separation)
+        solution = self._arm.follow(state, kinematics, separation)
         lap("arm")
         moved = self._limiter.step(
             state, frame, solution.velocity, solution.acceleration, separation
         )
         self._here = moved.here
+
         if moved.excess_speed:
             self.decision.fail(state, frame, Reason.TOOL_SPEED, speed=moved.excess_speed)
             frame["commanded"] = moved.moving
@@ -281,7 +290,7 @@ class Controller:
             | NEAR_LIMIT * solution.near_limit
         )
         flags |= UNSURE * (memory["unsure"][0] > 0) | LIMITED * (
-            met > 0 or solution.speed_limited or moved.limited
+            limitation > 0 or solution.speed_limited or moved.limited
         )
         flags |= ENGAGING * (memory["engaging"][0] > 0)
         frame["flags"] = flags | SEPARATED * (solution.separated or moved.separated)

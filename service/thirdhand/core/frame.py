@@ -110,11 +110,11 @@ TIMING_FIELDS = (
     Field("tick", "int64"),
     Field("time_ns", "int64"),  # the tick's deadline on the wall clock
     Field("missed", "int64"),  # deadlines skipped since start
-    Field("lateness_us", "float32"),
-    Field("work_us", "float32"),
+    Field("lateness_us", "float32"),  # from the deadline to the begin of the tick
+    Field("work_us", "float32"),  # from the begin of the tick to its published command
     # from the newest hand sample's stamp to the published command; 0: no new one
     Field("latency_us", "float32"),
-    Field("stages_us", "float32", (len(STAGES),)),
+    Field("stages_us", "float32", (len(STAGES),)),  # durations, in the order of STAGES
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
 _TIMING = struct.Struct(f"<3q3f{len(STAGES)}f")  # as TIMING

@@ -61,11 +61,11 @@ def quaternion_of(matrix: Vector, out: Vector) -> None:
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     largest = 3
-    most = trace
+    largest_term = trace
     for i in range(3):
-        if matrix[i, i] > most:
+        if matrix[i, i] > largest_term:
             largest = i
-            most = matrix[i, i]
+            largest_term = matrix[i, i]
     if largest == 3:
         out[0] = matrix[2, 1] - matrix[1, 2]
         out[1] = matrix[0, 2] - matrix[2, 0]
@@ -210,6 +210,7 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
     capsule = 0
     count = len(capsules)
     for link in range(len(q) + 1):
+        # the link's pose (turn, origin) from that of the link before
         if link > 0:
             frame = frames[link - 1]
             for i in range(3):
@@ -233,6 +234,7 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
                     turn[i, j] = 0.0
                     for k in range(3):
                         turn[i, j] += moved[i, k] * joint_turn[k, j]
+
         while capsule < count and capsules[capsule].link == link:
             for end in range(2):
                 for i in range(3):
@@ -284,6 +286,8 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa
         c += u * w
         d += v * v
         e += v * w
+
+    # s and t, the shares of the segments at their nearest points
     if a <= LEAST and d <= LEAST:
         s = t = 0.0
     elif a <= LEAST:
@@ -302,6 +306,7 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa
         elif t > 1.0:
             s = _unit((b - c) / a)
             t = 1.0
+
     square = 0.0
     for i in range(3):
         near[i] = one[0, i] + s * (one[1, i] - one[0, i])
@@ -313,6 +318,8 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa
         for i in range(3):
             near[6 + i] /= distance
         return distance
+
+    # they intersect: from middle to middle
     square = 0.0
     for i in range(3):
         near[6 + i] = other[0, i] + other[1, i] - one[0, i] - one[1, i]
@@ -326,12 +333,12 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa
 @compiled
 def carry_back(near: Vector, then: Vector, now: Vector) -> None:
     """Move the first point of `near` from the segment `then` (2, 3) to the same share of `now`."""
-    long = whole = 0.0
+    along = square = 0.0
     for i in range(3):
         extent = then[1, i] - then[0, i]
-        long += extent * (near[i] - then[0, i])
-        whole += extent * extent
-    share = long / whole if whole > 0.0 else 0.0
+        along += extent * (near[i] - then[0, i])
+        square += extent * extent
+    share = along / square if square > 0.0 else 0.0
     for i in range(3):
         near[i] = now[0, i] + share * (now[1, i] - now[0, i])
 
@@ -380,7 +387,7 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
     from that face inward.
     """
     square = 0.0
-    least = math.inf
+    depth = math.inf
     face = 2
     side = -1.0
     for i in range(3):
@@ -389,12 +396,12 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
         near[3 + i] = min(max(point, box[0, i]), box[1, i])
         near[6 + i] = near[3 + i] - point
         square += near[6 + i] * near[6 + i]
-        if point - box[0, i] < least:
-            least = point - box[0, i]
+        if point - box[0, i] < depth:
+            depth = point - box[0, i]
             face = i
             side = 1.0
-        if box[1, i] - point < least:
-            least = box[1, i] - point
+        if box[1, i] - point < depth:
+            depth = box[1, i] - point
             face = i
             side = -1.0
     distance = math.sqrt(square)
@@ -404,7 +411,7 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
         return distance
     for i in range(3):
         near[6 + i] = side if i == face else 0.0
-    return -least
+    return -depth
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Quantities derived from joint limits, for the segments that plan joint motion."""
+"""Quantities derived from joint limits, for the stages that plan joint motion."""
 
 from __future__ import annotations
 

@@ -116,10 +116,13 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
         wx = jacobian[3, j]
         wy = jacobian[4, j]
         wz = jacobian[5, j]
+
         # moment about the origin: the tool's velocity less w × tool
         ux = jacobian[0, j] - (wy * tool[2] - wz * tool[1])
         uy = jacobian[1, j] - (wz * tool[0] - wx * tool[2])
         uz = jacobian[2, j] - (wx * tool[1] - wy * tool[0])
+
+        # the screw as the joints before have moved it, w' and u', and its part of the speed
         for i in range(3):
             axis[i] = rotation[i, 0] * wx + rotation[i, 1] * wy + rotation[i, 2] * wz
             moment[i] = rotation[i, 0] * ux + rotation[i, 1] * uy + rotation[i, 2] * uz
@@ -128,6 +131,8 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
         linear[2] += dq[j] * (moment[2] + shift[0] * axis[1] - shift[1] * axis[0])
         for i in range(3):
             angular[i] += dq[j] * axis[i]
+
+        # exp(screw way): the rotation `turn`, with the shift `own_shift`
         s, c = sin_cos(way[j])
         turns = wx * wx + wy * wy + wz * wz > 0.5
         if not turns:
@@ -143,7 +148,7 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
         turn[2, 0] = v * wx * wz - s * wy
         turn[2, 1] = v * wy * wz + s * wx
         turn[2, 2] = c + v * wz * wz
-        if turns:  # about the point o = w × u of the axis: o - own o
+        if turns:  # about the point o = w × u of the axis: o - turn o
             ox = wy * uz - wz * uy
             oy = wz * ux - wx * uz
             oz = wx * uy - wy * ux
@@ -154,6 +159,8 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
             own_shift[0] = ux * way[j]
             own_shift[1] = uy * way[j]
             own_shift[2] = uz * way[j]
+
+        # (R, s), with this joint's motion after those before
         for i in range(3):
             moved[i] = shift[i]
             for k in range(3):
@@ -165,6 +172,8 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
                 )
         rotation[:] = turned
         shift[:] = moved
+
+    # the tool, moved by all joints
     for i in range(3):
         moved[i] = (
             rotation[i, 0] * tool[0]
@@ -185,7 +194,7 @@ def joint_costs(arms: Records, heres: Records, out: Vector) -> None:
     The first index is the order: velocity, acceleration, jerk. The second is the axis i. With Jv
     (3, J) the first rows of the tasks, S = diag(spared) of the order, and M = Jv S:
 
-        out[order, i] = S M^T (M M^T + damping I)^-1 e_i / (PLANNED_LIMIT_SHARES[order] joint limit)
+        out[order, i] = S M^T (M M^T + damping I)^-1 e_i / (planned_limit_shares[order] joint limit)
 
     These are the damped least-squares joint motions that move the tool along one axis and leave its
     orientation free. S makes joints with higher limits move more.

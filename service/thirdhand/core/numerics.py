@@ -28,7 +28,8 @@ LEAST_SPEED_MPS = 1e-3  # below this speed a motion has no direction
 # the search for a jerk ends when the stop leaves less than this distance unused
 STOP_SECANT_TOLERANCE_M = 1e-3
 
-# Larger inputs are errors elsewhere: joints, targets and errors are clipped, a state is rejected.
+# Larger inputs come from errors elsewhere: joints, targets and errors are clipped, a state is
+# rejected.
 LARGEST_USABLE = 1e6  # a state of the joints with a larger number is rejected
 MAX_JOINT_RAD = 1e4  # [rad, m] positions of joints
 MAX_TARGET_M = 1e3  # coordinates of a target
@@ -36,7 +37,7 @@ MAX_ERROR_M = 10.0  # [m, m/s] errors and velocities of the tool
 MAX_STAMP_DIFFERENCE_NS = 2.0**62  # larger differences of stamps would overflow as integers
 
 # Iterations.
-# of an exponential series of at most 1/2: the next one is below 2^-19 / 19! = 1.6e-23
+# terms of the exponential series up to 1/2: the next one is below 2^-19 / 19! = 1.6e-23
 SERIES_TERMS = 18
 BOUND_ROUNDS = 12  # largest number of rounds in which a joint is held at its bound or released
 CONSTRAINT_ROUNDS = 40  # largest number of rounds in which an inequality is added or removed

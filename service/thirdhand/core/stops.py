@@ -54,6 +54,8 @@ def fastest_stop(  # noqa: C901, PLR0912, PLR0915 - a case for each phase
         ) / max_acceleration
     else:
         peak = max(peak, a)
+
+    # follow the three phases: sample at dt, and note the extreme displacements
     x = t = low = high = 0.0
     is_sampled = False
     after_x = after_v = after_a = 0.0
@@ -72,12 +74,14 @@ def fastest_stop(  # noqa: C901, PLR0912, PLR0915 - a case for each phase
             lasts = peak / max_jerk
         if lasts <= 0.0:
             continue
+
         if not is_sampled and dt <= t + lasts:
             h = dt - t
             after_x = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
             after_v = v + h * (a + h * jerk / 2.0)
             after_a = a + h * jerk
             is_sampled = True
+
         # the displacement is extreme where the velocity is 0, or at an end of the phase
         disc = a * a - 2.0 * jerk * v
         for root in (-1.0, 1.0):
@@ -90,12 +94,14 @@ def fastest_stop(  # noqa: C901, PLR0912, PLR0915 - a case for each phase
                 displacement = x + h * (v + h * (a / 2.0 + h * jerk / 6.0))
                 low = min(low, displacement)
                 high = max(high, displacement)
+
         x += lasts * (v + lasts * (a / 2.0 + lasts * jerk / 6.0))
         v += lasts * (a + lasts * jerk / 2.0)
         a += lasts * jerk
         t += lasts
         low = min(low, x)
         high = max(high, x)
+
     if not is_sampled:
         after_x = x
         after_v = 0.0

@@ -47,10 +47,10 @@ def tool_limits(
     bounds = (settings.tool.max_speed, settings.tool.acceleration)
     names = settings.joints.names
     limits: list[tuple[float, str]] = []
-    for order, most in enumerate(bounds):
+    for order, setting in enumerate(bounds):
         joint = int(shares[:, order].max(axis=0).argmax())
         needed = float(shares[:, order].max())
-        limits.append((1.0 / needed, names[joint]) if needed * most > 1.0 else (most, ""))
+        limits.append((1.0 / needed, names[joint]) if needed * setting > 1.0 else (setting, ""))
     (speed, speed_joint), (acceleration, acceleration_joint) = limits
     return ToolLimits(round(speed, 3), speed_joint, round(acceleration, 2), acceleration_joint)
 
@@ -58,8 +58,8 @@ def tool_limits(
 def limits_of_task(
     settings: Settings, urdf: str, positions: Vector, orientation: Vector
 ) -> dict[str, ToolLimits]:
-    """Limits of the tool where it goes through `positions` (M, 3) [m] in an orientation (4,), by
-    ANY_DIRECTION and ALONG_TASK; empty if the arm reaches none of them.
+    """Limits of the tool on a path through `positions` (M, 3) [m] in an orientation (4,), one named
+    ANY_DIRECTION and one named ALONG_TASK; empty if the arm reaches none of the positions.
     """
     arm = Arm(settings, urdf)
     postures, directions = _along(arm, settings, positions, orientation)
@@ -95,8 +95,10 @@ def _along(
     q = np.array(settings.arm.posture)
     still = np.zeros(3)
     step_m = PATH_SPEED_SHARE * settings.tool.max_speed * PATH_STEP_S
+    # to the first position
     for _ in range(PATH_END_STEPS):
         q = q + PATH_STEP_S * arm.step(q, positions[0], still, orientation).velocity
+
     postures = []
     directions = []
     step = 0
@@ -124,8 +126,8 @@ def binding(settings: Settings, frames: Records) -> Iterator[tuple[str, NDArray[
     """Each limit that a frame of the T `frames` meets, and a mask (T,) of the frames that do.
 
     A frame that follows meets the one limit of which it uses the largest share: speed or
-    acceleration of a joint, or of the tool's setpoint. It has to be more than what a setpoint plans
-    with, the planned share of the tool's acceleration, of which the joints get that share again.
+    acceleration of a joint, or of the tool's setpoint. It meets none if that share is below the
+    square of the planned one: setpoint and joints are each planned with the planned share.
     """
     least = TUNING.arm.planned_limit_shares[1] ** 2
     joints = settings.joints

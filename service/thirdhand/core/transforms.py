@@ -42,7 +42,9 @@ class Frames:
         )
 
     def moving(self, frame: Frame, joints: Sequence[float]) -> list[Transform]:
-        """Transforms of a frame at joints [rad], in chain order; unknown ones are left out."""
+        """Moving transforms for a tick's `frame`: links at joints [rad], in chain order, then
+        setpoint, hands and target; unknown ones are left out.
+        """
         transforms = [
             transform for transform in self._at(joints) if transform.child not in self._still
         ]
@@ -58,6 +60,6 @@ class Frames:
                         self._root, f"{name}_hand", tuple(frame["hands"][side].tolist()), _UPRIGHT
                     )
                 )
-        if frame["covariance"].any():  # without both hands nothing is predicted
+        if frame["covariance"].any():  # zeros: nothing is predicted
             transforms.append(Transform(self._root, "target", target, target_turn))
         return transforms

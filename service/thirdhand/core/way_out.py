@@ -1,4 +1,4 @@
-"""Ways out of places that a step-by-step controller cannot leave: paths in joint space from the
+"""Ways out of postures in which a step-by-step controller is stuck: paths in joint space from the
 arm's posture to one that has the tool at its target.
 
 They are planned outside of the control loop, which receives them as events. Goal postures are found
@@ -178,9 +178,9 @@ class WayOut:
             tasks = kinematics.tasks[:3]
             turn = 0.0
             if orientation is not None:
-                left = kinematics.rotation.T @ self._turn(kinematics, orientation)
-                turn = float(np.linalg.norm(left))
-                error = np.append(error, self._lever * left[: len(kinematics.tasks) - 3])
+                angles = kinematics.rotation.T @ self._turn(kinematics, orientation)
+                turn = float(np.linalg.norm(angles))
+                error = np.append(error, self._lever * angles[: len(kinematics.tasks) - 3])
                 tasks = kinematics.tasks
             if np.linalg.norm(error[:3]) < REACHED_M and turn < REACHED_RAD:
                 return q
@@ -202,10 +202,11 @@ class WayOut:
             quaternion_of(here.rotation, now)
             turn_between(now, orientation, turn)
             return turn
+
         axis_of(orientation, target_axis)
-        now = np.ascontiguousarray(here.rotation[:, 2])
-        swing(now, orientation, turn)
-        return math.pi * here.rotation[:, 0] if now @ target_axis < OPPOSITE else turn
+        axis = np.ascontiguousarray(here.rotation[:, 2])
+        swing(axis, orientation, turn)
+        return math.pi * here.rotation[:, 0] if axis @ target_axis < OPPOSITE else turn
 
     def _is_free(self, a: Vector, b: Vector, hands: Vector, least: float) -> bool:
         """True if all postures on a straight line in joint space, GRAIN_RAD apart, have more than
@@ -233,37 +234,37 @@ class WayOut:
             return [start, goal]
         trees = [([start], [-1]), ([goal], [-1])]
         for number in range(NODES):
-            grown, before = trees[number % 2]
-            other, other_before = trees[1 - number % 2]
+            grown, parents = trees[number % 2]
+            other, other_parents = trees[1 - number % 2]
             drawn = random.uniform(limits[0], limits[1])
-            new = self._grow(grown, before, drawn, hands, least)
+            new = self._grow(grown, parents, drawn, hands, least)
             while new is not None:
-                met = self._grow(other, other_before, new, hands, least)
+                met = self._grow(other, other_parents, new, hands, least)
                 if met is None:
                     break
                 if np.array_equal(met, new):
-                    branch = _to_root(grown, before)
-                    two = _to_root(other, other_before)[::-1]
-                    path = branch[::-1] + two[::-1][1:] if number % 2 == 0 else two + branch[1:]
+                    branch = _to_root(grown, parents)
+                    tail = _to_root(other, other_parents)[::-1]
+                    path = branch[::-1] + tail[::-1][1:] if number % 2 == 0 else tail + branch[1:]
                     return path if np.array_equal(path[0], start) else path[::-1]
         return []
 
     def _grow(
-        self, nodes: list[Vector], before: list[int], toward: Vector, hands: Vector, least: float
+        self, nodes: list[Vector], parents: list[int], toward: Vector, hands: Vector, least: float
     ) -> Vector | None:
         """Grow a tree toward a posture (J,), by at most REACH_RAD. Returns the new node, which may
         be that posture; None if the line to it is not free.
 
-        `before` has the index of each node's parent.
+        `parents` has the index of each node's parent.
         """
         nearest = int(np.argmin(np.abs(np.array(nodes) - toward).max(axis=1)))
         step = toward - nodes[nearest]
-        far = float(np.abs(step).max())
-        new = toward if far <= REACH_RAD else nodes[nearest] + REACH_RAD / far * step
+        size = float(np.abs(step).max())
+        new = toward if size <= REACH_RAD else nodes[nearest] + REACH_RAD / size * step
         if not self._is_free(nodes[nearest], new, hands, least):
             return None
         nodes.append(new)
-        before.append(nearest)
+        parents.append(nearest)
         return new
 
     def _shortened(
@@ -284,11 +285,11 @@ def _length(path: list[Vector]) -> float:
     return sum(float(np.abs(b - a).max()) for a, b in itertools.pairwise(path))
 
 
-def _to_root(nodes: list[Vector], before: list[int]) -> list[Vector]:
+def _to_root(nodes: list[Vector], parents: list[int]) -> list[Vector]:
     """Postures from the newest node of a tree back to its root."""
     path = []
     index = len(nodes) - 1
     while index >= 0:
         path.append(nodes[index])
-        index = before[index]
+        index = parents[index]
     return path

@@ -254,6 +254,9 @@ def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
     joints = len(x)
     transposed = np.empty((joints, len(wanted)))
     root = np.empty((joints, joints))
+
+    # the minimum without constraints:
+    # (tasks^T tasks + damping I) x = tasks^T wanted + damping posture
     for j in range(joints):
         x[j] = damping * posture[j]
         for i in range(len(wanted)):
@@ -261,6 +264,7 @@ def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
             x[j] += tasks[i, j] * wanted[i]
     factorise(transposed, damping, root)
     substitute(root, x)
+
     # active constraints: multipliers, normals, and images, the normals times the inverse Hessian
     active = 0
     multiplier = np.zeros(joints)
@@ -271,12 +275,15 @@ def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
     decrease = np.empty(joints)
     entering = -1
     entering_multiplier = 0.0
+
     for _ in range(CONSTRAINT_ROUNDS):
         if entering < 0:
             entering = _farthest(bounds, rows, limits, x, 0.1 * TOLERANCE)
             entering_multiplier = 0.0
             if entering < 0:
                 break
+
+        # which way x moves, and how far until the entering constraint is met
         limit = _constraint(entering, bounds, rows, limits, normal)
         direction[:] = normal
         substitute(root, direction)
@@ -290,6 +297,8 @@ def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
                 direction[j] -= decrease[k] * images[k, j]
             excess += normal[j] * x[j]
             slope += normal[j] * direction[j]
+
+        # which active multiplier falls to 0 first, and is that a shorter step
         for k in range(active):
             if decrease[k] > ROUNDING and multiplier[k] < step * decrease[k]:
                 leaving = k
@@ -299,12 +308,14 @@ def _solve_with_rows(  # noqa: C901, PLR0912, PLR0915 - one algorithm
             step = excess / slope
         elif leaving < 0:
             break  # not all constraints can be kept, or the rest is rounding
+
         if slope > LEAST_SLOPE:
             for j in range(joints):
                 x[j] -= step * direction[j]
         entering_multiplier += step
         for k in range(active):
             multiplier[k] -= step * decrease[k]
+
         if leaving < 0:
             normals[active] = normal
             multiplier[active] = entering_multiplier

@@ -77,16 +77,21 @@ class Arm:
             pin.FrameType.OP_FRAME,
         )
         self._tool = self._model.addFrame(tool)
+
+        # the same bits on every processor
         for placement in (
             *self._model.jointPlacements,
             *(frame.placement for frame in self._model.frames),
         ):
             placement.rotation = np.round(placement.rotation, ROTATION_DECIMALS)
+
+        # joints whose configuration is a cosine and a sine: those without limits
         self._turns = np.array([joint.nq == 2 for joint in self._model.joints])[1:]
         self._data = self._model.createData()
+
         top = settings.tool.max_speed
         limits = settings.joints
-        size = settings.reach.outer / Reach().outer
+        size = settings.reach.outer / Reach().outer  # of the arm, relative to the WAM
         closing = closing or Closing(
             numbers.closing_brake_share * settings.tool.stop_acceleration,
             min(top, numbers.closing_speed_mps),
@@ -94,6 +99,7 @@ class Arm:
         )
         joints = len(limits.names)
         acceleration = np.array(limits.acceleration)
+        # weights of the joints, with a geometric mean of 1; and shares of motion, with a mean of 1
         scale = acceleration**numbers.sparing_power
         scale /= exp(sum(log(float(factor)) for factor in scale) / len(scale))
         self._jerk = np.array(limits.jerk)
@@ -103,6 +109,7 @@ class Arm:
             numbers.position_gain_per_s,
             numbers.position_gain_rate_share * acceleration_rate(limits),
         )
+
         self.parameters = parameters(
             period_s=settings.period_s,
             closing_braking=closing.braking,
@@ -140,6 +147,7 @@ class Arm:
         )
         self._engaging = self.parameters.copy()
         self._engaging["max_tool_speed"] = numbers.tool_speed_share * settings.tool.engaging_speed
+
         tasks = 6 if settings.tool.orientation == "full" else 5
         self._kinematics = shared_dtype(
             [
@@ -246,8 +254,9 @@ class Arm:
         )
 
 
-def _solution(found: Vector, flags: int) -> Solution:
-    found.setflags(write=False)
+def _solution(motion: Vector, flags: int) -> Solution:
+    """Solution of velocities and accelerations (2, J), made read-only, and the flags of a step."""
+    motion.setflags(write=False)
     return Solution(
-        found[0], found[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED)
+        motion[0], motion[1], bool(flags & SPEED), bool(flags & NEAR), bool(flags & SEPARATED)
     )

@@ -67,6 +67,7 @@ def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> N
     kinematics.jacobian[:] = jacobian
     kinematics.position[:] = pose[:3, 3]
     kinematics.rotation[:] = pose[:3, :3]
+
     for joint in range(joints):
         for i in range(3):
             tasks[i, joint] = jacobian[i, joint]
@@ -75,6 +76,8 @@ def describe(arms: Records, heres: Records, jacobian: Vector, pose: Vector) -> N
             for k in range(3):
                 turn += pose[k, i] * jacobian[3 + k, joint]
             tasks[3 + i, joint] = arm.turn_lever * turn
+
+    # det(Jv Jv^T), and the damping
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -167,20 +170,20 @@ def joint_step(
     singular_damping m / (m + constrained_speed²), where m = |v - T x|² in the first three rows of
     T: where few directions are left free, the least motion would change the solution much.
 
-    If no row changed it, and the joints cannot reach it soon (`_can_have`), `_turn_less` moves it
-    toward the solution of the first three rows alone, in which idle joints brake.
+    If no row changed the solution, and the joints cannot reach its velocities soon (`_can_have`),
+    `_turn_less` moves it toward that of the first three rows alone, in which idle joints brake.
 
     Finally all velocities are scaled down together to the speed limits. The accelerations minimise
     |T y - (goal acceleration)|² + damping |y|², in the first three rows, within the acceleration
     limits.
     """
     arm = arms[0]
-    posture = heres[0]
-    task_count, joints = posture.tasks.shape
+    kinematics = heres[0]
+    task_count, joints = kinematics.tasks.shape
 
     # The programme: what the tool shall do, what the joints can do, and what separation allows.
     wish = np.empty(task_count)
-    damping = posture.damping + _wish(arms, heres, goals, wish)
+    damping = kinematics.damping + _wish(arms, heres, goals, wish)
     scaled = np.empty((task_count, joints))
     home = np.empty(joints)
     bounds = np.empty((2, joints))
@@ -201,7 +204,7 @@ def joint_step(
         )
         solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
 
-    # If the joints cannot reach it soon, the turn is reduced, so that the position is kept. This
+    # If the joints cannot reach this soon, the turn is reduced, so that the position is kept. This
     # mixes two solutions, and a mixture need not keep separation's rows.
     is_reachable = _can_have(arms, goals, velocity)
     scaled[3:] = 0.0
@@ -213,6 +216,7 @@ def joint_step(
         _turn_less(arms, goals, velocity, without_turn)
     excess = _excess(arms, velocity)
 
+    # The accelerations: the same programme, without turn and separation.
     _wish_acceleration(arms, goals, wish, home, bounds)
     solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
 
@@ -246,8 +250,8 @@ def _brake_idle(arms: Records, goals: Records, home: Vector) -> None:
 def _wish_acceleration(
     arms: Records, goals: Records, wish: Vector, home: Vector, bounds: Vector
 ) -> None:
-    """Write what `joint_step` asks of the accelerations: the goal's, none of the joints', and their
-    limits, divided by `scale`.
+    """Write the programme of the accelerations: the goal's for the tool, 0 for the joints, and the
+    joints' limits, divided by `scale`.
     """
     arm = arms[0]
     wish[:3] = goals[0].acceleration
@@ -263,13 +267,13 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
     goal.
     """
     arm = arms[0]
-    posture = heres[0]
+    kinematics = heres[0]
     goal = goals[0]
     linear = np.empty(3)
     error = np.empty(3)
     for i in range(3):
         linear[i] = min(max(goal.velocity[i], -MAX_ERROR_M), MAX_ERROR_M)
-        error[i] = min(max(goal.position[i] - posture.position[i], -MAX_ERROR_M), MAX_ERROR_M)
+        error[i] = min(max(goal.position[i] - kinematics.position[i], -MAX_ERROR_M), MAX_ERROR_M)
         error[i] -= arm.period_s * linear[i]
 
     # The rate is constant for small errors; large ones are closed at constant deceleration.
@@ -285,12 +289,12 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
 
     turn = np.empty(3)
     turn_rows = len(wish) - 3
-    _turn(arms, posture.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
+    _turn(arms, kinematics.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
     wish[:3] = linear
     wish[3:] = 0.0
     for i in range(turn_rows):
         for k in range(3):
-            wish[3 + i] += arm.turn_lever * posture.rotation[k, i] * turn[k]
+            wish[3 + i] += arm.turn_lever * kinematics.rotation[k, i] * turn[k]
     excess = max(rate * distance - arm.far_speed, 0.0)
     far_damping: float = arm.far_damping * excess * excess
     return far_damping
@@ -304,24 +308,24 @@ def _bound_joints(
     near its limit, else 0.
     """
     arm = arms[0]
-    posture = heres[0]
+    kinematics = heres[0]
     flags = 0
     for j in range(len(home)):
-        below = posture.joints[j] - arm.lower[j]
-        above = arm.upper[j] - posture.joints[j]
+        below = kinematics.joints[j] - arm.lower[j]
+        above = arm.upper[j] - kinematics.joints[j]
         if min(below, above) < arm.near_limit_rad * arm.per_rad[j]:
             flags = NEAR
         bounds[0, j] = -arm.approach_gain[j] * max(below, 0.0) / arm.scale[j]
         bounds[1, j] = arm.approach_gain[j] * max(above, 0.0) / arm.scale[j]
 
         # Any number of turns away; 0 at half a turn, where no direction is shorter.
-        error = arm.posture[j] - posture.joints[j]
+        error = arm.posture[j] - kinematics.joints[j]
         if arm.is_continuous[j]:
             error, _ = sin_cos(error)
         max_speed = arm.posture_speed * arm.per_rad[j]
         home[j] = min(max(arm.posture_gain * error, -max_speed), max_speed) / arm.scale[j]
         for i in range(len(scaled)):
-            scaled[i, j] = posture.tasks[i, j] * arm.scale[j]
+            scaled[i, j] = kinematics.tasks[i, j] * arm.scale[j]
     return flags
 
 

@@ -8,8 +8,8 @@ WAY = 24  # largest number of postures of a way out
 STATE = (
     Field("slow_tick", "int64"),  # the last tick at which the tool was below its fault speed
     Field("followed_tick", "int64"),  # the last tick at which the arm followed
-    # Tick from which a duration is measured: without progress of a tool that follows; of a way out;
-    # without motion of joints that return out of a thing.
+    # Tick from which a duration counts: the last progress of a tool that follows; the begin of a
+    # way out; the last motion of joints that return out of a thing.
     Field("stuck_tick", "int64"),
     Field("way_next", "int64"),  # index of the posture of the way out to which the arm moves
     Field("way_count", "int64"),  # number of postures of the way out; 0: there is none

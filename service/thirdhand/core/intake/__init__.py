@@ -21,8 +21,8 @@ KEPT = 49
 STATE = (
     Field("hand_stamps_ns", "int64", (2,)),  # stamp of the newest sample
     Field("hand_ticks", "int64", (2,)),  # tick of the newest sample; -1: none yet
-    Field("arm_stamp_ns", "int64"),
-    Field("arm_tick", "int64"),
+    Field("arm_stamp_ns", "int64"),  # stamp of the arm's newest sample
+    Field("arm_tick", "int64"),  # tick of the arm's newest sample; -1: none yet
     Field("arm_still_tick", "int64"),  # tick since which the arm has reported `arm_still_posture`
     # the last two ticks with a plausible state of the arm
     Field("arm_sample_ticks", "int64", (2,)),
@@ -91,8 +91,8 @@ STATE = (
     # share of the arm's recent states that contradict the others
     Field("arm_contested", "float64"),
     Field("arm_still_posture", "float64", (PER_JOINT,)),  # posture in which the arm is at rest
-    Field("measured", "float64", (PER_JOINT,)),
-    Field("measured_velocities", "float64", (PER_JOINT,)),
+    Field("measured", "float64", (PER_JOINT,)),  # joints of the arm's newest sample [rad, m]
+    Field("measured_velocities", "float64", (PER_JOINT,)),  # their velocities [rad/s, m/s]
     Field("kept_late", "int32", (2, KEPT)),  # ticks between making and arrival of each sample
     Field("rejected", "uint32", (len(Cause),)),  # rejected samples by cause, since start
     Field("trembles", "uint8", (2,)),  # 1: the hand's tremor is evident

@@ -35,8 +35,8 @@ def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
 def compared(
     states: Records, parameters: Records, position: Vector, velocity: Vector
 ) -> tuple[bool, float, float]:
-    """Check of joint positions and velocities (J,) [rad, rad/s] against plausible ranges and known
-    ones.
+    """Plausibility of joint positions and velocities (J,) [rad, rad/s], and their differences from
+    earlier samples.
 
     Returns: true if every joint is within `plausible_joints` and not faster than max_joint_radps;
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
@@ -44,17 +44,18 @@ def compared(
     """
     state = states[0]
     config = parameters[0]
-    near = True
+    plausible = True
     deviation = 0.0
     moved = 0.0
     for i in range(len(position)):
-        near = (
-            near and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
+        plausible = (
+            plausible
+            and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
         )
-        near = near and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        plausible = plausible and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
         deviation = max(deviation, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
-    return near, deviation, moved
+    return plausible, deviation, moved
 
 
 @compiled

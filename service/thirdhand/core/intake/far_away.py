@@ -16,8 +16,8 @@ PLAUSIBLE_DISTANCES_M = (0.05, 2.5)
 def unit_meant(position: Sequence[float], unit: str) -> str:
     """The unit in which a position was probably reported, if that is not `unit`; empty otherwise.
 
-    In `unit`, its distance from the origin is nothing that a hand has; among the units in which it
-    is, the one nearest to 1 m is meant.
+    A `unit` is wrong if no hand is as far from the origin (PLAUSIBLE_DISTANCES_M). Of the units in
+    which a hand may be, the one is returned that puts it nearest to 1 m.
     """
     distance = math.hypot(*position)
     nearest_m, farthest_m = PLAUSIBLE_DISTANCES_M

@@ -44,11 +44,11 @@ def smoothing(period_s: float, numbers: IntakeTuning = TUNING.intake) -> Vector:
 
 @compiled
 def stillness_after(
-    velocity: Vector, changes: Vector, still_speed: float, lowpass: Vector, stillness: float
+    velocity: Vector, gains: Vector, still_speed: float, lowpass: Vector, stillness: float
 ) -> float:
     """Stillness s of a hand one period later, at the velocity v (3,) [m/s].
 
-    With the gains g of `smoothing` (`changes`), and the velocity without tremor u (`lowpass`, (3,),
+    With the `gains` g of `smoothing`, and the velocity without tremor u (`lowpass`, (3,),
     updated in place):
 
         u = u + g_0 (v - u),   n = exp(-(|u| / still_speed)⁴)
@@ -57,13 +57,13 @@ def stillness_after(
     square = 0.0
     for axis in range(3):
         lowpass[axis] = (
-            np.rint((lowpass[axis] + changes[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO)
+            np.rint((lowpass[axis] + gains[0] * (velocity[axis] - lowpass[axis])) * ROUND_TO)
             / ROUND_TO
         )
         square += lowpass[axis] * lowpass[axis]
     share = square / still_speed**2
     now = exp(-share * share)
-    after = stillness + (changes[1] if now > stillness else changes[2]) * (now - stillness)
+    after = stillness + (gains[1] if now > stillness else gains[2]) * (now - stillness)
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 
 
@@ -71,13 +71,13 @@ def stillness_of(velocities: Vector, period_s: float) -> Vector:
     """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
     out = np.empty((len(velocities), 2))
     stillness = STILL.copy()
-    changes = smoothing(period_s)
+    gains = smoothing(period_s)
     still_mps = TUNING.intake.hand_still_mps
     lowpass = np.zeros((2, 3))
     for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
         for side in (0, 1):
             stillness[side] = stillness_after(
-                velocity[side], changes, still_mps, lowpass[side], stillness[side]
+                velocity[side], gains, still_mps, lowpass[side], stillness[side]
             )
         row[:] = stillness
     return out
@@ -96,14 +96,14 @@ class HandEstimator:
     def _model_over(self, ticks: int) -> Records:
         """The motion model and the gains of `smoothing` over an interval of some ticks, and the
         speed of a still hand, as one record (1,). Over minutes the model's covariance would
-        overflow; beyond the intervals of `models` both hands are stale, and it is not used.
+        overflow; beyond the intervals of `models` both hands are stale, and no model is used.
         """
         interval_s = ticks * self._period_s
-        changed = smoothing(interval_s, self._numbers)
+        gains = smoothing(interval_s, self._numbers)
         used_s = min(ticks, len(self._models)) * self._period_s
         return parameters(
             **model(used_s, self._numbers),
-            smoothing=changed,
+            smoothing=gains,
             still_speed=self._numbers.hand_still_mps,
         )
 
@@ -166,19 +166,19 @@ def _update_noise(
 
 @compiled
 def _advance_both(
-    states: Records, ticks: int, stale_ticks: int, one: Records, models: Records
+    states: Records, ticks: int, stale_ticks: int, overs: Records, models: Records
 ) -> None:
-    """Advance the state by some ticks: modes, estimate and stillness of both hands. `one` (1,) is
-    the record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale hand
-    stands still: its velocity, acceleration and tremor are set to zero.
+    """Advance the state by some ticks: modes, estimate and stillness of both hands. `overs` (1,)
+    is the record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale
+    hand stands still: its velocity, acceleration and tremor are set to zero.
     """
     state = states[0]
-    over = one[0]
+    over = overs[0]
     state.tick += ticks
     for side in range(2):
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
-            advance_hand(states, side, one)
+            advance_hand(states, side, overs)
             look_ahead(states, models, side)
         else:
             state.mode_means[side, :, 1:] = 0.0
@@ -239,11 +239,11 @@ def goes_on(states: Records, parameters: Records, side: int, position: Vector) -
 
 @compiled
 def turn_to(
-    states: Records, side: int, turn: tuple[float, float, float, float], frame: Vector
+    states: Records, side: int, turn: tuple[float, float, float, float], mapping: Vector
 ) -> None:
     """Store the orientation of one hand as a rotation matrix in frame base, row by row.
 
-    `turn` is the quaternion x y z w in the tracker's axes. `frame` (3, 4) maps the tracker's
+    `turn` is the quaternion x y z w in the tracker's axes. `mapping` (3, 4) maps the tracker's
     coordinates to base: rotation times unit [m], and origin.
     """
     x, y, z, w = turn
@@ -259,12 +259,12 @@ def turn_to(
     matrix[2, 0] = s * (x * z - y * w)
     matrix[2, 1] = s * (y * z + x * w)
     matrix[2, 2] = 1.0 - s * (x * x + y * y)
-    unit = math.sqrt(frame[0, 0] ** 2 + frame[1, 0] ** 2 + frame[2, 0] ** 2)
+    unit = math.sqrt(mapping[0, 0] ** 2 + mapping[1, 0] ** 2 + mapping[2, 0] ** 2)
     out[:] = 0.0
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                out[3 * i + j] += frame[i, k] / unit * matrix[k, j]
+                out[3 * i + j] += mapping[i, k] / unit * matrix[k, j]
 
 
 @compiled
@@ -326,16 +326,18 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
     if not has_clock or (
         not fresh and _later_s(states, side, 0, stamp_ns, period_s) > longest_late_s
     ):
+        # learning (re)starts
         stamps[:] = stamp_ns
         ticks[:] = state.tick
         state.clock_tick[side] = state.tick
         state.clock[side] = LEARNING
         state.longest_delay_ticks[side] = 0
     elif (state.tick - state.clock_tick[side]) * period_s >= config.tracker_memory_s:
-        apart_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(
+        # the window is over: is its minimum delay that of the window before?
+        change_s = _later_s(states, side, 1, stamps[0], period_s) - _later_s(
             states, side, 0, stamps[0], period_s
         )
-        steady = abs(apart_s) <= config.delay_tolerance_s and state.clock[side] != LEARNING
+        steady = abs(change_s) <= config.delay_tolerance_s and state.clock[side] != LEARNING
         state.clock[side] = TRUSTED if steady else DOUBTED
         stamps[1] = stamps[0]
         ticks[1] = ticks[0]
@@ -345,8 +347,10 @@ def note_clock(states: Records, parameters: Records, side: int, stamp_ns: int, f
         state.longest_delay_ticks[side, 1] = state.longest_delay_ticks[side, 0]
         state.longest_delay_ticks[side, 0] = 0
     elif _later_s(states, side, 0, stamp_ns, period_s) < 0.0:
+        # a new minimum
         stamps[0] = stamp_ns
         ticks[0] = state.tick
+
     late = ticks_late(states, side, stamp_ns, period_s, longest_late_s)
     state.longest_delay_ticks[side, 0] = max(state.longest_delay_ticks[side, 0], late)
     stale = math.ceil(state.longest_delay_ticks[side].max() / config.end_share)

@@ -180,13 +180,13 @@ def insert(
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
     state.kept[side] = min(state.kept[side] + 1, KEPT)
     for newer in range(order):
-        to = slot(states, side, newer)
-        of = slot(states, side, newer + 1)
-        state.kept_stamps_ns[side, to] = state.kept_stamps_ns[side, of]
-        state.kept_ticks[side, to] = state.kept_ticks[side, of]
-        state.kept_late[side, to] = state.kept_late[side, of]
-        state.kept_restarts[side, to] = state.kept_restarts[side, of]
-        state.kept_positions[side, to] = state.kept_positions[side, of]
+        new = slot(states, side, newer)
+        old = slot(states, side, newer + 1)
+        state.kept_stamps_ns[side, new] = state.kept_stamps_ns[side, old]
+        state.kept_ticks[side, new] = state.kept_ticks[side, old]
+        state.kept_late[side, new] = state.kept_late[side, old]
+        state.kept_restarts[side, new] = state.kept_restarts[side, old]
+        state.kept_positions[side, new] = state.kept_positions[side, old]
     index = slot(states, side, order)
     state.kept_stamps_ns[side, index] = stamp_ns
     state.kept_ticks[side, index] = tick
@@ -216,20 +216,23 @@ def take_late(
     config = parameters[0]
     order = order_of(states, side, stamp_ns)
     count = state.kept[side]
+
+    # the filter as it was after the next older sample; the oldest sample starts it anew
     if count > 0:
         _recall(states, side, slot(states, side, min(order, count - 1)))
-    first = order == count
+    is_oldest = order == count
     insert(states, side, order, stamp_ns, tick, position, restarts)
+
     for newer in range(order, -1, -1):
         index = slot(states, side, newer)
-        first = first and newer == order
+        is_oldest = is_oldest and newer == order
         ticks = (
             0
-            if first
+            if is_oldest
             else state.kept_ticks[side, index]
             - state.kept_ticks[side, slot(states, side, newer + 1)]
         )
-        anew = first or state.kept_restarts[side, index] > 0
+        anew = is_oldest or state.kept_restarts[side, index] > 0
         if not anew:
             _advance_by(states, models, side, ticks)
         filter_in(
@@ -237,9 +240,10 @@ def take_late(
             parameters,
             side,
             index,
-            config.tracker_memory_s if first else ticks * config.period_s,
+            config.tracker_memory_s if is_oldest else ticks * config.period_s,
             anew,
         )
+
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
     settle(states, parameters, models, side)

@@ -95,9 +95,13 @@ def move_on(  # noqa: C901, PLR0912 - one nest of loops
     trembles = overs[0].tremor[rate]
     driving = overs[0].noise[motion]
     trembling = overs[0].tremor_noise[rate]
+
+    # the blocks of F, below each other
     for row in range(STATES):
         for k in range(3 if row < 3 else 2):
             over[row, k] = moves[row, k] if row < 3 else trembles[row - 3, k]
+
+    # F m, and the product F P
     for row in range(STATES):
         first, count = (0, 3) if row < 3 else (3, 2)  # F is block-diagonal: motion and tremor
         for column in range(STATES):
@@ -111,6 +115,8 @@ def move_on(  # noqa: C901, PLR0912 - one nest of loops
                 m += over[row, k] * mean[first + k, axis]
             moved[row, axis] = m
     mean[:] = moved
+
+    # F P Fᵀ + Q
     for row in range(STATES):
         for column in range(row, STATES):
             p = 0.0
@@ -165,8 +171,8 @@ def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> Non
 @compiled
 def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None:
     """Condition a moving mode on being slow: a Kalman update by v = 0 with standard deviation
-    rest_speed_std_mps, then by a = 0 with as many m/s²: a resting hand changes its drift by as much
-    in a second.
+    rest_speed_std_mps, then by a = 0 with the same number in m/s²: the drift of a resting hand
+    changes within a second.
     """
     spread = parameters[0].rest_speed_std_mps
     for order in range(1, 3):
@@ -198,9 +204,8 @@ def _leave_rest(mean: Vector, covariance: Vector) -> None:
 
 @compiled
 def bounded(parameters: Records, innovation: float) -> float:
-    """Squared, normalised innovation x on three axes, at most so large that exp(-½ x) =
-    least_mode_probability³, a factor for each axis: a less probable sample does not distinguish
-    modes.
+    """Squared, normalised innovation x on three axes, limited to 6 outlier_variances, where exp(-½
+    x) is least_mode_probability on each axis: a less probable sample does not distinguish modes.
     """
     most: float = 6.0 * parameters[0].outlier_variances
     return min(innovation, most)
@@ -272,6 +277,7 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
                 if i == REST:
                     _leave_rest(of_means[j, i], of_covariances[j, i])
                 _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
+
     for j in range(MODES):
         expected[j] = 0.0
         mixed = means[j]
@@ -345,6 +351,7 @@ def update(
         _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
     _switched(parameters, means, covariances, modes, interval_s, shares)
     _mix(parameters, means, covariances, shares, expected, tremor)
+
     best = -1e300
     for i in range(MODES):
         mean = means[i]
@@ -357,6 +364,8 @@ def update(
         if i == REST:
             likelihood[i] -= 0.5 * _beyond_rest(parameters, mean, tremor)
         best = max(best, likelihood[i])
+
+    # Relative to the best one, no likelihood underflows in all modes.
     for i in range(MODES):
         modes[i] = expected[i] * exp(likelihood[i] - best)
     _normalise(modes)

@@ -50,15 +50,15 @@ def models(period_s: float, count: int, numbers: IntakeTuning = TUNING.intake) -
     tremors = [(name, np.float64, (TREMOR_RATES, 2, 2)) for name in ("tremor", "tremor_noise")]
     out = structured(count, [*motions, *tremors, ("onward", np.float64, (MODES, 3, 3))])
     times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
-    kept_on_s: Vector = np.minimum(times_s, numbers.max_late_s)
+    steady_s: Vector = np.minimum(times_s, numbers.max_late_s)
     for name, values in model(times_s, numbers).items():
         out[name] = values
     for mode in (REACH, CHANGE):
         fades = numbers.mode_acceleration_reversions_per_s[mode]
         ending = _over(
-            _motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - kept_on_s
+            _motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - steady_s
         )[0]
-        out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), kept_on_s)[0])
+        out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), steady_s)[0])
     out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
@@ -112,13 +112,13 @@ def _over(dynamics: Vector, interval_s: Vector) -> tuple[Vector, Vector]:
         expm([[-A, E], [0, Aᵀ]] t) = [[..., F⁻¹ Q], [0, Fᵀ]]
     """
     n = len(dynamics)
-    whole = np.zeros((2 * n, 2 * n))
-    whole[:n, :n] = -dynamics
-    whole[n - 1, 2 * n - 1] = 1.0
-    whole[n:, n:] = dynamics.T
-    grown = _exponential(whole * interval_s[..., None, None])
-    transition = np.swapaxes(grown[..., n:, n:], -1, -2)
-    return np.ascontiguousarray(transition), _product(transition, grown[..., :n, n:])
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n] = -dynamics
+    block[n - 1, 2 * n - 1] = 1.0
+    block[n:, n:] = dynamics.T
+    expm = _exponential(block * interval_s[..., None, None])
+    transition = np.swapaxes(expm[..., n:, n:], -1, -2)
+    return np.ascontiguousarray(transition), _product(transition, expm[..., :n, n:])
 
 
 def _exponential(matrices: Vector) -> Vector:

@@ -1,9 +1,9 @@
 """Plausibility of samples, compared with earlier ones: stamps, jumps, swapped hands, and a second
 arm. The rules are the same for both hands and for the arm:
 
-* A stamp differs from the newest one. It is at most MAX_LATE_S older than the newest one (the arm's
-  stamps must increase), and is ahead of it by at most the time since the newest sample arrived plus
-  the time after which the source is silent. Silence is judged by arrival; after a silence, any
+* A stamp differs from the newest one. It is at most `longest_late_s` older (the arm's stamps must
+  increase), and ahead by at most the time since the newest sample arrived plus the time after which
+  the source is silent. Silence is judged by arrival; after a silence, any
   stamp but the newest one is accepted.
 * A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
   jump is accepted once CONFIRMED_SAMPLES successive samples, over at least confirmed_s, agree with
@@ -11,8 +11,8 @@ arm. The rules are the same for both hands and for the arm:
 * A hand that appears where the other hand was, while that one is no longer seen there, is taken for
   the other one: the tracker has swapped them. The new position is accepted after `swapped_s`,
   within which the tracker may correct itself.
-* The arm is contested when more than CONTESTED_ON_SHARE of its states within about
-  TRACKER_MEMORY_S jumped, until the share is below CONTESTED_OFF_SHARE: two drivers report it. Of
+* The arm is contested when more than contested_on_share of its states within about
+  tracker_memory_s jumped, until the share is below contested_off_share: two drivers report it. Of
   two trackers of one hand, the daemon takes the samples of one only.
 """
 

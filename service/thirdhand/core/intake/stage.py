@@ -80,6 +80,7 @@ class Intake:
         self._clutch_ticks, self._guided_ticks = (
             _stale_ticks(key, settings) for key in ("clutch", "joints/guided")
         )
+
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         longest_s = hands.longest_stale_ms / 1000
         stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
@@ -90,6 +91,7 @@ class Intake:
         longest_late_s = max(numbers.max_late_s, longest_s)
         late_ticks = math.ceil(longest_late_s / settings.period_s)
         self._models = models(settings.period_s, unseen_ticks + late_ticks + 1, numbers)
+
         joints = settings.joints
         limits = np.array([joints.lower, joints.upper])
         per_rad = np.array(joints.per_rad)
@@ -121,6 +123,8 @@ class Intake:
             max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
         )
+
+        # by the frame that samples name: the mapping to base, and whether the axes are left-handed
         self._mappings = {
             frame: (base_from(of_frame := settings.hands_in(frame)), of_frame.axes == "left-handed")
             for frame in settings.tracker_frames
@@ -128,6 +132,7 @@ class Intake:
         if hands.frame not in ("", BASE):
             # If the tracker has a frame of its own, samples in frame base have been mapped already.
             self._mappings[BASE] = np.eye(3, 4), False
+
         self.rejected = np.zeros((len(SOURCES), len(Cause)), np.int64)
         self.refused: dict[tuple[str, Cause], Refused] = {}
         self._estimator = HandEstimator(self.parameters, self._models, numbers)

@@ -72,9 +72,8 @@ def refusal(
         return REPEATED
     if not fresh:
         return -1
-    ahead_s = (
-        float(stamp_ns) - float(newest_ns)
-    ) * 1e-9  # the difference of two integers may overflow
+    # as floats, because the difference of two integers may overflow
+    ahead_s = (float(stamp_ns) - float(newest_ns)) * 1e-9
     if ahead_s > passed_s + silent_s:
         return AHEAD
     return OLDER if stamp_ns < newest_ns and ahead_s < -late_s else -1
@@ -86,10 +85,10 @@ def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
 
         c = c + (1 - exp(-Δ / tracker_memory_s)) (jumped - c)
 
-    Δ is half the time since the tick with a state before the last one; for a further state in the
-    same tick, it is the time since the last tick with one. Δ is at most the time after which the
-    arm is silent. So the states of two drivers that take turns have the same weight, however soon
-    one follows the other.
+    For the first state in a tick, Δ is half the time since the last but one earlier tick with a
+    state; for a further state in this tick, it is the time since the last earlier one. Δ is at most
+    the time after which the arm is silent. So the states of two drivers that take turns have the
+    same weight, however soon one follows the other.
     """
     state = states[0]
     config = parameters[0]
@@ -172,9 +171,10 @@ def _judge_arm(
     """
     state = states[0]
     config = parameters[0]
-    near, deviation, moved = compared(states, parameters, position, velocity)
-    if not near:
+    plausible, deviation, moved = compared(states, parameters, position, velocity)
+    if not plausible:
         return OUT_OF_RANGE
+
     passed_s = (state.tick - state.arm_tick) * config.period_s
     silent_s = config.silent_ticks * config.period_s
     cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
@@ -183,6 +183,7 @@ def _judge_arm(
         note_arm(states, parameters, jumped)
         if jumped and cause < 0:
             cause = JUMPED
+
     if moved > config.arm_still_rad or not fresh:
         state.arm_still_posture[:] = position
         state.arm_still_tick = state.tick
@@ -199,17 +200,17 @@ def _malformed(
     """Cause for which the pose itself is rejected: NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE; -1 if
     it is accepted. `in_base` (3,) [m] is the position in frame base.
     """
-    norm = far = 0.0
+    square = square_m2 = 0.0
     for k in range(4):
-        norm += turn[k] * turn[k]
+        square += turn[k] * turn[k]
     for i in range(3):
-        far += in_base[i] * in_base[i]
+        square_m2 += in_base[i] * in_base[i]
     if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
         return NOT_FINITE
-    if not abs(math.sqrt(norm) - 1.0) <= 0.01:
+    if not abs(math.sqrt(square) - 1.0) <= 0.01:
         return NOT_A_ROTATION
     most_m = parameters[0].max_hand_distance_m
-    return -1 if far <= most_m * most_m else OUT_OF_RANGE
+    return -1 if square_m2 <= most_m * most_m else OUT_OF_RANGE
 
 
 @compiled
@@ -232,10 +233,12 @@ def _in_time(
     cause = refusal(stamp_ns, newest_ns, fresh, passed_s, stale_s, config.longest_late_s)
     if cause >= 0:
         return cause, 0, state.tick
+
     if not fresh and (stamp_ns < newest_ns or not goes_on(states, parameters, side, in_base)):
         state.kept[side] = 0
     elif fresh and stamp_ns < newest_ns:
         order = order_of(states, side, stamp_ns)
+
     late = ticks_late(states, side, stamp_ns, period_s, config.longest_late_s)
     if order >= KEPT - 1:
         return OLDER, 0, state.tick
@@ -250,15 +253,15 @@ def _in_time(
 
 
 @compiled
-def _in_base(position: tuple[float, float, float], frame: Vector) -> Vector:
+def _in_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
     """Position (3,) [m] in frame base of a tracker's position, by its axes times its unit, and its
-    origin: `frame` (3, 4).
+    origin: `mapping` (3, 4).
     """
     in_base = np.empty(3)
     for i in range(3):
-        in_base[i] = frame[i, 3]
+        in_base[i] = mapping[i, 3]
         for k in range(3):
-            in_base[i] += frame[i, k] * position[k]
+            in_base[i] += mapping[i, k] * position[k]
     return in_base
 
 
@@ -276,13 +279,15 @@ def _jump(
     """True if a hand's sample has jumped, and the number of wrong samples before it.
 
     The sample at `position` (3,) [m] was made in tick `made`, and has number `order` among the
-    retained ones. The samples before it were wrong if it continues the ones before those.
+    retained ones. If it continues these without the newest few, those were wrong (`wrong_samples`),
+    and it has not jumped.
     """
     state = states[0]
     config = parameters[0]
     jumped = False
     wrong = 0
     if fresh:
+        # predicted from the sample before it, by stamp
         prediction = state.hands[side, 0].copy()
         if order > 0 or made != state.tick:
             expected(states, models, side, order, made, prediction)
@@ -310,7 +315,7 @@ def _judge_hand(
     fresh: bool,
 ) -> tuple[int, int, int, bool, int]:
     """Cause for which a hand's well-formed sample (3,) [m] is rejected, or -1; its order and tick,
-    as of `_in_time`; and `_jump`.
+    as of `_in_time`; and the result of `_jump`.
     """
     cause, order, made = _in_time(states, parameters, side, stamp_ns, position, fresh)
     if cause >= 0:
@@ -330,16 +335,16 @@ def take_hand(
     stamp_ns: int,
     position: tuple[float, float, float],
     turn: tuple[float, float, float, float],
-    frame: Vector,
+    mapping: Vector,
 ) -> int:
     """Filter a sample of one hand; compiled part of `Intake.take_hand`. Returns the cause for which
     it was rejected, or -1.
 
     `position` [unit of the tracker] and the quaternion `turn` x y z w are in the tracker's axes.
-    `frame` (3, 4) maps them to frame base: axes times unit [m], and origin.
+    `mapping` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
     state = states[0]
-    in_base = _in_base(position, frame)
+    in_base = _in_base(position, mapping)
     fresh = (
         state.hand_ticks[side] >= 0
         and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
@@ -374,7 +379,7 @@ def take_hand(
         _note_correction(states, parameters, side, wrong, before)
         state.jump_count[side] = 0
         state.jump_is_swap[:] = 0  # this hand is seen, so the other one is not taken for it
-        turn_to(states, side, turn, frame)
+        turn_to(states, side, turn, mapping)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
     return -1
@@ -388,7 +393,7 @@ def _note_correction(
     (3,) [m].
 
     Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
-    confirmed_s, the hand may be as far away from it (`hand_doubt_m`).
+    confirmed_s, the hand may still be this far away: `hand_doubt_m`.
     """
     state = states[0]
     config = parameters[0]

@@ -67,6 +67,7 @@ def note_tremor(states: Records, parameters: Records, models: Records, side: int
     if not 0 <= ticks < len(models) or state.kept_restarts[side, at] > 0:
         _start(parameters, means, covariances, noise, position)
         return
+
     fade = exp(-ticks * config.period_s / config.tracker_memory_s)
     overs = models[ticks : ticks + 1]
     null = 0.0
@@ -79,7 +80,7 @@ def note_tremor(states: Records, parameters: Records, models: Records, side: int
             move_on(mean, covariance, overs, CHANGE if k == 1 else STEADY, rate, driven)
         variance, error = measure(mean, covariance, noise, position)
         likelihood = -1.5 * log(variance) - 0.5 * min(error, config.outlier_variances)
-        if k == 0:
+        if k == 0:  # the others are compared with it
             null = likelihood
         evidence[k] = np.rint((evidence[k] * fade + likelihood - null) * ROUND_TO) / ROUND_TO
         if k >= NO_TREMOR:

@@ -233,6 +233,8 @@ class LimiterStage:
         """
         moved = self._limiter.advance(state["joints"], wanted, ramp)
         limited = moved.limited
+
+        # separation: the synchronised step, or a stop
         excess = separation.excess(moved.velocity, moved.acceleration)
         separated = excess > 0.0
         if separated:
@@ -242,6 +244,8 @@ class LimiterStage:
                 other = self._brake(state, separation)[0]
             separated = separation.excess(*other[1:3]) < excess
             moved, limited = (other, True) if separated else (moved, limited)
+
+        # the tool's speed
         kinematics = self._arm.at(moved.position)
         excess_speed = 0.0
         if self._largest_speed_in_stop(moved, kinematics) > self._stop_speed:
@@ -250,6 +254,7 @@ class LimiterStage:
             kinematics = self._arm.at(moved.position)
             speed = tool_speeds(kinematics.record, *moved[1:3], self._jerk)[0]
             excess_speed = speed if speed > self._max_speed else 0.0
+
         moving = take(as_array(state), as_array(frame), kinematics.record, *moved[:3])
         return Moved(kinematics, limited, separated, excess_speed, moving)
 

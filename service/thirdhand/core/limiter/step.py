@@ -74,6 +74,7 @@ def _toward(
         a = state[2, i]
         top = config.max_velocity[i]
         max_jerk = config.max_jerk[i]
+
         highest = min(top, config.approach_gain[i] * max(config.upper[i] - q, 0.0))
         lowest = max(-top, config.approach_gain[i] * min(config.lower[i] - q, 0.0))
         aim = 0.0 if stopping else min(max(velocity[i], lowest), highest)
@@ -86,6 +87,7 @@ def _toward(
         )
         wanted[0, i] = aim
         wanted[1, i] = min(max(ramp, -most), most)
+
         acceleration = (aim - v) / dt
         v_then = v + 0.5 * dt * (a + acceleration)
         # speed once the acceleration is 0

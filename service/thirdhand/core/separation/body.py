@@ -1,8 +1,8 @@
 """The arm's body: capsules around the shapes of its links, and the pairs that can collide.
 
-Each capsule covers one shape. For a box, along its longest side, and for a cylinder it has the
-least volume; for a mesh the description gives it. A link without a shape gets a capsule from its
-joint to the next one, with a configured radius.
+Each capsule covers one shape. That of a cylinder, and that of a box along its longest side, has the
+least volume; that of a mesh is given by the description. A link without a shape gets a capsule from
+its joint to the next one, with a configured radius.
 """
 
 from __future__ import annotations

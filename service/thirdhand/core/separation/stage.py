@@ -51,6 +51,8 @@ class Separation:
         self.max_speed = float(body.capsules["max_speed"].max())
         centre = np.array(table.centre)
         half = np.array([*table.half_size, 0.0])
+
+        # the table, then the boxes of the settings
         boxes = [[centre - half - [0.0, 0.0, TABLE_DEPTH_M], centre + half]]
         boxes += [
             [np.subtract(b.centre, b.half_size), np.add(b.centre, b.half_size)]
@@ -59,6 +61,7 @@ class Separation:
         self._boxes = np.array(boxes)
         self._capsules = body.capsules
         self._pairs = body.pairs
+
         direction = np.array(people.toward_elbow)
         brake = np.array([people.brake, things.brake, things.brake])
         late_s = things.reaction_ms / 1000
@@ -87,7 +90,7 @@ class Separation:
             # Inside a clearance the tolerated excess falls linearly, to a tenth at 0.9 of this
             # depth: the arm slips by as much in a reaction time.
             slip_depth_m=numbers.slip_speed_mps * numbers.planned_reaction_s,
-            # and the time constant with which a hand's acceleration fades
+            # time until braking has built up, and with which a hand's acceleration fades
             brake_ramp_s=numbers.brake_ramp_s,
             lookahead_s=lookahead_s,
             # A hand approaches at `unknown_speed` until its velocity is better known than after
@@ -105,10 +108,12 @@ class Separation:
             frames=body.frames,
             axes=body.axes,
             max_velocity=np.array(limits.velocity, np.float64),
+            # the first capsule that a joint moves
             first=int(np.flatnonzero(body.capsules["link"])[0]),
         )
-        self._bare = self._parameters.copy()
+        self._bare = self._parameters.copy()  # for `intrusion`
         self._bare["clearance"] = 0.0
+
         capsules = len(body.capsules)
         joints = len(limits.names)
         most = 2 * capsules * len(lookahead_s) + 3 * capsules * len(boxes) + len(body.pairs)

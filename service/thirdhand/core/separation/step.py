@@ -19,12 +19,13 @@ from thirdhand.core.vectors import norm
 NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)
 
 Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records, Vector]
-"""States, heres, parameters, capsules, contacts and constraints of a step; and `near` (9,) [m]: the
-nearest points of the two things at hand, and the unit normal between them.
+"""States, heres, parameters, capsules, contacts and constraints of a step; and `near` (9,) [m], in
+which `geometry` writes the nearest points of two shapes and the unit normal between them.
 """
 
 Approach: TypeAlias = tuple[bool, Vector, float, float, float, float]
-"""A hand: is its velocity known; velocity; faster_by, nearer_by, contact_speed, braked."""
+"""A hand: is its velocity known; velocity (3,) [m/s]; faster_by [m/s] and nearer_by [m], its
+possible motion while unseen; contact_speed and braked [m/s], see `step`."""
 
 
 @compiled
@@ -73,8 +74,7 @@ def step(
     else 0.
 
     A moving hand is also evaluated at the times h = moving lookahead_s, with moving = `_swiftness`
-    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = brake_ramp_s,
-    at
+    in 0 ... 1. The joints are then at q + h dq, and the hand is, with τ = brake_ramp_s, at
 
         p + h v + τ (h - f) a,    with the velocity v + f a,    f = τ (1 - exp(-h / τ))
 
@@ -123,7 +123,7 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
     states, heres, parameters, capsules, contacts, _, _ = scene
     state = states[0]
     config = parameters[0]
-    posture = heres[0]
+    kinematics = heres[0]
 
     # What is known of the hand: its velocity, and how much faster and nearer it may be.
     is_known = _is_velocity_known(states, parameters, side)
@@ -132,14 +132,14 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
     faster_by, nearer_by = _while_unseen(states, parameters, side)
     moving = _swiftness(state.hands[side, 1], config.tremor_speed) if is_known else 0.0
 
-    later = np.empty(len(posture.joints))
+    later = np.empty(len(kinematics.joints))
     forearm = np.empty((2, 3))
     velocity = np.empty(3)
     for k in range(len(config.lookahead_s) if moving > 0.0 else 1):
         ahead_s = moving * config.lookahead_s[k]
         if k > 0:
             for j in range(len(later)):
-                later[j] = posture.joints[j] + ahead_s * state.joints[1, j]
+                later[j] = kinematics.joints[j] + ahead_s * state.joints[1, j]
             place(later, config.frames, config.axes, capsules, placed[1])
         _move_hand(states, parameters, side, ahead_s, forearm, velocity)
         braked = config.brake[PEOPLE] * max(ahead_s - config.brake_ramp_s, 0.0)
@@ -267,7 +267,8 @@ def _keep_from_boxes(
         part = capsules[capsule]
         for box in range(len(boxes)):
             inner = nearest_to_box(placed[capsule], boxes[box])
-            for point in range(3):  # the ends have constraints too: a capsule along a face may tip
+            # 0: the nearest point; 1, 2: the ends, because a capsule along a face may tip
+            for point in range(3):
                 share = inner if point == 0 else point - 1.0
                 distance = to_box(placed[capsule], share, boxes[box], near) - part.radius
                 planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)

@@ -167,10 +167,11 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
 
         σ = slow / max(1, max |costs[0]| V)
 
-    where costs (3, 3, J) are those of `joint_costs`. If only the second condition fails on an axis,
-    `_fall_back` replaces the step of that axis, provided that the norms of all axes then keep Â and
-    Ĵ. Otherwise all axes take `_fall_back` for one period; with ρ = 0 if N(setpoint) > V, so that a
-    setpoint that began too fast only brakes.
+    where costs (3, 3, J) are those of `joint_costs`, and `slow` is the share of V that the lag of
+    the tool leaves. If only the second condition fails on an axis, `_fall_back` replaces the step
+    of that axis, provided that the norms of all axes then keep Â and Ĵ. Otherwise all axes take
+    `_fall_back` for one period; with ρ = 0 if N(setpoint) > V, so that a setpoint that began too
+    fast only brakes.
 
     Returns False if all axes fell back.
     """
@@ -184,6 +185,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
         for joint in range(costs.shape[2]):
             max_joint_cost = max(max_joint_cost, abs(costs[0, i, joint]))
     required_return_m = return_speed * slow / max(1.0, max_joint_cost * max_speed) * config.period_s
+
     is_kept = True
     is_mixed = False
     for i in range(3):
@@ -203,6 +205,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
             ):
                 _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
                 is_mixed = True
+
     if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
         is_kept = is_kept and square(ahead[2]) <= config.max_acceleration**2
         is_kept = (
@@ -212,6 +215,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
     if is_kept and speed_to_come(ahead[1], ahead[2], max_jerk, return_speed) <= max_speed:
         setpoint[:] = ahead
         return True
+
     if speed_to_come(setpoint[1], setpoint[2], max_jerk, return_speed) > max_speed:
         return_speed = 0.0  # following began too fast: all axes brake first
     for i in range(3):
@@ -362,7 +366,8 @@ def stopping(
 ) -> float:
     """Largest jerk [m/s³] in [lowest, wanted] at which a discrete barrier keeps a distance h.
 
-    With d the `stop_distance` by `brakes` (m/s², m/s³) before and d' after one period at this jerk:
+    `jerks` are (wanted, lowest). With d the `stop_distance` by `brakes` (m/s², m/s³) before and d'
+    after one period at this jerk:
 
         h  = length - d                        left at the end of a stop [m]
         h' = length + growth - v dt - d'       the same, one period later

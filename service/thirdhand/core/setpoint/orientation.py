@@ -27,6 +27,7 @@ class OrientationSetpoint:
             max_acceleration=float(tool.max_turn_acceleration),
             planned_brake_share=brake_share,
             gain=numbers.turn_gain_share * numbers.position_gain_per_s,  # as of quick joints
+            # 1: the turn about +z is followed too
             about=int(tool.orientation == "full"),
             period_s=settings.period_s,
         )

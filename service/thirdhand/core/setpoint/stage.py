@@ -15,9 +15,9 @@ that the step before has checked. So these limits hold by induction, whatever th
 * the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
 * after a start or a hold, until the setpoint is within stuck_gap_m of its target, the norm of its
   speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
-* the setpoint stays inside the workspace, and within HULL_MARGIN_M of the box around the targets of
+* the setpoint stays inside the workspace, and within hull_margin_m of the box around the targets of
   the last hull_time_s. If that box has moved away, or if following began outside of it, the
-  setpoint returns at RETURN_SHARE of max_speed or faster. docs/bounds.md has the proof.
+  setpoint returns at return_share of max_speed or faster. docs/bounds.md has the proof.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class SetpointGenerator:
         longest_stop = (
             0.5 * tool.max_speed * tool.max_speed / tool.stop_acceleration + 1.0 * tool.max_speed
         )
-        # Of the tool's limits, and again of the joints', which `joint_costs` has reduced already.
+        # Planned shares of the tool's limits, and of the joints', which `joint_costs` has already
+        # reduced by them once.
         speed_share, brake_share, jerk_share = tuning.arm.planned_limit_shares
         self._parameters = parameters(
             period_s=settings.period_s,
@@ -92,7 +93,7 @@ class SetpointGenerator:
     def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
         """Start from the motion of the tool (3, 3), which becomes the only known target.
 
-        If it `engages`, it engages anew; otherwise it continues to if it has not yet ended.
+        If it `engages`, it engages anew; otherwise an engaging that has not ended continues.
         """
         state["setpoint"] = setpoint
         state["engaging"] = self._engages and (engages or state["engaging"])
@@ -193,6 +194,7 @@ class SetpointStage:
         tool = here.record["position"][0]
         self._position.engage(state, target.position)
         limits = self._position.limits(state)
+
         slow, gap_m = ready(states, here.record, self._arm.parameters, limits, share, self._costs)
         if gap_m > self._gap_waiting_m:
             gaps_m = self._gap_waiting_m, self._gap_stopped_m
@@ -200,12 +202,14 @@ class SetpointStage:
         if gap_m > self._gap_stopped_m:
             box = self._position.stretched(box, state["setpoint"])
         met = self._position.step(state, target, box, self._costs, slow)
+
         closure = float(states["closure"][0])
         if closure != NO_GRIPPER:
             distance_m = math.dist(wanted.target.position.tolist(), tool.tolist())
             self._grip(state, closure, distance_m)
         elif self._takes_wishes:
             self._grip(state, float(state["gripper_wish"]), 0.0)
+
         finish(states, frames, self._orientation.limits(state))
         return met
 

@@ -75,6 +75,7 @@ def lead(
     state.hull_ticks = bounds_around(
         state.hull, state.hull_ticks, position, parameters, box, low, high
     )
+
     jerk = np.empty(3)
     ahead = np.empty((3, 3))
     dt = config.period_s
@@ -87,6 +88,7 @@ def lead(
         ahead[0, i] = x + dt * (v + dt * (a / 2.0 + dt * j / 6.0))
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
+
     if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
         met = STOPPED
     if broken_bound(setpoint, before, state.hull, box, parameters):

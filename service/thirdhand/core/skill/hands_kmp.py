@@ -135,6 +135,7 @@ class HandsKMP:
             local_scatter(inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
         if known is not None and self.errors is not None:
+            # the gate compares the primitive's own covariance, which was not computed
             deviation = math.nan
         return Motion(out[0], out[1], out[2], out[3:], deviation)
 

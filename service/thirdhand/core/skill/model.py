@@ -62,7 +62,8 @@ class Motion(NamedTuple):
     velocity: Vector  # (3,) [m/s]
     acceleration: Vector  # (3,) [m/s²]
     covariance: Vector  # (3, 3) [m²]
-    # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: as before
+    # [m] distance that is compared with the skill's threshold: see `Model.measure`; NaN: that of
+    # the prediction before
     gate_m: float
     ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another segment
 
@@ -74,9 +75,8 @@ class Seen(NamedTuple):
     moving: Vector
     stillness: Vector  # (2,) stillness of each hand, 0 to 1
     past: Vector  # (ORDER, 6) [m] memory of the hands' positions, see `remember`
-    turns: (
-        Vector  # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
-    )
+    # (TURNS, 18) filters of the hands' rotation matrices; (0, 18) if these are unknown
+    turns: Vector
     turn_lag_s: float  # time constant of these filters
     now: Vector  # (3, 6) motion of the hands at this tick, from which gate and belief are computed
     belief: Vector  # (MOST_SEGMENTS,) probability of each segment; zeros: not yet known
@@ -97,7 +97,7 @@ class Target(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """Request of the skill to the segments after it: target in the workspace, and orientation."""
+    """Request of the skill to the stages after it: target in the workspace, and orientation."""
 
     target: Target
     orientation: Vector  # (4,) quaternion x y z w

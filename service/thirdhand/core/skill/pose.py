@@ -140,6 +140,8 @@ def _turned(  # noqa: C901, PLR0912 - one nest of loops
         vector[i] = 2.0 * np.rint(zeta[i] * TURN_ROUND_TO) / TURN_ROUND_TO
         square += vector[i] * vector[i]
     angle = math.sqrt(square)
+
+    # factors of [φ]× and [φ]×² in J_l, then `per_zeta` = J
     first = 0.5
     second = 1.0 / 6.0
     if angle > 1e-3:
@@ -155,6 +157,7 @@ def _turned(  # noqa: C901, PLR0912 - one nest of loops
         k = (i + 2) % 3
         per_zeta[j, k] -= 2.0 * first * vector[i]
         per_zeta[k, j] += 2.0 * first * vector[i]
+
     for i in range(3):
         turning[i] = 0.0
         for j in range(3):

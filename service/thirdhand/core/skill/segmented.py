@@ -108,9 +108,12 @@ class Placed(Immutable):
             sizes["unknown_std"] = unknown.std_m
             scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
             segments["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
+
         sizes["scale"], _ = primitive.kernel.coordinates(1)
         sizes["std"] = at.std
         sizes["prior"] = primitive.prior_offset
+
+        # compiled functions always have a clock as the last input
         inputs = primitive.centres
         count = len(off)
         if clock is None or not clock.weight:
@@ -118,13 +121,14 @@ class Placed(Immutable):
         else:
             sizes["clock_weight"] = clock.weight
         centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
+
         columns = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
-        wrong = (
+        rows = (
             error_table(np.hstack([errors[:, :2], columns]), errors[:, 3:])
             if len(errors)
             else NO_ERRORS
         )
-        return cls(segments, sizes, centres, wrong, NO_PULLS)
+        return cls(segments, sizes, centres, rows, NO_PULLS)
 
     def pulled(self, pulls: Vector) -> Placed:
         """These segments with pulls (X, 9) that act in all of them."""

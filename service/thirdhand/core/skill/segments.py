@@ -52,8 +52,8 @@ from thirdhand.core.skill.tuning import (
 from thirdhand.core.vectors import dot, norm, squared_distance
 
 MOST_SEGMENTS = 64  # segments for which the state has room
-# `square` of a hand that rests; the hand that the tool follows
-STAYS = 0.0
+STAYS = 0.0  # `square` of a hand that rests
+# the hand that the tool follows, or that leads
 NONE = -1
 LEFT = 0
 RIGHT = 1
@@ -88,7 +88,7 @@ PLACED = np.dtype(
         ("std", np.float64),  # [m] standard deviation of the via-points on each axis
         # as an input, a second in the segment counts as this share of it; 0: no clock
         ("clock_weight", np.float64),
-        # [m] that of the tool where no demonstration was; 0: as at the nearest ones
+        # [m] standard deviation of the tool where nothing was shown; 0: as at the nearest data
         ("unknown_std", np.float64),
         ("prior", np.float64, (OUTPUTS,)),  # the primitive's outputs far from all data
         ("pulls", np.int64),  # number of pulls that act in all segments; they are the first rows
@@ -148,12 +148,12 @@ def along_both(hands: Vector, still: Vector, segment: Record) -> tuple[float, fl
     one hand leads the segment, its share counts for both.
     """
     left = along_way(hands[:3], still[0], segment, 0)
-    other = along_way(hands[3:6], still[1], segment, 1)
+    right = along_way(hands[3:6], still[1], segment, 1)
     if segment["leads"] == LEFT:
-        other = left
+        right = left
     elif segment["leads"] == RIGHT:
-        left = other
-    return left, other
+        left = right
+    return left, right
 
 
 @compiled
@@ -221,6 +221,8 @@ def recognise(
     share = min(period_s / SAMPLE_CORRELATION_S, 1.0)
     for k in range(count):
         total += belief[k]
+
+    # a new belief, or the transitions
     if total <= 0.0:
         share = 1.0
         for k in range(count):
@@ -241,6 +243,8 @@ def recognise(
         belief[0] += restart
         for k in range(count):
             belief[k] += SEGMENT_ASTRAY_PER_S * period_s * (1.0 / count - belief[k])
+
+    # the evidence
     likelihood = np.empty(count)
     for k in range(count):
         likelihood[k] = _likely(moving, segments[k])
@@ -308,8 +312,8 @@ def add_followed(hands: Vector, share: float, segment: Record, out: Vector) -> N
 def _tool_of(
     hands: Vector, share: float, offset: Vector, segment: Record, size: Record, pulls: Vector
 ) -> Vector:
-    """Tool position (3,) [m] in a segment for hands (6 or 24,), of which the tool has covered a
-    `share` s, with an `offset` δ (3,) [m]:
+    """Tool position (3,) [m] for hands (6 or 24,) when the tool has covered a `share` s of a
+    segment, with an `offset` δ (3,) [m]:
 
         tool = t + s u + δ
 
@@ -355,7 +359,7 @@ def tools_at(
     padded = centres.shape[1]
     x = np.empty(3 + count)
     outputs = np.empty(OUTPUTS)
-    values = np.empty(padded)
+    values = np.empty(padded)  # this and `room`: space for `add_table`
     room = np.empty(padded)
     for k in range(count):
         if belief[k] >= LEAST_SEGMENT_PROBABILITY:
@@ -492,11 +496,14 @@ def scatter(
         if belief[k] < LEAST_SEGMENT_PROBABILITY:
             continue
         in_all += belief[k]
+
+        # the errors near x_k: their weights and their products
         x[:] = near[:] = 0.0
         x[0], x[1] = along_both(hands, still, segments[k])
         x[2 + k] = ERROR_SEGMENT_DISTANCE
         add_table(x, errors, ERROR_SCALE, values, room, near)
         total = 1e-9 + mass + near[0]
+
         share = _tool_share(tools[k], segments[k]) if mass else 0.0
         for i in range(3):
             for j in range(i, 3):
@@ -509,6 +516,7 @@ def scatter(
                     end = segments[k]["scatter"][1, i, j]
                     covariance += (1.0 - share) ** 2 * begin + share**2 * end
                 out[i, j] += belief[k] * covariance
+
     for i in range(3):
         for j in range(i, 3):
             out[i, j] /= in_all
@@ -550,6 +558,8 @@ def elsewhere(
     if difference < LEAST_SEGMENT_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
+
+    # the tools of segment k and of all that are probable without a first segment
     either = np.empty(count)
     tools = np.empty((1, count, 3))
     tempos = np.zeros((1, 3))
@@ -601,6 +611,8 @@ def predicted(
     tools = np.empty((3, len(segments), 3))
     if seen.period_s > 0.0:
         recognise(belief, seen.now, seen.period_s, segments, FIRST_SEGMENT_ODDS)
+
+    # hands and tempo at three times, and the tool there
     _around(seen.moving, hands)
     if entries:
         rates = np.empty((3, entries))
@@ -613,6 +625,7 @@ def predicted(
     tools_at(hands, tempos, belief, segments, sizes, centres, pulls, tools)
     for n in range(3):
         expected(belief, tools[n], steps[n])
+
     for i in range(3):
         acceleration = (steps[2, i] - 2.0 * steps[1, i] + steps[0, i]) / MOTION_STEP_S**2
         out[0, i] = steps[1, i]

@@ -88,10 +88,14 @@ def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
     outer = reach.outer
     min_x = reach.min_x - reach.centre[0]
     floor = reach.min_z - reach.centre[2]
+
+    # into the half-spaces
     moved_x = x < min_x
     moved_z = z < floor
     x = max(x, min_x)
     z = max(z, floor)
+
+    # into the outer sphere, and back across the plane of the least x
     distance = math.hypot(x, y, z)
     moved_out = distance > outer
     if moved_out:
@@ -104,6 +108,8 @@ def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
             shrink = math.sqrt(max(outer**2 - x**2, 0.0)) / max(math.hypot(y, z), 1e-12)
             y = y * min(shrink, 1.0)
             z = z * min(shrink, 1.0)
+
+    # out of the inner sphere, and back across the plane of the least z
     distance = math.hypot(x, y, z)
     moved_in = distance < inner
     if moved_in:
@@ -117,6 +123,7 @@ def _nearest(point: Vector, reach: Reach) -> tuple[Vector, list[Vector]]:
             grow = math.sqrt(max(inner**2 - z**2, 0.0)) / max(math.hypot(x, y), 1e-12)
             x = x * max(grow, 1.0)
             y = y * max(grow, 1.0)
+
     if not (moved_x or moved_z or moved_out or moved_in):
         return point, []
     radial = np.array([x, y, z]) / max(math.hypot(x, y, z), 1e-12)
@@ -158,9 +165,7 @@ class Prediction(NamedTuple):
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
     ambiguity: float  # probability that the tool belongs elsewhere, in another segment
     turn: Turn
-    closure: (
-        float  # closure of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
-    )
+    closure: float  # of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +227,7 @@ class Skill(Immutable):
         in all that follows.
         """
         now = self._conducting(np.stack([hands, velocities, accelerations])).reshape(3, 6)
-        behind = (
+        memory = (
             np.tile(now[0], (ORDER, 1))
             if past is None
             else self._conducting(past).reshape(ORDER, 6)
@@ -233,7 +238,7 @@ class Skill(Immutable):
         late_s = self.model.delay_s - lead_s
         if late_s:
             moving = np.empty((3, 6))
-            delayed(now, behind, late_s, moving)
+            delayed(now, memory, late_s, moving)
         if self.conductor is not None:
             stillness = stillness[[self.conductor] * 2]
         rotations = UNTOLD if turns is None else self._conducting(turns).reshape(len(turns), -1)
@@ -241,7 +246,7 @@ class Skill(Immutable):
             Seen(
                 moving,
                 stillness,
-                behind,
+                memory,
                 rotations,
                 turn_lag_s(late_s),
                 now,

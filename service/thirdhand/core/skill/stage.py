@@ -1,4 +1,4 @@
-"""The core's segment of the skill: predict the tool at each sample of a hand."""
+"""Skill stage: predict the tool at each sample of a hand."""
 
 from __future__ import annotations
 
@@ -106,6 +106,7 @@ class SkillStage:
         self._count(state)
         motion = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
         is_new = recall(states, rules, motion)
+
         before = None
         covariance = state["covariance"]
         if not is_new:
@@ -118,10 +119,11 @@ class SkillStage:
         prediction = self.skill.predicted(motion, before)
         if is_new:
             state["known_gate_m"] = prediction.gate_m
+
         error_m = 0.0
         if unseen is not None:
             columns = [3 * n for n, side in enumerate(self._sides) if side == unseen]
-            # need not be computed
+            # only positions are compared: the rest is passed, so that it is not computed again
             earlier = (
                 prediction.covariance,
                 prediction.turn.covariance,
@@ -135,12 +137,14 @@ class SkillStage:
                 columns,
                 deviation,
             )
+
         doubt = 0.0
         unprimed = state["unprimed_belief"]
         if self._doubts and unprimed[0] != UNPRIMED_DECIDED:
             doubt = self.skill.model.elsewhere(
                 motion.now, motion.stillness, self._period_s, motion.belief, unprimed
             )
+
         outcome = conclude(
             states,
             frames,

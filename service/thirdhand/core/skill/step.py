@@ -54,9 +54,9 @@ def calibrate(
         for j in range(3):
             variance = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
             out[i, j] = np.rint(variance * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
-    mean = (
-        out[0, 0] + out[1, 1] + out[2, 2]
-    ) / 3.0  # from here on, the largest eigenvalue: Smith 1961
+
+    # the largest eigenvalue (Smith 1961)
+    mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0
     a = out[0, 0] - mean
     b = out[1, 1] - mean
     c = out[2, 2] - mean
@@ -107,17 +107,21 @@ def conclude(
     state.covariance[:] = covariance
     state.orientation_covariance[:] = turn[2]
     state.closure = closure
+
     passed_s = (state.tick - state.trail_tick) * rule.period_s
     state.trail_tick = state.tick
     moved = recent(position, passed_s, state.trail)
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
     probability = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
     frame.error_probability = probability + (1.0 - probability) * doubt
+
+    # An unsure skill remains so until the measure is below `end_share` of its limit.
     ease = rule.end_share if state.unsure else 1.0
     if rule.alarm > 0.0:
         state.unsure = frame.error_probability > ease * rule.alarm
     else:
         state.unsure = math.sqrt(reach_m * reach_m + off * off) > ease * UNSURE_M
+
     tell_segment(states, frames)
     if ambiguity <= AMBIGUOUS_PROBABILITY * (rule.end_share if state.reason == AMBIGUOUS else 1.0):
         state.sure_tick = state.tick

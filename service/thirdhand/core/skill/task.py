@@ -71,6 +71,7 @@ class Task(NamedTuple):
                 at_corner = self.corners[:, side] == corner
                 averaged = at_corner & is_known if (at_corner & is_known).any() else at_corner
                 hands[at_corner, side] = positions[averaged, 3 * side : 3 * side + 3].mean(axis=0)
+
         out = structured(len(rows) - 1, SEGMENT)
         out["begins"] = hands[:-1]
         out["way"] = np.diff(hands, axis=0)

@@ -39,13 +39,14 @@ from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
 from thirdhand.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS, OWN_NEAR_M
 from thirdhand.core.vectors import norm, squared_distance
 
+# entries of `task_clock` in the state
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_SEGMENT, PROGRESS, OWN_BEGIN = range(7)
-CLOCK_SIZE = OWN_BEGIN + 6  # entries of `task_clock` in the state
-# progress: hands that rest, that moved, that left where they began
+CLOCK_SIZE = OWN_BEGIN + 6  # their number
+# values of PROGRESS: hands that rest, that moved, that left where they began
 NOT_BEGUN = 0.0
 NEAR_BEGIN = 1.0
 GONE = 2.0
-# of `TaskClock.numbers`
+# entries of `TaskClock.numbers`
 WAITS_AT = 0
 LONGEST_AT = 2
 OVER_AT = 3
@@ -63,7 +64,7 @@ class TaskClock(NamedTuple):
 
     waits: bool  # true if the clock waits while both hands rest
     # As an input, a second counts as this length [m], with segments as this share of a path. With
-    # 0, the clock is no input, and only tells when a task begins again.
+    # 0, the clock is no input, and only shows when a task begins again.
     weight: float
     longest_s: float  # the clock stops at this time
     over_s: float  # from this time on the task may be over
@@ -106,7 +107,7 @@ class TaskClock(NamedTuple):
 
 @compiled
 def _are_near(hands: Vector, begin: Vector, near_m: float) -> bool:
-    """True if both hands (6,) [m] are within `near_m` [m] of where they are in `begin` (6,) [m]."""
+    """True if both hands (6,) [m] are within `near_m` [m] of their positions `begin` (6,) [m]."""
     for side in range(2):
         part = slice(3 * side, 3 * side + 3)
         if squared_distance(hands[part], begin[part]) > near_m**2:
@@ -216,6 +217,7 @@ def _counted(
     rows: Vector,
     out: Vector,
 ) -> None:
+    """Compiled part of `counted`; `moving` (T, 8) are hands, speed and stillness."""
     clock = np.zeros(CLOCK_SIZE)
     for t in range(len(moving)):
         for step in range(steps if t else 0):

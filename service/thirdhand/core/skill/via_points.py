@@ -36,8 +36,8 @@ def neighbourhoods(via_points: Sequence[ViaPoint]) -> tuple[Vector, Vector, Vect
 
 
 def rest_of(point: ViaPoint, names: Sequence[str]) -> str:
-    """The via-point of the task, of `names` in its order, at which hands rest that are at a
-    via-point: itself, or the end of the segment in which it acts; empty if there is none.
+    """Name of the via-point of the task at which hands at this `point` rest: its own name, or that
+    of the end of the segment in which it acts. `names` are those of the task, in its order.
     """
     return names[names.index(point.segment) + 1] if point.segment in names[:-1] else point.name
 
