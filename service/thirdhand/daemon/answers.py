@@ -51,8 +51,8 @@ MAX_VIA_POINTS = 400
 
 
 class OrderRequest(NamedTuple):
-    """A hold, resume or reset, `by` the one of this name. Resumes that a hold separates differ in
-    `holds`, the number of holds that were received before them.
+    """A hold, resume or reset, `by` the one of this name. `holds`, the number of holds that were
+    received before a resume, distinguishes resumes before and after a hold.
     """
 
     kind: str

@@ -1,8 +1,8 @@
 """The daemon's subscribers and publishers of its cell's streams.
 
-If two publishers report one hand, the samples of one count. Each message of this library's trackers
-names its publisher, and so does each of a ROS 2 node behind rmw_zenoh. All messages without a name
-count as one publisher's.
+If two publishers report one hand, only the samples of one are used. Each message of this library's
+trackers names its publisher, and so does each of a ROS 2 node behind rmw_zenoh. All messages without
+a name are taken as those of one publisher.
 """
 
 from __future__ import annotations
@@ -38,12 +38,11 @@ TRACKED_S = 2.0
 EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
 # a hand that was lost appears this many steps away; one that rested goes on from where it was
 LEAP_STEPS = 5.0
-SMOOTH_SHARE = 0.05  # of the median step: with noise, one step in 10 000 is as small
-LEAST_BATCHES = 3  # pauses; fewer are of a hand that was out of sight
+SMOOTH_SHARE = 0.05  # a smooth step / the median step: noise makes one in 10 000 as small
+LEAST_BATCHES = 3  # with fewer pauses than this, a hand was out of sight
 ARM_STATE = "joints/state"
-CONFIGURED: Mapping[
-    str, Callable[[Settings], bool]
-] = {  # channels that are heard with some settings only
+# channels that are heard with some settings only
+CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {
     ARM_STATE: lambda settings: settings.arm.source == "state",
     "joints/guided": lambda settings: settings.arm.source == "state",
     "clutch": lambda settings: settings.hands.clutch == "key",
@@ -65,13 +64,14 @@ class Arrivals:
     def __init__(self) -> None:
         # stamp, arrival - stamp [ns]
         self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT_DELAYS)
+        # messages: all; not decoded; of a lost hand; of another publisher. Arrival of `newest` [ns]
         self.count = self.malformed = self.frozen = self.others = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
-        self.why = ""
+        self.why = ""  # the reason why the newest malformed message was not decoded
 
     def take(self, message: PoseStamped | JointState | bool | float, at_ns: int) -> None:
-        """Note a message and its arrival by the system clock [ns]; of a clutch, a wish or a
-        report of guiding, which have no stamp, only that it arrived.
+        """Note a message and its arrival by the system clock [ns]. Messages of a clutch, a wish or
+        guiding have no stamp, and are only counted.
         """
         if isinstance(message, PoseStamped | JointState):
             self.newest = message
@@ -152,18 +152,18 @@ class FrozenHand:
     """Detection of a tracker that has lost a hand and repeats its last pose, or a pose of its own.
 
     A program's hands rest exactly: repeated poses are accepted if the hand came to rest smoothly,
-    if its stream began with a rest, or if most rests so far ended without a leap, as `learn` does
-    in takes.
+    if its stream began with a rest, or if most rests so far ended without a leap. `learn` applies
+    the same rule to takes.
     """
 
     def __init__(self) -> None:
         self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
         # distances between poses that differ, in the tracker's unit
         self._steps: deque[float] = deque(maxlen=50)
-        self._repeated_ns = 0  # stamp of its newest repetition
+        self._repeated_ns = 0  # stamp of the newest repetition of that pose
         self._varies_since_ns = 0  # stamp since which each sample differs from the one before
         self._is_tracked = False
-        self._begins_exactly = False  # its stream began with a rest, as that of a page does
+        self._begins_exactly = False  # the stream began with a rest, as that of a page does
         self._rests = self._leaps = 0
 
     def is_frozen(self, pose: PoseStamped) -> bool:
@@ -185,7 +185,7 @@ class FrozenHand:
                 self._rests += 1
                 self._leaps += bool(self._steps) and step > LEAP_STEPS * median(self._steps)
             self._steps.append(step)
-            # its clock may be set back
+            # the tracker's clock may be set back
             self._varies_since_ns = min(self._varies_since_ns, pose.stamp_ns)
             self._is_tracked |= pose.stamp_ns - self._varies_since_ns >= 1e9 * TRACKED_S
         self._pose = pose
@@ -242,7 +242,7 @@ class CellStreams:
         )
 
     def receive(self) -> list[Event]:
-        """The hands' messages since the last call, and the newest state of the arm. Messages that
+        """The messages since the last call; of the arm's states only the newest. Messages that
         cannot be decoded are counted.
         """
         events: list[Event] = []
@@ -301,7 +301,7 @@ class CellStreams:
             arrivals.refuse(str(error))
             return None
 
-        # Of two publishers of a hand, the samples of one count; a lost hand is not seen.
+        # Of two publishers of a hand, only one is heard; the pose of a lost hand is not used.
         sole = self._sole.get(suffix)
         if sole is not None and sole.is_other(publisher, now_s):
             arrivals.others += 1

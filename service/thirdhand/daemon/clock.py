@@ -74,6 +74,7 @@ class Deadlines:
         use this.
         """
         if self._now_ns() > self._sleeps_until_ns - BESIDE_NS:
+            # locked, if it is not yet; then locked again once the loop has released it
             self._is_in_tick.acquire(blocking=False)
             self._is_in_tick.acquire(timeout=NO_TICK_S)
 
@@ -90,6 +91,7 @@ class Deadlines:
         self._sleeps_until_ns = deadline - (self._spin_ns if prepare is None else PREPARE_NS)
         if self._is_in_tick.locked():
             self._is_in_tick.release()
+
         if prepare is not None:
             self._sleep_until(deadline - PREPARE_NS)
             if self._now_ns() < deadline - PREPARING_NS:
@@ -97,6 +99,8 @@ class Deadlines:
         self._sleep_until(deadline - self._spin_ns)
         while (late := self._now_ns() - deadline) < 0:
             pass
+
+        # The stamp advances by whole periods, and follows the system clock.
         due = self.stamp_ns + passed * self.period_ns
         drift_ns = self._wall_ns() - late - due
         if -STEP_NS < drift_ns < STEP_NS:
@@ -128,7 +132,7 @@ class SystemClock:
     ) -> None:
         self._now_ns = now_ns
         self._wall_ns = wall_ns
-        self._apart_ns: int | None = None
+        self._apart_ns: int | None = None  # difference of the clocks at the last reading
 
     def set_by(self) -> str:
         """How far the clock was set since the last call, in words; empty if it was not.

@@ -59,8 +59,8 @@ def _name(event: event.Event) -> str:
 def compile_cell(settings: Settings, skill: Path, report: Callable[[str, bool], object]) -> None:
     """Compile what a cell calls with the skill in a file, and wait for it.
 
-    `report(function, is_ready)` is called where a compilation begins and where it ends. What a
-    process that fails has not compiled is compiled by whoever calls it.
+    `report(function, is_ready)` is called where a compilation begins and where it ends. If a
+    process fails, what it has not compiled is compiled at its first call.
     """
     compilers = [child.start("compiler", __name__, socket.SOCK_SEQPACKET) for _ in range(2)]
     with selectors.DefaultSelector() as selector:

@@ -31,8 +31,8 @@ def held_since(state: Record) -> int:
 
 
 def check_same_hold(held_tick: int | None, state: Record) -> None:
-    """Raise RequestError unless the operator's hold that began at this tick lasts; None: never. The
-    tool then approaches a corrected target at the engaging speed.
+    """Raise RequestError unless the operator's hold that began at this tick lasts; None: never.
+    After a hold, the tool approaches a corrected target at the engaging speed.
     """
     is_held = state["mode"] == HOLD and state["operator_hold"] and state["held_tick"] == held_tick
     if held_tick is not None and not is_held:

@@ -67,10 +67,10 @@ class Daemon:
     def __init__(self, cell: CellState, skill_worker: SkillWorker, skills: Path) -> None:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
-        self._newest = -1  # newest tick
+        self._newest = -1  # index of the newest tick
         self._failed_at: int | None = None  # tick of the loop's last failure
 
-        # A second controller rehearses likely ticks.
+        # A second controller rehearses likely ticks, see `_warm_up`.
         self._twin = Controller(
             cell.settings, cell.controller.skill, urdf=robot_description(cell.settings)
         )
@@ -176,6 +176,9 @@ class Daemon:
         run(self._cell.controller, self._ticks(), [self._publish], self._cell.times.lap)
 
     def _ticks(self) -> Iterator[Tick]:
+        """A tick at each deadline, with what arrived until then. After `stop`, each tick orders a
+        hold; the last one is that in which the arm rests.
+        """
         cell = self._cell
         requests = cell.inbox
         stop_by: float | None = None
@@ -196,6 +199,7 @@ class Daemon:
                         REST_TIMEOUT_S,
                     )
                     return
+
             inbox = cell.streams.receive()
             if requests:
                 inbox += requests.take(cell.controller.state)
@@ -278,7 +282,7 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     if skill.residual_risk:
         log.warning("residual risk of skill %r, %s", skill.name, skill.residual_risk)
 
-    def taught(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
+    def adapt(points: tuple[ViaPoint, ...], tolerance: float) -> StoredSkill:
         if points == skill.via_points:
             return skill
         adapted = skill_of(skill.file, points, tolerance)
@@ -292,7 +296,7 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
         )
         return adapted
 
-    restored = saved.restored(skill, taught, skill)
+    restored = saved.restored(skill, adapt, skill)
     finding = out_of_reach(restored, beyond_m(settings, restored.tool_positions), settings)
     if finding.is_refused:
         raise SkillError(finding.text)
@@ -325,7 +329,7 @@ def serve(
     announce: Announce,
     hold: bool = False,
 ) -> str:
-    """Run a daemon, which if `hold` begins in an operator's hold, and return a message on ticks
+    """Run a daemon, from its begin in an operator's hold if `hold`, and return a message on ticks
     that were not recorded (empty: none).
 
     Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and

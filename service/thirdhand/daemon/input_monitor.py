@@ -106,7 +106,9 @@ class InputMonitor:
     def update(
         self, controller: Controller, state: Record, now_s: float
     ) -> Iterator[tuple[str, Source]]:
-        """Each source with its name at this moment, from the state of this controller."""
+        """Name and input of each hand and of the arm at this moment; the `state` is that of the
+        controller.
+        """
         for source in SOURCES:
             if source in self._keys:
                 yield source, self._source(source, controller, state, now_s)
@@ -219,31 +221,33 @@ class InputMonitor:
 
     def news(self, sources: dict[str, Source], now_s: float) -> Iterator[str]:
         """Lines for the log: the first rejection of each cause at once, then counts."""
-        counts = now_s - self._counted_s >= COUNTS_EVERY_S
-        for source, now in sources.items():
+        is_due = now_s - self._counted_s >= COUNTS_EVERY_S
+        for source, newest in sources.items():
             history = self._histories[source]
             name = input_name(source)
             logged = history.logged
             explanations = history.found
-            for cause in now.rejected.keys() - logged.keys():
-                logged[cause] = now.rejected[cause]
+            for cause in newest.rejected.keys() - logged.keys():
+                logged[cause] = newest.rejected[cause]
                 yield f"{name}: rejected as {cause}{in_full(*explanations[cause])}"
             more = {
-                cause: n - logged[cause] for cause, n in now.rejected.items() if n > logged[cause]
+                cause: n - logged[cause]
+                for cause, n in newest.rejected.items()
+                if n > logged[cause]
             }
-            if counts and more:
-                logged |= now.rejected
+            if is_due and more:
+                logged |= newest.rejected
                 causes = ", ".join(
-                    f"{n} {cause} ({now.rejected[cause]} in all)" for cause, n in more.items()
+                    f"{n} {cause} ({newest.rejected[cause]} in all)" for cause, n in more.items()
                 )
                 yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {causes}"
-        if counts:
+        if is_due:
             self._counted_s = now_s
 
 
 def _rejected(name: str, arrivals: Arrivals, intake: Intake | None) -> dict[str, int]:
-    """Rejected messages of a source by cause: first those that its samples have, then those of the
-    stream.
+    """Rejected messages of a source by cause: first those that the intake rejected, then those of
+    the stream.
     """
     counts = {
         MALFORMED: arrivals.malformed,

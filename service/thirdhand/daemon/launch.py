@@ -110,7 +110,7 @@ def launched(
     config = folder / "cell.toml"
     log = folder / "service.log"
     base_settings = settings or Settings()
-    # nobody resumes
+    # followed from the start on, because nobody resumes it
     followed = msgspec.structs.replace(
         base_settings, arm=msgspec.structs.replace(base_settings.arm, start="follow")
     )

@@ -92,8 +92,8 @@ class Queryables:
     """The queryables of one cell, which answer from `open` on.
 
     Each key of TOGETHER has its own queue, and the requests for which the skill worker computes
-    have one, so that no kind waits for another. `list` is answered at once. A request that changed
-    something is answered after a status that shows the change was published.
+    have one, so that no kind waits for another. `list` is answered at once. A request that changes
+    something is answered once a status with the change has been published.
     """
 
     def __init__(self, cell: CellState, answers: Answers) -> None:

@@ -128,8 +128,8 @@ class RequestInbox:
     def _check(self, kind: str, by: str, holds: int, state: Record) -> None:
         """Add a name for a hold, and remove all names for a resume.
 
-        Raises RequestError for more than MAX_HOLDERS names, and for a resume that is older than a
-        hold, while the arm is led by hand, or of one who does not hold the arm alone.
+        Raises RequestError for more than MAX_HOLDERS names, and for a resume that came before a
+        hold, while the arm is led by hand, or by a name that does not hold the arm alone.
         """
         if kind == "hold":
             if by and by not in self._holders and len(self._holders - {""}) >= MAX_HOLDERS:

@@ -19,13 +19,13 @@ from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings
 
 OBJECTS_KEY = "objects"
-WAITING_IMAGES = 32  # of each key between two polls; beyond it, the oldest are left out
+WAITING_IMAGES = 32  # images of a key between two polls; beyond it, the oldest are left out
 
 
 class SideStream:
     """A subscriber that passes the newest messages on one key, and their times [ns], to `take`, and
-    counts them in `arrivals`, also those of which `take` raises WireError. Between two polls,
-    `waiting` messages are kept.
+    counts them in `arrivals`; those for which `take` raises WireError count as malformed. Between
+    two polls, `waiting` messages are kept.
     """
 
     def __init__(

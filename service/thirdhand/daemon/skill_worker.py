@@ -31,7 +31,7 @@ from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, skill_
 from thirdhand.skills.via_points import adapted
 
 MODULE = "thirdhand.daemon.skill_worker"
-# the rest is for the tick that takes a request, and for the status
+# 5 s of the answer's time are left for the tick that takes the request, and for the status
 WORK_TIMEOUT_S = ANSWER_TIMEOUT_S - 5.0
 HUNG_S = 5.0  # the process hangs if it makes no progress for this time
 WORKER_POLL_S = 0.1
@@ -238,8 +238,8 @@ def run(channel: socket.socket) -> None:
             answer = (
                 str(error) if isinstance(error, SkillError) else f"{type(error).__name__}: {error}"
             )
-        skill = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
+        data = pickle.dumps(answer, protocol=5, buffer_callback=buffers.append)
         try:
-            _send(channel, skill, *(b.raw() for b in buffers))
+            _send(channel, data, *(b.raw() for b in buffers))
         except BrokenPipeError:
             return

@@ -156,6 +156,7 @@ class Startup:
             if progress != notified:
                 notified = progress
                 self.systemd.notify(f"STATUS={progress}", f"EXTEND_TIMEOUT_USEC={MAX_PAUSE_US}")
+            # the quarter that is reached; -1: the functions are not known yet
             now_in = 4 * self._ready // len(self._functions) if self._functions else -1
             if terminal:
                 say(progress)
