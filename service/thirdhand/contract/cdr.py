@@ -33,11 +33,11 @@ _COVARIANCE = struct.Struct("<36d")
 _TICK = struct.Struct("<qII")
 _ATTACHMENT = struct.Struct("<Qqq")
 _STAMPED = 12  # bytes of header and stamp
-_MOST_LAYOUTS = 16
+_MOST_LAYOUTS = 16  # layouts of joint states that are remembered
 MAX_BYTES = 8192  # bounds the time in which the loop reads a message
 LONGEST_TRANSFORMS = 32768  # bytes of a TFMessage: of about 300 transforms
-# By half the number with which a message begins; odd numbers are little endian. CDR2 has the number
-# of RTPS, which implementations of DDS write, or that of XTypes.
+# Encodings by half of their number, with which a message begins; odd ones are little endian. CDR2
+# has the number of RTPS, which implementations of DDS write, or that of XTypes.
 _ENCODINGS = {0: "CDR", 1: "PL_CDR", 2: "XML", 3: "CDR2", 4: "DELIMITED_CDR2", 5: "PL_CDR2"}
 _ENCODINGS |= {8: "CDR2", 9: "PL_CDR2", 10: "DELIMITED_CDR2"}
 
@@ -251,6 +251,7 @@ class Reader:
     def __init__(self, data: bytes, most: int | None = None) -> None:
         if most is not None and len(data) > most:
             raise WireError(f"a message of {len(data)} bytes, at most {most} accepted")
+        # MAX_BYTES is no encoding's number
         number = data[1] if len(data) >= 4 and not data[0] else MAX_BYTES
         encoding = _ENCODINGS.get(number >> 1, "")
         if encoding not in ("CDR", "CDR2"):
@@ -282,7 +283,7 @@ class Reader:
         return count
 
     def items(self) -> int:
-        """Length of a sequence of strings or structures, which CDR2 precedes by its bytes."""
+        """Length of a sequence of strings or structures; CDR2 has its size in bytes before it."""
         if self._max_align == 4:
             self.length()
         return self.length()
@@ -379,6 +380,7 @@ def decode_joints(data: bytes) -> JointState:
         and data.startswith(layout.fixed, _STAMPED)
         and data.startswith(CDR_HEADER)
     ):
+        # positions, number of velocities, velocities, number of efforts, efforts
         numbers = layout.numbers.unpack_from(data, _STAMPED + len(layout.fixed))
         n = layout.counts[0]
         v = layout.counts[0] + 1 + layout.counts[1]
@@ -391,6 +393,7 @@ def decode_joints(data: bytes) -> JointState:
                 numbers[v + 1 :],
                 layout.frame_id,
             )
+
     reader = Reader(data, MAX_BYTES)
     stamp, frame = reader.header()
     names = tuple(reader.string() for _ in range(reader.items()))
@@ -442,8 +445,8 @@ def decode_closure(data: bytes) -> float:
 
 
 def bytes_of_frame(frame: str) -> bytes:
-    """The bytes with which the name of a frame ends in a TFMessage, where it may begin with a
-    slash.
+    """The name of a frame as a TFMessage has it, with a zero byte at its end; a slash may precede
+    it.
     """
     return frame.encode() + b"\0"
 

@@ -84,7 +84,7 @@ class Evidence(NamedTuple):
     sources: Mapping[str, Source] = MappingProxyType({})
     contested: float = 0.0  # accepted share of the arm's states that contradict the rest
     settings: Any = None  # of the cell
-    # deviation from what the skill knows, and below which the hold ends
+    # deviation from what the skill knows, and the one below which the hold ends
     gate_m: Exceeded | None = None
     measure: str = ""  # the skill's name for that deviation
     outside: Outside | None = None
@@ -206,15 +206,15 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
     """The rejected sample, and what to do if the figures show a closer cause; empty otherwise."""
     if seen.sample is None:
         return seen.mistake, ""
-    came = seen.sample
+    sample = seen.sample
     finding = seen.mistake
     closer = ""
-    turned = getattr(came, "orientation", ())
-    advanced_s = (came.stamp_ns - seen.newest_ns) * 1e-9
+    turned = getattr(sample, "orientation", ())
+    advanced_s = (sample.stamp_ns - seen.newest_ns) * 1e-9
     position_text = (
-        f"at {figures(came.position)} in the tracker's frame"
+        f"at {figures(sample.position)} in the tracker's frame"
         if turned
-        else f"joints at {figures(came.position)}"
+        else f"joints at {figures(sample.position)}"
     )
     match cause:
         case Cause.NOT_FINITE if (out := seen.outside) is not None:
@@ -237,7 +237,7 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
             closer = what_to_do(Condition.DEGREES) if is_degrees else ""
         case Cause.REPEATED:
             finding = (
-                f"stamp {came.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
+                f"stamp {sample.stamp_ns * 1e-9:.3f} s again; a newer one with each sample needed"
             )
         case Cause.OLDER:
             finding = f"stamped {lasting(-1000 * advanced_s)} before the newest accepted one"
@@ -265,7 +265,7 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
             finding = f"{position_text}, where the other hand was; left and right look exchanged"
         case Cause.WRONG_FRAME:
             accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
-            finding = f"frame {came.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
+            finding = f"frame {sample.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"
     return finding, closer
 
 

@@ -211,7 +211,9 @@ def _inner(node: Any, field: str, index: str) -> Any:
 
 
 def _chosen(node: Any, value: Any) -> Any:
-    """Of tagged structs, the one that the value's tag names; of a type or null, that type."""
+    """The type of a union that a value is meant for: the struct that its tag names, or the only
+    type beside null; without such a type, the union.
+    """
     if not isinstance(node, inspect.UnionType):
         return node
     types = [member for member in node.types if not isinstance(member, inspect.NoneType)]

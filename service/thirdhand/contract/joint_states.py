@@ -35,16 +35,15 @@ class JointStates:
     def __init__(self, names: tuple[str, ...], patience_s: float) -> None:
         self._names = names
         self._patience_s = patience_s
-        self._parts: dict[
-            str, tuple[float, int, float, float]
-        ] = {}  # arrival [s], stamp [ns], position, velocity
+        # arrival [s], stamp [ns], position and velocity of each joint, by name
+        self._parts: dict[str, tuple[float, int, float, float]] = {}
         self._heard_s = -math.inf  # arrival of the newest message
         # arrival of the newest state, or of the first message after a pause
         self._state_s = -math.inf
 
     def take(self, message: JointState, at_s: float) -> JointState | None:
-        """The state that a message completes, which arrived at a time [s]; None where it completes
-        none.
+        """The state that is complete with a message, which arrives at the time `at_s` [s]; None if
+        none is.
         """
         if at_s - self._heard_s > self._patience_s:
             self._state_s = at_s

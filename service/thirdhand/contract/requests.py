@@ -172,9 +172,8 @@ class Correction(msgspec.Struct, frozen=True):
     name: str
     moved_m: float
     reach_m: float
-    segment: tuple[
-        str, ...
-    ] = ()  # the via-points at which its segment begins and ends; empty: in the whole skill
+    # the via-points at which its segment begins and ends; empty: in the whole skill
+    segment: tuple[str, ...] = ()
     corrections: int = 1  # number of corrections at these hands
     undone: bool = False
 
@@ -312,9 +311,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     rejected: dict[str, int]
     received: dict[str, int] = {}  # messages that arrived, by channel of each input
     hand_age_ms: dict[str, float]
-    hand_distance_m: (
-        float  # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
-    )
+    # distance of the nearest hand from the arm; 3 if it is farther, or no hand is seen
+    hand_distance_m: float
     hand_limit_m_s: float  # smallest speed allowed toward a hand, over all parts of the arm
     lateness_us: Percentiles
     work_us: Percentiles
@@ -328,25 +326,19 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     time_ns: int = 0  # time of the status by the daemon's clock
     sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
     streams: dict[str, Source] = {}  # all other streams that the cell receives, by key
-    frames: tuple[
-        str, ...
-    ] = ()  # accepted names of a hand's frame; the empty name stands for the tracker's
-    trackers: dict[
-        str, tuple[float, ...]
-    ] = {}  # pose of each known tracker frame in `base`, by the frame's name
+    # accepted names of a hand's frame; the empty name stands for the tracker's
+    frames: tuple[str, ...] = ()
+    # pose of each known tracker frame in `base`, by the frame's name
+    trackers: dict[str, tuple[float, ...]] = {}
     joints: tuple[str, ...] = ()  # their names, in order
-    hands_m: dict[
-        str, Vector3
-    ] = {}  # estimated positions of the hands that were seen, frame `base`
-    below_table_m: dict[
-        str, float
-    ] = {}  # depth of hands below the table top: an error of the tracker's calibration
-    demonstrated_m: dict[
-        str, tuple[Vector3, Vector3]
-    ] = {}  # least and greatest corner of the demonstrated box
-    hands_at_m: dict[
-        str, tuple[Vector3, Vector3]
-    ] = {}  # left and right hand at each learned via-point
+    # estimated positions of the hands that were seen, frame `base`
+    hands_m: dict[str, Vector3] = {}
+    # depth of hands below the table top: an error of the tracker's calibration
+    below_table_m: dict[str, float] = {}
+    # least and greatest corner of the demonstrated box
+    demonstrated_m: dict[str, tuple[Vector3, Vector3]] = {}
+    # left and right hand at each learned via-point
+    hands_at_m: dict[str, tuple[Vector3, Vector3]] = {}
     tool_m: Vector3 | None = None  # commanded position; None before the first tick
     tool_measured_m: Vector3 | None = None  # by the newest joint state; None: not recent
     target_m: Vector3 | None = None  # None if a needed hand is not seen
@@ -358,9 +350,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     turn_std_rad: float | None = None
     gripper: str = ""  # commanded, `open` or `closed`; empty: the skill has no gripper
     closure: float | None = None  # predicted closure of the gripper, 0 to 1
-    segment: tuple[
-        str, ...
-    ] = ()  # the via-points at which the segment begins and ends; empty: unknown
+    # the via-points at which the segment begins and ends; empty: unknown
+    segment: tuple[str, ...] = ()
     segment_belief: float = 0.0  # probability of that segment
     # time since the hands began the task; None: the skill has no clock
     task_clock_s: float | None = None
@@ -368,9 +359,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     error_probability: float | None = None
     deviation_m: float | None = None  # deviation of the hands from what the skill knows
     threshold_m: float = 0.0  # limit of that deviation
-    tool_limits: dict[
-        str, ToolLimits
-    ] = {}  # of the demonstrated positions, by ANY_DIRECTION and ALONG_TASK
+    # limits at the demonstrated positions, by ANY_DIRECTION and ALONG_TASK
+    tool_limits: dict[str, ToolLimits] = {}
     binding: str = ""  # the limit that holds the tool back now; empty: none
     command_heard: bool = True  # True if somebody subscribes to `joints/command`
     busy: str = ""  # signs of a busy machine, now or when the arm stopped; empty: none

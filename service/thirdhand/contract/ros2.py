@@ -27,7 +27,7 @@ TYPE_HASHES = {  # hashes of the definitions by REP 2011; Humble has none
 }
 # stands for the hash in the keys of Humble, whose subscribers match no hash
 NO_TYPE_HASH = "TypeHashNotSupported"
-# of a cell, beside the arm's links
+# frames of a cell, beside the arm's links
 OWN_FRAMES = ("left_hand", "right_hand", "setpoint", "target", "tool")
 # channels whose messages may be frames of TFMessages
 FRAMES = ("hands/left", "hands/right", "tool/pose")
@@ -36,7 +36,7 @@ HEARD = tuple(
 )
 SAID = tuple(channel for channel in channels.CHANNELS if channel.direction == "out")
 _DEPTH = 10
-# the rest are the defaults of ROS 2
+# qualities of service in the tokens of topics; what is left out has the default of ROS 2
 _RELIABLE = f"::,{_DEPTH}:,:,:,,"
 _BEST_EFFORT = f"2::,{_DEPTH}:,:,:,,"
 _LATCHED = ":1:,1:,:,:,,"  # reliable, transient local: later subscribers get the last message

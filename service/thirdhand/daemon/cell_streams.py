@@ -1,8 +1,8 @@
 """The daemon's subscribers and publishers of its cell's streams.
 
 If two publishers report one hand, only the samples of one are used. Each message of this library's
-trackers names its publisher, and so does each of a ROS 2 node behind rmw_zenoh. All messages without
-a name are taken as those of one publisher.
+trackers names its publisher, and so does each of a ROS 2 node behind rmw_zenoh. All messages
+without a name are taken as those of one publisher.
 """
 
 from __future__ import annotations
