@@ -53,10 +53,10 @@ FROM_HERE = (("files", "state"), ("files", "record"))
 # [1/s] acceleration limit / speed limit: the defaults' 10 m/s² / 0.8 m/s
 MAX_ACCELERATION_PER_SPEED = 12.5
 MAX_JERK_PER_SPEED = 500.0  # [1/s²] jerk limit / speed limit: the defaults' 400 m/s³ / 0.8 m/s
-# sizes of numbers but 0; powers of others overflow, or are 0
+# accepted sizes of numbers other than 0; powers of others overflow, or become 0
 SMALLEST_NUMBER = 1e-9
 LARGEST_NUMBER = 1e9
-FARTHEST_FRAME_M = 100.0  # of a tracker from the arm, or of the tool from its plate
+FARTHEST_FRAME_M = 100.0  # largest distance of a tracker from the arm, or of tool from plate
 LEAST_OUTER_M = 0.01  # an arm that moves its tool by less is none
 # tolerance of a prismatic joint for 1 rad of others: on a lever of 0.5 m the tool moves as far
 PRISMATIC_M = 0.5
@@ -194,9 +194,8 @@ class ArmSettings(Section, frozen=True):
     """
 
     urdf: str = ""  # URDF file; empty: the shipped Barrett WAM
-    packages: tuple[
-        str, ...
-    ] = ()  # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
+    # folders of ROS packages for package:// in the URDF, like /opt/ros/jazzy/share
+    packages: tuple[str, ...] = ()
     plate: str = "tool_plate"  # the link that carries the tool
     # wait for `joints/state`, or begin at `posture` without an arm
     source: Literal["state", "assumed"] = "state"
@@ -230,9 +229,8 @@ class JointSettings(Section, frozen=True):
         "wam/wrist_pitch_joint",
         "wam/palm_yaw_joint",
     )
-    kinds: tuple[
-        Literal["revolute", "continuous", "prismatic"], ...
-    ] = ()  # from the URDF; empty: all revolute
+    # from the URDF; empty: all revolute
+    kinds: tuple[Literal["revolute", "continuous", "prismatic"], ...] = ()
     lower: PerJoint = (-2.6, -1.985, -2.8, -0.9, -4.55, -1.5707, -2.7)  # [rad]
     upper: PerJoint = (2.6, 1.985, 2.8, 3.1, 1.24, 1.5707, 2.7)  # [rad]
     velocity: PerJoint = (1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5)  # [rad/s]
@@ -353,9 +351,8 @@ class Files(Section, frozen=True):
 class RecordingSettings(Section, frozen=True):
     """The content of recordings."""
 
-    also: tuple[
-        CellName, ...
-    ] = ()  # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
+    # whole keys of foreign images: CompressedImage in CDR, JPEG or PNG
+    also: tuple[CellName, ...] = ()
     # whole frames a second; others as checksums; 0: every frame
     frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0
 
@@ -718,6 +715,7 @@ def _with_reach(settings: Settings, urdf: Urdf, given: set[str]) -> Settings:
             "moves it, or a pose of the tool away from the last axis ([tool] plate_from_tool), "
             "needed"
         )
+
     outer = reach.outer if "outer" in given else min(shell.outer, reach.outer)
     inner = reach.inner if "inner" in given else min(shell.inner, shell.inner / shell.outer * outer)
     centre = reach.centre if "centre" in given else shell.centre

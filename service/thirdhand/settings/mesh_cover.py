@@ -153,7 +153,7 @@ def _lost(
 
 def _candidates(name: str, urdf: Path, packages: tuple[str, ...]) -> list[Path]:
     """The paths at which the file of a mesh may be."""
-    # of the URDF, and of a link's target
+    # the folder of the URDF, and if it is a symbolic link, that of the file to which it leads
     folders = dict.fromkeys((urdf.absolute().parent, urdf.resolve().parent))
     scheme, _, path = name.rpartition("://")
     if scheme in ("package", "model"):
@@ -282,9 +282,8 @@ def _along(points: Points, along: Points, start: Points) -> tuple[float, Points]
     away = points - start
     heights = away @ along
     squares = np.maximum((away * away).sum(axis=1) - heights * heights, 0.0)
-    radii = (
-        math.sqrt(squares.max()) + 10.0**-END_DIGITS
-    ) * RADII  # above 0, or points on a line cost nothing
+    # above 0, or points on a line cost nothing
+    radii = (math.sqrt(squares.max()) + 10.0**-END_DIGITS) * RADII
     depths = np.sqrt(radii[:, None] ** 2 - squares)
     low = (heights + depths).min(axis=1)
     high = (heights - depths).max(axis=1)

@@ -63,9 +63,8 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     connect: tuple[str, ...] = ()  # endpoints of routers or peers to connect to
     # the folder with the daemon's certificate.pem, key.pem and authority.pem; empty: none
     certificate: str = ""
-    revoked: tuple[
-        str, ...
-    ] = ()  # names of certificates, like tracker-2, that are no longer accepted
+    # names of certificates, like tracker-2, that are no longer accepted
+    revoked: tuple[str, ...] = ()
     # file with Zenoh's own settings, where the service sets none; empty: none
     zenoh_config: str = ""
     # domain of ROS 2 nodes that see the cell through rmw_zenoh; None: none
@@ -132,9 +131,8 @@ class Ros2(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     trajectory: Topic = ""  # joint_trajectory_controller: /<its name>/joint_trajectory
     # joint_state_broadcaster: /joint_states, received in addition to the cell's own
     joint_states: Topic = ""
-    joints: tuple[
-        str, ...
-    ] = ()  # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
+    # joints in the order of the controller's parameter `joints`; empty: as `joints.names`
+    joints: tuple[str, ...] = ()
     # left and right hand, as frames in a TFMessage; their parent is the tracker's frame
     hands: HandSources = ("", "")
     tool: FrameSource = ""  # the tool in demonstrations, as such a frame

@@ -60,12 +60,15 @@ class Workspace:
         ends = np.array([_turns(low, high) for low, high in zip(lower, upper, strict=True)])
         shares = _spread(POSTURES, len(moving))
         self.postures = ends[:, 0] + shares * (ends[:, 1] - ends[:, 0])
+
+        # The rails, prismatic joints below the first one that turns, only shift what is above them.
         rails = next((i for i, joint in enumerate(moving) if joint.kind != "prismatic"), 0)
         unmoved = self.postures.copy()
         unmoved[:, :rails] = 0.0
         from_rails, self.directions, axes = _placed(chain, unmoved, plate_from_tool)
         along = np.array([axis for _, axis in axes[:rails]]).reshape(rails, 3)
         self.positions = from_rails + self.postures[:, :rails] @ along
+
         self._turns = moving[rails].kind != "prismatic"
         self._axis = axes[rails][1]
         self._centre = _shoulder(axes[rails:])
@@ -73,6 +76,8 @@ class Workspace:
         self.shoulder = self._centre + ends[:rails].mean(axis=1) @ along
         self._reach = float(np.linalg.norm(from_rails - self._centre, axis=1).max())
         self.extent = float(np.linalg.norm(self.positions - self.shoulder, axis=1).max())
+
+        # displacements by the rails, and the tree of the positions that the other joints reach
         steps = [np.linspace(low, high, RAIL_STEPS) for low, high in ends[:rails]]
         self._stops = (
             [np.array(stop) @ along for stop in itertools.product(*steps)]
@@ -232,6 +237,8 @@ def _placed(
         joint_turn = Rotation.from_quat(joint.rotation).as_matrix().T
         positions = positions @ joint_turn + joint.translation
         along = along @ joint_turn
+
+    # from the root to the plate, with all joints at 0
     rest_turn = np.eye(3)
     rest_at = np.zeros(3)
     axes = []

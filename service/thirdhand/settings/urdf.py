@@ -288,7 +288,7 @@ SIZE_COUNTS = {
     "sphere": 1,
 }
 VERSIONS = ("1", "1.0", "1.1", "1.2")
-ATTRIBUTES = {  # that are read, of joints of the chain
+ATTRIBUTES = {  # attributes that are read, for joints of the chain
     "axis": {"xyz"},
     "limit": {"lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk"},
     "safety_controller": {"soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"},

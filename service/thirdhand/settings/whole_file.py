@@ -12,7 +12,8 @@ from pathlib import Path
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A context with a path for a new file or folder, which is moved to `path` once it is complete,
-    and removed after a failure. What is neither a file nor missing is written directly.
+    and removed after a failure. A `path` that exists and is no file, like a pipe, is written
+    directly.
 
     Raises OSError with the name of `path`.
     """
