@@ -35,7 +35,7 @@ from thirdhand.process.pages import release_start_memory
 
 _PART_LENGTH = struct.Struct("<Q")
 _PID = struct.Struct("<i")
-ENDED_POLL_S = 0.5
+ENDED_POLL_S = 0.5  # interval at which a process is looked for, where the kernel does not report it
 _ALIGNED = 64  # [bytes] parts begin at multiples of this, so that arrays are used without a copy
 # Linux defines them, Python does not
 _PR_SET_PDEATHSIG = 1
@@ -78,7 +78,7 @@ class Child:
             return self.pid is not None
 
     def poll(self) -> int | None:
-        """The exit code once the process has ended, negative where a signal ended it."""
+        """The exit code once the process has ended, negative where a signal ended it; else None."""
         if self.has_begun():
             with self._lock:
                 if self.returncode is None and self.pid is not None:

@@ -7,7 +7,7 @@ import ctypes
 import re
 from pathlib import Path
 
-# of a file, private to this process: begin, end, is writable, path, anonymous pages [kB]
+# a file's mapping, private to this process: begin, end, is writable, path, anonymous pages [kB]
 _MAPPING = re.compile(
     r"^([0-9a-f]+)-([0-9a-f]+) r(.).p \S+ \S+ [1-9]\d* +(.+)\n(?:[A-Z].*\n)*?Anonymous: +(\d+) kB",
     re.MULTILINE,

@@ -31,6 +31,7 @@ _FOOTER = struct.Struct("<BQQQI")  # head, summary, summary offsets, checksum
 _COMPRESSION = re.compile(b"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _BEFORE_COMPRESSION = _HEAD.size + 28  # [bytes] offset of the name of the compression in a chunk
 _BLOCK = 1 << 20
+# records that are read by their type alone, beside chunks, messages and attachments
 _NAMING = {
     int(kind): record
     for kind, record in (
@@ -39,6 +40,7 @@ _NAMING = {
         (Opcode.METADATA, Metadata),
     )
 }
+# errors of a damaged record
 _BROKEN = (
     McapError,
     zstandard.ZstdError,

@@ -76,14 +76,13 @@ class Recorder(McapFile):
         thin: bool = False,
     ) -> None:
         self._urdf = robot_description(settings) if urdf is None else urdf
-        # `skill` is the file of the skill in force
         self._settings = settings
-        self.skill = skill
+        self.skill = skill  # the file of the skill in force
         self._state = state
         self._begun = False
         self._sequence = 0
         self._every = self._shown_every = self._state_every = 1  # [ticks]
-        self._types: dict[str, str] = {}  # of messages whose type differs from the table's
+        self._types: dict[str, str] = {}  # types of messages that differ from the table's
         self._tf_every = channels.BY_KEY["/tf"].every
         if thin:
             self._every = settings.frame_every
@@ -274,8 +273,8 @@ def _is_cut(messages: Messages) -> bool:
 
 
 def _lacks_parts(messages: Messages) -> bool:
-    """True if a needed attachment is missing. A damaged file needs no skill; one that is cut has no
-    ticks for a report.
+    """True if a needed attachment is missing. A cut file without skill and arm has no ticks either;
+    from a damaged one, a report can be made without.
     """
     needed = ["settings.json"]
     if _is_cut(messages):
@@ -379,8 +378,7 @@ class Recording:
                 "frames"
             )
         messages = Messages(self.path)
-        whole = not self.checksums
-        yield from steps(messages, self.settings, outputs=outputs, whole=whole)
+        yield from steps(messages, self.settings, outputs=outputs, whole=not self.checksums)
         self.faults = [
             *messages.faults,
             *(fault for fault in self.faults if fault not in messages.faults),

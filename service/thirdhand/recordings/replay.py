@@ -50,13 +50,13 @@ class Replay:
     missing: list[ReplayGap] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     truncated: bool = False
-    joined: int = 0
+    joined: int = 0  # recordings that continue the one before without a gap
     first_difference: str = ""
     largest: dict[str, float] = field(default_factory=dict)
     # stages whose constants are not those of the recording
     differing: set[str] = field(default_factory=set)
-    recorded_on: str = ""
-    here: str = ""
+    recorded_on: str = ""  # the machine of the recording
+    here: str = ""  # this machine
 
     @property
     def exact(self) -> bool:
@@ -186,7 +186,7 @@ class _Comparison:
 
     recording: Recording
     result: Replay
-    after: int | None
+    after: int | None  # the first state is at this tick or later; None: any
     last: Step | None  # the last step that was read
     follows: bool  # True if another recording precedes this one
     progress: Callable[[int], None] | None
@@ -195,7 +195,8 @@ class _Comparison:
     gap_at: Step | None = None
 
     def __post_init__(self) -> None:
-        self._skills, self._steps = _Skills(self.recording), self.recording.steps(whole=False)
+        self._skills = _Skills(self.recording)
+        self._steps = self.recording.steps(whole=False)
 
     def _anew(
         self, skill: StoredSkill, start: Step

@@ -223,7 +223,7 @@ class _Assembly:
 
 
 def _value(name: str, data: bytes, layouts: dict[str, Any]) -> Any:
-    """The content of a message: of an event its bytes, which can be decoded. Raises WireError."""
+    """The content of a message; for an event its bytes, which were decoded. Raises WireError."""
     channel = channels.BY_KEY[name]
     if name == "tick":
         return cdr.decode_tick(data)
