@@ -254,6 +254,7 @@ class ScribeProcess:
 
     def catch_up(self, waiting: int) -> None:
         """Pause the live view and raise the process's weight while the recording is behind."""
+        # it is behind above BEHIND_MESSAGES, until a tenth of that
         if waiting <= BEHIND_MESSAGES / 10 if self._is_behind else waiting > BEHIND_MESSAGES:
             self._is_behind = not self._is_behind
             _run_with(CATCH_UP_NICE if self._is_behind else child.CHILD_NICE)
@@ -307,6 +308,7 @@ def _receive(source: socket.socket, buffer: bytearray) -> tuple[bytes, list[byte
 
 
 def _work(source: socket.socket) -> None:
+    """Write what a second thread reads from the socket, until that is closed and all is written."""
     buffer = bytearray(MAX_PACKET_BYTES)
     first, skills = _receive(source, buffer)
     setup = msgspec.json.decode(first, type=ScribeSetup)

@@ -84,16 +84,18 @@ class Scribe:
         self._listens = False  # True once the child has reported
         # messages with the skills to send; for the loop
         self._queue: deque[tuple[bytes, list[bytes]]] = deque()
-        self._most = round(MAX_QUEUED_S * settings.rate_hz)
-        self._send_all = True
-        self._overflows = False
+        self._most = round(MAX_QUEUED_S * settings.rate_hz)  # messages in the queue; 0 once closed
+        self._send_all = True  # the next message has state and skill
+        self._overflows = False  # ticks are skipped until the queue is empty
+        # ticks lost since the newest message, lost in all, sent; processes after the first
         self._gap = self._lost = self._sent = self._restarts = 0
-        self._since_state = 0
+        self._since_state = 0  # ticks since the newest message with a state
         # ticks lost with dead scribes, and those that no recording marks
         self._lost_before = self._unmarked = 0
         self._sent_before = 0  # ticks sent to dead scribes
         self._started = 0.0
         self._constants: dict[str, str] = {}
+        # skills with the descriptors of their memory files, by `id`
         self._memory: dict[int, tuple[bytes, int]] = {}
         self._report = ScribeReport()
         self.newest_recording: str | None = None  # the path, also while no recording can be written
@@ -102,7 +104,7 @@ class Scribe:
     def start(
         self, *, skill: bytes, state: Record | None, constants: Mapping[str, str] | None = None
     ) -> None:
-        """Start the process; ticks may be sent at once. Never waits. Recordings tell these digests
+        """Start the process; ticks may be sent at once. Never waits. Recordings hold these digests
         of the core's `constants`.
         """
         self._constants = dict(constants or {})

@@ -33,9 +33,8 @@ PRUNE_S = 5.0  # interval at which old recordings are deleted
 class Segments:
     """Writer of ticks and notes. `say` is called once with the message of each failure.
 
-    `kept` counts the received ticks on disk,
-    `lost` the lost ones, and `unmarked` the lost ones that no recording on disk marks yet,
-    including those of earlier scribes.
+    `kept` counts the received ticks on disk, `lost` the lost ones, and `unmarked` the lost ones
+    that no recording on disk marks yet, including those of earlier scribes.
     """
 
     def __init__(
@@ -52,15 +51,15 @@ class Segments:
         self._paths = paths
         self._say = say
         self._recorder: Recorder | None = None
-        self._wanted = True
+        self._wanted = True  # False if only a live view is required
         self._skill: bytes | None = None
-        self._complete: Path | None = None
+        self._complete: Path | None = None  # the last recording, once it was closed
         self._kept = self.lost = 0
         self._unmarked = unmarked
         # lost ticks marked in this recording; those marks not on disk yet
         self._marked = self._marked_pending = 0
         self._began = self._tried = self._pruned = -1e9
-        self._full = self._moved = False
+        self._full = self._moved = False  # the disk is full; the file is no longer at its path
         self._failure: object = None  # cause of the last reported failure
         self._written = 0  # [bytes] in files that have ended
         # time [s], total [bytes]
@@ -248,6 +247,9 @@ class Segments:
             self._leave(recorder, recorder.pending, self._marked_pending if recorder.pending else 0)
 
     def _leave(self, recorder: Recorder, lost: int, unmarked: int) -> None:
+        """Abandon a recording of which `lost` ticks, and the marks of `unmarked` earlier ones, are
+        not on disk.
+        """
         recorder.abandon()
         self._written += recorder.size
         self._recorder = None
