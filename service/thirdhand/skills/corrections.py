@@ -58,8 +58,8 @@ def correction_at(
     """The correction that puts the tool (3,) [m], and its orientation if given, for hands (6,) [m]
     in a segment of the task (-1 for a skill without segments).
 
-    It replaces earlier ones of the same segment at hands that are nearer than
-    PATH_END_M, which are at the same positions.
+    It replaces earlier ones of the same segment at hands that are nearer than PATH_END_M, which
+    are at the same positions.
     """
     left = _point(hands[:3])
     right = _point(hands[3:])

@@ -32,7 +32,7 @@ def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
 
 
 def is_flat(primitive: KMP) -> bool:
-    """Return whether the primitive is constant, but for its via-points."""
+    """True if the primitive is constant, but for its via-points."""
     return bool((primitive.base.reference.mean == primitive.prior_offset).all())
 
 

@@ -48,6 +48,7 @@ def turn_through(
     taught_inputs = inputs[list(taught)]
     quaternions = np.array(list(taught.values()))
     quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
+    # of q and -q, which are the same orientation, the one nearer to what was learned
     now = OrientationKMP(base.primitive, base.auxiliary).mean(taught_inputs)
     quaternions *= np.where((now * quaternions).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     zeta = log(quaternions, base.auxiliary)

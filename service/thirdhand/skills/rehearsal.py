@@ -27,7 +27,7 @@ def rehearse() -> None:
     counted(hands, still[:, 0], still[:, 1], SAMPLE_PERIOD_S, np.zeros((1, BEGIN_AT + 6)))
 
     labels = np.zeros(2, np.int64)
-    # of a demonstration, of a skill
+    # writable segments of a demonstration, and read-only ones of a skill, which are another type
     for segments in (np.ones(1, SEGMENT), frozen(np.ones(1, SEGMENT))):
         recognised(np.zeros((2, 3, 6)), SAMPLE_PERIOD_S, segments, np.zeros((2, MOST_SEGMENTS)))
         covered(hands, still, labels, segments)

@@ -40,7 +40,7 @@ SKILL_FORMAT = 6
 # prefixes of the arrays of their primitives
 TURN_PREFIX = "turn."
 GRIPPER_PREFIX = "gripper."
-# [B] unpacked, and in how many arrays; a skill has below a hundred
+# [B] largest file, unpacked, and its number of arrays; a skill has fewer than a hundred
 LARGEST_FILE = 100_000_000
 MOST_ARRAYS = 500
 MOST_POINTS = 2500  # reference points, which bound the duration of a tick
@@ -64,8 +64,8 @@ RANGES = {  # minimum, maximum and unit of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-# The array holds a scale, a time [s], squared distances, and, of a skill with an alarm, ratios and
-# the alarm.
+# The array of `Regions`: a scale, a time [s], squared distances, and for a skill with an alarm,
+# ratios and the alarm.
 REGIONS = "regions"
 FARTHEST_RADIUS = 1e6
 ALL_RANGES = (
@@ -302,7 +302,7 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     """Faults of the arrays: changes since they were written, and values that no skill has."""
     for name in sorted(set(arrays) - KNOWN):  # kmp supports more than the loop was tested with
         yield f"an array {name!r}, which no skill has"
-    # An array that is missing is found missing later.
+    # A model's array that is missing raises KeyError later.
     model_arrays = [name for name in _model(arrays).ranges if name in arrays]
     yield from _beyond(arrays, [*RANGES, *model_arrays], "")
     for prefix in (TURN_PREFIX, GRIPPER_PREFIX):

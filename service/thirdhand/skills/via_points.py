@@ -105,8 +105,8 @@ def check_agreement(via_points: Sequence[ViaPoint], skill: Skill | None = None) 
 
 
 def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]:
-    """Return whether each pair (V, V) belongs to two via-points of the skill's task, to via-points
-    of two of its segments, or to one of each.
+    """True for each pair (V, V) of two via-points of the skill's task, of via-points of two of its
+    segments, or of one of each.
     """
     task_names = skill.model.names
     names = np.array(
@@ -131,8 +131,8 @@ def in_force(skill: Skill) -> tuple[ViaPointInForce, ...]:
 
 
 def warnings_of(before: Skill, after: Skill) -> tuple[str, ...]:
-    """Warnings when one skill replaces another: via-points that are missed by more than NOTED_M,
-    and via-points of both skills that move by more.
+    """Warnings when one skill replaces another: via-points that are missed by more than
+    REPORTED_M or NOTED_RAD, and via-points of both skills that move by more.
     """
     out = [
         f"via-point {point.name!r} is missed by {1000 * point.missed_by_m:.0f} mm: what was "
