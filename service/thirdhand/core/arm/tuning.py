@@ -47,7 +47,7 @@ class ArmTuning(NamedTuple):
     # a turn is scaled down unless its joint velocities can be reached within this time
     turn_horizon_s: float = 0.008
     # 0.5 to 1. More: the setpoint is faster. Less: joints can correct more.
-    # for the setpoint, of joint speed, acceleration, jerk
+    # usable by the setpoint: of joint speed, acceleration, jerk
     planned_limit_shares: tuple[float, ...] = (0.97, 0.95, 0.85)
 
     @property

@@ -19,7 +19,7 @@ class SeparationTuning(NamedTuple):
     # share of braking and of contact speed that is planned with; ramps need the rest
     planned_brake_share: float = 0.8
     # 0.2 to 1. More: the arm comes faster. Less: braking is gentle.
-    # largest / tool's deceleration: people, things, arm
+    # largest planned deceleration / the tool's: people, things, arm
     planned_brake_limits: tuple[float, ...] = (1.0, 0.5, 0.5)
     # 5e-3 to 0.1. More: the arm slows down early. Less: joints oscillate.
     # smallest reaction time that is planned with; joints oscillate with a shorter one
