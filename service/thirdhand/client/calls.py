@@ -220,18 +220,18 @@ class Client:
                 return False
         return True
 
-    def _is_daemon(self, own: str) -> bool:
-        """True if a daemon of the cell has, or had, this Zenoh session.
+    def _is_daemon(self, zid: str) -> bool:
+        """True if a daemon of the cell has, or had, the Zenoh session of this identity.
 
         Tokens may be missing for a moment while other sessions join or leave, so the query is
         repeated up to ALIVE_QUERIES times.
         """
         for attempt in range(ALIVE_QUERIES):
-            if own in self._daemons:
+            if zid in self._daemons:
                 return True
             time.sleep(RETRY_S * (attempt > 0))
             self._daemons |= living(self._session, self._cell, timeout_s=self._timeout_s)
-        return own in self._daemons
+        return zid in self._daemons
 
     def _key(self, suffix: str) -> str:
         return channels.key(self._cell, suffix)

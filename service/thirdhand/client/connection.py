@@ -262,7 +262,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
 
 def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:
-    """The encoding of a pose for a stamp [ns]. Raises ValueError for what is no name of a frame."""
+    """The encoding of a pose for a stamp [ns]. Raises ValueError for an invalid frame."""
     checked_frame(frame_id)
     return lambda stamp_ns: cdr.encode_pose(PoseStamped(stamp_ns, frame_id, position, orientation))
 

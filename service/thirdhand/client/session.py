@@ -184,7 +184,7 @@ def check_open(session: zenoh.Session) -> None:
 
 
 def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
-    """By endpoint, why the system connects to none of them; empty where one accepts or hangs."""
+    """The reasons why no endpoint can be reached, by endpoint; empty if one accepts or hangs."""
     failed: dict[str, OSError] = {}
     for endpoint in endpoints:
         if (address := tcp_address(endpoint)) is None:
@@ -201,7 +201,7 @@ def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
 
 
 def _unreached(failed: Mapping[str, OSError]) -> str:
-    """The failures in words that are no refusals; empty if all are refusals."""
+    """The failures other than refusals, in words; empty if there are none."""
     return "; ".join(
         f"{endpoint} cannot be reached: {in_words(error)}"
         for endpoint, error in failed.items()

@@ -233,12 +233,13 @@ class _Received(AbstractContextManager[Any]):
     """
 
     def __init__(self, session: zenoh.Session, cell: str, suffix: str) -> None:
+        # messages that cannot be decoded, and the cause of the last one
         self.rejected = 0
         self.reason = ""
         self.lost = 0
         self._newest = "", 0  # publisher and number of the newest message
         self._session = session
-        self._came = threading.Condition()
+        self._came = threading.Condition()  # guards the queue and the flag
         self._is_closed = False
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
@@ -256,6 +257,7 @@ class _Received(AbstractContextManager[Any]):
         raise NotImplementedError
 
     def _count_lost(self, sample: zenoh.Sample) -> None:
+        """Count what is lost between the newest message and this one, which may displace one."""
         before = self.lost
         lost = int(len(self._queue) == MAX_QUEUED)
         if (info := sample.source_info) is not None:

@@ -33,6 +33,8 @@ Name = Annotated[
 class ViaPoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Positions of both hands and the tool position that belongs to them [m], frame `base`.
 
+    `std` is the standard deviation [m] of the tool position on each axis.
+
     With a `radius`, the via-point has a flat neighbourhood: twelve neighbours, each with one hand
     coordinate `radius` away. Their tool position is the same, or moves with the hand named in
     `follow`. `orientation` is the tool's, a quaternion x y z w of norm 1; `gripper` opens or closes
