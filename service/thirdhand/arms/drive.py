@@ -25,8 +25,8 @@ class DriveError(ExplainedError, RuntimeError):
 
 
 class Measured(NamedTuple):
-    """An arm's joints (J,) [rad, rad/s] at the begin of a period, and the time [s] since the
-    last.
+    """An arm's joints (J,) [rad, rad/s] at the begin of a period, and the time since the
+    last reading.
     """
 
     position: Vector

@@ -94,9 +94,8 @@ class Playback:
         self._parameters = parameters(
             period_s=period_s,
             max_acceleration=np.array(limits.acceleration),
-            max_change=JERK_SHARE
-            * period_s
-            * max_jerk,  # [rad/s²] change of acceleration in a period
+            # [rad/s²] change of acceleration in a period
+            max_change=JERK_SHARE * period_s * max_jerk,
             velocity_gain=np.minimum(VELOCITY_GAIN, np.sqrt(max_jerk / SETTLED_RADPS)),
         )
         self._limiter = Limiter(limits, period_s)
@@ -110,14 +109,16 @@ class Playback:
         # [s] time by counting steps, and the time at which the newest command arrived
         self._now = self._heard = 0.0
         self._lateness_s = 0.0  # time of the drive's clock that is not made up yet
+        # [s] present and needed delay from the motion's time to the time of writing
         self._offset = self._needed = 0.0
+        self._paused = False  # True if the loop paused before this step
+
+        # compiles both ways of moving: a period has no time for that
         knots = Knot(0, 0.0, self._state[:2]), Knot(1, period_s, self._state[:2])
         self._knots.extend(knots)
-        self._moved()  # compiles it: a period has no time for that
+        self._moved()
         self._knots.clear()
         self._moved()
-        self._paused = False  # True if the loop paused before this step
-        # [s] present and needed delay from the motion's time to the time of writing
         self._offset = self._needed = 0.0
 
     @property
@@ -153,13 +154,14 @@ class Playback:
         elapsed_s: float = -1.0,
     ) -> Limited:
         """Position, velocity and acceleration (J,) [rad, rad/s, rad/s²] at the end of this period,
-        given the commands that arrived since the last.
+        given the commands that arrived since the last step.
 
         `measured` (J,) [rad] closes the loop over a drive that follows velocities. `elapsed_s` is
         the time since the last step, for a loop that is not punctual; without it, one period.
         """
         if measured is not None:
             self._state[0] = self.in_turn(measured)
+
         if 0.0 <= elapsed_s <= MAX_ELAPSED_S:
             self._lateness_s += elapsed_s - self._period_s
         self._paused = self._lateness_s > LOOP_PAUSE_S
@@ -171,6 +173,7 @@ class Playback:
         )
         self._lateness_s -= made_up
         self._now += self._period_s + made_up
+
         for command in commands:
             if reason := self._take(command):
                 self.refused = self.refused + 1
@@ -179,6 +182,7 @@ class Playback:
             self._needed = max(self._needed, self._now - self._newest.time_s)
         if self._now - self._heard > BRAKE_AFTER_S:
             self._knots.clear()
+
         moved = self._moved()
         self._state = np.stack(moved[:3])
         return moved
@@ -282,7 +286,7 @@ class Playback:
 
     def _update_needed_delay(self, time_s: float) -> None:
         """Update the needed delay by a command for this time of the motion [s], which arrives now.
-        The segment to it is known only now, but was needed at its begin.
+        The curve to it is known only now, but was needed at its begin.
         """
         if not self._knots:
             self._needed = self._offset = self._now - time_s
@@ -303,6 +307,7 @@ class Playback:
         )
         self._offset += slower * self._period_s
         self._needed -= DELAY_DECAY * self._period_s
+
         playhead_s = self._now - self._offset
         while len(self._knots) > 2 and self._knots[1].time_s <= playhead_s:
             self._knots.popleft()
@@ -367,6 +372,7 @@ def _aim(
         acceleration = (2.0 * bend + u * 6.0 * twist) / lasts_s**2
         position += beyond_s * velocity + held_s * (beyond_s - 0.5 * held_s) * acceleration
         velocity = (velocity + held_s * acceleration) * (1.0 - span[3])
+
         if held_s != beyond_s:
             acceleration = 0.0
         error = position - state[0, i] - velocity * config.period_s
