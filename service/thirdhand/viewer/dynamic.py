@@ -100,7 +100,7 @@ class DynamicScene:
         self._widths: dict[str, int] = {}  # number of values of each curve that has begun, by path
 
     def set_gate(self, deviation_m: float) -> None:
-        """Sets the deviation [m] above which the skill in force holds."""
+        """Set the deviation [m] above which the skill in force holds."""
         self._gate = deviation_m
 
     def index(self, times_ns: NDArray[np.int64], *, to_ns: int = 1) -> list[rr.TimeColumn]:
@@ -345,12 +345,12 @@ class DynamicScene:
         sent = []
         ticks = frames["tick"].tolist()
         engaging = (frames["flags"] & int(Flag.ENGAGING) > 0).tolist()
-        for i, now in enumerate(
+        for i, outcome in enumerate(
             zip(frames["mode"].tolist(), frames["reason"].tolist(), engaging, strict=True)
         ):
-            if now != self._shown:
+            if outcome != self._shown:
                 changed.append(i)
-                self._shown = now
+                self._shown = outcome
             elif not (self._live and ticks[i] - self._mode_sent_tick > self._repeat_ticks):
                 continue
             sent.append(i)
@@ -438,7 +438,7 @@ class DynamicScene:
         body = self._body
         nearest = (NEAREST_SHOWN_M, np.zeros((2, 3)))
         placed = np.empty((len(body.capsules), 2, 3))
-        near = np.empty(9)
+        near = np.empty(9)  # both nearest points, and the normal
         place(np.ascontiguousarray(frame["joints"]), body.frames, body.axes, body.capsules, placed)
         if frame["hand_distance"] < min(NEAREST_SHOWN_M, FARTHEST_REPORTED_M):
             for side in np.flatnonzero(seen):
@@ -452,14 +452,13 @@ class DynamicScene:
                         )
                         nearest = distance, np.stack(surfaces)
         distance, line = nearest
-        return line.astype(
-            np.float32
-        ), f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
+        label = f"{100 * distance:.0f} cm" if distance < NEAREST_SHOWN_M else ""
+        return line.astype(np.float32), label
 
     def _trail(
         self, frames: NDArray[Any], rows: NDArray[np.intp], columns: Columns
     ) -> Iterator[rr.chunk.Chunk]:
-        """The trails of the last TRAIL_S; a trail restarts after its hand was lost."""
+        """The trails of the last SHOWN_TRAIL_S; a trail restarts after its hand was lost."""
         # older recordings have no limits of their own
         stale = np.maximum(frames["stale_ticks"], self._stale_ticks)
         tracks = [

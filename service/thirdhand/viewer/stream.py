@@ -80,9 +80,8 @@ class Viewer:
         self._skill = b""
         self._contents: SkillContents | None = None  # of the skill
         self._objects: tuple[SceneObject, ...] = ()
-        self._moved: list[
-            tuple[int, tuple[SceneObject, ...]]
-        ] = []  # times [ns], objects: to be sent with the frames
+        # times [ns], objects: to be sent with the frames
+        self._moved: list[tuple[int, tuple[SceneObject, ...]]] = []
         self._repeated_ns = 0
         self._repeated_tick = 0
 
