@@ -18,7 +18,7 @@ LEAST_SPREAD_RAD = 0.003
 LAG_STD_S = 0.003  # largest standard deviation of a lag that is reported
 MAX_RESIDUAL_SHARE = 0.2  # largest error that remains / standard deviation of the commands
 MAX_COMMAND_GAP_S = 0.05  # states are not compared where commands paused for longer
-LEAST_STATES = 20  # of a joint
+LEAST_STATES = 20  # of a joint, and as many commands
 
 Samples = Sequence[tuple[float, float]]  # arrival [s] and position [rad] of one joint
 
@@ -74,8 +74,8 @@ def _columns(samples: Samples) -> tuple[Vector, Vector]:
 
 
 def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -> Lag:
-    """The error that remains with an assumed lag [s]. The states within the range of all lags are
-    compared, so that each lag is judged by the same ones.
+    """An assumed lag [s] and the error that remains with it. The states within the range of all
+    lags are compared, so that each lag is judged by the same ones.
     """
     squares = 0.0
     speeds = 0.0
@@ -87,6 +87,7 @@ def _at(lag_s: float, joints: Sequence[tuple[Vector, Vector, Vector, Vector]]) -
         )
         after = np.clip(np.searchsorted(command_times, times), 1, len(command_times) - 1)
         inside &= command_times[after] - command_times[after - 1] < MAX_COMMAND_GAP_S
+
         delayed_times = times[inside] - lag_s
         if len(delayed_times) < LEAST_STATES:
             continue

@@ -190,7 +190,9 @@ def _mode(now: Status) -> Finding:
 
 
 def _drives(travels: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
-    """Of the joints that did not move, the one with the largest commanded travel."""
+    """The joint with the largest commanded travel of those that did not move, if any; `travels`:
+    commanded and actual travel [rad] by joint.
+    """
     still = {
         name: commanded
         for name, (commanded, moved) in travels.items()

@@ -39,7 +39,7 @@ Series: TypeAlias = deque[tuple[float, float]]  # arrival [s] and position [rad]
 
 
 def doctor(args: argparse.Namespace) -> int:
-    """Exit code 1 if something is wrong."""
+    """Examine a cell and print what is found; exit code 1 if something is wrong."""
     results = []
     for finding in _examined(args):
         results.append(finding)

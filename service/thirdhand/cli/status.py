@@ -42,7 +42,9 @@ STUCK_WORD = word(Flag.STUCK)  # its explanation is already in `because`
 
 
 def status(args: argparse.Namespace) -> int:
-    """Exit code 0 if a daemon answers; 1 at a fault with --exit-code, and when --watch ends."""
+    """Print the status; exit code 0 if a daemon answers, 1 at a fault with --exit-code, and when
+    --watch ends.
+    """
     if args.watch:
         return _watch(args)
     now = msgspec.convert(ask(args, "status"), Status)

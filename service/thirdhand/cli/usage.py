@@ -161,9 +161,8 @@ def workers(given: str) -> str:
     )
 
 
-TYPE_OF_METAVAR: dict[
-    str | None, Callable[[str], Any]
-] = {  # the functions that read an option's value
+# the functions that read an option's value
+TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {
     **dict.fromkeys(("DIR", "FILE", "PNG"), Path),
     "S": float,
     "M": within(float, 0, 10, " m"),
@@ -257,9 +256,8 @@ def inputs_session(args: argparse.Namespace, timeout_s: float, settings: Setting
             timeout_s=timeout_s,
             certificate=reach.certificate,
             zenoh_config=reach.zenoh_config,
-            more={}
-            if listen
-            else {"mode": "client"},  # a daemon forwards others' messages only to clients
+            # a daemon forwards others' messages only to clients
+            more={} if listen else {"mode": "client"},
         )
     except UnreachableError as error:
         hint = "" if listen else f" Without a daemon, use --listen {ENDPOINT}"
