@@ -1,4 +1,4 @@
-"""What several tests share."""
+"""Environment, order and fixtures of all tests."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from thirdhand.viewer import vulkan
 
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
-os.environ["XDG_CONFIG_HOME"] = os.devnull  # no client file of whoever runs the tests
-# each of a thousand processes would compile what it imports
+os.environ["XDG_CONFIG_HOME"] = os.devnull  # the user's own client file is ignored
+# without bytecode, each of a thousand processes would compile its imports
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-# a script's `&` has it ignored, and children inherit that
+# a shell's `&` ignores SIGINT, and child processes inherit that
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest_plugins = ["support.busy"]
@@ -43,9 +43,10 @@ for arm in ("wam", "ur5"):
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin to compile what the tests call, beside their collection; cached functions take 2 s.
+    """Start compiling the functions that the tests call, while tests are collected; if all are
+    cached, this takes 2 s.
 
-    Files are begun in the order of the tests, not the one with the most tests first.
+    Files run in the order of the tests, not in that of their number of tests.
     """
     config.option.loadscopereorder = False
     if not hasattr(config, "workerinput"):
@@ -57,7 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class _Instantly:
-    """Prints a failure when it happens, so that a run that is cut tells what failed."""
+    """Prints a failure when it happens, so that an interrupted run shows what failed."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
@@ -77,20 +78,20 @@ class _Instantly:
             terminal.write_line(f"{report.nodeid} failed: {words}")
 
     def pytest_sessionfinish(self) -> None:
-        """Leave failures out of the end, where only their names are wanted."""
+        """Print only the names of failures at the end."""
         self._config.option.tbstyle = "no"
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop(session: pytest.Session) -> None:
-    """Begin no test before everything is compiled; workers wait for the process that they serve."""
+    """Start no test before everything is compiled; workers wait for the main process."""
     preparing = session.config.stash.get(PREPARING, None)
     if preparing is not None and preparing.wait() != 0:
         pytest.exit("compilation failed; its output is above", returncode=1)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Where only what is timed, or only what is quick, is asked for, no other file is imported."""
+    """Import only files with such tests if only timed or only quick tests are requested."""
     mark = config.option.markexpr
     if collection_path.suffix != ".py" or mark not in {"timed", "quick"}:
         return None
@@ -99,7 +100,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is quick and what is thorough, and put first the files that take longest."""
+    """Mark quick and thorough tests, and run first the files that take longest."""
     begun: set[str] = set()
     for item in items:
         test = item.nodeid.partition("[")[0]
@@ -113,7 +114,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _file(item: pytest.Item) -> str:
-    """The file of a test, below the folder of the tests."""
+    """The path of a test's file within tests/."""
     return str(item.path.relative_to(ROOT / "tests"))
 
 
@@ -132,8 +133,8 @@ def skill() -> Skill:
 
 @pytest.fixture(scope="session")
 def golden(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
-    """The golden session with a frame for each tick: made by a replay, once for all workers if
-    none begins before another has ended.
+    """The golden session with a frame for each tick, made by a replay. A lock lets one worker make
+    it for all.
     """
     folder = tmp_path_factory.mktemp("whole")
     whole = (folder if worker_id == "master" else folder.parent.parent) / "golden.mcap"

@@ -1,9 +1,9 @@
-"""The way of one hand sample through the service, from its subscriber to the joint command: which
-files it enters, in order, and how often one calls into another.
+"""The path of one hand sample through the service, from its subscriber to the joint command: the
+files that it enters, in order, and the number of calls between files.
 
     python -m tests.hand_sample
 
-Compiled functions run as plain Python here, so that they are seen too. A call from one function of
+Compiled functions run as plain Python here, so that they count too. A call from one function of
 a file to a function of another counts once, however often a loop repeats it. A re-entry is such a
 call into a file that was entered before. A segment's class and its compiled step count as one file.
 """
@@ -37,8 +37,8 @@ from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings, robot_description
 
 ROOT = Path(__file__).parents[1]
-LOOP = str(Path(daemon.__file__))  # this file does what the loop there does
-# left out, as operators are
+LOOP = str(Path(daemon.__file__))  # this program does the work of the daemon's loop
+# left out like operators
 ARITHMETIC = {
     str(ROOT / "service/thirdhand/core/vectors.py"),
     str(ROOT / "kmp/elementary.py"),
@@ -53,7 +53,7 @@ class Walk:
         self.calls: list[tuple[str, str, str, str]] = []
 
     def see(self, frame: FrameType, event: str, _: Any) -> None:
-        """Notes a call into another file."""
+        """Record a call into another file."""
         if event != "call" or not self._is_ours(frame):
             return
         caller = frame.f_back
@@ -83,7 +83,7 @@ class Walk:
 
     @property
     def re_entries(self) -> int:
-        """How many calls go into a file that was entered before."""
+        """The number of calls into files that were entered before."""
         return len(self.calls) + 1 - len(self.files)
 
 
@@ -93,7 +93,7 @@ def _file_of(frame: FrameType) -> str:
 
 
 def walk() -> Walk:
-    """A sample's way, while the arm follows."""
+    """The path of a sample while the arm follows."""
     settings = Settings()
     skill = shipped_skill().for_loop()
     trace = Walk()
@@ -145,7 +145,7 @@ def walk() -> Walk:
 
 
 def main() -> None:
-    """Prints the way, and counts it."""
+    """Print the path and its counts."""
     trace = walk()
     print("\n".join(f"{number:2} {file}" for number, file in enumerate(trace.files, 1)))
     print(

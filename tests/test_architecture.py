@@ -1,4 +1,4 @@
-"""The house rules that a machine can check: who imports whom, names, first lines."""
+"""Rules of the architecture that can be checked: imports, names, first lines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from support import tiers
 from support.cell_commands import python
 from support.paths import ROOT
 
-PACKAGES = {"kmp": "", "thirdhand": "service", "thirdhand_sim": "sim"}  # and the folder of each
+PACKAGES = {"kmp": "", "thirdhand": "service", "thirdhand_sim": "sim"}  # the folder of each package
 VAGUE = {
     "utils",
     "util",
@@ -30,7 +30,7 @@ VAGUE = {
     "interface",
     "misc",
 }
-# of something in code that a test runs, or a name that it patches
+# access to private names in code strings of tests, or in names that they patch
 PRIVATE = r"[a-z]\._[a-z]|, \"_[a-z]"
 MODULES = sorted(
     path for folder in ("kmp", "service", "sim", "tests") for path in (ROOT / folder).rglob("*.py")
@@ -51,10 +51,10 @@ STRUCTURAL = """
     SEPARATED SPEED STATES STAYS TABLE_DEPTH_M THINGS TREMOR_RATES TURNS TURN_INPUTS
     TURN_ROUND_TO UNKNOWN UNSAFE UNUSABLE USUAL_RATE WAITS_AT WAY
 """
-# `KMP.save` and `KMP.load` import what stores primitives
+# `KMP.save` and `KMP.load` import the storage of primitives
 CONVENIENCES = {("kmp.primitive", "kmp.storage")}
-IN_EVERY_STAGE = {"FRAME", "STATE"}  # the fields that a stage owns in the frame and in the state
-# Names of constants and classes that are still defined twice. This list only becomes shorter.
+IN_EVERY_STAGE = {"FRAME", "STATE"}  # each stage's own fields of frame and state
+# Names of constants and classes that are still defined twice. Add none.
 NAMED_TWICE = """
     ARM BLOCK BLOCKS COLOURS COVARIANCE_ROUND_TO Evidence HANDS Hyperparameters KEPT KMP
     LEFT LEVELS MACHINE NEAR NEAREST NONE OBJECTS OTHERS Options Outcome PEOPLE Percentiles
@@ -62,7 +62,7 @@ NAMED_TWICE = """
     WayOut _ATTACHMENT _FREE _LENGTH _MACHINE _NAMES _NOISES _RESIDUAL _ROUNDS _SHOWN
     _System _TICK _TINY
 """
-# lines that break a contract, by what they break, and the contracts that are then broken
+# lines that break contracts, by the kind of violation, and the contracts that they break
 PLANTED = {
     "what comes from outside": (
         {
@@ -102,12 +102,12 @@ PLANTED = {
 
 
 def named(path: Path) -> str:
-    """The path below the root."""
+    """The path relative to the root."""
     return str(path.relative_to(ROOT))
 
 
 def imported(path: Path) -> set[str]:
-    """The first parts of the names of all modules that a file imports, wherever in it."""
+    """The first parts of the names of all modules that a file imports, at any level."""
     packages: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -118,7 +118,7 @@ def imported(path: Path) -> set[str]:
 
 
 def modules_imported(folder: Path) -> dict[str, set[str]]:
-    """The modules of PACKAGES that each module imports, also in functions and for types alone."""
+    """The modules of PACKAGES that each module imports, also in functions and for types only."""
     names: dict[str, Path] = {}
     for package, place in PACKAGES.items():
         for path in (folder / place / package).rglob("*.py"):
@@ -151,7 +151,7 @@ def circle(imports: dict[str, set[str]]) -> list[str]:
 
 
 def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
-    """The import contracts of a tree, checked."""
+    """The results of the import contracts in a source tree."""
     code = (
         "import sys; from importlinter.cli import lint_imports_command; "
         "sys.exit(lint_imports_command())"
@@ -249,7 +249,7 @@ def test_a_process_of_a_cell_imports_what_it_needs(
 
 @pytest.mark.parametrize("path", ENTRY_POINTS, ids=named)
 def test_entry_points_ask_for_one_blas_thread_first(path: Path) -> None:
-    """An entry point asks for one blas thread before all but the standard library."""
+    """Only the standard library may be imported before."""
     imports = (
         node
         for node in ast.parse(path.read_text(encoding="utf-8")).body
@@ -315,7 +315,7 @@ def defined(path: Path) -> set[str]:
 
 
 def test_a_class_or_constant_has_a_name_of_its_own() -> None:
-    """So a name that is searched for leads to one definition."""
+    """A search for a name then finds one definition."""
     modules: dict[str, list[str]] = {}
     for path in (path for path in MODULES if not path.is_relative_to(ROOT / "tests")):
         for name in defined(path) - IN_EVERY_STAGE - set(NAMED_TWICE.split()):
@@ -325,7 +325,6 @@ def test_a_class_or_constant_has_a_name_of_its_own() -> None:
 
 
 def test_tests_share_support_and_never_import_each_other() -> None:
-    """Tests share what stands in support and never import each other."""
     tests = [path for path in MODULES if path.is_relative_to(ROOT / "tests")]
     theirs = {
         path.stem for path in tests if not path.is_relative_to(ROOT / "tests" / "support")
@@ -334,7 +333,7 @@ def test_tests_share_support_and_never_import_each_other() -> None:
 
 
 def test_tests_ask_for_nothing_private_by_import_or_in_a_string() -> None:
-    """Nor as an attribute, which the linter finds."""
+    """The linter finds private attributes."""
     findings = []
     for path in (path for path in MODULES if path.is_relative_to(ROOT / "tests")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -369,8 +368,8 @@ def test_constraints_name_versions_and_no_places() -> None:
 
 
 def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
-    """Tuned numbers in tuning.py, compiled functions in step.py, the class in stage.py; no stage
-    imports another one's step.
+    """Tuned numbers are in tuning.py, compiled functions in step.py, the class in stage.py; no
+    stage imports another stage's step.
     """
     core = ROOT / "service" / "thirdhand" / "core"
     stages = sorted(path.parent for path in core.glob("*/stage.py"))

@@ -1,4 +1,4 @@
-"""A test that fails on a busy machine is run again, and counted apart if it then passes."""
+"""A test that fails on a busy machine is run again, and counted separately if it then passes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def busy_processor() -> Iterator[int]:
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processes cannot be pinned here")
 def test_failure_on_a_busy_processor_must_repeat(tmp_path: Path) -> None:
-    """A failure on a busy processor counts only if it comes again."""
+    """A single failure there does not count."""
     (tmp_path / "test_both.py").write_text(TESTS)
     with busy_processor() as processor:
         options = [

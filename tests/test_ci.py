@@ -1,5 +1,5 @@
-"""The script that runs all checks: each part runs, whatever failed before it, and the end names
-what failed.
+"""The script of all checks: each part runs, whatever failed before, and the end names the failed
+parts.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ PARTS = ("the README's tests", "thorough", "timed", "a newer Python")
 
 
 def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
-    """A checkout whose README has this test command and whose Pythons are this shell script; the
-    environment for its script.
+    """A checkout whose README has this test command and whose Python interpreters are this shell
+    script; and the environment for its checks.
     """
     (folder / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
@@ -42,7 +42,7 @@ def checkout(folder: Path, *, readme: str, python: str) -> dict[str, str]:
 
 
 def checked(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """The script's run in a checkout."""
+    """A run of the script in a checkout."""
     command = ["bash", ".ci/run"]
     return subprocess.run(
         command,
@@ -84,7 +84,7 @@ def test_every_part_runs_and_the_end_names_those_that_failed(
 
 
 def test_a_part_that_cannot_run_has_failed(tmp_path: Path) -> None:
-    # a Python that cannot make environments
+    # this Python cannot make environments
     environment = checkout(tmp_path, readme="true", python='[ "$1" != -c ]')
     (tmp_path / "README.md").write_text("# A\n", encoding="utf-8")
     done = checked(tmp_path, environment)

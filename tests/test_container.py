@@ -1,6 +1,4 @@
-"""The container in examples/: its image, the services beside it, and the settings within agree with
-this version.
-"""
+"""The container in examples/: image, services and settings agree with this version."""
 
 from __future__ import annotations
 
@@ -27,12 +25,12 @@ COMPOSE: dict[str, Any] = yaml.safe_load((EXAMPLES / "compose.yaml").read_text(e
 
 
 def instruction(name: str) -> list[str]:
-    """The words of the last instruction of this name, which is written as a list."""
+    """The words of the last instruction of this name, which is in list form."""
     return list(json.loads(re.findall(rf"^{name} .*?(\[.*\])$", IMAGE, re.MULTILINE)[-1]))
 
 
 def test_image_installs_this_distribution_and_runs() -> None:
-    """The image installs this distribution as tested and runs its commands without rights."""
+    """The versions are the tested ones, and commands run without rights of the superuser."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = re.findall(r'"/source\[(.*?)\]"', IMAGE)[0].split(",")
     assert set(extras) <= set(project["optional-dependencies"])
@@ -64,7 +62,7 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
 
 
 def test_services_reach_each_other() -> None:
-    """The services are commands of this version and reach each other."""
+    """Their commands are those of this version."""
     services = COMPOSE["services"]
     configs = COMPOSE["configs"]
     cell, metrics = (parser().parse_args(services[name]["command"]) for name in ("cell", "metrics"))

@@ -1,5 +1,5 @@
-"""The pages agree with the code: the status, faults with their figures, tests behind promises, the
-wire, ROS 2 topics, commands, options, settings and files. Words that the glossary retires stay out.
+"""The pages agree with the code: status, faults with their figures, tests of promises, the wire,
+ROS 2 topics, commands, options, settings and files. Retired words of the glossary are not used.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STATUS = (ROOT / "docs" / "status.md").read_text(encoding="utf-8")
 
 
 def table(head: str) -> list[list[str]]:
-    """The cells of each row of the table with this head on the page on the status."""
+    """The rows of the table with this head on the page about the status, as cells."""
     lines = STATUS[STATUS.index(f"\n| {head} |") :].lstrip().split("\n\n")[0].splitlines()
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
@@ -93,7 +93,7 @@ def test_the_table_of_signs_is_that_of_the_shipped_arm() -> None:
 
 
 def cells_below(text: str, head: str) -> list[list[str]]:
-    """The cells of each row of all tables in a text whose first column has this head."""
+    """The rows of all tables in a text whose first column has this head, as cells."""
     tables = re.findall(rf"^\| {head} \|.*\n\|---.*\n((?:\|.*\n?)+)", text, flags=re.MULTILINE)
     return [
         [cell.strip() for cell in row.strip("|").split("|")]
@@ -107,7 +107,7 @@ def cells_below(text: str, head: str) -> list[list[str]]:
     [("faults.md", "fault", len(MEASURED) + 10), ("bounds.md", "bound", 10)],
 )
 def test_promises_of_the_appendix_have_tests(page: str, head: str, least: int) -> None:
-    """Each promise has its tests in the appendix and they exist."""
+    """The tests exist."""
     promises = [
         row[0] for row in cells_below((ROOT / "docs" / page).read_text(encoding="utf-8"), head)
     ]
@@ -129,13 +129,13 @@ def test_each_fault_that_was_measured_has_a_row_with_its_figures() -> None:
 
 
 def rows_of(page: str, first: str) -> list[str]:
-    """The rows of a page's tables that begin so."""
+    """The rows of a page's tables that begin with this text."""
     lines = (ROOT / "docs" / page).read_text(encoding="utf-8").splitlines()
     return [line for line in lines if line.startswith(first)]
 
 
 def publisher(channel: Channel) -> str:
-    """The role that publishes or answers on a channel."""
+    """The role that publishes on a channel or answers there."""
     if channel.direction == "out":
         return "the service" + ", which answers too" * channel.queryable
     if channel.direction == "request":
@@ -166,7 +166,7 @@ def test_the_table_of_topics_is_that_of_the_ros2_node() -> None:
 
 
 def test_foxglove_layout_shows_existing_topics() -> None:
-    """The layout for foxglove shows topics and fields that a recording has."""
+    """A recording has these topics and fields."""
     layout = json.loads((ROOT / "docs" / "foxglove-layout.json").read_text(encoding="utf-8"))
     fields = {
         topic("thirdhand", name): {field.name for field in fields}
@@ -196,7 +196,7 @@ def test_foxglove_layout_shows_existing_topics() -> None:
     assert panels(layout["layout"]) == set(layout["configById"])
 
 
-# All but the log of changes.
+# All pages except the log of changes.
 PAGES = sorted(
     path
     for folder in (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
@@ -232,7 +232,7 @@ TABLES = {
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_names_on_a_page_exist(page: Path) -> None:
-    """Commands options settings and files that a page names exist."""
+    """The names are those of commands, options, settings and files."""
     text = page.read_text(encoding="utf-8")
     code = re.findall(r"```(?:sh|console)\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL)
     for name, arguments in re.findall(

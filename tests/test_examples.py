@@ -1,5 +1,5 @@
-"""The programs in examples/, run as they stand: a tracker and a follower around one daemon, a
-teacher and a watcher beside them; and the mathematics alone.
+"""The programs in examples/, run as they stand: tracker, follower, teacher and watcher with one
+daemon; and the example of kmp.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ EXAMPLES = ROOT / "examples"
 
 
 def example(name: str) -> ModuleType:
-    """An example as a module."""
+    """The module of an example."""
     spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -33,7 +33,7 @@ def example(name: str) -> ModuleType:
 def test_tracker_follower_teacher_and_watcher_work_together(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Once more with twice the time where a busy machine did not let them."""
+    """They get a second attempt with twice the time, as the machine may be busy."""
     output = ""
     ended = dict[str, Any]()
     with serving(tmp_path) as daemon:
@@ -75,7 +75,7 @@ def test_tracker_follower_teacher_and_watcher_work_together(
 
 
 def test_mathematics_alone_goes_through_the_point(capsys: pytest.CaptureFixture[str]) -> None:
-    """The mathematics alone goes through the point it was given."""
+    """The mean passes through the given point."""
     adapted = example("kmp_alone").main()
     assert np.allclose(adapted.mean(np.array([[1.0]])), [[0.20, 0.10]], atol=2e-3)
     assert len(capsys.readouterr().out.splitlines()) == 6

@@ -1,4 +1,4 @@
-"""The way of one hand sample through the service stays short, and is told as it is."""
+"""The path of one hand sample through the service is short, and documented correctly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 @pytest.fixture(scope="module")
 def printed() -> list[str]:
-    """What the program prints that follows one sample."""
+    """The output of the program that follows one sample."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.hand_sample"],
         capture_output=True,

@@ -1,5 +1,5 @@
-"""The loop keeps its time on two cores, as ratios within one run; what would break that is found:
-planted work, and a busy thread. The first run is that of the command, with all that it writes.
+"""The loop keeps its time on two cores, as ratios within one run; planted work and a busy thread
+are detected. The first run is that of the command, with all its output files.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from thirdhand.workbench.timing import benchmark
 pytestmark = pytest.mark.timed
 SECONDS = 5.0
 RATE_HZ = 500
-# What a shared machine's noise leaves room for; a quiet one has 5 - 8, 1, 0 and 0.
+# Limits for a shared machine; a quiet one has 5 - 8, 1, 0 and 0.
 MOST_WORK = 14.0
 MOST_LATENCY = 1.4
 MOST_MISSED = 0.03
-# shares of a period; a busy thread exceeds one of them, seldom both
+# shares of a period; a busy thread exceeds at least one of them
 MOST_LATE = {
     "p50": 0.02,
     "p99": 0.5,
@@ -60,7 +60,7 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.fixture(scope="module", autouse=True)
 def two_cores() -> Iterator[None]:
-    """All that is started here runs on two cores."""
+    """Processes of this module run on two cores."""
     if not hasattr(os, "sched_setaffinity"):
         pytest.skip("processes cannot be pinned here")
     before = os.sched_getaffinity(0)
@@ -71,7 +71,7 @@ def two_cores() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command keeps of a run."""
+    """The folder with the command's output of a run."""
     folder = tmp_path_factory.mktemp("kept")
     done = thirdhand(
         "bench", "--seconds", str(SECONDS), "--json", "--output", str(folder), timeout=150
@@ -83,7 +83,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The empty loop and the core, which no plant changes, are not measured again."""
+    """Reuse the measurements of the empty loop and the core, which planted faults do not change."""
     report = json.loads((kept / "bench.json").read_text())
     measure = benchmark.probe
     reports = {kind: report[kind] for kind in ("empty", "core")}
@@ -93,7 +93,7 @@ def probed_once(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def complaints(report: dict[str, Any]) -> list[str]:
-    """What of the loop's time is not as it should be."""
+    """The figures of the loop's time that exceed their limits."""
     ratios = report["ratios"]
     checks = {
         "work": (ratios["work_to_fixed_work"], MOST_WORK),
@@ -140,7 +140,7 @@ def test_what_breaks_it_is_found(thread: bool) -> None:
 
 
 def test_busy_processes_take_no_message_from_a_subscriber(tmp_path: Path) -> None:
-    """With a sender's queue of two, one in twenty of what leaves last in a tick was lost."""
+    """With a sender's queue of two, 5 % of the last messages of a tick were lost."""
     numbers: dict[str, list[int]] = {}
 
     def note(sample: zenoh.Sample) -> None:

@@ -1,4 +1,4 @@
-"""The README's program runs as it stands, and its first commands arrive in an order that works."""
+"""The README's program runs as it stands, and its first commands are in a working order."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def program() -> str:
-    """The program that is marked as one."""
+    """The program that is marked in the README."""
     programs = re.findall(r"<!-- program -->\n```python\n(.*?)```", README, re.DOTALL)
     assert len(programs) == 1
     return str(programs[0])
 
 
 def test_program_runs_as_it_stands_by_the_client_alone(tmp_path: Path) -> None:
-    """The program runs as it stands by the client alone and the service follows its hands."""
+    """Only the client's packages are installed; the service follows the program's hands."""
     assert len([line for line in program().splitlines() if line]) <= 10
     site = unpacked(wheel_of(ROOT, tmp_path), tmp_path / "site")
     with serving(tmp_path, "--joints", "assumed") as daemon:
         environment = {"THIRDHAND_CONNECT": daemon.endpoint, "HOME": str(tmp_path)}
-        # a busy machine may leave the hands stale, or the skill worker without time
+        # on a busy machine the hands may be stale, or the skill worker late
         for _ in range(3):
             done = isolated(site, program(), "zenoh", "msgspec", env=environment)
             held = daemon.client.status().reason
@@ -44,7 +44,7 @@ def test_program_runs_as_it_stands_by_the_client_alone(tmp_path: Path) -> None:
 
 
 def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
-    """Its program as it stands, but shorter: the left hand moves to the tool once."""
+    """The page's program runs, shortened: the left hand moves to the tool once."""
     page = (ROOT / "docs" / "first-tracker.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"<!-- tracker -->\n```python\n(.*?)```", page, re.DOTALL)
     with serving(tmp_path, "--joints", "assumed") as daemon:
@@ -68,7 +68,6 @@ def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:
 
 
 def test_environment_is_activated_before_a_bare_command() -> None:
-    """The environment is activated before the first bare command."""
     lines = [
         line
         for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL)

@@ -1,5 +1,5 @@
-"""The site of the documents: it builds without a warning, every link has a target, and the pages
-that programs write are those of the code.
+"""The site of the documents: it builds without a warning, every link has a target, and generated
+pages agree with the code.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a p
     "SUPPORT_SHARPNESS",
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-# of `thirdhand.client`, for the service's own programs
+# names in `thirdhand.client` for the service's own programs
 INSIDE = {
     "decoded",
     "no_room_to_brake",
@@ -106,7 +106,7 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 
 
 def test_tuned_numbers_have_unit_meaning_and_range() -> None:
-    """Each tuned number has a unit a meaning and a range around its value."""
+    """The value is within the range."""
     page = program("tuning_page")
     numbers = [number for segment in page.STAGES for number in page.numbers_of(segment)]
     assert len(numbers) > 70
@@ -128,7 +128,6 @@ def test_the_page_lists_each_tuned_number_that_is_data() -> None:
 
 
 def test_page_on_the_command_line_is_complete() -> None:
-    """The page on the command line has every command and option."""
     written = written_by("command_line_page")
     commands = {name for names in GROUPS.values() for name in names}
     assert set(re.findall(r"^## thirdhand ([\w-]+)$", written, re.MULTILINE)) == commands
@@ -142,7 +141,7 @@ def test_page_on_the_command_line_is_complete() -> None:
 
 
 def test_pages_on_python_are_those_of_the_docstrings() -> None:
-    """The pages on python are those of the docstrings and have every name."""
+    """They have every name."""
     for page, written in program("library_page").pages().items():
         assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
         module = {"library": kmp, "client": client}[page.stem]
@@ -184,7 +183,7 @@ def test_a_picture_is_drawn_by_its_program(
 ) -> None:
     drawing = program(f"{name}_picture")
     monkeypatch.setattr(drawing, "PICTURE", tmp_path / "drawn.png")
-    # experiments, which this process may have run before, have a style of their own
+    # experiments that ran before in this process may have changed the style
     matplotlib.rcdefaults()
     drawing.main()
     assert (tmp_path / "drawn.png").stat().st_size > 20_000
@@ -196,7 +195,7 @@ def test_the_figures_of_the_experiments_are_those_of_the_results() -> None:
 
 
 def test_figure_without_a_result_is_an_error() -> None:
-    """A figure without a result is an error and a stale result is marked."""
+    """A stale result is marked."""
     page = program("experiments_page")
     options = {"share": 1.0, "arm": "wam", "set": "test"}
     results: dict[str, dict[str, Any]] = {
@@ -233,7 +232,7 @@ def test_figure_without_a_result_is_an_error() -> None:
 
 
 def test_errors_with_and_without_jumps_are_shown() -> None:
-    """Errors against a truth without jumps are shown beside those with them."""
+    """The truth is used with and without the jumps of a tracker."""
     page = program("experiments_page")
     results: dict[str, dict[str, Any]] = {
         name: page.result_of(page.RESULTS, name) for name in EXPERIMENTS
@@ -267,7 +266,7 @@ def test_errors_with_and_without_jumps_are_shown() -> None:
 
 
 def test_programs_for_users_of_other_libraries_run() -> None:
-    """Names and programs for users of other libraries exist and run."""
+    """The names on the page exist too."""
     text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
     cells = [line.strip("| ").split("|")[-1] for line in text.splitlines() if line.startswith("| ")]
     names = {name for cell in cells for name in re.findall(r"`([A-Za-z]\w*(?:\.\w+)*)[`(]", cell)}
@@ -282,14 +281,14 @@ def test_programs_for_users_of_other_libraries_run() -> None:
 
 
 def test_each_setting_has_words_or_a_unit() -> None:
-    """Each setting has words or a unit beside it in the source."""
+    """They stand beside it in the source."""
     rows = [line for line in written_by("settings_page").splitlines() if line.startswith("| `")]
     assert len(rows) > 40
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
 def anchor(heading: str) -> str:
-    """The name of a heading in links, as GitHub makes it."""
+    """GitHub's anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
@@ -335,7 +334,7 @@ def test_a_site_is_built_of_all_pages_without_a_warning(tmp_path: Path) -> None:
         html = (tmp_path / "site" / f"{page.stem}.html").read_text(encoding="utf-8")
         assert not re.search(
             "[\u2013\u2014](json|mouse|web|output|each|live|[a-z]+-[a-z]+)\\b", html
-        ), page  # options
+        ), page  # dashes of options were changed
         assert f'href="{page.stem}.html"' in front or page.stem == "index", (
             f"{page.stem} is not in the navigation"
         )

@@ -1,4 +1,4 @@
-"""What is checked without running anything: lint, format, types."""
+"""Static checks: lint, format, types."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from support.paths import ROOT
 
-MYPY_CACHE = Path.home() / ".cache" / "thirdhand" / "mypy"  # by content, for every checkout
+MYPY_CACHE = Path.home() / ".cache" / "thirdhand" / "mypy"  # shared by all checkouts
 
 
 @pytest.mark.parametrize(

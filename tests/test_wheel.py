@@ -1,5 +1,5 @@
-"""The wheel: it holds service, bench, the shipped skill and what that was learned from; its page
-shows no picture and no link that leads nowhere there.
+"""The wheel: it contains service, bench, the shipped skill and its demonstrations; its page has no
+pictures, and no links that would be broken there.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ def test_it_holds_service_bench_and_recordings_and_nothing_else(wheel: Path) -> 
 
 
 def test_citation_names_version_and_papers(wheel: Path) -> None:
-    """How to cite it is told with its version and the papers it follows."""
     citation = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text(encoding="utf-8"))
     assert f"-{citation['version']}-" in wheel.name
     paper, article = citation["preferred-citation"], *citation["references"]
@@ -76,7 +75,7 @@ def test_nothing_in_it_needs_the_lab(wheel: Path) -> None:
 
 
 def test_page_of_the_package_has_the_readmes_text(wheel: Path) -> None:
-    """Its page has the readmes text without pictures and links of the repository."""
+    """Pictures and links within the repository are left out."""
     with zipfile.ZipFile(wheel) as archive:
         page = archive.read(
             next(name for name in archive.namelist() if name.endswith("/METADATA"))

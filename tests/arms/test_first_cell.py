@@ -1,4 +1,6 @@
-"""A first cell from a URDF alone: the plate, a posture, rates, and a demo that meets its places."""
+"""A first cell from a URDF alone: tool plate, posture, rates, and a demo that meets its
+via-points.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,7 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.one_case
 def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
-    """A first cell meets the demos places with a posture over the table."""
+    """The arm meets the demo's via-points, and its posture is over the table."""
     where, plate = ARMS[name]
     path = where()
     proposal = proposed(path, plate=plate)
@@ -94,7 +96,7 @@ def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
 def test_accelerations_follow_from_velocities_and_efforts(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """Accelerations follow from velocities and less where efforts are small."""
+    """Accelerations follow from velocities, and are lower where efforts are small."""
     text = (SHIPPED / "ur5.urdf").read_text()
     moving = Urdf(text).movable("tool0")
     acceleration, jerk, by_effort = rates(text, moving)

@@ -1,5 +1,5 @@
-"""`thirdhand follow`: bad input ends in a sentence; a daemon killed in motion in an arm at rest,
-which follows again once there is another.
+"""`thirdhand follow`: bad input ends in a sentence; an arm whose daemon is killed in motion comes
+to rest, and follows the next daemon.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
-STILL_RADPS = 0.02  # of a measured joint at rest
+STILL_RADPS = 0.02  # a slower measured joint is at rest
 
 
 @contextlib.contextmanager
@@ -42,7 +42,7 @@ def hub(folder: Path) -> Iterator[zenoh.Session]:
 
 
 class Following:
-    """A running `thirdhand follow`, and what it says."""
+    """A running `thirdhand follow`, and its output."""
 
     def __init__(self, *arguments: str) -> None:
         command = [sys.executable, "-m", "thirdhand", "follow", *arguments]
@@ -88,7 +88,7 @@ def following(*arguments: str) -> Iterator[Following]:
 
 
 class Joints:
-    """The arm's joints as it tells them last."""
+    """The joints that the arm reported last."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._subscriber = session.declare_subscriber("thirdhand/joints/state", self._take)
@@ -104,8 +104,8 @@ class Joints:
 
 
 def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -> None:
-    """Kills a daemon in motion, and starts another, which the arm then follows; stops that in
-    motion as well; and ends with the arm at rest.
+    """Kill a daemon while the arm moves, and start another, which the arm then follows; stop the
+    second one in motion as well. The arm is at rest at the end.
     """
     config = folder / "arm.toml"
     config.write_text(network)
@@ -114,7 +114,7 @@ def killed_and_started_again(folder: Path, arm: str, network: str, *more: str) -
         joints = Joints(session)
         with following(
             arm, *connect, "--config", str(config), *more
-        ) as running:  # it waits for the daemon
+        ) as running:  # `follow` waits for the daemon
             with serving(folder, *connect, network=network) as daemon:
                 running.until("commands arrive")
                 for attempt in range(20):
@@ -150,13 +150,11 @@ fault_error_rad = 0.5
 
 @pytest.mark.thorough
 def test_arm_rests_when_its_daemon_is_killed(tmp_path: Path) -> None:
-    """A daemon killed in motion leaves an arm at rest that follows the next."""
     killed_and_started_again(tmp_path, "simulated", PATIENT)
 
 
 @simulated
 def test_franka_keeps_its_limits_while_daemons_are_killed(tmp_path: Path) -> None:
-    """A franka keeps its limits while daemons are killed and started."""
     network = franka_toml().replace("[arm]\n", "[arm]\nsilent_ms = 1000\nfault_error_rad = 0.5\n")
     with robot(tmp_path) as device:
         killed_and_started_again(
@@ -174,7 +172,7 @@ def test_franka_keeps_its_limits_while_daemons_are_killed(tmp_path: Path) -> Non
 
 
 def refused(*arguments: str) -> str:
-    """What `thirdhand follow` says on standard error, of what fails."""
+    """The standard error of a `thirdhand follow` that fails."""
     done = told("follow", *arguments)
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
@@ -206,7 +204,7 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with following("simulated", "--connect", endpoint) as running:
         running.until("waiting, up to 60 s: ")
-        time.sleep(3.0)  # longer than a connection or a request is tried
+        time.sleep(3.0)  # longer than the time-outs of a connection and a request
         with (
             serving(tmp_path, network=f'[network]\nlisten = ["{endpoint}"]\n') as daemon,
             Tracker(daemon.session),
@@ -218,7 +216,7 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
 @pytest.mark.parametrize("program", ["follow", "sim"])
 @pytest.mark.one_case
 def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> None:
-    """A rate that leaves no room to brake is refused in one sentence."""
+    """The refusal is one sentence."""
     with serving(tmp_path, "--rate", "50") as daemon, Tracker(daemon.session):
         done = thirdhand(
             program, *(("simulated",) if program == "follow" else ()), "--connect", daemon.endpoint

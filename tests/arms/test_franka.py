@@ -1,5 +1,5 @@
 """A Franka by libfranka's protocol: each cycle that is written holds the limits that its maker
-publishes, whatever comes; and it is where it is told to be.
+publishes, whatever commands arrive; and the arm follows the commands.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from thirdhand.core.arm.stage import Arm
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.settings.config import JointSettings, Settings, robot_description
 
-# [s]
+# period of the commands [s]
 TICK = 0.002
 PERIOD = franka.FRANKA_PERIOD_S
 Vector = npt.NDArray[np.float64]
@@ -48,7 +48,7 @@ def sway(seconds: float) -> Vector:
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize("lost", [0.0, 0.2])
 def test_toward_its_ends_each_joint_is_slower_as_the_robot_asks(way: float, lost: float) -> None:
-    """Commands go there faster than it allows, as fast as they may."""
+    """The commands move toward a joint's end faster than the robot allows there."""
     rng = np.random.default_rng(1)
     commands = motion(np.full((2000, 7), way * 1.5))
     limits = franka.limits_of(fr3())

@@ -1,5 +1,5 @@
-"""Playback of commands: whatever the network, daemons and clocks do, what is written holds every
-limit; and where they do little, it is what was commanded, a little later.
+"""Playback of commands: whatever the network, daemons and clocks do, the positions written to the
+drive hold every limit. Without such disturbances they are the commanded ones, a little later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from thirdhand.settings.config import JointSettings
 TICK = 0.002  # [s]
 COMMANDED = JointSettings()
 STRONG = JointSettings(velocity=(2.0,) * 7, acceleration=(30.0,) * 7, jerk=(4000.0,) * 7)
-# cannot follow all that is commanded
+# too weak to follow all commands
 WEAK = JointSettings(acceleration=(4.0,) * 7, jerk=(60.0,) * 7)
 DRIVES = {"as commanded": COMMANDED, "stronger": STRONG, "weaker": WEAK}
 AT = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])
@@ -32,14 +32,14 @@ Vector = npt.NDArray[np.float64]
 
 
 class Written(NamedTuple):
-    """What a drive was told, (N, 7) each, at rest before."""
+    """The positions and velocities written to a drive, (N, 7) each; before them it was at rest."""
 
     position: Vector
     velocity: Vector
 
 
 class Sent(NamedTuple):
-    """A command, and when it is received."""
+    """A command, and its time of receipt."""
 
     at_s: float
     command: Command
@@ -64,7 +64,7 @@ def motion(wanted: Vector, *, at: Vector = AT, tick: int = 0) -> list[Command]:
 
 
 def sway(seconds: float) -> Vector:
-    """Wanted velocities of a motion that is fast and smooth."""
+    """Velocities of a fast and smooth motion."""
     times = TICK * np.arange(round(seconds / TICK))[:, None]
     swayed: Vector = 1.2 * np.minimum(times, 1.0) * np.sin(2.0 * times + 0.5 * np.arange(7))
     return swayed
@@ -73,7 +73,7 @@ def sway(seconds: float) -> Vector:
 def sent(
     commands: Sequence[Command], late_s: Sequence[float] = (0.0,), begin_s: float = 0.0
 ) -> list[Sent]:
-    """Commands on their way, tick by tick, each so late."""
+    """Commands tick by tick, each received with a delay."""
     return [
         Sent(begin_s + i * TICK + late_s[i % len(late_s)], command)
         for i, command in enumerate(commands)
@@ -116,7 +116,7 @@ def assert_held(limits: JointSettings, written: Written, period: float) -> None:
     ).all()
 
 
-# --- whatever comes ------------------------------------------------------------------------------
+# --- any commands --------------------------------------------------------------------------------
 
 speeds = st.tuples(*[st.sampled_from([0.0, 0.3, -0.7, 1.5, -1.5])] * 7)
 wishes = st.lists(st.tuples(speeds, st.integers(5, 60)), min_size=1, max_size=4)
@@ -164,11 +164,10 @@ def test_limits_hold_whatever_network_and_clocks_do(
     hostile: list[tuple[float, Command]],
     restart: tuple[int, int, float, float] | None,
 ) -> None:
-    """Every limit holds whatever network daemons and clocks do."""
     wishes_radps = np.array([value for value, count in wishes for _ in range(count)])
     commands = motion(wishes_radps)
     arriving = [*sent(commands, late), *(Sent(*pair) for pair in hostile)]
-    if restart is not None:  # by a daemon that counts anew, and takes the arm to be somewhere near
+    if restart is not None:  # the new daemon counts ticks anew, and starts near the arm
         after, tick, offset_rad, silent_s = restart
         end = commands[min(after, len(commands) - 1)]
         commands = commands[:after]
@@ -195,7 +194,7 @@ def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, whic
 
 
 def test_jump_within_the_limits_is_refused() -> None:
-    """A jump within the limits is refused and the motion goes on."""
+    """The motion of the other commands continues."""
     commands = motion(sway(1.0))
     jumping = [
         Sent(message.at_s, message.command._replace(position=tuple(AT)))
@@ -220,7 +219,7 @@ def test_another_number_of_joints_is_refused_and_named() -> None:
 
 
 def test_it_brakes_20_ms_after_the_last_command() -> None:
-    """Without commands it brakes after 20 ms and as fast as the limits allow."""
+    """The arm brakes as fast as its limits allow."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     commands = motion(np.full((400, 7), 0.5))
     written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
@@ -251,7 +250,6 @@ def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
 def test_after_silence_only_what_begins_at_the_arm_is_followed(
     off: float, speed: float, followed: bool, at_start: bool
 ) -> None:
-    """After silence it follows only what begins where the arm stands."""
     assert REJOIN_RAD == 0.05
     playback = Playback(COMMANDED, AT, period_s=0.001)
     arm = AT
@@ -268,7 +266,7 @@ def test_after_silence_only_what_begins_at_the_arm_is_followed(
 
 
 def test_late_commands_do_not_move_a_stopped_arm() -> None:
-    """Half a second of motion comes at once, half a second late."""
+    """Half a second of commands arrives at once, half a second late."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     commands = motion(sway(1.5))
     held = [
@@ -281,7 +279,9 @@ def test_late_commands_do_not_move_a_stopped_arm() -> None:
 
 
 def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
-    """The one that came first is followed; the other's ticks are none of that sequence."""
+    """The daemon heard first is followed; the ticks of the second one do not continue its
+    sequence.
+    """
     first = motion(sway(1.0))
     other = motion(-sway(1.0), tick=40_000)
     playback = Playback(COMMANDED, AT, period_s=0.001)
@@ -294,7 +294,7 @@ def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
 
 
 def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT) -> list[Sent]:
-    """Commands of a daemon of this rate: from rest, 0.15 rad to and fro at 0.4 Hz."""
+    """Commands of a daemon of this rate: from rest, an oscillation of 0.15 rad at 0.4 Hz."""
     pace = 2 * math.pi * 0.4
     arriving = []
     for k in range(round(seconds * rate_hz)):
@@ -307,7 +307,7 @@ def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT) -> list[Sent]:
 
 
 def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> float:
-    """The largest distance between what is written and what was commanded by then [rad]."""
+    """The largest distance between a written position and the newest command at that time [rad]."""
     when = [message.at_s for message in arriving]
     where = [message.command.position[0] for message in arriving]
     expected_rad = np.interp(period * np.arange(1, len(written.position) + 1), when, where)
@@ -324,7 +324,7 @@ def test_commands_of_any_rate_are_played_back_at_their_own_pace(
     written = play(playback, arriving, 4.0, period)
     assert playback.tick_s == pytest.approx(1 / rate_hz, rel=1e-3)
     assert playback.refused == 0
-    # at 0.38 rad/s
+    # at most two periods late, at up to 0.38 rad/s
     assert farthest_rad(written, arriving, period) < 0.4 * (2 / rate_hz + 2 * period)
 
 
@@ -332,7 +332,7 @@ def test_commands_of_any_rate_are_played_back_at_their_own_pace(
     ("since", "stamped"),
     [
         (800, lambda stamp_ns, k: stamp_ns + 3_600_000_000_000),
-        # creeps until time has caught up
+        # stamps that advance by 1 us until the clock has caught up
         (800, lambda stamp_ns, k: 10**18 + 1_598_000_000 + 1_000 * (k - 799)),
         (0, lambda stamp_ns, k: stamp_ns + 20_000 * (k % 7)),
     ],
@@ -356,7 +356,7 @@ def test_a_clock_that_is_set_does_not_change_the_pace(
 
 
 def test_daemon_of_another_rate_is_followed() -> None:
-    """A daemon of another rate that takes over is followed at its own."""
+    """A daemon of another rate that takes over is followed at that rate."""
     playback = Playback(STRONG, AT, period_s=0.001)
     first = at_rate(250, 1.0)
     stands = play(playback, first, 1.5, 0.001).position[-1]
@@ -367,7 +367,7 @@ def test_daemon_of_another_rate_is_followed() -> None:
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 66])
 def test_commands_without_room_to_brake_are_refused(rate_hz: int) -> None:
-    """Commands that leave no room to brake are refused and move nothing."""
+    """The refused commands do not move the arm."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     assert (play(playback, at_rate(rate_hz, 2.0), 2.0, 0.001).position == AT).all()
     period = f"{1000 / rate_hz:.0f} ms"
@@ -379,7 +379,7 @@ def test_commands_without_room_to_brake_are_refused(rate_hz: int) -> None:
 
 
 def test_commands_without_a_tick_length_are_refused() -> None:
-    """Commands whose stamps tell no length of a tick are refused."""
+    """Commands are refused if their stamps do not show the length of a tick."""
     playback = Playback(COMMANDED, AT, period_s=0.001)
     unstamped = [
         message._replace(command=message.command._replace(stamp_ns=0))
@@ -395,7 +395,7 @@ def test_commands_without_a_tick_length_are_refused() -> None:
 
 
 def behind(written: Written, commands: Sequence[Command], period: float) -> tuple[float, float]:
-    """By how much it is late [s], and how far off it is beside that [rad]."""
+    """The delay [s] of the written positions, and their largest error apart from it [rad]."""
     times = TICK * np.arange(len(commands))
     positions, speed = (
         np.array([getattr(command, name) for command in commands])
@@ -423,7 +423,9 @@ def behind(written: Written, commands: Sequence[Command], period: float) -> tupl
 def test_delay_error_and_smoothness_under_jitter(
     period: float, jitter_s: float, lost: float, delay_s: float, off_rad: float, share: float
 ) -> None:
-    """It is late by what jitter needs hardly off beside that and as smooth as commanded."""
+    """The delay is what the jitter needs; apart from it, errors are small and the motion is
+    smooth.
+    """
     rng = np.random.default_rng(3)
     commands = motion(sway(6.0))
     late_s = np.where(
@@ -442,7 +444,7 @@ def test_delay_error_and_smoothness_under_jitter(
 
 @pytest.mark.parametrize("share", [0.97, 1.03])
 def test_slow_and_fast_loops_keep_pace(share: float) -> None:
-    """A step is taken each 0.97 or 1.03 ms, by a drive whose period is 1 ms."""
+    """A loop takes a step each 0.97 or 1.03 ms for a drive whose period is 1 ms."""
     commands = motion(sway(6.0))
     playback = Playback(STRONG, AT, period_s=0.001)
     arriving = [Sent(message.at_s / share, message.command) for message in sent(commands)]
@@ -453,7 +455,7 @@ def test_slow_and_fast_loops_keep_pace(share: float) -> None:
 
 
 def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
-    """The loop stands for 60 ms each second; the network is as punctual as ever."""
+    """The loop pauses for 60 ms each second; the network is punctual."""
     commands = motion(sway(6.0))
     playback = Playback(STRONG, AT, period_s=0.001)
     queue = list(reversed(sent(commands)))
@@ -473,7 +475,7 @@ def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
 
 
 def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
-    """Ticks jump over these, but the motion goes on by one period."""
+    """Tick numbers jump over missed deadlines, but the motion advances by one period."""
     commands = motion(sway(3.0))
     jumped = []
     tick = 0
@@ -492,7 +494,7 @@ def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
 
 
 def test_delay_grows_with_jitter_and_shrinks_again() -> None:
-    """The delay grows at once with jitter and shrinks again without."""
+    """The delay grows at once with jitter, and shrinks slowly without it."""
     rng = np.random.default_rng(5)
     commands = motion(sway(6.0))
     late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))

@@ -1,4 +1,4 @@
-"""`thirdhand arm`: what it prints, what it writes, and what it refuses."""
+"""`thirdhand arm`: its output, the files that it writes, and its refusals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UR5 = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The folder of a first cell for a UR5, and what was printed."""
+    """The folder of a first cell for a UR5, and the output of the command."""
     folder = tmp_path_factory.mktemp("arm")
     shutil.copy(UR5, folder / "my.urdf")
     done = succeeded("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
@@ -51,7 +51,7 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
     assert 'urdf = "my.urdf"  # beside this file' in (folder / "cell.toml").read_text()
     with Image.open(folder / "cell.png") as picture:
         assert min(picture.size) > 500
-        # something is drawn
+        # the picture is not empty
         assert len(picture.convert("RGB").resize((60, 30)).getcolors(10_000)) > 20
 
 

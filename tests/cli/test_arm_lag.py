@@ -34,9 +34,7 @@ def followed(commanded: np.ndarray, lag_s: float) -> np.ndarray:
 def simulated(
     servo: str, lag_s: float, *, state_hz: float = 500.0, noise_rad: float = 0.0, seed: int = 0
 ) -> Lag | None:
-    """The lag that is measured in 3 s: joints on smooth paths, followed by a pure delay or by a
-    servo.
-    """
+    """The lag that is measured in 3 s of joints on smooth paths, behind a pure delay or a servo."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, 5.0, PERIOD_S)
     commanded = np.zeros((len(times), len(NAMES)))
@@ -50,7 +48,7 @@ def simulated(
         )
     else:
         measured = followed(commanded, lag_s)
-    measured += np.array([0.02, -0.01, 0.0])  # what gravity bends
+    measured += np.array([0.02, -0.01, 0.0])  # constant errors caused by gravity
     window = times >= 2.0
     every = round(1 / (state_hz * PERIOD_S))
 

@@ -1,6 +1,4 @@
-"""`thirdhand bundle`: what the archive holds, that no secret is in it, and that it is whole or not
-there.
-"""
+"""`thirdhand bundle`: the archive's content, without secrets; it is complete, or does not exist."""
 
 from __future__ import annotations
 
@@ -42,7 +40,7 @@ def unpacked(path: Path) -> dict[str, bytes]:
 
 
 def everything_in(name: str, content: bytes, folder: Path) -> bytes:
-    """A file's content, of a recording all that its compressed parts hold."""
+    """A file's content; of a recording, the content of its compressed parts too."""
     if not name.endswith(".mcap"):
         return content
     (folder / "taken.mcap").write_bytes(content)
@@ -71,7 +69,7 @@ def test_an_archive_holds_what_it_says_and_no_secret(
     with serving(tmp_path, *arguments, network=network) as daemon, Tracker(daemon.session):
         daemon.until(lambda now: now["mode"] == "follow" and now["scribe"]["state"] == "recording")
         daemon.until(lambda now: os.stat(now["scribe"]["recording"]).st_size > 50_000)
-        with daemon.log.open("a") as log:  # as if somebody had printed them
+        with daemon.log.open("a") as log:  # as if a program had printed secrets
             log.write(
                 f"a line\ntls/bench:7447#connect_private_key_base64={SECRET}\n{KEY}\n{keys[0]}\n"
             )
@@ -110,13 +108,13 @@ def test_an_archive_holds_what_it_says_and_no_secret(
     assert "left hand" in files["doctor.txt"].decode()
     versions = files["versions.txt"].decode()
     assert all(f"{name}: " in versions for name in ("thirdhand", "python", "cpu", "eclipse-zenoh"))
-    assert "listening" not in files["log.txt"].decode()  # that is on standard output
+    assert "listening" not in files["log.txt"].decode()  # standard output only
     assert (
         "a line\ntls/bench:7447#(left out)\n(a private key, left out)\n"
         in files["log.txt"].decode()
     )
     (tmp_path / "cut.mcap").write_bytes(files[recording])
-    result = replay(tmp_path / "cut.mcap")  # a recording that was being written, up to its cut
+    result = replay(tmp_path / "cut.mcap")  # copied while it was written: it ends in a cut
     assert result.identical == result.ticks > 0
 
 
@@ -143,7 +141,7 @@ def test_only_what_may_be_secret_is_left_out_of_a_text(text: str, left: str) -> 
 
 
 def test_bundle_without_a_daemon_says_so(tmp_path: Path) -> None:
-    """Without a daemon the archive says so and has the newest recording."""
+    """The archive has the newest recording."""
     config = tmp_path / "bench.toml"
     output = tmp_path / "bundle.tar.gz"
     config.write_text(CELL.format(folder=tmp_path, secret=SECRET))

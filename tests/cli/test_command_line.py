@@ -54,18 +54,18 @@ def test_one_thing_has_one_word_and_an_example(command: str) -> None:
     "command", [("serve", "--listen"), ("record", "take", "--listen"), ("status", "--connect")]
 )
 def test_incomplete_endpoint_is_explained(given: str, meant: str, command: tuple[str, ...]) -> None:
-    """An endpoint without all its parts is told with what was meant."""
+    """An endpoint that lacks a part is refused with the form that it should have."""
     done = told(*command, given)
     assert (done.returncode, done.stderr.rstrip().endswith(f": {meant} ?")) == (2, True), (
         done.stderr
     )
 
 
-# --- exit codes, as docs/incidents.md promises them -----------------------------------------------
+# --- exit codes, as docs/incidents.md states them -------------------------------------------------
 
 
 def test_exit_codes_of_bad_configurations(tmp_path: Path) -> None:
-    """A configuration that cannot be meant is 2 and one that cannot be read is 1."""
+    """An invalid configuration is 2; one that cannot be read is 1."""
     config = tmp_path / "cell.toml"
     takes = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in (1, 2)]
     config.write_text("rate_hz = 3\n")
@@ -166,7 +166,7 @@ PATHS = {
 def folder(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """The working folder, with files that cannot be used; commands soon give up to connect."""
+    """The working folder, with files that cannot be used; commands try to connect for 0.2 s."""
     monkeypatch.setenv("HOME", str(tmp_path))
     # else Matplotlib keeps its own folder
     monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp()))
@@ -186,7 +186,6 @@ def folder(
 def test_refusals_have_their_exit_code_and_write_nothing(
     code: int, words: str, command: str, folder: Path
 ) -> None:
-    """What cannot be done is refused with the promised exit code and writes nothing."""
     before = sorted(folder.rglob("*"))
     done = assert_refused(code, words.format_map(PATHS), *shlex.split(command.format_map(PATHS)))
     assert "Traceback" not in done.stderr
@@ -196,7 +195,6 @@ def test_refusals_have_their_exit_code_and_write_nothing(
 
 
 def test_view_without_a_screen_is_refused_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A view without a screen is refused before anything is drawn."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     done = told("view", str(RECORDINGS / "golden.mcap"))
@@ -238,7 +236,7 @@ def test_so_are_those_of_a_process(
 
 @pytest.mark.thorough
 def test_silence_is_reported_and_waited_for() -> None:
-    """That nobody listens is said and who is silent is waited for."""
+    """A closed port is reported at once; a listener that does not answer is waited for."""
     done = thirdhand("status", "--connect", "tcp/bench.invalid:1")
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(
@@ -252,7 +250,7 @@ def test_silence_is_reported_and_waited_for() -> None:
 
 @pytest.mark.parametrize("command", [("play", str(RECORDINGS / "demonstration-6.mcap")), ("sim",)])
 def test_publishers_wait_for_a_daemon(command: tuple[str, ...]) -> None:
-    """What publishes waits for a daemon until it is interrupted."""
+    """Commands that publish wait for a daemon until they are interrupted."""
     with started(*command, *NOBODY) as process:
         assert process.stderr.readline().startswith(
             "waiting, until Ctrl-C: nobody answers at tcp/127.0.0.1:1"

@@ -1,4 +1,4 @@
-"""The main job: bench, service and scribe as processes; the robot hands the board over, fetches the
+"""The demo: bench, service and scribe are processes; the robot hands the board over, fetches the
 glass and holds it over the board.
 """
 
@@ -60,7 +60,6 @@ def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
 @timed
 @pytest.mark.timeout(330)
 def test_task_succeeds_in_new_places_and_replays(tmp_path: Path) -> None:
-    """The task succeeds in new places and its recording replays identically."""
     (tmp_path / "scene.toml").write_text(SCENE)
     report = demonstrated(
         "--output", str(tmp_path / "out"), "--scene", str(tmp_path / "scene.toml")
@@ -78,14 +77,16 @@ def test_task_succeeds_in_new_places_and_replays(tmp_path: Path) -> None:
     left = {f"/thirdhand/{name}" for name in left} | {"/tf", "/robot_description"}
     with Path(report["recording"]).open("rb") as file:
         decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        while left:  # a reader of ROS 2 finds each
+        while left:  # a ROS 2 reader finds each topic
             left -= {next(decoded).channel.topic}
 
 
 @timed
 @pytest.mark.timeout(330)
 def test_a_cell_of_ones_own_is_demonstrated_at_1000_hz(tmp_path: Path) -> None:
-    """Its URDF lies beside it, both are named by a relative path, and its arm would start held."""
+    """The URDF lies beside the settings; both are named by relative paths, and `start_held` is
+    set.
+    """
     (tmp_path / "my").mkdir()
     for name in ("ur5.toml", "ur5.urdf"):
         (tmp_path / "my" / name).write_bytes(WAM.with_name(name).read_bytes())
@@ -109,7 +110,7 @@ open(sys.argv[2], "a").write(f"{web.urlopen(viewer).status} {status}\\n")
 def test_live_view_of_a_demo_is_open_before_the_arm_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The live view of a demo is open in the browser before the arm moves."""
+    """The view is open in the browser."""
     (tmp_path / "browser.py").write_text(BROWSER)
     monkeypatch.setenv(
         "BROWSER", f"{sys.executable} {tmp_path / 'browser.py'} %s {tmp_path / 'opened'}"
@@ -134,7 +135,9 @@ def test_a_scene_out_of_reach_is_refused_before_anything_starts(tmp_path: Path) 
 
 @timed
 def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
-    """A person's hands are still there when the bench reports, so the arm still follows them."""
+    """The person's hands are still tracked when the bench reports, so the arm still follows
+    them.
+    """
     settings = Settings(rate_hz=100)
     stop = threading.Event()
     ends = list[tuple[str, int]]()
@@ -167,7 +170,7 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
 
 
 def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, Any]:
-    """The report of a demo: an event is reached unless there is a reason why not."""
+    """The report of a demo: an event is reached unless a reason for its failure is given."""
     events = {
         name: {"reached": why is None, "error_mm": 80.0, "time_s": 3.0}
         | ({"why": why} if why else {})
@@ -205,7 +208,7 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
 def test_demo_fails_by_a_missed_event_or_missing_ticks(
     why: str | None, missing: str, code: int
 ) -> None:
-    """A demo fails by a missed event and by missing ticks alone."""
+    """Nothing else makes a demo fail."""
     report = report_of(None, None, why, missing=missing)
     assert exit_code(report) == code
     printed = text(report)

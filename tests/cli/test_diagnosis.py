@@ -1,5 +1,5 @@
-"""What `thirdhand doctor` finds in statuses: nothing in a healthy cell's, and each thing that is
-wrong, with what is wanted and what to do.
+"""Findings of `thirdhand doctor` in statuses: none in a healthy cell's; each fault is named with
+the expected value and the remedy.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ HEALTHY = Status(
 def diagnosed(
     before: Status = HEALTHY, more: Any = MappingProxyType({}), **changed: Any
 ) -> list[Finding]:
-    """The findings of a healthy cell of which something has become otherwise, two seconds later."""
+    """The findings of a healthy cell whose status differs in these fields two seconds later."""
     now = msgspec.structs.replace(before, tick=2000, time_ns=HEALTHY.time_ns + 2 * 10**9)
     now = msgspec.structs.replace(now, **changed)
     return findings(before, now, own_ns=now.time_ns, own_version="0.1.0", **more)
@@ -76,7 +76,7 @@ def source(name: str, **changed: Any) -> dict[str, Source]:
 
 
 def test_healthy_cell_has_no_findings() -> None:
-    """Of a healthy cell nothing is wrong and everything is told."""
+    """Every line is printed, and none is a fault."""
     diagnosis = diagnosed()
     assert {finding.level for finding in diagnosis} == {"ok"}
     subjects = {finding.what for finding in diagnosis}
@@ -94,7 +94,7 @@ def test_healthy_cell_has_no_findings() -> None:
 
 
 def test_hand_below_the_table_shows_a_wrong_calibration() -> None:
-    """Only if it is there all the time, and deeper than a hand's noise."""
+    """Only if the hand is below the table all the time, and deeper than the tracker's noise."""
     below = {"right": 0.05, "left": 0.01}
     (text,) = wrongs(diagnosed(msgspec.structs.replace(HEALTHY, below_table_m=below)))
     assert "calibration        below the table top: right hand 5 cm" in text
@@ -228,7 +228,7 @@ def test_hand_below_the_table_shows_a_wrong_calibration() -> None:
 def test_findings_name_what_is_wrong_and_what_to_do(
     changed: dict[str, Any], what: str, words: tuple[str, ...]
 ) -> None:
-    """What is wrong is named with what is wanted and what to do."""
+    """Each finding names the expected value too."""
     lines = [
         finding.text()
         for finding in diagnosed(**changed)
@@ -252,7 +252,7 @@ def test_what_need_not_be_mended_is_a_note() -> None:
 
 
 def test_hidden_latency_is_unknown_and_lost_hands_are_not_near() -> None:
-    """A latency that clocks hide is unknown and hands that are gone are not near."""
+    """A latency that clocks hide is unknown; hands that have disappeared are not near."""
     ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
     assert (
         rows(ahead)["latency"]
@@ -267,7 +267,7 @@ def test_hidden_latency_is_unknown_and_lost_hands_are_not_near() -> None:
 
 
 def test_causes_come_before_their_effects() -> None:
-    """What is wrong comes first and causes before what follows from them."""
+    """Faults stand before notes, and causes before their effects."""
     silent = source("arm", rate_hz=0.0, age_ms=4000.0, fresh=False)
     diagnosis = diagnosed(
         mode="fault", reason="arm_silent", sources=silent, command_heard=False, realtime=False
@@ -283,7 +283,7 @@ def test_causes_come_before_their_effects() -> None:
 
 
 def test_stuck_joint_is_named_before_its_fault() -> None:
-    """A joint that does not go where it is told is named before the fault that it makes."""
+    """A joint that does not follow its command is named before it causes a fault."""
     travels = {"a": (0.05, 0.049), "b": (0.31, 0.001), "c": (0.01, 0.0)}
     lines = wrongs(
         diagnosed(
@@ -345,7 +345,7 @@ def test_the_lag_of_the_arm_is_reported_with_what_to_do(
     ids=["silent", "error", "nothing comes", "clock", "ahead"],
 )
 def test_busy_machine_is_named_before_arm_and_network(changed: dict[str, Any]) -> None:
-    """A machine that is too busy is named before arm network and clock."""
+    """A machine that is too busy is named before arm, network and clock."""
     words = "90 of 1000 deadlines were missed, the loop was up to 60 ms late"
     first, *others = wrongs(diagnosed(busy=words, **changed))
     assert first.startswith(f"wrong  machine            too busy: {words}")
@@ -354,7 +354,7 @@ def test_busy_machine_is_named_before_arm_and_network(changed: dict[str, Any]) -
 
 
 def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:
-    """The findings of statuses in which left and right hand are there, over two seconds."""
+    """The findings of statuses over two seconds with the left and right hand at these positions."""
     statuses = [
         msgspec.structs.replace(
             HEALTHY,
@@ -377,7 +377,7 @@ def test_a_tracker_whose_y_points_up_is_told_with_what_to_write() -> None:
 
 
 def test_hands_on_the_table_do_not_mean_that_y_points_up() -> None:
-    """Hands that slide over the table are of no tracker whose y points up."""
+    """Hands slide over the table along y."""
     inside = [((0.8, -0.3 + shift_m, 0.1), (0.9, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
     outside = [((1.4, -0.3 + shift_m, 0.1), (1.4, 0.3, 0.1)) for shift_m in (0.0, 0.1, 0.2)]
     assert not any(
@@ -414,12 +414,12 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     assert "right hand         nothing arrives; the skill does not need it" in [
         finding.text()[7:] for finding in diagnosis
     ]
-    assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # as a hand that is needed
+    assert wrongs(diagnosed(**unseen | {"hands": "both"}))  # a needed hand is missing
     lost_fields = {
         "sources": source("right", rate_hz=0.0, age_ms=3000.0, fresh=False),
         "hand_age_ms": HEALTHY.hand_age_ms,
     }
-    # it may be anywhere
+    # a hand that was lost may be anywhere
     assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]
     now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"

@@ -1,5 +1,5 @@
-"""A cell with one's own arm and tracker, as its user meets it: the driver template follows and
-brakes by itself, and `doctor`, `status --watch` and the log say what is wrong.
+"""A cell with one's own arm and tracker: the driver template follows and brakes by itself, and
+`doctor`, `status --watch` and the log name faults.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from thirdhand.daemon.launch import launched
 from thirdhand.daemon.single_instance import occupy
 from thirdhand.settings.config import Settings
 
-NEAR_LEFT = (0.95, -0.30, 0.08)  # a hand that moves a little: an arm that is late is not far off
+NEAR_LEFT = (0.95, -0.30, 0.08)  # the hand moves little, so that a late arm has a small error
 PATIENT = """# Threads of a busy test may be late.
 [network]
 listen = ["tcp/127.0.0.1:0"]
@@ -60,7 +60,7 @@ def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
 
 @contextlib.contextmanager
 def misnamed(session: zenoh.Session) -> Iterator[None]:
-    """A tracker that publishes under a key of another name."""
+    """A tracker that publishes under a misspelled key."""
     stop = threading.Event()
     pose = messages.PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))
 
@@ -112,7 +112,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
 
         with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
-            for _ in range(5):  # a rate is known once its driver has been heard for a while
+            for _ in range(5):  # the rate is known some time after the driver's first state
                 _, report = findings(daemon, capsys)
                 if all(finding["level"] == "ok" for finding in report):
                     break
@@ -168,7 +168,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
 def test_foreign_port_is_distinguished_from_a_closed_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A port that is no daemons is told from one that is closed."""
+    """A port of another program is distinguished from a closed one."""
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -189,7 +189,7 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
 
 
 def test_silent_daemon_is_distinguished_from_none(capsys: pytest.CaptureFixture[str]) -> None:
-    """A daemon that is there but does not answer is told from none."""
+    """A daemon that runs but does not answer is distinguished from none."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as near:
         token = occupy(near, "lab")
         reach = ["--connect", endpoints(near)[0], "--cell", "lab"]

@@ -1,4 +1,4 @@
-"""Errors of commands about files: which file and which value, in words, without names of code."""
+"""Errors of commands about files name the file and the value, in words, without names of code."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
     is_recording = takes in ("recording", "played", "replayed")
     path = tmp_path / f"given{suffix.get(takes, '.mcap' if is_recording else '')}"
     WRONG[wrong](path)
-    # the others leave no process behind
+    # other commands leave no process behind, and run in this one
     run = thirdhand if takes in ("skill", "arm of the bench", "scene") else told
     done = run(*TAKES[takes], str(path))
     assert done.returncode in (1, 2), done.stdout
@@ -81,6 +81,6 @@ def test_a_file_that_cannot_be_used_is_reported_in_words(
     ],
 )
 def test_path_in_json_is_named_as_in_a_file(text: str, words: str) -> None:
-    """A path in json is named as in a file except in what was given."""
+    """A path in JSON is named as in a TOML file, except inside quoted values."""
     assert in_file(text) == words
     assert in_file(words) == words

@@ -1,4 +1,4 @@
-"""`thirdhand serve --log json`: each line of the log is an object, also the last one."""
+"""`thirdhand serve --log json`: each line of the log is a JSON object, the last one included."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.cell_commands import python
 
 
 def test_each_line_of_a_json_log_is_an_object(tmp_path: Path) -> None:
-    """Each line of a json log is an object also the last before a failure."""
+    """The last line before a failure is an object too."""
     with serving(tmp_path, "--joints", "assumed", "--log", "json") as daemon:
         daemon.client.ask("hold")
         daemon.client.ask("resume")

@@ -1,4 +1,4 @@
-"""Keys of a command that is started without standard input."""
+"""The Enter key of commands that are started with and without standard input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INPUTS = {
 
 @pytest.mark.parametrize("given", INPUTS)
 def test_enter_is_heard_only_where_there_is_an_input(given: str) -> None:
-    """Enter is heard where there is an input and never awaited."""
+    """No command waits for Enter."""
     closes = (lambda: os.close(0)) if given == "closed" else None
     done = python(WAITS, input="\n" if given == "a line" else "", preexec_fn=closes)
     assert (done.stdout.strip(), done.stderr) == (INPUTS[given], "")

@@ -1,4 +1,4 @@
-"""`thirdhand learn`: table, file and picture; exit 1 and no file where unsafe."""
+"""`thirdhand learn`: table, file and picture; exit 1 and no file if the skill is unsafe."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
 
 
 def test_skill_with_a_residual_risk_names_who_accepts_it(tmp_path: Path) -> None:
-    """Fine motion of one hand, which a noisy tracker hardly tells."""
+    """One hand makes a fine motion that a noisy tracker hardly resolves."""
     takes = [tmp_path / f"fine-{seed}.mcap" for seed in range(4)]
     for seed, path in enumerate(takes):
         write_demonstration(path, fine(seed, 0.003))

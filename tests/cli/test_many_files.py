@@ -34,7 +34,7 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def files(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Three short recordings, and among them one that is cut."""
+    """Three short recordings, one of which is cut."""
     folder = tmp_path_factory.mktemp("many")
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(
@@ -62,7 +62,7 @@ def named_failures(errors: str) -> list[str]:
 def test_two_workers_print_what_one_process_prints(
     command: tuple[str, ...], files: list[str]
 ) -> None:
-    """Two workers print what one process prints and a broken file stops neither."""
+    """A damaged file does not stop the workers."""
     alone = told(*command, *files)
     assert alone.returncode == 1
     assert [

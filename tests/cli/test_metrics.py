@@ -56,7 +56,7 @@ def page(endpoint: str) -> Iterator[str]:
 
 
 def test_metrics_are_those_of_the_status(tmp_path: Path) -> None:
-    """A scrape holds the figures of the status and ends and returns with the daemon."""
+    """Scrapes fail while there is no daemon, and return with it."""
     network = f"[network]\nlisten = ['tcp/127.0.0.1:{free_port()}']\n"
     arguments = ("--joints", "assumed", "--record", str(tmp_path / "records"))
 

@@ -1,5 +1,5 @@
-"""The tutorial's commands, run in order as they stand: demonstrations recorded, learned from, and
-followed. But for the place where they meet, and haste: the person is four times as fast.
+"""The tutorial's commands, run in order as they stand: demonstrations are recorded, learned from
+and followed. Only the endpoint differs, and the person, who is four times as fast.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ REST_S = "0.6"
 
 
 class Shell:
-    """Runs the tutorial's lines; what ends with `&` beside the others, the daemon as a process."""
+    """Runs the tutorial's lines; those that end with `&` run beside the others, the daemon as a
+    process.
+    """
 
     def __init__(self) -> None:
         self.at = f"tcp/127.0.0.1:{free_port()}"
@@ -83,13 +85,13 @@ class Shell:
             self.daemon.communicate()
 
 
-@pytest.mark.timeout(300)  # it takes a quarter of a minute where nothing else runs
+@pytest.mark.timeout(300)  # it takes 15 s on an idle machine
 @pytest.mark.thorough
 def test_the_tutorial_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for kind in ("STATE", "CONFIG"):  # another HOME would have another cache, and compile
+    for kind in ("STATE", "CONFIG"):  # another HOME would have an empty cache of compiled code
         monkeypatch.setenv(f"XDG_{kind}_HOME", str(tmp_path))
     shell = Shell()
     try:

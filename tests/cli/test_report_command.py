@@ -1,4 +1,4 @@
-"""`thirdhand report`: one recording and two, on the terminal, as a page and as files."""
+"""`thirdhand report` of one recording and of two: on the terminal, as a page and as files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rows(path: Path) -> list[list[str]]:
 def test_two_recordings_are_compared_on_a_page(
     tmp_path: Path, golden: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two recordings are told of side by side on a page and in files."""
+    """Two recordings stand side by side on a page and in files."""
     page = tmp_path / "report.html"
     folder = tmp_path / "tables"
     assert (
@@ -38,7 +38,7 @@ def test_two_recordings_are_compared_on_a_page(
         "same",
     ):
         assert words in output
-    assert "Settings, versions" not in output  # one file twice: none differs
+    assert "Settings, versions" not in output  # the same file twice has no differences
 
     verdict = output.splitlines()[0]
     counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 4 holds and no faults"
@@ -63,7 +63,7 @@ def test_two_recordings_are_compared_on_a_page(
     fetched = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]+)""", text)
     assert [url for url in fetched if not url.startswith("#")] == []
     assert "far_from_demonstrations" in text
-    # as in the viewer
+    # the viewer's colours
     for colour in (palette.LEFT, palette.RIGHT, palette.TOOL, *palette.BY_MODE.values()):
         assert palette.written(colour) in text
 

@@ -1,5 +1,5 @@
-"""`thirdhand serve --check`: one line for each condition of a start, and nothing started or left
-behind. `thirdhand status --exit-code`: a fault is seen from the exit code.
+"""`thirdhand serve --check` prints one line for each condition of a start, and starts and writes
+nothing. `thirdhand status --exit-code` shows a fault by its exit code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
 from thirdhand.daemon.launch import free_port
 
-# the second is an address that no machine has
+# no machine has the second address
 TLS = "tls/127.0.0.1:0"
 FOREIGN = "tcp/192.0.2.1:7447"
 CELL = """
@@ -51,7 +51,7 @@ def cell(
 
 
 def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str, list[str]]:
-    """What the check prints, by level and condition, after its exit code was compared."""
+    """The output of the check by level and condition; its exit code must be this one."""
     done = told("serve", "--check", "--config", cell(folder, **settings), *arguments)
     assert done.returncode == code, done.stdout + done.stderr
     checks: dict[str, list[str]] = {}
@@ -63,7 +63,7 @@ def lines(folder: Path, *arguments: str, code: int, **settings: str) -> dict[str
 
 
 def test_check_of_a_good_cell_writes_nothing(tmp_path: Path) -> None:
-    """A cell that can start is ok in each line and nothing is written."""
+    """Each line is ok."""
     checks = lines(tmp_path, code=0)
     assert list(checks) == [
         "ok configuration",
@@ -201,7 +201,7 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
             pytest.skip(f"other users cannot read {folder}")
     lines(tmp_path, code=0)  # all imports and files of this check have been read
     for folder in tmp_path.parents:
-        # the folders of this run, which only its user can read
+        # folders of this test run, which only its user can read
         if folder.stat().st_mode & 0o005 != 0o005:
             folder.chmod(0o755)
     tmp_path.chmod(0o555)
@@ -215,7 +215,7 @@ def test_a_folder_without_rights_is_wrong(tmp_path: Path) -> None:
 
 
 def test_check_beside_the_running_daemon(tmp_path: Path) -> None:
-    """Beside the running daemon its own port is fine and a fault has an exit code."""
+    """A port that the cell's own daemon uses is fine; a fault has an exit code."""
     listen = f"tcp/127.0.0.1:{free_port()}"
     network = f"[network]\nlisten = ['{listen}']\n"
     sabotage = SABOTAGE.format(folder=str(tmp_path))

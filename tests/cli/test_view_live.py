@@ -1,5 +1,5 @@
-"""The running daemon in a browser: mode and reason at once, the arm held by a button, the scene
-drawn; and nobody but the page may ask.
+"""The running daemon in a browser: mode and reason appear at once, a button holds the arm, the
+scene is drawn; only the page itself may send requests.
 """
 
 from __future__ import annotations
@@ -50,9 +50,7 @@ class Page:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A page beside a daemon that has a live view and sees two hands; slow, for both are drawn
-    tick by tick.
-    """
+    """A page of a daemon with a live view and two hands, at a low rate: each tick is drawn."""
     arguments = ("--joints", "assumed", "--live", "0", "--rate", "100")
     with serving(tmp_path_factory.mktemp("cell"), *arguments) as daemon, Tracker(daemon.session):
         daemon.until(
@@ -64,12 +62,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @contextlib.contextmanager
 def served(daemon: Daemon) -> Iterator[str]:
-    """The URL of a page that `thirdhand view live --web` serves; it must end without a word on
-    standard error.
+    """The URL of a page that `thirdhand view live --web` serves; the command must end with nothing
+    more on standard error.
     """
     arguments = ("view", "live", "--web", "127.0.0.1:0", "--connect", daemon.endpoint)
     with started(*arguments, within_s=5 * TIMEOUT_S) as server:
-        assert server.stderr.readline() == "thirdhand: follow\n"  # said before all else
+        assert server.stderr.readline() == "thirdhand: follow\n"  # the first line
         yield server.stdout.readline().strip()
         server.terminate()
         assert server.wait(TIMEOUT_S) == 0
@@ -94,7 +92,7 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     )
     for origin in ("null", "http://[", f"http://{page.host}.example"):
         assert page.ask("POST", "/hold", X_Thirdhand_Token=token, Origin=origin)[0] == 403
-    # the first is a name that was made to point here
+    # the first one is a foreign name that resolves to this machine
     for host in ("elsewhere.example", '"@127.0.0.1', "[", ""):
         assert page.ask("GET", "/", Host=host)[0] == 403
     for method, path in (
@@ -122,7 +120,7 @@ def test_only_the_page_itself_may_hold_the_arm(page: Page) -> None:
     chromium.PROGRAM is None, reason="needs Chromium: on Debian, apt install chromium"
 )
 def test_browser_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
-    """A browser shows mode and reason and its buttons hold and resume."""
+    """The page shows mode and reason."""
     with chromium.opened(page.url, tmp_path, size=(1200, 600), timeout_s=TIMEOUT_S) as tab:
 
         def click(name: str, *, until: str) -> Any:
@@ -151,8 +149,8 @@ def test_browser_buttons_hold_and_resume(page: Page, tmp_path: Path) -> None:
         assert "What to do: press Resume" in tab.until("document.getElementById('why').textContent")
         click("resume", until="follow")
         assert grey() == ["resume", "reset"]
-        tab.until("document.getElementById('answer').textContent == ''")  # the answer does not stay
+        tab.until("document.getElementById('answer').textContent == ''")  # the answer disappears
         assert "/?url=rerun%2Bhttp" in tab.ask("document.querySelector('iframe').src")
         tab.picture(tmp_path / "page.png")
     with Image.open(tmp_path / "page.png") as image:
-        assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # beside the word
+        assert image.convert("RGB").getpixel((30, 20)) == (0, 158, 115)  # the mode's colour

@@ -1,5 +1,5 @@
-"""The client's side: sessions between named endpoints, and requests as calls that end in an answer
-or in words.
+"""The client's side: sessions between named endpoints, and requests as calls that return an answer
+or raise an error with words.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Answer = Callable[[zenoh.Query], object]
 
 @pytest.fixture(scope="module")
 def daemon() -> Iterator[zenoh.Session]:
-    """A session that listens where the system gave it a port."""
+    """A session that listens at a port that the system chose."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         yield session
 
@@ -49,7 +49,7 @@ def session(daemon: zenoh.Session) -> Iterator[zenoh.Session]:
 
 @pytest.fixture
 def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
-    """Declares who answers on a key, until the test ends."""
+    """Declare queryables, until the test ends."""
     declared: list[Any] = []
 
     def answer(key: str, with_what: Answer) -> None:
@@ -83,7 +83,7 @@ def ready(query: zenoh.Query) -> None:
 def test_sessions_find_each_other_by_name_only(
     daemon: zenoh.Session, session: zenoh.Session
 ) -> None:
-    """No scouting: who was not told where another listens does not meet it."""
+    """There is no scouting: a session connects only to endpoints that it was given."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as stranger:
         time.sleep(0.5)
         assert list(session.info.peers_zid()) == [daemon.zid()]
@@ -143,7 +143,7 @@ def test_lost_query_is_repeated_if_that_is_safe(
     answering: Callable[[str, Answer], None],
     suffix: str,
 ) -> None:
-    """A query that is lost is asked again if nothing is done twice."""
+    """A lost query is repeated only if repeating it does nothing twice."""
     lost: list[zenoh.Query] = []
     client = Client(session, "bench", timeout_s=2.0)
     with daemon.declare_queryable("bench/resume", lost.append):
@@ -197,7 +197,7 @@ def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[]
 def test_requests_survive_a_broken_connection(
     breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
 ) -> None:
-    """Status via points and hold survive a connection that breaks before the answer."""
+    """`status`, `via_points` and `hold` survive a connection that breaks before the answer."""
     session, cut = breaking
     asked: list[str] = []
 
@@ -224,7 +224,7 @@ def test_requests_survive_a_broken_connection(
 def test_order_with_a_lost_answer_is_not_repeated(
     breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
 ) -> None:
-    """An order whose answer is lost may have been carried out and is not repeated."""
+    """The order may have been carried out."""
     session, cut = breaking
     resumed: list[str] = []
 
@@ -239,7 +239,7 @@ def test_order_with_a_lost_answer_is_not_repeated(
     with pytest.raises(UncertainError, match="The request may have been carried out"):
         client.resume()
     assert len(resumed) == 1
-    assert client.resume() == requests.Reply(3)  # it waits for the connection
+    assert client.resume() == requests.Reply(3)  # the call waits for the connection
     assert len(resumed) == 2
     cut()
     until(lambda: not is_connected(session))
@@ -248,7 +248,7 @@ def test_order_with_a_lost_answer_is_not_repeated(
 
 
 def test_known_daemon_is_not_asked_again(daemon: zenoh.Session, session: zenoh.Session) -> None:
-    """Its token may be out of sight at the moment of the answer, which is no less true."""
+    """The answer of a known daemon counts, though its liveliness token has disappeared."""
     with daemon.declare_queryable(
         "bench/status", lambda query: query.reply(query.key_expr, encoded)
     ):

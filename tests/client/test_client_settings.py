@@ -1,4 +1,4 @@
-"""How clients reach a cell: by option, environment or file; and whoever is started first."""
+"""Endpoints by which clients reach a cell: from option, environment or file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VARIABLES = ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG")
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the client's file is looked for; nothing is given otherwise."""
+    """The path of the client's file; option and environment are not set."""
     for name in VARIABLES:
         monkeypatch.delenv(f"THIRDHAND_{name}", raising=False)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
@@ -27,7 +27,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_option_goes_before_environment_file_and_default(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An option goes before the environment the file and the default."""
+    """The order is option, environment, file, default."""
     assert (client_settings().cell, client_settings().connect) == ("thirdhand", ())
     file.write_text(
         'connect = "tcp/127.0.0.1:1"\ncell = "filed"\ncertificate = "secrets/operator"\n'
@@ -80,6 +80,3 @@ def test_a_wrong_file_is_told_with_what_is_accepted(
         client_settings()
     assert main(["status"]) == 2
     assert str(file) in capsys.readouterr().err
-
-
-# --- whoever is started first --------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Messages that a subscriber did not get: the client counts them, and reports the first."""
+"""Messages that a subscriber did not receive: the client counts them, and reports the first."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BYTES = 50_000
 
 
 class Starved(Watch):
-    """A watch whose program does not come to take messages until `free`."""
+    """A watch whose program takes no messages before `free` is set."""
 
     def __init__(self, *arguments: Any, free: threading.Event) -> None:
         self.free = free
@@ -57,7 +57,7 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(
                     and watch.taken + watch.lost == COUNT + len(sent)
                 ):
                     return True
-                # what was lost before it is counted when it arrives
+                # losses are counted when the next message arrives
                 streams.publish("joints/command", b"")
                 sent.append(1)
                 return False
@@ -72,7 +72,7 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(
 
 
 def test_slow_loop_counts_what_its_queue_dropped() -> None:
-    """A slow loop knows what its queue dropped and message numbers may wrap around."""
+    """Message numbers may wrap around."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         publisher = session.declare_publisher("thirdhand/clutch")
         true = channels.BY_KEY["clutch"].codec.encode(True)

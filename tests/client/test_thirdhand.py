@@ -1,5 +1,5 @@
-"""`import thirdhand`: the same classes as in `thirdhand.client` however it is installed; and a
-connection's calls.
+"""`import thirdhand` gives the classes of `thirdhand.client`, whatever extras are installed; and
+the calls of a connection.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def test_extras_in_messages_are_those_of_the_project() -> None:
 
 @pytest.fixture(scope="module")
 def listener() -> Iterator[zenoh.Session]:
-    """A session that listens as a daemon does."""
+    """A session that listens in the daemon's place."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         yield session
 
@@ -262,7 +262,7 @@ WRONG |= {
 def test_a_wrong_value_is_refused_before_anything_is_sent(
     call: Callable[[Connection], object], error: str, cell: Connection
 ) -> None:
-    """At once: nobody listens, for which a valid call would wait."""
+    """The refusal is immediate: there is no daemon, for which a valid call would wait."""
     with pytest.raises(ValueError, match=error):
         call(cell)
 
@@ -348,7 +348,9 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
 def test_watch_yields_in_order_and_none_in_silence(
     cell: Connection, listener: zenoh.Session
 ) -> None:
-    """A watch yields in order none in silence and skips what is not readable."""
+    """A watch yields messages in order, None in silence, and skips messages that cannot be
+    decoded.
+    """
     encode = channels.BY_KEY["tool/setpoint"].codec.encode
     poses = [PoseStamped(n, "base", (0.0, 0.0, float(n)), (0.0, 0.0, 0.0, 1.0)) for n in range(3)]
     with cell.watch("tool/setpoint", timeout_s=0.2) as watch:

@@ -1,4 +1,4 @@
-"""The examples of trackers: what they make of synthetic rigid bodies, packets and messages."""
+"""The example programs for trackers, given synthetic rigid bodies, packets and messages."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ KEYS = {"left": "hands/left", "right": "hands/right"}
 
 
 def test_object_of_vicon_is_a_hand_in_metres() -> None:
-    """An object of vicon is a hand in metres and one that is not seen is none."""
+    """An object that is not seen is no hand."""
     ((key, pose),) = example("vicon_hands").poses(VICON, KEYS, 9)
     assert (key, pose[:3]) == ("hands/left", (9, "vicon", (0.1, -0.2, 0.3)))
     np.testing.assert_allclose(
@@ -69,7 +69,7 @@ def test_other_bytes_are_no_packet_of_vicon(packet: bytes) -> None:
 
 
 def test_wrist_of_the_streamer_is_right_handed() -> None:
-    """A mirrored rotation turns mirrored points to where the mirrored turned points are."""
+    """Mirroring a rotation and a point, then rotating, equals rotating and then mirroring."""
     ((key, pose),) = example("hts_hands").poses(HTS, 9)
     assert (key, pose[:3]) == ("hands/left", (9, "hts", (0.1, 1.2, -0.5)))
     unity = Rotation.from_quat([0.1, -0.5, 0.5, 0.7])
@@ -90,7 +90,7 @@ def test_a_wrist_without_seven_numbers_is_refused(values: str) -> None:
 
 @pytest.mark.parametrize(("name", "frame"), [("vicon_hands", "vicon"), ("hts_hands", "hts")])
 def test_example_publishes_what_it_receives(name: str, frame: str) -> None:
-    """The program publishes what it receives and goes on after nonsense."""
+    """The program continues after packets that it cannot read."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -1,5 +1,5 @@
-"""The wire: bytes as the ROS 2 ecosystem has them, and every malformed message and request answered
-by an error that says where.
+"""The wire: bytes equal those of other ROS 2 implementations, and each malformed message or request
+causes an error that names the position.
 """
 
 from __future__ import annotations
@@ -68,7 +68,6 @@ def test_poses_are_the_bytes_of_another_implementation(
 def test_poses_with_covariance_have_the_bytes_of_rosbags(
     stamp_ns: int, frame: str, position: Any, orientation: Any, covariance: list[float]
 ) -> None:
-    """Poses with covariance are the bytes of another implementation."""
     message = messages.PoseWithCovarianceStamped(
         stamp_ns, frame, position, orientation, tuple(covariance)
     )
@@ -227,7 +226,6 @@ def test_transforms_are_the_bytes_of_another_implementation(
 
 
 def test_each_frame_of_a_message_has_its_stamp_and_parent() -> None:
-    """The frames of a message are read each with its own stamp and parent."""
     stamped = ROS.types["geometry_msgs/msg/TransformStamped"]
     transform = ROS.types["geometry_msgs/msg/Transform"]
     vector = ROS.types["geometry_msgs/msg/Vector3"]
@@ -301,7 +299,7 @@ def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec) -> Non
     data = {channels.POSE: POSE, channels.JOINTS: JOINTS, channels.TRANSFORMS: TRANSFORMS}.get(
         codec
     ) or OBJECTS
-    store = get_typestore(Stores.ROS2_JAZZY)  # its MarkerArray is that of the service
+    store = get_typestore(Stores.ROS2_JAZZY)  # its MarkerArray equals the service's
     big = store.serialize_cdr(
         store.deserialize_cdr(data, codec.type), codec.type, little_endian=False
     )
@@ -515,7 +513,9 @@ def test_joints_whose_layout_is_known_are_read_as_at_first(counts: tuple[int, in
     "stamp_ns", [2**31 * 10**9, 2**32 * 10**9, 2**63 - 1, -1, -(10**20), 10**20]
 )
 def test_no_stamp_stops_what_encodes_it(stamp_ns: int) -> None:
-    """From 2038-01-19 on its seconds are more than an int32 holds; they are told until 2106."""
+    """From 2038-01-19 on, the seconds exceed an int32; read as unsigned, they are right until
+    2106.
+    """
     message = messages.PoseStamped(stamp_ns, "base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     decoded_ns = cdr.decode_pose(cdr.encode_pose(message)).stamp_ns
     assert decoded_ns == stamp_ns % (2**32 * 10**9)

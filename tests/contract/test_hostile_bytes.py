@@ -1,4 +1,4 @@
-"""Bytes from strangers: every decoder answers with a value or a refusal in words, and soon.
+"""Bytes of unknown origin: every decoder returns a value or a refusal in words, in bounded time.
 
 `THIRDHAND_EXAMPLES=100000 pytest tests/contract/test_hostile_bytes.py` mutates more;
 `support/hostile_bytes.py` itself searches with atheris.
@@ -20,8 +20,8 @@ from thirdhand.contract.messages import WireError
 from thirdhand.contract.requests import RequestError
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "1500"))
-LARGE = 2_000_000  # bytes, far more than any message has
-SOON_S = 5.0  # on a machine that does much else; what is quadratic takes minutes
+LARGE = 2_000_000  # [bytes] far more than in any message
+SOON_S = 5.0  # on a busy machine; a decoder of quadratic time would take minutes
 
 
 @pytest.mark.parametrize("name", DECODERS)

@@ -1,4 +1,4 @@
-"""Images of foreign streams: as ROS 2 has them, or files as they are; nothing else is let in."""
+"""Images of foreign streams are ROS 2 messages or image files; anything else is refused."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Incidents stand in one table: a member without a row does not import, each is named in no other
-room, and the words hold the cell's own settings and the constants that decide.
+"""Incidents stand in one table: the module does not import if a member has no row, no other package
+repeats the words, and the words contain the cell's settings and the deciding constants.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Condition.ARM_UNSETTLED, f"for {TUNING.intake.max_late_s:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do
-    # in words: a quarter, three
+    # the table spells these numbers out: a quarter, three
     assert (TUNING.intake.contested_on_share, CONFIRMED_SAMPLES) == (0.25, 3)
 
 

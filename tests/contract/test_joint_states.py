@@ -32,7 +32,7 @@ STATE = JointState(1, NAMES, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
     ],
 )
 def test_unmeasured_velocity_is_zero(message: JointState, velocity: tuple[float, ...]) -> None:
-    """A velocity that is not measured is zero and all else is as given."""
+    """Other values are unchanged."""
     assert measured(message, NAMES) == ((1.0, 2.0, 3.0), velocity)
 
 
@@ -49,14 +49,14 @@ def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
 
 
 def test_messages_without_joints_of_the_arm_are_ignored() -> None:
-    """Messages without joints of the arm are ignored and named once no state comes."""
+    """They are named once no state arrives."""
     states = JointStates(NAMES, 0.1)
     fingers = part("xy", 1)
     for k in range(300):
         at_s = k / 1000
         assert states.take(fingers, at_s) is None
         assert states.incomplete(fingers, at_s) is None
-        assert states.take(STATE._replace(position=()), at_s) is None  # velocities only
+        assert states.take(STATE._replace(position=()), at_s) is None  # it has velocities only
         if k % 10 == 0:
             assert states.take(STATE, at_s) is STATE
     for k in range(300, 500):
@@ -66,7 +66,7 @@ def test_messages_without_joints_of_the_arm_are_ignored() -> None:
 
 @pytest.mark.parametrize("split", ["a bc", "c ba", "a b c", "ab bc ca", "ax by cz"])
 def test_partial_publishers_give_states_at_the_slowest_rate(split: str) -> None:
-    """Publishers of some joints each give states at the slowest one s rate."""
+    """If each publisher has some of the joints, states have the rate of the slowest publisher."""
     states = JointStates(NAMES, 0.1)
     samples = []
     parts = split.split()
@@ -90,7 +90,7 @@ def test_partial_publishers_give_states_at_the_slowest_rate(split: str) -> None:
 
 
 def test_joints_of_a_publisher_that_ended_are_named() -> None:
-    """A publisher that ends ends the states and its joints are named."""
+    """Without them there are no states."""
     states = JointStates(NAMES, 0.1)
     for k in range(400):
         at_s = k / 1000
@@ -124,7 +124,7 @@ def test_a_stamp_that_does_not_advance_shows_in_the_state() -> None:
 
 
 def test_joint_without_a_position_comes_from_its_publisher() -> None:
-    """A joint without a measured position is taken from who measures it."""
+    """A joint without a measured position is taken from the publisher that measures it."""
     states = JointStates(NAMES, 0.1)
     assert states.take(part("ab", 1, value=NAN), 0.0) is None
     assert states.take(part("bc", 1), 0.0) is None

@@ -1,5 +1,5 @@
-"""Text from files and the network is shown without effects: in the terminal, the log, the viewer,
-the report and on the web page.
+"""Text from files and the network has no effect where it is shown: in the terminal, the log, the
+viewer, the report and the web page.
 """
 
 from __future__ import annotations

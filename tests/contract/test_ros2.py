@@ -1,5 +1,5 @@
-"""What ROS 2 is told of a cell, against independent implementations: rosbags' hashes of the types,
-the names and attachments of zenoh-ros2-sdk.
+"""A cell as ROS 2 sees it, against independent implementations: type hashes of rosbags, names and
+attachments of zenoh-ros2-sdk.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def test_the_hashes_of_the_types_are_those_of_ros2(store: Stores) -> None:
 
 
 def test_every_stream_has_the_key_and_token_of_rmw_zenoh() -> None:
-    """Every stream has a topic with a key and a token as others make them."""
+    """Key and token equal those of another implementation."""
     topics = [ros2.of_channel(CELL, channel) for channel in (*ros2.HEARD, *ros2.SAID)]
     topics += ros2.of_settings(NAMED)
     tokens = ros2.tokens(DOMAIN, CELL, SESSION, topics)
@@ -72,7 +72,7 @@ def test_every_stream_has_the_key_and_token_of_rmw_zenoh() -> None:
         *LATCHED,
         *FRAMES,
     }
-    # three frames are heard on two topics
+    # three frames arrive on two topics
     once = [*{(topic.name, topic.heard): topic for topic in topics}.values()]
     assert [(topic.frame, topic.channel) for topic in topics if topic.frame] == [
         ("left_wrist", "hands/left"),
@@ -187,7 +187,7 @@ def test_what_rides_with_a_message_is_read_by_others() -> None:
     ],
 )
 def test_cell_name_is_checked_only_with_a_ros2_domain(cell: str, ok: bool) -> None:
-    """A cell that ros2 cannot name is refused with a domain and only then."""
+    """A name that ROS 2 does not allow is refused only if a domain is configured."""
     assert ros2.is_name(cell) == ok
     if cell.endswith("/"):
         return

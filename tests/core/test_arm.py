@@ -1,5 +1,5 @@
-"""The arm: the model against its published numbers, and inverse kinematics that is right, bounded
-and steady.
+"""The arm's model against published numbers, and its inverse kinematics: accurate, bounded and
+without chatter.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ DH = (
 )
 START = np.array([0.45, -0.05, 0.35])  # [m]
 AHEAD_AND_DOWN = np.array([1.0, 0.0, -1.0]) / math.sqrt(2.0)
-# [rad] at START, pointing ahead and down
+# [rad] joints with the tool at START, pointing ahead and down
 POSTURE = (0.1761, 0.8604, -0.5, 2.5414, -0.4273, -1.0823, 0.0)
 CELL = Settings(arm=ArmSettings(posture=POSTURE))
 LOWER, UPPER, FASTEST = (
@@ -47,7 +47,7 @@ ARM = Arm(CELL, URDF)
 
 
 def facing(direction: Vector) -> Vector:
-    """A quaternion (4,) that turns +z there, the shortest way."""
+    """The quaternion (4,) of the smallest rotation of +z to a direction."""
     x, y, z = direction / np.linalg.norm(direction)
     quaternion = np.array([-y, x, 0.0, 1.0 + z])
     return (
@@ -82,8 +82,8 @@ def random_joints(count: int, seed: int) -> Vector:
 
 
 class Followed(NamedTuple):
-    """What came of a path: errors (N,) [m], joints (N, 7) and their accelerations, and how often
-    speeds were limited.
+    """The motion along a path: errors (N,) [m], joints (N, 7), their accelerations, and the number
+    of steps with a limited speed.
     """
 
     error: Vector
@@ -117,7 +117,7 @@ def wait(q: Vector, target: Vector, direction: Vector, seconds: float) -> Follow
 
 
 def test_forward_kinematics_is_as_published() -> None:
-    """Forward kinematics is the product of the published parameters and gives their check
+    """Forward kinematics equals the product of the published frames, and gives the published check
     values.
     """
     for q in random_joints(200, seed=1):
@@ -147,7 +147,7 @@ def test_tool_sits_on_the_plate() -> None:
 
 
 def test_model_agrees_with_wire_and_settings() -> None:
-    """Joint names and limits of the model are those of wire and settings."""
+    """Joint names and limits equal those of wire and settings."""
     model = pin.buildModelFromXML(URDF)
     assert tuple(model.names)[1:] == JOINT_NAMES
     assert model.frames[1].name == BASE
@@ -160,7 +160,6 @@ def test_model_agrees_with_wire_and_settings() -> None:
 
 
 def test_tool_velocity_is_the_derivative() -> None:
-    """Tool velocity is the derivative of its position."""
     step = 1e-6
     for q, dq in zip(random_joints(50, seed=4), random_joints(50, seed=5), strict=True):
         ahead = ARM.at(q + step * dq).position
@@ -248,7 +247,7 @@ def test_a_step_never_raises_nor_returns_nan(
 
 
 def test_velocities_are_continuous_at_limits() -> None:
-    """The wanted joint velocity is continuous across the limits."""
+    """The joint velocities that the arm asks for are continuous across a joint's limits."""
     rng = np.random.default_rng(7)
     for _ in range(200):
         q = random_joints(1, seed=int(rng.integers(1 << 30)))[0]

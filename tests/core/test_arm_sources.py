@@ -1,5 +1,5 @@
-"""Strangers that tell of the arm: whatever they say, no command jumps, and the arm that was heard
-first is not locked out.
+"""Foreign publishers of joint states: whatever they send, no command jumps, and the arm that was
+heard first is not locked out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "10"))
 
 
 def rejected(loop: Loop) -> dict[Cause, int]:
-    """How many samples were rejected, by cause."""
+    """The number of rejected samples by cause."""
     return {
         cause: int(n) for cause, n in zip(Cause, loop.steps[-1][1]["rejected"], strict=True) if n
     }
@@ -52,7 +52,7 @@ def test_one_state_ahead_changes_nothing(
 
 
 def test_state_ahead_is_no_start_after_reset(skill: Skill) -> None:
-    """The attack: fault, then a stranger's posture an hour ahead, then `reset`."""
+    """The attack: a fault, then a foreign posture with a stamp an hour ahead, then `reset`."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     shifted_rad = tuple(q + 0.15 for q in loop.joints)
@@ -82,7 +82,7 @@ def test_two_arms_in_turns_are_not_ready(skill: Skill, every: int) -> None:
 
 
 def test_second_arm_is_refused_while_following(skill: Skill) -> None:
-    """A second arm while following is refused and holds until it ends."""
+    """The service holds until the second arm ends."""
     loop = Loop(SETTINGS, skill)
     loop.run(500, every=5)
     frames = loop.run(
@@ -97,7 +97,7 @@ def test_second_arm_is_refused_while_following(skill: Skill) -> None:
 
 
 def test_joint_that_jumps_is_refused_then_faults(skill: Skill) -> None:
-    """A joint that jumps is refused until its arm would be silent and then a fault."""
+    """A joint that jumps is refused; after the time that makes an arm silent, it is a fault."""
     loop = Loop(SETTINGS, skill)
     loop.run(1000, every=5)
     other = (loop.joints[0] - 1.2, *loop.joints[1:])
@@ -152,7 +152,7 @@ def test_arm_far_outside_is_never_commanded(skill: Skill, value: float) -> None:
 
 
 def test_moving_arm_is_not_ready(skill: Skill) -> None:
-    """An arm that moves is not ready before it rests."""
+    """An arm is ready once it rests."""
     loop = Loop(SETTINGS, skill)
     moving = {k: arm((POSTURE[0] + 0.001 * k, *POSTURE[1:]), stamp_ns(k)) for k in range(0, 400, 5)}
     assert not loop.run(400, moving, every=0)["commanded"].any()
@@ -163,7 +163,7 @@ def test_moving_arm_is_not_ready(skill: Skill) -> None:
 
 
 STRANGERS = st.tuples(
-    st.integers(1, 12),  # a state every so many ticks
+    st.integers(1, 12),  # ticks between states of the arm
     st.integers(0, 11),
     st.sampled_from([-HOUR_NS, -3_000_000, 1, 3_000_000, 90_000_000, 10**9, HOUR_NS]),
     st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7),
@@ -191,7 +191,7 @@ def test_no_stranger_makes_a_command_jump(
     loop.run(1600, events | {k: order("reset") for k in resets}, every=every)
     frames = loop.frames
     assert_limits_hold(frames)
-    # what is adopted anew was told alone for a tenth of a second
+    # before a new posture is adopted, it must be the only one for a tenth of a second
     begins = np.flatnonzero(np.diff(frames["commanded"].astype(int)) == 1) + 1
     real = [k for k in range(1600) if k % every == 0]
     for k in begins:

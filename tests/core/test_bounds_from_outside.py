@@ -1,7 +1,7 @@
-"""Every bound of docs/bounds.md is kept, whatever comes in: cells, hands and arms drawn at random.
+"""Every bound of docs/bounds.md is kept for any input: cells, hands and arms drawn at random.
 
 Each seed is a session. `THIRDHAND_EXAMPLES=300 pytest tests/core/test_bounds_from_outside.py` plays
-other ones, and longer; with `THIRDHAND_SEED=5000` that is the first of them.
+other and longer sessions; `THIRDHAND_SEED=5000` sets their first seed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if "THIRDHAND_EXAMPLES" in os.environ:
 
 
 def assert_every_bound_is_kept(seed: int, arm: str, *, engages: bool) -> None:
-    """Play a session, within every bound, and again with the same frames."""
+    """Assert that a session keeps every bound, and gives the same frames when played again."""
     played = play(seed, arm, **LENGTH, engages=engages)
     happened = "\n  ".join(played.what_happens)
     passed = "\n  ".join(broken(played.session))
@@ -44,7 +44,7 @@ def assert_every_bound_is_kept(seed: int, arm: str, *, engages: bool) -> None:
 @pytest.mark.parametrize(("arm", "seed"), [(ARMS[seed % len(ARMS)], seed) for seed in SEEDS])
 @pytest.mark.one_case
 def test_bounds_hold_in_drawn_sessions(arm: str, seed: int) -> None:
-    """Every bound is kept whatever comes in."""
+    """Every bound is kept for any input."""
     assert_every_bound_is_kept(seed, arm, engages=False)
 
 
@@ -67,7 +67,7 @@ def kept() -> Session:
     return session
 
 
-SPOILED: dict[Bound, dict[str, float]] = {  # what is added to fields of a late frame
+SPOILED: dict[Bound, dict[str, float]] = {  # numbers added to fields of a late frame
     bounds.every_number_is_finite: {"target": np.nan},
     bounds.joints_are_within_limits_or_move_inwards: {"joints": 9.0},
     bounds.joint_speeds_are_within_limits: {"joint_velocities": 9.0},
@@ -100,7 +100,7 @@ def test_a_bound_that_is_passed_is_found(kept: Session, bound: Bound) -> None:
 
 
 def test_entered_clearance_is_found(kept: Session) -> None:
-    """A part in a clearance and a setpoint that leaves are found."""
+    """A part within a clearance is detected, and a setpoint that leaves the workspace too."""
     low = kept.placed.copy()
     folded = kept.placed.copy()
     frames = kept.frames.copy()
@@ -113,7 +113,7 @@ def test_entered_clearance_is_found(kept: Session) -> None:
         spoiled = replace(kept)
         spoiled.__dict__["placed"] = placed
         assert bound(spoiled).max() > 0.0
-    frames["setpoint_velocity"] = 0.0  # it began at rest
+    frames["setpoint_velocity"] = 0.0  # the setpoint begins at rest
     frames["setpoint"][-100] += 2.0
     assert bounds.setpoint_stays_in_the_workspace(replace(kept, frames=frames)).max() > 0.0
 

@@ -30,7 +30,9 @@ def cell(base: Settings = ASSUMED, rate_hz: int = 500, **hands: Any) -> Settings
 
 
 def at(events: Mapping[int, Event], every: int = 0) -> Callable[[int], tuple[Event, ...]]:
-    """Events by their ticks, and a pressed clutch every so many ticks before the first of them."""
+    """Events by their ticks; before the first one, a pressed clutch is sent at regular
+    intervals.
+    """
     last = min(events, default=10**9)
     return lambda k: (
         *((clutch(True),) if every and k % every == 0 and k < last else ()),
@@ -58,7 +60,6 @@ def test_release_holds_at_once(taught: Skill, rate_hz: int) -> None:
 
 @pytest.mark.parametrize("rate_hz", LOOP_RATES_HZ)
 def test_silent_clutch_is_released(taught: Skill, rate_hz: int) -> None:
-    """A clutch whose messages cease counts as released."""
     pressed = lambda k: (clutch(True),) if k in (0, 10) else ()  # noqa: E731
     reason = reasons(
         cell(rate_hz=rate_hz), taught, resting(0, rate_hz, pressed, every=rate_hz // 100)
@@ -80,14 +81,14 @@ def test_missed_deadlines_count_as_silence(taught: Skill) -> None:
 
 
 def test_without_a_clutch_messages_change_nothing(taught: Skill) -> None:
-    """Without a clutch in the settings its messages change nothing."""
+    """The settings have no clutch."""
     plain = followed(taught, resting(0, 300))
     chattered = followed(taught, resting(0, 300, lambda k: (clutch(k % 3 == 0), wish(1))))
     assert plain.tobytes() == chattered.tobytes()
 
 
 def test_reasons_before_the_clutch(taught: Skill) -> None:
-    """An operator and an arm that is not ready are named before the clutch."""
+    """The reasons `operator` and an arm that is not ready are named before the clutch."""
     loop = Loop(cell(Settings()), taught)
     not_ready = loop.run(20)
     assert (not_ready["reason"] == Reason.ARM_NOT_READY).all()
@@ -111,12 +112,14 @@ def test_return_needs_a_pressed_clutch(taught: Skill) -> None:
 
 
 def gripper(settings: Settings, skill: Skill, events: Mapping[int, Event]) -> list[int]:
-    """State of the gripper in each tick in which the hands rest at a via-point."""
+    """The gripper's state in each tick while the hands rest at a via-point."""
     return followed(skill, resting(0, 900, at(events)), settings)["gripper"].tolist()
 
 
 def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
-    """With hysteresis and pause as where a skill decides it, and not while the arm holds."""
+    """Wishes have the hysteresis and the pause of a skill's decisions, and no effect while the arm
+    holds.
+    """
     wishes = cell(gripper="key")
     events = {50: wish(0.2), 350: wish(0.7), 400: wish(0.95), 420: wish(0.0)}
     states = gripper(wishes, taught, events)
@@ -137,7 +140,7 @@ def test_wish_decides_gripper_without_skill(taught: Skill) -> None:
 
 
 def test_skill_decides_its_gripper_alone(skill: Skill) -> None:
-    """A skill with a gripper decides the gripper's state alone."""
+    """Wishes have no effect on a skill with a gripper."""
     first, *more = Scene().via_points()
     point = msgspec.structs.replace(first, left=LEFT, right=RIGHT, gripper="closed")
     closing = adapted(skill, (point, *more), tolerance=0.05)

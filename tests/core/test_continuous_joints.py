@@ -1,5 +1,5 @@
-"""Joints that turn on and on: whatever turn an arm reports, and however it counts turns, it follows
-as one that starts at 0, and no command ever jumps by a turn.
+"""Continuous joints: an arm may report any turn and count turns in any way. It follows as an arm
+that starts at 0, and no command jumps by a turn.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def turns_on(cell: Settings) -> Vector:
 
 
 def session(cell: Settings, skill: Skill, counts: Counts, start: Vector) -> Loop:
-    """A loop whose arm reports its joints as `counts` says, with the hands of a scene."""
+    """A loop with the hands of a scene, whose arm reports its joints through `counts`."""
     loop = Loop(cell, skill, start)
     loop.hands = script_hands(HandScript(Scene(), seed=3))
     loop.reports = lambda q, dq: (counts(q), dq)
@@ -43,7 +43,7 @@ def session(cell: Settings, skill: Skill, counts: Counts, start: Vector) -> Loop
 
 
 def commands(frames: np.ndarray) -> Vector:
-    """The joints (T, J) that were commanded."""
+    """The commanded joints (T, J)."""
     return np.asarray(frames["joints"][frames["commanded"] != 0])
 
 
@@ -87,7 +87,7 @@ def test_task_crosses_the_seam(reference: Vector) -> None:
 def test_any_turn_is_followed_alike(
     cell: Settings, skill: Skill, turns_on: Vector, reference: Vector, turns: int, how: str
 ) -> None:
-    """An arm in any turn is commanded in that turn, and moves as from the first one."""
+    """An arm in any turn is commanded in that turn, and moves as in the first turn."""
     start = np.array(cell.arm.posture) + TURN * turns * turns_on
     counts = counted if how == "counted" else wrapped(turns_on)
     frames = session(cell, skill, counts, start).run(TICKS)
@@ -95,7 +95,7 @@ def test_any_turn_is_followed_alike(
     np.testing.assert_allclose(sent[0], counts(start), atol=1e-3)
     assert_limits_hold(frames, cell)
     in_turn = sent - TURN * np.rint((sent - reference) / TURN)
-    # rounding differs by the turn, and grows
+    # rounding depends on the turn, and accumulates
     np.testing.assert_allclose(in_turn, reference, atol=1e-3)
     assert np.ptp(np.rint((sent - reference) / TURN), axis=0).max() == 0.0
     assert not frames["rejected"][-1].any()
@@ -106,7 +106,7 @@ def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_
     loop = session(cell, skill, counted, np.array(cell.arm.posture) + TURN * turns_on)
     loop.run(600)
     loop.run(201, {200: order("reset")}, every=0)
-    loop.joints = loop.joints - TURN * turns_on  # it was switched off, and counts from 0
+    loop.joints = loop.joints - TURN * turns_on  # the arm was switched off, and counts from 0
     loop.speed[:] = 0.0
     sent = commands(loop.run(500))
     assert len(sent) > 300
@@ -116,7 +116,7 @@ def test_turn_reported_after_silence_counts(cell: Settings, skill: Skill, turns_
 
 def test_allowed_silence_turns_nothing(cell: Settings, skill: Skill, turns_on: Vector) -> None:
     """A silence of the longest accepted duration changes no turn."""
-    # beyond the seam
+    # start beyond the seam
     loop = session(cell, skill, wrapped(turns_on), np.array(cell.arm.posture) + 0.05)
     loop.joints[0] = math.pi + 0.01
     for k in range(1500):
@@ -139,7 +139,7 @@ def test_jump_of_a_turn_is_none(cell: Settings, skill: Skill, turns_on: Vector) 
 
 
 def test_narrow_limits_hold_in_their_turn(tmp_path: Path, skill: Skill) -> None:
-    """Narrower limits of a continuous joint hold in the turn that they are given for."""
+    """Narrow limits of a continuous joint apply to the turn in which they are configured."""
     cell = continuous_cell(tmp_path)
     text = (tmp_path / "cell.toml").read_text(encoding="utf-8")
     limits = "lower = [2.0, -6.0, -3.0, -6.0, -6.0, -6.0]\nupper = [4.0, 6.0, 3.0, 6.0, 6.0, 6.0]"

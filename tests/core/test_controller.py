@@ -1,5 +1,5 @@
 """The core as a whole: modes and reasons, limits, stops without a jump, smoothness without lag, and
-going on from a state bit for bit.
+continuing from a state bit for bit.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ Session = tuple[list[Tick], np.ndarray]  # ticks and the frame of each
 
 
 def modes(seen: np.ndarray) -> list[tuple[str, str]]:
-    """The modes and reasons that were, in order."""
+    """The modes and reasons in the order of their occurrence."""
     pairs = [(Mode(f["mode"]).name.lower(), Reason(f["reason"]).name.lower()) for f in seen]
     return [pair for i, pair in enumerate(pairs) if i == 0 or pair != pairs[i - 1]]
 
 
 def test_demonstrated_relation_with_little_tremor() -> None:
-    """Half a millimetre of tremor at 8 to 10 Hz, and as much noise; a setpoint that can stop lags
-    by v / 2a.
+    """Tremor is half a millimetre at 8 to 10 Hz, noise the same; a setpoint that can stop lags by v
+    / 2a.
     """
     skill = decoded((RECORDINGS / "experiments" / "as-paper.npz").read_bytes(), origin="as-paper")
     taught = adapted(skill, Scene().via_points(), tolerance=0.05)
@@ -77,14 +77,13 @@ def test_demonstrated_relation_with_little_tremor() -> None:
 
 
 def test_first_setpoint_is_at_the_tool(taught: Skill) -> None:
-    """The first setpoint is where the tool is."""
     trace = followed(taught, resting(0, 300, every=1))
     assert modes(trace) == [("follow", "none")]
     assert np.linalg.norm(trace["setpoint"] - trace["tool"], axis=1).max() < 0.002
 
 
 def unseen(ticks: Iterable[Tick], when: range, *kinds: str) -> list[Tick]:
-    """Ticks without the samples of these kinds at that time."""
+    """The ticks without the samples of these kinds in a period."""
     return [
         Tick(t.index, tuple(e for e in t.inbox if not (e.kind in kinds and t.index in when)))
         for t in ticks
@@ -93,13 +92,13 @@ def unseen(ticks: Iterable[Tick], when: range, *kinds: str) -> list[Tick]:
 
 @pytest.fixture(scope="module")
 def moving(taught: Skill) -> Session:
-    """A scene's ticks, and the frames of all."""
+    """The ticks of a scene, and the frame of each."""
     ticks = list(ticks_of(HandScript(Scene(), seed=8)))
     return ticks, followed(taught, ticks)
 
 
 def without(unseen_ms: float) -> Settings:
-    """Settings by which the arm does without a hand for so long."""
+    """Settings with this longest time for which the arm moves without a hand."""
     return changed(ASSUMED, hands={"unseen_ms": unseen_ms})
 
 
@@ -183,7 +182,7 @@ def test_nothing_is_commanded_before_arm_is_heard(taught: Skill) -> None:
     assert modes(before) == [("hold", "arm_not_ready")]
     assert not before["commanded"].any()
     after = frames(controller, resting(200, 60, lambda k: (arm(start, k),)))
-    assert np.flatnonzero(after["commanded"])[0] == 50  # a tenth of a second of one posture
+    assert np.flatnonzero(after["commanded"])[0] == 50  # after 0.1 s of one posture
     after = after[50:]
     assert after["commanded"].all()
     assert np.abs(after["joints"][0] - start).max() < 1e-3
@@ -240,7 +239,6 @@ def test_reset_waits_for_rest(taught: Skill) -> None:
 
 
 def test_reset_without_fault_changes_nothing(taught: Skill) -> None:
-    """Reset without a fault changes nothing."""
     plain = followed(taught, resting(0, 400))
     reset = followed(taught, resting(0, 400, lambda k: (order("reset"),) if k == 200 else ()))
     assert plain.tobytes() == reset.tobytes()
@@ -266,7 +264,7 @@ def test_new_skill_is_approached_within_limits(skill: Skill, taught: Skill) -> N
 @pytest.mark.parametrize("wrong_s", [0.05, 0.08])
 @pytest.mark.parametrize("jump_m", [0.25, 0.3, 0.5])
 def test_repeated_jumps_hold_once(taught: Skill, jump_m: float, wrong_s: float) -> None:
-    """Hands that jump again and again hold once."""
+    """Hands that jump again and again cause one hold."""
     hands = np.tile((LEFT, RIGHT), (4000, 1, 1))
     time_s = np.arange(len(hands)) * PERIOD_S
     is_jumped = (time_s > 2.0) & (time_s < 4.0) & (time_s % 0.2 < wrong_s)
@@ -297,7 +295,7 @@ def test_ticks_must_grow(taught: Skill) -> None:
 
 
 def test_frames_are_read_only(taught: Skill) -> None:
-    """Frames cannot be changed and describe themselves."""
+    """Frames are read-only, and their fields have names."""
     frame = Controller(ASSUMED, taught, urdf=URDF).step(Tick(0))
     with pytest.raises(ValueError, match="read-only"):
         frame["joints"][0] = 1.0
@@ -307,7 +305,7 @@ def test_frames_are_read_only(taught: Skill) -> None:
 
 
 def test_every_event_has_a_case(taught: Skill) -> None:
-    """Every kind of event has a case and any other is refused."""
+    """Any other event is refused."""
     controller = Controller(ASSUMED, taught, urdf=URDF)
     for index, kind in enumerate(channels.EVENT_NUMBERS):
         values = {

@@ -1,4 +1,4 @@
-"""Engaging: after a start, a hold or a fault the tool approaches its target slowly, once."""
+"""Engaging: after a start, a hold or a fault, the tool approaches its target slowly, once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
 E = 0.15  # [m/s]
 LOOP_HZ = (100, 250, 500, 1000)
 TOOL_RISE_MPS = 0.1  # the tool may be faster than its slow setpoint, as in a stop
-RAISED = np.array(((0.75, -0.30, 0.25), RIGHT))  # hands of which the left one is on its way
+RAISED = np.array(((0.75, -0.30, 0.25), RIGHT))  # the left hand has left its start
 RESUMED = 600  # tick in which the hands of the script move
 inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
 wild = st.tuples(*(st.floats(-1e3, 1e3),) * 3)
@@ -49,7 +49,7 @@ def cell(
 
 
 def resumed(script: HandScript) -> Iterator[Tick]:
-    """Ticks of the script in which the arm is held until the hands are on their way."""
+    """Ticks of the script in which the arm is held until the hands move."""
     orders = {0: order("hold"), RESUMED: order("resume")}
     for tick in ticks_of(script, wait_s=0.0):
         yield Tick(
@@ -75,7 +75,7 @@ def reached(taught: Skill) -> tuple[Vector, Vector]:
 def test_tool_engages_slowly_after_a_hold(
     taught: Skill, reached: tuple[Vector, Vector], rate_hz: int, apart_m: float
 ) -> None:
-    """After a hold the tool comes slowly to where the hands have gone."""
+    """The hands have moved during the hold."""
     hands, targets = reached
     between = np.linalg.norm(targets[:, None] - targets, axis=2)
     before, after = np.unravel_index(np.abs(between - apart_m).argmin(), between.shape)
@@ -120,7 +120,7 @@ def test_tool_engages_slowly_after_a_hold(
 def test_brief_hold_by_hands_does_not_engage(
     taught: Skill, unseen_s: float, orders: dict[float, str], anew: bool
 ) -> None:
-    """Unseen hands hold the arm 0.1 s later. They have moved when they are seen again."""
+    """Unseen hands cause a hold after 0.1 s. They have moved when they are seen again."""
     loop = Loop(cell(Settings()), taught)
     loop.hands = lambda k: RAISED
     assert not engages(loop.run(3000))[-1]
@@ -155,7 +155,7 @@ def test_a_brief_hold_does_not_end_engaging(taught: Skill) -> None:
 @pytest.mark.parametrize("rate_hz", LOOP_HZ)
 @pytest.mark.parametrize("what", ["resume", "clutch"])
 def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) -> None:
-    """At random, for one tick up to a third of a second, while the hands move."""
+    """Holds begin at random and last from one tick to a third of a second, while the hands move."""
     random = np.random.default_rng(rate_hz)
     count = 3 * rate_hz
     lengths = np.maximum(1, (rate_hz * 10 ** random.uniform(-3, -0.5, count)).astype(int))
@@ -189,7 +189,9 @@ def test_storms_of_holds_break_no_limit(taught: Skill, rate_hz: int, what: str) 
 def test_engaging_setpoint_keeps_its_bounds(
     told: list[tuple[tuple[float, ...], ...]], ticks: int, speed: float, engage_speed: float
 ) -> None:
-    """From any speed, toward any target; `driven` asserts the bounds that hold at all times."""
+    """The setpoint starts at any speed, with any target; `driven` asserts the bounds of every
+    step.
+    """
     tool = ToolSettings(engage_speed=engage_speed)
     start = np.array([MIDDLE, (speed, 0.0, 0.0), (0.0, 0.0, 0.0)])
     targets = [np.array(target) for target in told for _ in range(ticks)] + [
@@ -205,7 +207,7 @@ def test_engaging_setpoint_keeps_its_bounds(
 
 
 def test_turn_is_slowed_in_proportion(taught: Skill) -> None:
-    """The turn of the tool is slowed in proportion."""
+    """The tool's rotation is slowed in proportion to its translation."""
     ticks = [*resumed(HandScript(Scene(), seed=5))][: RESUMED + 1000]
     frames = followed(taught, ticks, cell(engage_speed=0.05))[RESUMED:]
     assert engages(frames).all()
@@ -214,7 +216,6 @@ def test_turn_is_slowed_in_proportion(taught: Skill) -> None:
 
 
 def test_without_engage_speed_nothing_engages(taught: Skill) -> None:
-    """Without an engage speed nothing engages."""
     ticks = list(ticks_of(HandScript(Scene(), seed=3), wait_s=0.2))[:800]
     disabled, full = (followed(taught, ticks, cell(engage_speed=e)) for e in (0.0, 0.8))
     assert disabled.tobytes() == full.tobytes()
@@ -235,7 +236,6 @@ def test_without_engage_speed_nothing_engages(taught: Skill) -> None:
     ],
 )
 def test_engage_speed_is_at_most_tool_speed(text: str, speed: float, words: str) -> None:
-    """The engage speed is at most the speed of the tool."""
     if words:
         with pytest.raises(SettingsError, match=words):
             parse(f"[tool]\n{text}", origin="cell.toml")

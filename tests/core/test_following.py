@@ -1,4 +1,4 @@
-"""How the setpoint follows: stops and turns of its target, quiet motion, and a noisy tracker."""
+"""The setpoint follows its target: stops and reversals, quiet motion, and a noisy tracker."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from support.setpoints import FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
 def test_jump_is_approached_without_overshoot(
     direction: tuple[float, ...], distance_m: float
 ) -> None:
-    """A jump is approached without overshoot."""
     offset_m = distance_m * np.array(direction) / np.linalg.norm(direction)
     states, _ = driven([at_rest(MIDDLE)] * 10 + [at_rest(MIDDLE + offset_m)] * 2000)
     assert ((states[:, 0] - MIDDLE) @ offset_m / distance_m).max() <= distance_m + 0.0025
@@ -27,7 +26,6 @@ def test_jump_is_approached_without_overshoot(
 @pytest.mark.parametrize("speed", [0.2, 0.4, 0.6])
 @pytest.mark.parametrize(("acceleration", "jerk"), [(5.0, 120.0), (7.5, 170.0), (10.0, 231.0)])
 def test_no_swing_back_after_hard_stop(speed: float, acceleration: float, jerk: float) -> None:
-    """After a hard stop it does not swing back."""
     costs = FREE.copy()
     direction = np.array([0.6, -0.8, 0.0])
     for joint in range(3):
@@ -78,7 +76,7 @@ def test_comes_to_rest_at_any_rate_and_jerk(rate_hz: int, max_jerk: float) -> No
     ("brake", "hz", "most_m"), [(3.0, 1.0, 0.1), (5.0, 1.2, 0.07), (5.0, 1.5, 0.06)]
 )
 def test_fast_oscillation_is_still_met(brake: float, hz: float, most_m: float) -> None:
-    """Without a stop planned before the target's own speed it would run 120 to 200 mm off."""
+    """A setpoint that does not plan to stop before the target's turn would be 120 to 200 mm off."""
     costs = FREE.copy()
     rate = 2.0 * np.pi * hz
     far = np.array([0.12 if hz < 1.5 else 0.08, 0.0, 0.0])
@@ -108,7 +106,9 @@ def test_rest_on_target_is_exact() -> None:
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 100, 500])
 def test_steady_target_is_followed_at_every_rate(rate_hz: int) -> None:
-    """At 50 Hz it was 37 mm behind: in a long tick a stop's way is no straight line of the jerk."""
+    """In a long tick, the stopping distance is not linear in the jerk; taken as linear, the lag was
+    37 mm at 50 Hz.
+    """
     for velocity in np.array([[0.2, 0.0, 0.0], [0.1, -0.05, 0.03]]):
         places = [MIDDLE + velocity * (k / rate_hz - 1.0) for k in range(2 * rate_hz)]
         states, _ = driven(

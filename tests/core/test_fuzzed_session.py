@@ -1,5 +1,5 @@
-"""A session of spoilt bytes, decoded as the daemon decodes them, recorded and replayed: the same
-bit for bit, and within every bound. It is made anew from its seed.
+"""A session of damaged bytes, decoded as in the daemon, recorded and replayed: the replay is the
+same bit for bit, and within every bound. The session follows from its seed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from thirdhand.recordings.recording import Recorder
 from thirdhand.settings.config import Settings
 
 SETTINGS = Settings()
-# between samples [ticks]
+# duration of the session [s], and ticks between samples
 SECONDS = 12.0
 EVERY = 5
 ORDERS = ("hold", "resume", "reset")
 
 
 def event(key: str, payload: bytes) -> Event | None:
-    """What becomes of a message's bytes, as in the daemon; None of those that are refused."""
+    """The event of a message's bytes, as in the daemon; None if they are refused."""
     channel = channels.BY_KEY[key]
     try:
         value = channel.codec.decode(payload)

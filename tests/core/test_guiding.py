@@ -24,7 +24,7 @@ def guided(led: bool) -> Event:
 
 
 def lead(loop: Loop, ticks: int, by: float = LED_RAD, *, is_reported: bool = True) -> np.ndarray:
-    """The frames while a hand moves two joints of the arm, by so much in the whole time."""
+    """The frames while a person moves two joints of the arm, by the angle `by` [rad] each."""
     start = loop.joints.copy()
     shape = np.array([1.0, 0, 0, -1.0, 0, 0, 0])
     for k in range(ticks):
@@ -45,8 +45,8 @@ def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, firs
     held_at = loop.index if first == "nothing" else loop.index - 200
     led = lead(loop, 800)
     assert (led["reason"] == Reason.GUIDED).all()
-    assert not led["commanded"][200:].any()  # after the stop of an arm that followed
-    # what is drawn is the led arm
+    assert not led["commanded"][200:].any()  # before, an arm that followed stops
+    # the frame has the joints of the led arm
     np.testing.assert_allclose(led["joints"][-1], loop.joints, atol=1e-2)
     ended = loop.run(300, {0: guided(False)})
     assert (ended["reason"][100:] == Reason.OPERATOR).all()
@@ -81,7 +81,7 @@ def test_hold_knows_hands_that_were_seen(taught: Skill) -> None:
     assert loop.controller.state["held"] == HELD_UNSEEN
     loop.hands = lambda k: np.array((LEFT, RIGHT))
     loop.run(100)
-    # hands that come later are not those of this hold
+    # hands that appear later do not belong to this hold
     assert loop.controller.state["held"] == HELD_UNSEEN
     loop.run(100, {0: order("resume"), 50: order("hold")})
     assert loop.controller.state["held"] == HELD_SEEN
@@ -92,7 +92,7 @@ def test_guiding_ends_when_its_reports_cease(taught: Skill) -> None:
     loop.run(500)
     lead(loop, 100, 0.05)
     silent = loop.run(200)
-    assert (silent["reason"][:49] == Reason.GUIDED).all()  # 100 ms after the last report
+    assert (silent["reason"][:49] == Reason.GUIDED).all()  # until 100 ms after the last report
     assert silent["reason"][-1] == Reason.OPERATOR
 
 

@@ -1,4 +1,6 @@
-"""The hand estimator: right between samples, whatever the tracker's noise, told or not."""
+"""The hand estimator: accurate between samples, whether the tracker's noise is configured or
+not.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,14 @@ LEAST_NOISE_M = TUNING.intake.least_noise_m
 
 
 def reach(t: float) -> Vector:
-    """A minimum-jerk reach of 30 cm in a second, which begins at 1 s."""
+    """A minimum-jerk reach of 30 cm in one second, beginning at 1 s."""
     u = min(max(t - 1.0, 0.0), 1.0)
     return np.array([0.5, 0.0, 0.2]) + u**3 * (10 - 15 * u + 6 * u * u) * np.array([0.2, -0.2, 0.1])
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 def test_reach_is_known_between_samples(rate_hz: int) -> None:
-    """A reach is known to a millimetre between the samples too."""
+    """The error is a millimetre at most."""
     states = follow(Hands(), reach, until_s=3.0, rate_hz=rate_hz)
     truth = np.array([reach(k * PERIOD_S) for k in range(len(states))])
     error = np.linalg.norm(states[100:, 0] - truth[100:], axis=1)
@@ -34,7 +36,9 @@ def test_reach_is_known_between_samples(rate_hz: int) -> None:
 
 
 def test_even_motion_survives_a_late_sample() -> None:
-    """In the 60 ms after the newest one: as one that is about to end it would lose a third."""
+    """In the 60 ms after the newest sample the speed is kept; predicted as a reach that ends, it
+    would fall by a third.
+    """
     hands = Hands()
     follow(hands, lambda t: np.array([0.3 * t, 0.0, 0.2]), until_s=1.0)
     speeds = []
@@ -73,7 +77,7 @@ def test_jump_over_ticks_equals_single_ticks() -> None:
 
 
 def test_pause_of_minutes_keeps_position() -> None:
-    """Over which the covariance of the motion model overflows."""
+    """In that time the covariance of the motion model overflows."""
     hands = Hands()
     follow(hands, reach, until_s=1.5)
     before = hands.state["hands"][LEFT, 0].copy()
@@ -121,7 +125,7 @@ def shaking(hz: float, size_m: float, speed: float) -> tuple[Vector, Vector]:
 
 
 def part_at(hz: float, deviation: Vector) -> float:
-    """Amplitude of the part of a deviation (T, 3) that has a frequency."""
+    """Amplitude of the component of a deviation (T, 3) at a frequency."""
     waves = np.exp(2j * np.pi * hz * PERIOD_S * np.arange(len(deviation)))
     return float(
         np.linalg.norm(2.0 * (deviation - deviation.mean(axis=0)).T @ waves / len(deviation))
@@ -130,7 +134,7 @@ def part_at(hz: float, deviation: Vector) -> float:
 
 @pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 8.0, 10.0, 12.0])
 def test_slow_tremor_at_rest_is_removed(hz: float) -> None:
-    """A slow tremor is no part of the motion of a hand at rest."""
+    """The estimated hand rests."""
     position, velocity = shaking(hz, 0.002, 0.0)
     assert part_at(hz, position) < 0.0002
     assert np.sqrt(np.mean(np.sum(velocity**2, axis=1))) < 0.003
@@ -147,7 +151,7 @@ def test_tremor_hardly_ripples_velocity(hz: float, size_m: float, speed: float) 
 @pytest.mark.parametrize(("rate_hz", "noise_m"), [(30, 0.002), (100, 0.0005)])
 @pytest.mark.parametrize("unseen_s", [0.1, 0.2, 0.4])
 def test_unseen_hand_at_rest_does_not_dart(rate_hz: int, noise_m: float, unseen_s: float) -> None:
-    """A resting hand that is out of sight for a moment makes no jump."""
+    """The hand disappears for a moment."""
     hands = Hands()
     still = np.array([0.5, 0.0, 0.2])
     random = np.random.default_rng(9)
@@ -185,7 +189,9 @@ def test_a_slow_hand_goes_on_evenly(rate_hz: int, speed: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [100, 334, 500])
 def test_quickest_reaches_are_not_lost(rate_hz: int) -> None:
-    """There and back at 1.5 m/s, in a third of a second each way: none of the modes moves so."""
+    """The hand moves there and back at 1.5 m/s, in a third of a second each; no motion model
+    describes such a reach.
+    """
 
     def hand(t: float) -> Vector:
         turns, u = divmod(t / 0.32, 1.0)
@@ -206,7 +212,9 @@ HZ = 125
 
 
 def rest_of(along: Vector, hz: int = HZ) -> Vector:
-    """The rest (T,) of a left hand that moves so (T,) [m/s] along x; the right one does not."""
+    """The rest (T,) of a left hand with these speeds (T,) [m/s] along x; the right hand does not
+    move.
+    """
     velocities = np.zeros((len(along), 6))
     velocities[:, 0] = along
     stillness = stillness_of(velocities, 1.0 / hz)
@@ -224,7 +232,7 @@ def test_a_hand_that_trembles_rests(tremor_m: float) -> None:
 
 @pytest.mark.parametrize("hz", [25, 125, 500])
 def test_rest_ends_at_once_and_begins_slowly(hz: int) -> None:
-    """Rest ends at once and begins slowly, at any rate."""
+    """This holds at any rate."""
     speed = np.concatenate([np.zeros(hz), np.full(hz, 0.3), np.zeros(hz)])
     stillness = rest_of(speed, hz)
     assert stillness[hz - 1] == 1.0

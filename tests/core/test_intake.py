@@ -1,5 +1,5 @@
-"""Intake: samples checked and mapped to frame `base`, ages in ticks, and a filter that knows a hand
-between its samples.
+"""Intake: samples are checked and mapped to frame `base`, ages count in ticks, and a filter
+estimates hands between their samples.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from thirdhand.settings.config import HandSettings, TrackerSettings
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # about z
 
 
-# --- what a tracker says -------------------------------------------------------------------------
+# --- samples of a tracker -----------------------------------------------------------------------
 
 
 def test_tracker_is_scaled_turned_and_moved() -> None:
@@ -34,7 +34,7 @@ def test_tracker_is_scaled_turned_and_moved() -> None:
 
 
 def test_left_handed_axes_are_mirrored() -> None:
-    """Left-handed axes become right-handed by their z before all else."""
+    """Left-handed axes are mirrored along z before any other mapping."""
     mapping = (1.0, 2.0, 3.0, *QUARTER_TURN)
     hands = Hands(HandSettings(unit="mm", axes="left-handed", base_from_tracker=mapping))
     np.testing.assert_allclose(
@@ -77,7 +77,6 @@ def only_counted(hands: Hands, cause: Cause) -> Iterator[None]:
 def test_useless_hand_sample_is_only_counted(
     position: tuple[float, ...], turn: tuple[float, ...], cause: Cause
 ) -> None:
-    """A useless hand sample is counted and changes nothing else."""
     hands = Hands()
     hands.hand(1)
     with only_counted(hands, cause):
@@ -100,7 +99,7 @@ BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
         ("", "base", MAPPED),
         ("camera", "camera", MAPPED),
         ("camera", "", MAPPED),
-        ("camera", "base", IN_BASE),  # not mapped again, as the tracker has a frame of its own
+        ("camera", "base", IN_BASE),  # not mapped: the tracker's frame is another one
         ("camera", "optitrack", BY_ITS_TABLE),
         ("camera", "vicon/world", IN_BASE),
         ("camera", "headset", None),
@@ -111,7 +110,7 @@ BY_ITS_TABLE = (1.0 - 0.0002, 2.0 + 0.0004, 3.0 + 0.0001)
 def test_frame_decides_the_mapping(
     configured: str, frame: str, at: tuple[float, ...] | None
 ) -> None:
-    """A hand is mapped as its frame is configured or refused."""
+    """A hand of a configured frame is mapped by its settings; others are refused."""
     settings = HandSettings(
         frame=configured, unit="mm", base_from_tracker=(0.5, 0.0, 0.0, *STRAIGHT)
     )
@@ -127,7 +126,6 @@ def test_frame_decides_the_mapping(
 
 
 def test_repeated_and_older_are_counted_apart() -> None:
-    """Repeated and older stamps are counted apart."""
     hands = Hands()
     for stamp in (200_000_000, 200_000_000, 99_999_999, 100_000_000, 100_000_000):
         hands.hand(stamp)
@@ -147,7 +145,6 @@ def test_repeated_and_older_are_counted_apart() -> None:
     ],
 )
 def test_hand_is_stale_after_configured_time(rate_hz: int, stale_ms: float, ticks: int) -> None:
-    """A hand is stale after exactly the configured time."""
     hands = Hands(HandSettings(stale_ms=stale_ms), rate_hz=rate_hz)
     hands.hand(1)
     assert hands.fresh()
@@ -159,7 +156,7 @@ def test_hand_is_stale_after_configured_time(rate_hz: int, stale_ms: float, tick
 
 @pytest.mark.parametrize(("stale_max_ms", "most"), [(0.0, 50), (200.0, 100)])
 def test_bursts_extend_the_stale_time(stale_max_ms: float, most: int) -> None:
-    """The link is blocked again and again, for 0 to 150 ms."""
+    """The link is blocked again and again, for 0 to 150 ms each time."""
     hands = Hands(HandSettings(stale_max_ms=stale_max_ms))
     random = np.random.default_rng(8)
     arrivals: dict[int, list[int]] = {}
@@ -182,7 +179,7 @@ def test_bursts_extend_the_stale_time(stale_max_ms: float, most: int) -> None:
 
 
 def test_clock_set_back_locks_a_hand_out_until_stale_only() -> None:
-    """A clock set back locks a hand out until it is stale only."""
+    """The hand is accepted again once it is stale."""
     hands = Hands()
     hands.hand(5_000_000_000)
     for stamp in range(49):
@@ -198,9 +195,9 @@ def test_clock_set_back_locks_a_hand_out_until_stale_only() -> None:
 
 @pytest.mark.parametrize("ahead_ns", [110_000_000, 10**9, 3600 * 10**9, 2**62, 2**63 - 1])
 def test_stamp_from_the_future_locks_no_source_out(ahead_ns: int) -> None:
-    """A stamp from the future is refused and locks no source out."""
+    """Such a sample is refused."""
     hands = Hands()
-    hands.hand(0, side=RIGHT)  # repeated: the same as none
+    hands.hand(0, side=RIGHT)  # stamp 0 stands for no sample: repeated
     for tick in range(1, 60):
         hands.hand(tick)
         hands.arm(tick)
@@ -226,7 +223,7 @@ def test_stamp_may_be_ahead_by_passed_time() -> None:
 
 @pytest.mark.parametrize("first", [-(2**63), -1, 1, 2**63 - 1])
 def test_extreme_stamps_do_not_overflow(first: int) -> None:
-    """Stamps at the ends of their numbers are compared without overflow."""
+    """Stamps at the ends of the int64 range are compared without overflow."""
     hands = Hands()
     hands.hand(first)
     hands.arm(first)
@@ -245,7 +242,7 @@ def test_extreme_stamps_do_not_overflow(first: int) -> None:
 
 
 def test_joints_are_taken_in_any_order() -> None:
-    """Joints are taken in any order among others."""
+    """Other joints may stand between them."""
     hands = Hands()
     values = {name: 0.1 * i for i, name in enumerate(JOINT_NAMES)} | {"gripper": 3.0}
     for stamp, names in (
@@ -281,7 +278,6 @@ def test_joints_are_taken_in_any_order() -> None:
 def test_useless_arm_sample_is_only_counted(
     names: tuple[str, ...], position: tuple[float, ...], velocity: tuple[float, ...], cause: Cause
 ) -> None:
-    """A useless arm sample is counted and changes nothing else."""
     hands = Hands()
     hands.arm(1)
     with only_counted(hands, cause):

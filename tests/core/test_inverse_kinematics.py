@@ -1,4 +1,4 @@
-"""The compiled numbers of the inverse kinematics against plain references."""
+"""The compiled functions of the inverse kinematics against plain references."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GAP_SLOW_M = TUNING.setpoint.gap_slow_m
 
 @pytest.mark.parametrize("seed", range(40))
 def test_bounded_least_squares(seed: int) -> None:
-    """The bounded least squares are those of another solver."""
+    """The solution equals that of another solver."""
     random = np.random.default_rng(seed)
     tasks = random.normal(size=(6, 7))
     target = random.normal(size=6)
@@ -40,7 +40,7 @@ def test_bounded_least_squares(seed: int) -> None:
 
 
 def test_speeds_and_errors_are_those_of_numpy() -> None:
-    """Present, future and total tool speed, and the error of the measured joints."""
+    """Tool speed now, after the step and in total, and the error of the measured joints."""
     random = np.random.default_rng(2)
     tasks, q, dq, ddq = random.normal(size=(6, 7)), *random.normal(size=(3, 7))
     jerk = random.uniform(300, 500, 7)
@@ -74,16 +74,15 @@ def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
 
 
 def test_setpoint_waits_for_a_late_tool() -> None:
-    """A setpoint waits for a tool that is behind."""
     setpoint = np.zeros((3, 3))
     tool = np.zeros(3)
     limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)
     setpoint[0, 0] = GAP_FREE_M + GAP_SLOW_M
     setpoint[1, 0] = 0.2
     assert slow_down(setpoint, tool, 1.0, limits) == pytest.approx(0.5)
-    # of 0.8 m/s, where 0.08 are allowed
+    # 40 % of max_speed is asked for, and 0.08 m/s allowed
     assert slow_down(setpoint, tool, 0.4, limits) == pytest.approx(0.1)
-    setpoint[1, 0] = -0.2  # it comes back
+    setpoint[1, 0] = -0.2  # the setpoint approaches the tool
     assert slow_down(setpoint, tool, 1.0, limits) == 1.0
 
 
@@ -92,7 +91,7 @@ def test_setpoint_waits_for_a_late_tool() -> None:
 
 @pytest.mark.parametrize("seed", range(30))
 def test_least_squares_under_inequalities(seed: int) -> None:
-    """Least squares under inequalities are those of another solver."""
+    """The solution equals that of another solver."""
     random = np.random.default_rng(seed)
     tasks = random.normal(size=(5, 7))
     target = random.normal(size=5)
@@ -104,11 +103,11 @@ def test_least_squares_under_inequalities(seed: int) -> None:
     rows = random.normal(size=(count, 7))
     limits = np.maximum(0.2 * random.normal(size=count), 0)
     if seed % 3 == 0 and count > 1:
-        # said twice
+        # the same inequality twice
         rows[1] = 2 * rows[0]
         limits[1] = 2 * limits[0]
     if seed % 5 == 0:
-        limits[0] = 0.3 * rows[0] @ np.where(rows[0] > 0, bounds[0], bounds[1])  # it is to be left
+        limits[0] = 0.3 * rows[0] @ np.where(rows[0] > 0, bounds[0], bounds[1])  # violated at 0
         count = min(count, 3)
         rows = rows[:count]
         limits = limits[:count]
@@ -135,7 +134,7 @@ def test_least_squares_under_inequalities(seed: int) -> None:
 
 
 def test_way_along_two_obstacles_is_free() -> None:
-    """Between two things that cannot both be left the way along them is free."""
+    """The arm cannot move away from both obstacles."""
     tasks = np.eye(3)
     target = np.array([0.3, 0.1, 0.0])
     bounds = np.tile([[-1.0], [1.0]], 3)

@@ -1,6 +1,4 @@
-"""Samples that come late, or overtake each other: taken by their stamps, as of when they were
-made.
-"""
+"""Samples that arrive late or overtake each other count at the time of their stamps."""
 
 from __future__ import annotations
 
@@ -17,12 +15,12 @@ from thirdhand.contract.records import Cause
 from thirdhand.core.frame import Vector
 from thirdhand.core.intake.late_samples import lateness_ms
 
-WARM_S = 2.5  # in which a clock is found to be steady
+WARM_S = 2.5  # a clock is recognised as steady within this time
 ZERO_NS = 1_700_000_000_000_000_000
 
 
 def moving(t: Vector) -> Vector:
-    """A hand (T, 3) [m] that goes up and down at up to 0.45 m/s."""
+    """A hand (T, 3) [m] that moves up and down at up to 0.45 m/s."""
     return np.stack([0.5 + 0.15 * np.sin(3.0 * t), 0.1 * np.cos(2.0 * t), 0.2 + 0.0 * t], axis=1)
 
 
@@ -33,8 +31,8 @@ def told(
     stamps: Callable[[Vector], Vector] = lambda made_s: made_s,
     until_s: float,
 ) -> tuple[Hands, Vector]:
-    """An intake that was told of where a hand was at times, so much later; and the estimates (T, 3)
-    [m] at each tick.
+    """An intake whose samples were made at these times and arrived later by these delays; and the
+    estimates (T, 3) [m] at each tick.
     """
     hands = Hands()
     places = moving(made_s)
@@ -58,7 +56,7 @@ def told(
 @given(st.sampled_from([30, 60, 100, 240, 500]), st.floats(0.01, 0.098), st.integers(0, 10**6))
 def test_order_of_arrival_does_not_matter(rate_hz: int, latest_s: float, seed: int) -> None:
     """The estimate does not depend on the order in which samples arrive."""
-    latest_s = min(latest_s, 0.098 - 1.0 / rate_hz)  # none is silent for long enough to begin anew
+    latest_s = min(latest_s, 0.098 - 1.0 / rate_hz)  # no gap is long enough to restart the filter
     until_s = WARM_S + 0.6
     made_s = np.arange(0.0, until_s, 1.0 / rate_hz)
     shuffles = (made_s > WARM_S) & (made_s < WARM_S + 0.4)
@@ -77,7 +75,6 @@ def test_order_of_arrival_does_not_matter(rate_hz: int, latest_s: float, seed: i
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 500])
 def test_samples_60_ms_late_are_nearly_as_good(rate_hz: int) -> None:
-    """A hand whose samples are up to 60 ms late is known nearly as well."""
     made_s = np.arange(0.0, 8.0, 1.0 / rate_hz)
     late_s = 0.06 * np.random.default_rng(1).random(len(made_s))
     hands, estimates = told(made_s, late_s, until_s=8.0)
@@ -120,7 +117,7 @@ def test_late_sample_does_not_undo_a_jump() -> None:
     for k in range(391, 399):
         hands.hand(ZERO_NS + 10_000_000 * k - 5_000_000, (0.5, 0.1, 0.2))
     assert abs(hands.state["hands"][LEFT, 0, 1] - 0.3) < 0.001
-    assert hands.rejected() == {Cause.JUMPED: 2 + 6}  # two of them are of before it
+    assert hands.rejected() == {Cause.JUMPED: 2 + 6}  # two of the samples are from before the jump
 
 
 def test_restarted_tracker_is_believed_again() -> None:

@@ -1,5 +1,5 @@
-"""The limiter: every limit holds by construction, whatever is wanted; what is within them passes
-unchanged.
+"""The limiter: every limit holds by construction, for any wanted velocity; a motion within the
+limits passes unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LOWERED = JointSettings(velocity=(0.3,) * 7, acceleration=(0.5,) * 7, jerk=(4.0,
 LOWER = np.array(LIMITS.lower)
 UPPER = np.array(LIMITS.upper)
 REST = np.zeros(7)
-START = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])  # amid the limits
+START = np.array([0.0, 0.0, 0.0, 1.2, -1.5, 0.0, 0.0])  # far from all limits
 # as published: joints 2 and 4 outside their limits
 HOME = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])
 Vector = npt.NDArray[np.float64]
@@ -62,7 +62,7 @@ def assert_held(limits: JointSettings, q: Vector, run: Run) -> None:
     assert (np.abs(run.acceleration) <= np.array(limits.acceleration) * (1 + 1e-9)).all()
     assert (np.abs(run.jerk) <= np.array(limits.jerk) * (1 + 1e-9)).all()
     between = 0.5 * (run.velocity[1:] + run.velocity[:-1])
-    # what jerk makes of one tick between the trapezoid's value and the true one
+    # the largest error of the trapezoidal rule in one tick of constant jerk
     slack = np.array(limits.jerk) * PERIOD**2 + 1e-6
     assert (np.abs(np.diff(run.position, axis=0) / PERIOD - between) <= slack).all(), (
         "position follows velocity"
@@ -85,7 +85,7 @@ anywhere = st.tuples(*[st.floats(0.0, 1.0)] * 7).map(
 
 
 def tick_by_tick(wanted: list[tuple[tuple[float, ...], int]]) -> Vector:
-    """What is wanted in each tick (N, 7)."""
+    """The wanted velocities (N, 7) in each tick."""
     return np.array([value for value, count in wanted for _ in range(count)])
 
 
@@ -97,14 +97,13 @@ def test_limits_hold_for_any_velocities(
     q: Vector,
     limits: JointSettings,
 ) -> None:
-    """From HOME, outside the limits, joints only move inwards."""
+    """HOME is outside the limits: from there, joints only move inwards."""
     inputs = tick_by_tick(wanted)
     changing = None if said is None else np.resize(tick_by_tick(said), inputs.shape)
     assert_held(limits, q, drive(limits, q, inputs, changing))
 
 
 def test_smooth_motion_passes_unchanged() -> None:
-    """Velocities that are smooth and within the limits pass unchanged."""
     times = PERIOD * np.arange(1, 4001)[:, None]
     start = 1.0 - np.exp(-(times**3))
     target = start * 0.4 * np.sin(1.3 * times + np.arange(7))
@@ -122,7 +121,7 @@ def test_announced_ramp_is_followed_without_lag() -> None:
         np.abs(drive(LIMITS, START, target, derivative).velocity - target)
         for derivative in (changing, None)
     )
-    last = slice(80, 124)  # of the ramp
+    last = slice(80, 124)  # the end of the ramp
     assert announced[last].max() < 1e-6
     late = rate**2 / (2.0 * np.array(LIMITS.jerk))
     np.testing.assert_allclose(untold[last], np.tile(late, (44, 1)), rtol=0.2)
@@ -130,7 +129,7 @@ def test_announced_ramp_is_followed_without_lag() -> None:
 
 
 def test_pushing_against_a_limit_rests_there() -> None:
-    """Pushing against a limit for long comes to rest there without chatter."""
+    """There is no chatter."""
     run = drive(LIMITS, START, np.full((5000, 7), 9.0))
     assert_held(LIMITS, np.zeros(7), run)
     assert (run.position[-1] > UPPER - 1e-4).all()
@@ -140,7 +139,9 @@ def test_pushing_against_a_limit_rests_there() -> None:
 
 
 def test_stop_is_shortest_and_ends_together() -> None:
-    """A stop takes the shortest time that the limits allow and all joints end it together."""
+    """A stop takes the shortest time that the limits allow, and all joints come to rest
+    together.
+    """
     limiter = Limiter(LIMITS, PERIOD)
     start = (np.zeros(7), np.full(7, 1.2), np.zeros(7))
     a = np.array(LIMITS.acceleration)
@@ -168,7 +169,7 @@ def test_joints_together_stay_on_their_way() -> None:
         step = limiter.together(*state, target)
         assert step is not None
         assert np.ptp(step.velocity / target) < 1e-6
-        assert (step.velocity / target).max() < 1.001  # of what is left of a tick
+        assert (step.velocity / target).max() < 1.001  # overshoot within the last tick
         assert (
             np.abs(step.acceleration - state[2]) <= np.array(LIMITS.jerk) * PERIOD * (1 + 1e-9)
         ).all()
@@ -219,7 +220,6 @@ def test_no_finite_state_raises_or_gives_nan(values: tuple[float, ...]) -> None:
 
 
 def test_too_fast_joint_is_brought_back() -> None:
-    """A joint that comes too fast is brought back into its limits."""
     limiter = Limiter(LIMITS, PERIOD)
     q = REST
     dq = np.full(7, 2.5)
@@ -231,7 +231,6 @@ def test_too_fast_joint_is_brought_back() -> None:
 
 
 def test_approach_takes_half_the_acceleration() -> None:
-    """Approaching a limit takes half of the acceleration."""
     gain = approach_gain(LIMITS)
     velocity = np.array(LIMITS.velocity)
     assert (gain * velocity <= 0.5 * np.array(LIMITS.acceleration) + 1e-12).all()

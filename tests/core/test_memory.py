@@ -1,5 +1,5 @@
-"""What is remembered of hands: as it was learned, whatever the rate, with its derivatives; and that
-`learn` takes it where hands alone do not tell where the tool is.
+"""The memory of past hand positions: the same live as in learning, at any rate, with its
+derivatives. `learn` uses it where the present hands do not determine the tool.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ FIELDS = (
 
 
 def motion(times: np.ndarray) -> np.ndarray:
-    """Hands (3, T, 6) that go to and fro: position, velocity, acceleration."""
+    """Hands (3, T, 6) that move back and forth: position, velocity, acceleration."""
     rates = np.linspace(0.5, 1.5, 6)
     waves = np.sin(np.multiply.outer(times, rates)), np.cos(np.multiply.outer(times, rates))
     return np.stack([waves[0], rates * waves[1], -(rates**2) * waves[0]]) * 0.2
 
 
 def remembered(hands: np.ndarray, period_s: float, unseen: range = range(0)) -> np.ndarray:
-    """The memory (T, ORDER, 6) of a state that is told hands (T, 6), but for some."""
+    """The memory (T, ORDER, 6) after hands (T, 6), of which those in `unseen` are missing."""
     return both_remembered(hands, np.zeros((len(hands), 18)), period_s, unseen)[0]
 
 
 def both_remembered(
     hands: np.ndarray, turns: np.ndarray, period_s: float, unseen: range = range(0)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """That, and the rows (T, TURNS, 18) of how hands are turned, told so (T, 18)."""
+    """The memory, and the filtered rows (T, TURNS, 18) of the hands' rotations `turns` (T, 18)."""
     states = np.zeros(1, [(field.name, field.type, field.shape) for field in FIELDS])
     state = states[0]
     out = []
@@ -92,7 +92,7 @@ def test_nothing_is_forgotten_unseen() -> None:
 
 
 def test_inputs_move_with_their_derivatives() -> None:
-    """Inputs move as their velocity and acceleration say."""
+    """The inputs' velocity and acceleration equal finite differences."""
     h = 1e-3
     times = np.arange(0.0, 4.0, h)
     moving = motion(times)
@@ -115,8 +115,8 @@ def test_inputs_move_with_their_derivatives() -> None:
 
 
 def takes(count: int, *, remembers: bool) -> list[Demonstration]:
-    """Hands that come from either side to the same place; the tool goes where they did not
-    come from, or where they are.
+    """Hands that come to the same place from either side. The tool moves to the opposite side if it
+    `remembers`, else always to the same side.
     """
     out = []
     times = np.arange(0.0, 5.0, 0.02)

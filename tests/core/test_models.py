@@ -1,4 +1,4 @@
-"""What every model of a skill does, whichever it is."""
+"""Properties that every model of a skill has."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from thirdhand_sim.scene import Scene
 FILES = {"HandsKMP": "experiments/as-paper.npz", "SegmentedKMP": "soldering.npz"}
 STILL = np.array([[1.0, 1.0]])
 H = 0.02
-# files lack them
+# arrays that files may lack
 LATER = {
     "HandsKMP": {"error_inputs", "error_samples", "error_unknown_std"},
     "SegmentedKMP": {"levers"},
@@ -29,7 +29,7 @@ LATER = {
 
 @pytest.fixture(params=MODELS, ids=lambda model: model.__name__)
 def skill(request: pytest.FixtureRequest) -> Skill:
-    """A skill with such a model, which goes through the scene's via-points."""
+    """A skill with this model, adapted to the scene's via-points."""
     learned = decoded(
         (RECORDINGS / FILES[request.param.__name__]).read_bytes(), origin="a recording"
     )
@@ -39,7 +39,7 @@ def skill(request: pytest.FixtureRequest) -> Skill:
 
 @pytest.fixture
 def hands(skill: Skill) -> Vector:
-    """Hands (6,) between two that the skill knows."""
+    """Hands (6,) between two demonstrated samples."""
     return 0.6 * skill.hands[0] + 0.4 * skill.hands[-1]
 
 
@@ -51,7 +51,7 @@ def predicted(skill: Skill, hands: Vector, velocity: Vector, **more: object) -> 
 
 
 def test_prediction_has_its_derivative(skill: Skill, hands: Vector) -> None:
-    """A prediction is the mean rounded with its derivative along the motion."""
+    """The rounded prediction is the mean with its derivative along the motion."""
     velocity = np.array([0.3, -0.4, 0.2, 0.4, 0.3, 0.1])
     prediction = predicted(skill, hands, velocity)
     belief = skill.model.belief(hands)
@@ -98,7 +98,7 @@ def test_its_inputs_move_with_the_hands(skill: Skill, hands: Vector) -> None:
 
 
 def test_stored_model_says_the_same(skill: Skill) -> None:
-    """Stored and read again, the status is the same."""
+    """A skill that is stored and read again predicts the same bits."""
     model = skill.model
     assert (
         set(model.own_arrays()) - {"names", "task_clock"}

@@ -1,6 +1,6 @@
-"""What a source cannot mean: stamps far ahead, jumps, two sources of one hand or of the arm.
+"""Implausible samples: stamps far ahead, jumps, two sources of one hand.
 
-Each was an attack once: on hands here, on the arm in `test_arm_sources`.
+Each case was an attack once; those on the arm are in `test_arm_sources`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ELSEWHERE = (0.5, 0.3, 0.2)
 
 
 def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int) -> list[float]:
-    """Samples at a rate, one after the other (None: missing); y of the estimate after each."""
+    """The estimated y after each of these samples at a rate; None is a missing sample."""
     every = 500 // rate_hz
     estimates_m = []
     for place in places:
@@ -78,7 +78,7 @@ def test_momentary_jump_leaves_no_trace(rate_hz: int, length: int) -> None:
 
 
 def test_wrong_samples_are_dropped_by_the_next() -> None:
-    """They make the hand seem to move at 2 m/s."""
+    """Two wrong samples make the hand seem to move at 2 m/s."""
     rate_hz = 30
     off_m = (0.068, 0.08)
     hands = Hands()
@@ -93,9 +93,9 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
         )
         estimate_m = hands.hand(round(1e9 * (1 + k / rate_hz)), tuple(sample_m.tolist()))
         if k == 2 * rate_hz + 2:
-            assert np.linalg.norm(estimate_m - place) < 0.005  # it would run off otherwise
+            assert np.linalg.norm(estimate_m - place) < 0.005  # the wrong speed has no effect
             assert np.linalg.norm(hands.state["hands"][LEFT_SIDE, 1]) < 0.1
-            # separation counts with both places
+            # separation considers both positions
             assert hands.state["hand_doubt_m"][LEFT_SIDE] > 0.05
         hands.advance(round((k + 1) / rate_hz / PERIOD_S) - round(k / rate_hz / PERIOD_S))
     assert hands.state["hand_doubt_m"][LEFT_SIDE] == 0.0
@@ -103,7 +103,7 @@ def test_wrong_samples_are_dropped_by_the_next() -> None:
 
 @pytest.mark.parametrize("rate_hz", [30, 100])
 def test_quick_motion_is_not_dropped(rate_hz: int) -> None:
-    """It starts within 50 ms to 1.2 m/s; none of its samples is dropped."""
+    """A hand accelerates to 1.2 m/s within 50 ms."""
     hands = Hands()
     random = np.random.default_rng(6)
     counts = []
@@ -144,7 +144,7 @@ def test_flood_of_samples_is_taken() -> None:
 
 
 class BothHands(Hands):
-    """Hands that go up and down, told at a rate by a tracker that may take one for the other."""
+    """Hands that move up and down, sampled at a rate by a tracker that may exchange them."""
 
     def __init__(self, rate_hz: int) -> None:
         super().__init__()
@@ -158,8 +158,8 @@ class BothHands(Hands):
     def tell(
         self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()
     ) -> tuple[Vector, Vector]:
-        """How far each estimate was off across (T, 2) [m], and whether each was fresh, tick by
-        tick, while some labels are hidden.
+        """The lateral error (T, 2) [m] of each estimate, and its freshness, tick by tick, while
+        some labels are hidden.
         """
         errors_m = []
         fresh = []
@@ -204,7 +204,7 @@ def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]
     """Hands that reappear with exchanged labels are rejected."""
     hands = BothHands(rate_hz)
     hands.tell(1.0)
-    hands.tell(0.2, hidden=hidden)  # the hand is covered, then its label goes to the other
+    hands.tell(0.2, hidden=hidden)  # a hand is covered, then the other one gets its label
     hands.tell(0.1, swapped=True, hidden=hidden)
     errors_m, fresh = hands.tell(0.8, swapped=True)
     assert errors_m.max() < 0.02

@@ -1,4 +1,4 @@
-"""The tool's orientation and the gripper: predicted, led at limited speed, followed by the arm, and
+"""The tool's orientation and the gripper are predicted, limited in speed, followed by the arm, and
 sent.
 """
 
@@ -66,7 +66,7 @@ def test_rotations_are_those_of_scipy() -> None:
 
 
 def test_learned_orientation_is_that_of_kmp() -> None:
-    """A learned orientation is that of kmp with its angular velocity."""
+    """Orientation and angular velocity equal those of kmp."""
     random = np.random.default_rng(3)
     inputs = random.normal(size=(12, 6))
     zeta = 0.5 * random.normal(size=(12, 3))
@@ -112,9 +112,7 @@ def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
     residual = target * Rotation.from_quat(state["orientation"]).inv()
     axis = Rotation.from_quat(state["orientation"]).apply([0, 0, 1.0])
     assert np.linalg.norm(axis - target.apply([0, 0, 1.0])) < 1e-3
-    assert (
-        residual.magnitude() < 1e-3
-    ) == about  # where a direction is followed, it does not turn about it
+    assert (residual.magnitude() < 1e-3) == about  # unless only a direction is followed
     assert np.linalg.norm(speeds[-1]) < 1e-2
 
 
@@ -134,11 +132,11 @@ def test_full_orientation_costs_no_position() -> None:
         q, dq, ddq, _ = limiter.step(q, dq, ddq, command.velocity)
         farthest = max(farthest, float(np.linalg.norm(arm.at(q).position - pose.position)))
     assert (target * Rotation.from_matrix(arm.at(q).rotation).inv()).magnitude() < 0.01
-    assert farthest < 5e-4  # it costs the tool's position nothing
+    assert farthest < 5e-4  # the tool stays at its position
 
 
 def test_taught_orientation_is_followed(skill: Skill) -> None:
-    """An orientation taught at a place is predicted and followed there."""
+    """An orientation taught with a via-point is predicted and followed there."""
     places = Scene().via_points()
     turned = (
         Rotation.from_euler("y", -40, degrees=True) * Rotation.from_quat(TOOL_ORIENTATION)
@@ -165,7 +163,6 @@ def test_taught_orientation_is_followed(skill: Skill) -> None:
 
 
 def test_gripper_has_hysteresis() -> None:
-    """A gripper is decided with hysteresis."""
     assert decided(UNKNOWN, 0.6) == CLOSED
     assert decided(UNKNOWN, 0.4) == OPEN
     for closure in np.linspace(0.11, 0.89, 20):
@@ -173,8 +170,8 @@ def test_gripper_has_hysteresis() -> None:
         assert decided(CLOSED, closure) == CLOSED
     assert decided(OPEN, 0.95) == CLOSED
     assert decided(CLOSED, 0.05) == OPEN
-    assert decided(CLOSED, 0.05, since_s=0.5 * GRIPPER_MOVES_S) == CLOSED  # it is still on its way
-    assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is not there yet
+    assert decided(CLOSED, 0.05, since_s=0.5 * GRIPPER_MOVES_S) == CLOSED  # the gripper still moves
+    assert decided(CLOSED, 0.05, off=0.05) == CLOSED  # the tool is 5 cm from its target
     assert [decided(state, NO_GRIPPER) for state in (UNKNOWN, OPEN, CLOSED)] == [
         UNKNOWN,
         OPEN,
@@ -190,7 +187,7 @@ def test_orientation_and_gripper_are_sent() -> None:
     frame["orientation"] = (0, 0, 0, 1)
     frame["setpoint_orientation"] = (0, 1, 0, 0)
     sent = dict(outgoing(frame, 1, Settings().joints.names))
-    assert "gripper/command" not in sent  # nothing is known of one
+    assert "gripper/command" not in sent  # this cell has no gripper
     covariance = np.array(cdr.decode_pose_with_covariance(sent["tool/target"]).covariance).reshape(
         6, 6
     )

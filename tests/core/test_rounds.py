@@ -14,22 +14,22 @@ from thirdhand_sim.script import HandScript
 
 BACK_S = 2.0
 REST_S = (1.5, 0.5, 1.0, 3.0, 0.5, 0.5)
-HALF = 3  # the round that is broken off half-way
-EVENTS = {  # what happens in a round, and when
+HALF = 3  # number of the round that is broken off halfway
+EVENTS = {  # the event of a round and its time
     1: ((3.0, "hold"), (4.0, "resume")),
     4: ((3.0, "fault"), (4.0, "reset")),
 }
 
 
 def way(first: Vector, last: Vector, period_s: float) -> Vector:
-    """Hands (T, 2, 3) [m] on their way back."""
+    """The hands (T, 2, 3) [m] on their return."""
     share = np.arange(period_s, BACK_S, period_s)[:, None, None] / BACK_S
     return first + share**3 * (10 - 15 * share + 6 * share**2) * (last - first)
 
 
 @pytest.mark.thorough
 def test_every_round_is_as_the_first(taught: Skill) -> None:
-    """After a hold, a fault, a round that was broken off, and with rests of 0.5 to 3 s."""
+    """There is a hold, a fault and a round that is broken off; rests last 0.5 to 3 s."""
     script = HandScript(Scene(), seed=1)
     period_s = ASSUMED.period_s
     whole = np.array(
@@ -42,7 +42,7 @@ def test_every_round_is_as_the_first(taught: Skill) -> None:
         if number:
             hands.append(way(hands[-1][-1], whole[0], period_s))
         rests = round(rest_s / period_s)
-        # the tracker samples each round at the same moments
+        # rounds are whole sample periods, so that samples of all rounds agree
         rests += -(sum(map(len, hands)) + rests) % 5
         hands.append(np.repeat(whole[:1], rests, axis=0))
         begins.append(sum(map(len, hands)))

@@ -1,5 +1,5 @@
-"""Scenes: an arm, a tracker and hands of the kinds that people have. What must hold in each of them
-is asserted by `played`; each family of scenes adds what it is about.
+"""Scenes: an arm, a tracker and hands that move as people's do. `played` asserts what must hold in
+every scene; each family of scenes asserts more.
 
 `THIRDHAND_EXAMPLES=300 pytest tests/core/test_scenes.py` draws more of each family.
 """
@@ -56,9 +56,9 @@ RISE = 1.01
 RISE_MPS = 0.01
 AT_REST_RADPS2 = 0.02  # root mean square of each joint
 PERIOD_S = ASSUMED.period_s
-NOISE_M = 0.0005  # of a tracker, each axis
-COMES_S = 2.0  # in which the tool comes to where the hands want it
-KNOWN_S = 2.0  # after which it is known how fast a slow hand moves
+NOISE_M = 0.0005  # standard deviation of a tracker, each axis
+COMES_S = 2.0  # the tool reaches its target within this time
+KNOWN_S = 2.0  # the speed of a slow hand is estimated within this time
 FAST = butter(4, 4.0, "highpass", fs=1.0 / PERIOD_S, output="sos")
 
 
@@ -74,8 +74,8 @@ def stored(name: str) -> Skill:
 def played(
     cell: Settings, skill: Skill, ticks: Iterable[Tick], *, start: Vector | None = None
 ) -> np.ndarray:
-    """The frames (T,) of a scene: without a fault, within every limit of the joints, and with the
-    tool within its speed limit, in stops too.
+    """The frames (T,) of a scene. Asserts that there is no fault, and that joints and tool keep
+    their limits, in stops too.
     """
     state = start_state(cell, skill)
     if start is not None:
@@ -101,7 +101,7 @@ def changed(
     jerk: float = 1.0,
     **tool: object,
 ) -> Settings:
-    """A cell whose joints have a share of their speed, acceleration and jerk, with another tool."""
+    """A cell with another tool and a share of the joints' speed, acceleration and jerk."""
     shares = {"velocity": speed, "acceleration": acceleration, "jerk": jerk}
     limits = {
         name: tuple(share * x for x in getattr(cell.joints, name)) for name, share in shares.items()
@@ -120,7 +120,7 @@ def every(cell: Settings) -> int:
 
 
 def smooth(u: Vector) -> Vector:
-    """The share of its way that a reach of minimum jerk has gone at a share of its time."""
+    """The share of its distance that a minimum-jerk reach has covered after a share of its time."""
     u = np.clip(u, 0.0, 1.0)
     return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u * u))
 
@@ -139,15 +139,13 @@ def smooth(u: Vector) -> Vector:
 def test_legal_hands_are_hardly_held_for(
     max_speed: float, noise_m: float, rate_hz: float, loop_hz: int, seed: int
 ) -> None:
-    """Reaches there and back at up to 1.5 m/s, with noise, late samples and dropouts of 30 to 90
-    ms.
-    """
+    """The hands reach there and back at up to 1.5 m/s, with noise and dropouts of 30 to 90 ms."""
     random = np.random.default_rng(seed)
     lasts_s = 2.0
     offsets_m = random.standard_normal((2, 3))
     offsets_m *= random.uniform(0.05, 0.3) / np.linalg.norm(offsets_m, axis=1, keepdims=True)
     far = np.linalg.norm(offsets_m, axis=1).max()
-    # a minimum-jerk reach, which no hand brakes harder at its end than the setpoint takes it to
+    # the duration of a minimum-jerk reach that brakes no harder than the setpoint assumes
     reach_s = max(1.875 * far / max_speed, math.sqrt(5.774 * far / HAND_BRAKE_MPS2))
     stamps = np.arange(0.0, lasts_s, 1.0 / rate_hz)
     missing = np.zeros(len(stamps), bool)
@@ -167,7 +165,7 @@ def test_legal_hands_are_hardly_held_for(
     ticks = (Tick(k, inboxes.get(k, ())) for k in range(round(lasts_s * loop_hz)))
     trace = played(replace(ASSUMED, rate_hz=loop_hz), stored("soldering"), ticks)
     assert not trace["rejected"][-1].any()
-    # The skill was not shown such reaches, and may say so.
+    # Such reaches were not demonstrated, so holds for that reason are allowed.
     unknown = np.isin(trace["reason"], (Reason.FAR_FROM_DEMONSTRATIONS, Reason.AMBIGUOUS))
     assert ((trace["mode"] == Mode.HOLD) & ~unknown).mean() <= 0.02
 
@@ -176,8 +174,8 @@ def test_legal_hands_are_hardly_held_for(
 
 
 def reaches(skill: Skill, cell: Settings, random: np.random.Generator, count: int) -> Vector:
-    """Hands (T, 2, 3) [m] that reach for where the skill knows them, in 0.3 to 0.7 s, and rest for
-    a while.
+    """Hands (T, 2, 3) [m] that reach for demonstrated positions in 0.3 to 0.7 s, with rests
+    between.
     """
     places = skill.hands.reshape(-1, 2, 3)
     hands_m = places[random.integers(len(places))].copy()
@@ -201,7 +199,7 @@ def reaches(skill: Skill, cell: Settings, random: np.random.Generator, count: in
 @pytest.mark.parametrize("seed", range(MANY or 8))
 @pytest.mark.thorough
 def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> None:
-    """As at the first start of a new arm, whose joints docs/hardware.md slows to a tenth."""
+    """docs/hardware.md lowers joint speeds to a tenth for the first start of a new arm."""
     random = np.random.default_rng(seed)
     name = ("wam", "panda", "ur5", "shipped franka", "shipped ur5")[seed % 5]
     base = shipped(name.removeprefix("shipped ")) if name.startswith("shipped") else cell_of(name)
@@ -223,7 +221,7 @@ def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> N
         led(hands, lambda k: (order(orders[k]),) if k in orders else (), every=every(cell)),
     )
     speeds = np.linalg.norm(np.diff(trace["tool"], axis=0), axis=1) / cell.period_s
-    assert speeds.max() >= 0.3 * slower * cell.tool.engaging_speed  # the arm did move
+    assert speeds.max() >= 0.3 * slower * cell.tool.engaging_speed  # the arm moved
 
 
 # --- hands that rest ---
@@ -232,8 +230,8 @@ def test_lowered_speed_never_faults(skill: Skill, taught: Skill, seed: int) -> N
 def settled(
     cell: Settings, skill: Skill, start: Vector, hands: list[Vector], seconds: float
 ) -> None:
-    """Assert that an arm that starts somewhere rests in the last second; the hands (2, 3) move from
-    the first place to the second at 2 s, and rest there.
+    """Assert that an arm rests in the last second, from any start; the hands (2, 3) move from the
+    first position to the second at 2 s, and rest there.
     """
     times = np.arange(1, round(seconds / cell.period_s)) * cell.period_s
     path = hands[0] + smooth((times - 2.0) / 0.8)[:, None, None] * (hands[1] - hands[0])
@@ -242,7 +240,7 @@ def settled(
     assert np.sqrt(np.mean(last**2, axis=0)).max() < AT_REST_RADPS2
 
 
-@pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10: once swung for ever
+@pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10 once oscillated for ever
 @pytest.mark.one_case
 def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
     """The arm comes to rest in every cell."""
@@ -288,7 +286,6 @@ def reach() -> Skill:
 @pytest.mark.parametrize("arm", ["wam", *MODELS])
 @pytest.mark.one_case
 def test_targets_are_followed_to_half_a_mm(arm: str, reach: Skill, tmp_path: Path) -> None:
-    """Moving targets are followed to half a millimetre."""
     cell = cell_of(arm)
     ticks = list(ticks_of(HandScript(Scene(), seed=3)))
     trace = played(cell, reach, ticks)
@@ -310,7 +307,7 @@ def tracked(skill: Skill, hands: Vector) -> np.ndarray:
 
 
 def above_4_hz(values: Vector) -> float:
-    """The root mean square of what is faster, once the tool has come."""
+    """The root mean square of frequencies above 4 Hz, after the tool has reached its target."""
     fast = sosfiltfilt(FAST, values, axis=0)[round(COMES_S / PERIOD_S) : -250]
     return float(np.sqrt(np.mean(np.sum(fast**2, axis=1))))
 
@@ -337,8 +334,8 @@ def test_tremor_does_not_reach_the_tool(name: str, size_m: float) -> None:
 
 
 def along(speed: float, parts: slice) -> Vector:
-    """Speeds (T,) [m/s] of the tool on its way while hands, those parts of (6,), move evenly. The
-    skill is a function of where the hands are alone.
+    """Speeds (T,) [m/s] of the tool while parts of the hands (6,) move evenly. The skill is a
+    function of the hands' positions only.
     """
     skill = stored("experiments/as-paper")
     t = np.arange(0.0, 9.0, PERIOD_S)

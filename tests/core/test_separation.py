@@ -1,5 +1,5 @@
-"""Speed and separation: where capsules are and how far apart, what the rule allows, and that the
-core keeps it.
+"""Speed and separation: positions and distances of capsules, the speeds that the rule allows, and
+the core's compliance.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def test_distance_of_capsule_and_box() -> None:
         assert max(distance_m, 0.0) == pytest.approx(least, abs=3e-4)
     inside = np.array([[0.0, 0.0, 0.07], [0.0, 0.0, 0.07]])
     assert to_box(inside, 0.0, box, near) == pytest.approx(-0.03)
-    assert near[6:].tolist() == [0.0, 0.0, -1.0]  # what goes down goes in
+    assert near[6:].tolist() == [0.0, 0.0, -1.0]  # moving down is moving in
 
 
 @pytest.mark.parametrize("hand_speed", [0.0, 0.4, 1.6])
@@ -225,8 +225,8 @@ def with_hands(
 def thrust(
     place: tuple[float, float, float], at_s: float, seconds: float = 3.5
 ) -> Iterator[tuple[Tick, Vector]]:
-    """Hands of the nominal scene from its handover on, the right of which is at a place from a time
-    on, within a tenth of a second.
+    """Hands of the nominal scene from its handover on; at `at_s` the right hand moves to `place`
+    within a tenth of a second.
     """
     script = HandScript(Scene(), seed=5)
     for k in range(round(seconds / 0.002)):
@@ -241,7 +241,7 @@ def thrust(
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
-    """The hand stops where the arm, which stays where it is, does not touch it."""
+    """The hand stops where a resting arm would not touch it."""
     cell = changed(cell_of(arm), people={"position_uncertainty": 0.03})
     ticks, hands = zip(*thrust((0.53, -0.27, 0.37), 1.2), strict=True)
     frames = followed(taught, list(ticks), cell)
@@ -262,7 +262,7 @@ def test_the_arm_stops_for_a_hand_in_its_way(taught: Skill, arm: str) -> None:
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.one_case
 def test_table_and_box_are_not_touched(taught: Skill, arm: str) -> None:
-    """A table so high that the glass is in it, and a box before the handover."""
+    """The table is so high that the glass is inside, and a box stands before the handover."""
     cell = cell_of(arm)
     urdf = robot_description(cell)
     body = body_of(cell, urdf)
@@ -286,7 +286,7 @@ def test_table_and_box_are_not_touched(taught: Skill, arm: str) -> None:
         distances_m = np.array(
             [_apart_from(corners, placed(q, body), body) for q in frames["joints"][::5]]
         )
-        # one that starts nearer goes away
+        # a part that starts nearer moves away
         least = np.minimum(distances_m[0], settings.obstacles.clearance)
         assert (distances_m > least - 0.001).all(), distances_m.min(axis=0)
 
@@ -303,7 +303,7 @@ def _apart_from(corners: Vector, capsules: Vector, body: Body) -> list[float]:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_near_parts_move_apart(arm: str) -> None:
-    """Small errors of many stops add up otherwise."""
+    """Otherwise small errors of many stops would accumulate."""
     cell = cell_of(arm)
     urdf = robot_description(cell)
     separation = Separation(cell, urdf)
@@ -321,11 +321,10 @@ def test_near_parts_move_apart(arm: str) -> None:
         assert least["allowed"].min() == pytest.approx(0.1 * SLIP_SPEED_MPS)
         planned.append(least["planned"].min())
     assert min(planned) == pytest.approx(-RETREAT_SPEED_MPS)
-    assert max(planned) <= 0.0  # some parts that joints can hardly move stay where they are
+    assert max(planned) <= 0.0  # parts that the joints can hardly move may rest
 
 
 def test_leaving_motion_is_not_slowed() -> None:
-    """Motion that leaves a hand is not slowed."""
     separation = Separation(ASSUMED, URDF)
     pose = ARM.at(POSTURE)
     state = with_hands(np.add(pose.position, (0.09, 0.0, 0.0)))
@@ -350,7 +349,7 @@ def test_leaving_motion_is_not_slowed() -> None:
 
 @pytest.mark.parametrize("hand_speed", [0.0, 0.05, 1.5])
 def test_passing_hand_is_foreseen(hand_speed: float) -> None:
-    """The tool leaves the hand now, but goes where a fast one will be a tenth of a second later."""
+    """The tool leaves the hand now, but moves to where a fast hand will be 0.1 s later."""
     separation = Separation(ASSUMED, URDF)
     pose = ARM.at(POSTURE)
     velocity = np.array([0.3, 0.4, 0.0])
@@ -375,7 +374,7 @@ def test_passing_hand_is_foreseen(hand_speed: float) -> None:
 
 
 def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
-    """The tool alone may touch the hand that receives gently."""
+    """Contact is allowed only with a gentle receiving hand."""
     separation = Separation(ASSUMED, URDF)
     separation.set_contacts(taught.via_points)
     pose = ARM.at(POSTURE)
@@ -389,7 +388,7 @@ def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
         )
         assert tool.sum() == 1
         assert all(limit >= 0 for limit in limits)
-        # the hand is at the tool: only where it receives it may be touched
+        # with the hand at the tool, contact is allowed only where the hand receives
         state["hands"][0, 0] = pose.position
         if gentle:
             place, *others = taught.via_points
@@ -399,7 +398,7 @@ def test_only_the_tool_touches_receiving_hand(taught: Skill) -> None:
         separation.step(state, FRAME, pose.record)
         allowed = separation.constraints["allowed"][: separation.count] - SLIP_SPEED_MPS
         assert (abs(allowed - 0.25) < 1e-9).sum() == (1 if gentle else 0)
-        # the other hand receives nothing
+        # the right hand receives nothing
         state["hands"][0, 0] = Scene().handover
         state["hands"][1, 0] = pose.position
         separation.step(state, FRAME, pose.record)
@@ -429,8 +428,8 @@ def test_a_hand_just_seen_counts_as_fast() -> None:
 
 
 def test_braking_joints_do_not_take_turns() -> None:
-    """As a Panda had it, whose forearm slid along a box: braking each alone, and all together,
-    approaches it more in turn.
+    """The case of a Panda whose forearm slides along a box: braking joints one by one and braking
+    all together approach the box alternately.
     """
     cell = cell_of("panda")
     urdf = robot_description(cell)
@@ -458,7 +457,7 @@ def test_braking_joints_do_not_take_turns() -> None:
 
 
 def test_stop_does_not_approach_passing_hand() -> None:
-    """The direction to a hand that sweeps past turns, until a straight stop approaches it."""
+    """As a hand sweeps past, the direction to it turns, until a straight stop approaches it."""
     separation = Separation(ASSUMED, URDF)
     state = blank(STATE)
     frame = blank(frame_layout(7))

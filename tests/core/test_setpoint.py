@@ -1,4 +1,4 @@
-"""The setpoint: bounds that hold whatever the target does; how it follows: test_following."""
+"""The setpoint's bounds, which hold for any target. How it follows is tested in test_following."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ JERK_WEIGHT = TUNING.setpoint.jerk_weight
 RETURN_SHARE = 0.75 * TUNING.decision.progress_share
 
 
-WAY_TICKS = round(2.0 / PERIOD_S)  # to come from anywhere to where the targets have gone
+WAY_TICKS = round(2.0 / PERIOD_S)  # time to reach the targets from any state
 properties = example_settings(max_examples=60, deadline=None, derandomize=True)
 inside = st.tuples(st.floats(0.2, 1.0), st.floats(-0.6, 0.6), st.floats(0.05, 0.8))
 moving = st.tuples(*(st.floats(-20.0, 20.0),) * 3)
@@ -44,7 +44,7 @@ def assert_bounds_hold(states: Vector, targets: list[Vector]) -> None:
     assert (
         np.linalg.norm(np.diff(states[:, 2], axis=0), axis=1).max() <= (TOOL.jerk + 1e-6) * PERIOD_S
     )
-    # of constant jerk: wrong by jerk period³ / 12
+    # error of one tick of constant jerk: jerk period³ / 12
     trapezia = 0.5 * PERIOD_S * (states[1:, 1] + states[:-1, 1])
     np.testing.assert_allclose(
         np.diff(states[:, 0], axis=0), trapezia, atol=1.01 * TOOL.jerk * PERIOD_S**3 / 12
@@ -76,7 +76,7 @@ def test_every_bound_holds_whatever_is_asked(
 def test_alternating_targets_keep_bounds(
     places: list[tuple[float, ...]], ticks: int, seed: int
 ) -> None:
-    """Targets that alternate or tremble make no setpoint run away."""
+    """The setpoint does not run away from targets that alternate or tremble."""
     random = np.random.default_rng(seed)
     targets = []
     for place in itertools.islice(itertools.cycle(places), 1500 // ticks):
@@ -99,7 +99,9 @@ def test_alternating_targets_keep_bounds(
 def test_starved_axis_comes_back(
     places: list[tuple[float, ...]], start: tuple[float, ...], ticks: int, wild: float
 ) -> None:
-    """Every axis but the first is asked for all it can do; the first has moved away and rests."""
+    """The targets of the other axes are extreme; that of the first axis rests, away from the
+    start.
+    """
     targets = []
     for k in range(1500):
         y, z = places[k // ticks % len(places)][1:]
@@ -113,7 +115,9 @@ def test_starved_axis_comes_back(
 
 @pytest.mark.parametrize("seed", range(30))
 def test_rests_on_a_side_of_the_workspace(seed: int) -> None:
-    """On a side, an edge or a corner, or a hair inside; at any rate, with any limits."""
+    """The target is on a side, an edge or a corner, or just inside; at any rate, with any
+    limits.
+    """
     random = np.random.default_rng(seed)
     speed = 10 ** random.uniform(-1.5, -0.1)
     tool = ToolSettings(
@@ -149,7 +153,7 @@ def test_rests_on_a_side_of_the_workspace(seed: int) -> None:
 
 
 def test_waits_for_a_tool_that_cannot_come() -> None:
-    """Bounded for good: it used to creep on to its target."""
+    """The distance stays bounded: the setpoint once crept toward its target."""
     generator = Explained(Settings(tool=TOOL))
     state = blank(STATE)
     generator.begin(state, at_rest(MIDDLE))
@@ -163,7 +167,7 @@ def test_waits_for_a_tool_that_cannot_come() -> None:
 
 
 def test_returns_into_the_workspace() -> None:
-    """A setpoint from outside the workspace only comes nearer."""
+    """A setpoint outside the workspace only moves toward it."""
     start = at_rest((0.05, 0.9, 0.02))
     targets = [at_rest(MIDDLE)] * 1500
     states, _ = driven(targets, start=start)
@@ -173,7 +177,6 @@ def test_returns_into_the_workspace() -> None:
 
 
 def test_state_beyond_limits_is_braked() -> None:
-    """A state beyond every limit is braked."""
     fast = np.array([MIDDLE, (2.0, -2.0, 0.0), (3.0, 0.0, -3.0)])
     states, flags = driven([at_rest(MIDDLE)] * 2500, start=fast)
     assert flags[0]
@@ -182,7 +185,7 @@ def test_state_beyond_limits_is_braked() -> None:
 
 
 def test_slow_joints_slow_it_on_its_way() -> None:
-    """Joints that cannot follow slow it down on its way."""
+    """The setpoint moves no faster than the joints allow."""
     costs = np.zeros((3, 3, 7))
     costs[0, 1, 2] = 1 / 0.1  # a joint that moves the tool along y by 0.1 m/s at most
     offset_m = np.array([0.1, 0.3, 0.0])
@@ -221,7 +224,7 @@ def test_broken_bound_is_named() -> None:
 def test_fastest_stop_is_that_of_ruckig(
     velocity: float, acceleration: float, max_acceleration: float, max_jerk: float
 ) -> None:
-    """The fastest stop of an axis is that of another implementation."""
+    """The fastest stop of one axis equals that of Ruckig."""
     acceleration = max(-max_acceleration, min(max_acceleration, acceleration))
     profile = ruckig_stop(velocity, acceleration, max_acceleration, max_jerk)
     out = np.empty(6)

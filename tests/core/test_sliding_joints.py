@@ -1,5 +1,5 @@
-"""An arm on a rail: kinematics, separation and every limit in metres; and joints beyond the plate,
-which never matter.
+"""An arm on a rail: kinematics, separation and limits in metres. Joints beyond the tool plate have
+no effect.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def test_no_part_is_faster_than_its_bound(cell: Settings) -> None:
 def test_rail_follows_within_limits_and_replays(
     cell: Settings, skill: Skill, tmp_path: Path
 ) -> None:
-    """It follows with every limit held and replays."""
+    """The session replays."""
     loop = Loop(cell, skill)
     loop.hands = script_hands(HandScript(Scene(), seed=3))
     frames = loop.run(3500)
@@ -77,7 +77,7 @@ def test_rail_follows_within_limits_and_replays(
 def test_rail_that_does_not_follow_is_a_fault(
     cell: Settings, skill: Skill, off_m: float, reason: Reason
 ) -> None:
-    """A rail that does not follow is a fault."""
+    """An error above 50 mm is a fault."""
     loop = Loop(cell, skill)
     rail = np.eye(7)[0]
     loop.reports = lambda q, dq: (q + off_m * max(0, loop.index - 200) / 100 * rail, 0.0 * dq)
@@ -106,7 +106,6 @@ def test_rail_outside_limits_returns(
 
 
 def test_joints_beyond_plate_change_nothing(tmp_path: Path) -> None:
-    """Joints beyond the plate change nothing."""
     plain = (ARMS / "ur5.urdf").read_text(encoding="utf-8")
     cells = []
     for name, urdf in (("plain", plain), ("more", plain.replace("</robot>", BEYOND + "</robot>"))):

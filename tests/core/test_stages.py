@@ -1,4 +1,4 @@
-"""Segments: how far along one hands are, and the filtered belief in which one it is."""
+"""Segments: the hands' progress along a segment, and the filtered belief in the present one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PERIOD_S = 0.01
 
 @pytest.fixture
 def there_and_back() -> np.ndarray:
-    """The left hand goes to B and back to A, twice; the right one rests."""
+    """The left hand moves to B and back to A, twice; the right hand rests."""
     segments = structured(4, SEGMENT)
     for k in range(4):
         sign = 1.0 if k % 2 == 0 else -1.0
@@ -38,7 +38,7 @@ def there_and_back() -> np.ndarray:
 
 
 def motion(x: np.ndarray) -> np.ndarray:
-    """Hands (T, 3, 6) whose left one goes along x so."""
+    """Hands (T, 3, 6); the left hand has these positions along x."""
     out = np.zeros((len(x), 3, 6))
     out[:, 0] = (0.0, 0.0, 0.1, 0.8, 0.3, 0.1)
     out[:, 0, 0] = x
@@ -47,7 +47,7 @@ def motion(x: np.ndarray) -> np.ndarray:
 
 
 def legs(*ends: float) -> np.ndarray:
-    """From end to end in a second each, with a second of rest at each."""
+    """Each leg lasts a second, and a second of rest follows it."""
     smooth = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 100))
     parts = [np.full(100, ends[0])]
     for begin, end in itertools.pairwise(ends):
@@ -77,7 +77,7 @@ def test_past_tells_visits_apart(there_and_back: np.ndarray) -> None:
 
 
 def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
-    """The hands' places distinguish segments with other paths; earlier ones are forgotten."""
+    """The hands' positions distinguish segments with other paths; a wrong belief is forgotten."""
     segments = there_and_back.copy()
     segments["begins"][3, 0] = (0.5, 0.4, 0.1)
     segments["way"][3, 0] = (0.4, 0.0, 0.0)
@@ -90,7 +90,7 @@ def test_wrong_belief_recovers_in_a_second(there_and_back: np.ndarray) -> None:
 
 
 def test_resting_hand_near_an_end_is_there(there_and_back: np.ndarray) -> None:
-    """A hand that rests near an end counts as there, a moving one as on its way."""
+    """A moving hand near an end has not reached it."""
     segment = there_and_back[0]
     near = np.array([0.54, 0.02, 0.1])
     half = np.array([0.7, 0.0, 0.1])
@@ -99,11 +99,11 @@ def test_resting_hand_near_an_end_is_there(there_and_back: np.ndarray) -> None:
     assert (
         along_way(half, 1.0, segment, 0) == along_way(half, 0.0, segment, 0) == pytest.approx(0.5)
     )
-    assert along_way(half, 0.0, segment, 1) == 1.0  # the right hand stays
+    assert along_way(half, 0.0, segment, 1) == 1.0  # the right hand rests
 
 
 def test_hands_are_delayed_as_learned() -> None:
-    """Hands are delayed as they were learned or foreseen."""
+    """Hands are delayed as in learning, or predicted ahead."""
     times = np.arange(0.0, 4.0, PERIOD_S)
     hands = np.tile(0.2 * np.sin(times)[:, None], (1, 6))
     rows = along(hands, PERIOD_S, 0.3 / 4, 4)
@@ -121,7 +121,7 @@ def test_hands_are_delayed_as_learned() -> None:
 
 
 def test_segment_is_set_kept_and_reset() -> None:
-    """The segment is set kept over a hold and begun anew by another task."""
+    """The segment is set by request, kept during a hold, and reset by another task."""
     settings = Settings()
     skill = shipped_skill()
     segment = SkillStage(settings, skill)

@@ -1,5 +1,5 @@
-"""A tool that comes no nearer to its target: noticed, said, and led out by a way that is looked for
-beside the loop; and an arm that stands in something: not followed with until it is out.
+"""A tool that comes no nearer to its target is detected and reported, and a path that is planned
+beside the loop leads it out. An arm that stands inside an obstacle does not follow until it is out.
 
 `THIRDHAND_EXAMPLES=500 pytest tests/core/test_stuck.py` draws more starts.
 """
@@ -30,15 +30,15 @@ from thirdhand.core.way_out import WayOut
 from thirdhand.settings.config import Settings, robot_description
 
 MANY = int(os.environ.get("THIRDHAND_EXAMPLES", "4"))
-# that a search takes, and until the next one
+# duration of a search, and the time until the next search
 SOUGHT_S = 0.3
 AGAIN_S = 2.0
 THERE_M = 0.02
 
 
 class Run(NamedTuple):
-    """What came of a session: each tick with its frame, the seconds until the tool was there or
-    None, and the ways that were found.
+    """The result of a session: ticks and frames, the seconds until the tool reached its target or
+    None, and the paths that were found.
     """
 
     steps: list[tuple[Tick, Frame]]
@@ -55,8 +55,8 @@ def session(
     seconds: float = 20.0,
     finds: bool = True,
 ) -> Run:
-    """Resting hands (2, 3) and an arm that starts somewhere; where it is stuck a way is looked for,
-    as the daemon does.
+    """A session of resting hands (2, 3) and an arm with this start; where the arm is stuck, a path
+    is planned as in the daemon.
     """
     urdf = robot_description(cell)
     dt = cell.period_s
@@ -95,7 +95,6 @@ def session(
 @pytest.mark.parametrize(("name", "seed"), [("wam", 1), ("panda", 2), ("ur5", 3)])
 @pytest.mark.one_case
 def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) -> None:
-    """From any free start the tool comes to its target."""
     cell = replace(cell_of(name), rate_hz=250)
     random = np.random.default_rng(seed)
     hands = taught.hands.reshape(-1, 2, 3)
@@ -112,7 +111,7 @@ def test_any_free_start_reaches_the_target(taught: Skill, name: str, seed: int) 
     assert len(late) <= MANY // 50, late
 
 
-# A start from which joints come to their ends; the tool then stays 0.3 m off for ever.
+# From this start, joints reach their ends; without a way out the tool would stay 0.3 m off.
 STUCK = 5
 
 
@@ -128,7 +127,7 @@ def stuck(taught: Skill) -> tuple[Settings, Vector, Vector]:
 def test_stuck_tool_is_reported_and_led_out(
     taught: Skill, stuck: tuple[Settings, Vector, Vector], tmp_path: Path
 ) -> None:
-    """A stuck tool is reported within a second, and a way out is followed."""
+    """The report follows within a second."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands)
     frames = np.array([frame for _, frame in ran.steps])
@@ -149,7 +148,7 @@ def test_stuck_tool_is_reported_and_led_out(
 
 
 def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> None:
-    """Without a way out, the arm holds until the target changes."""
+    """The hold lasts until the target changes."""
     cell, start, hands = stuck
     ran = session(cell, taught, start, hands, seconds=12.0, finds=False)
     last = ran.steps[-1][1]
@@ -160,7 +159,7 @@ def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Ve
 def test_way_from_elsewhere_is_ignored(
     taught: Skill, stuck: tuple[Settings, Vector, Vector]
 ) -> None:
-    """A way out that begins elsewhere is not followed."""
+    """Such a path does not begin at the arm's posture."""
     cell, start, hands = stuck
     state = start_state(cell, taught)
     state["joints"][0] = start

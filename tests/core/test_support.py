@@ -1,4 +1,6 @@
-"""Predictions are as uncertain as errors at like inputs, and more where no error is near."""
+"""Predictions are as uncertain as errors at similar inputs, and more uncertain far from all
+errors.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ def errors() -> LocalErrors:
 
 
 def test_covariance_is_scatter_of_near_errors(errors: LocalErrors) -> None:
-    """The covariance is the scatter of near errors and away from all that of the tool."""
+    """The covariance is the scatter of near errors; far from all inputs it is that of the tool."""
     least = LEAST_STD_M**2 * np.eye(3)
     near, other, far = errors.covariances(np.array([[0.0, 0.0], [1.0, 1.0], [6.0, -6.0]])) - least
     prior = 0.1 / 20.1 * FAR_STD_M**2
@@ -121,8 +123,9 @@ def test_unshown_places_are_uncertain() -> None:
 
 
 def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], list[bool], float]:
-    """Error probabilities and flags of hands (2, 3) that rest, and the last unprimed belief in the
-    first segment."""
+    """Error probabilities and flags of resting hands (2, 3), and the final belief in the first
+    segment without its prior.
+    """
     settings = Settings()
     segment = SkillStage(settings, skill)
     state = start_state(settings, skill)
@@ -141,13 +144,15 @@ def doubts(skill: Skill, hands: np.ndarray, ticks: int) -> tuple[list[float], li
 
 
 def test_possible_other_segment_is_unsure() -> None:
-    """A task that may have begun in another segment is unsure until the hands tell."""
+    """If the task may have begun in another segment, the skill is uncertain until the hands show
+    it.
+    """
     shipped = shipped_skill()
     regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
     model = segmented()
     begin = model.hands[0].reshape(2, 3)
     places = model.nominal.at.copy()
-    # the hands return to where they began, and the tool is elsewhere then
+    # the hands return to their start, where the tool then has another position
     places[2, :6] = model.hands[0]
     places[2, 6:] = places[0, 6:] + (0.0, 0.3, 0.0)
     task = model.task._replace(corners=np.tile(np.arange(len(places))[:, None], 2))

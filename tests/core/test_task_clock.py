@@ -1,6 +1,6 @@
-"""The clock of a task: when it starts, waits, ends and starts anew; that it is learned as it counts
-live; that `learn` takes it for a timetable and for nothing else; and that no memory of a skill
-outlasts a round of a session.
+"""The clock of a task: it starts, waits, ends and restarts; learning and the live service count
+alike; `learn` uses the clock for timetables only; and no memory of a skill outlasts a round of a
+session.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2,
 WAITS = RUNS._replace(waits=True)
 HOME = np.array(RUNS.begin)
 AWAY = np.array(RUNS.begin) + 0.5
-OWN = HOME + 0.3  # begin of a person whose hands start elsewhere than those of the demonstrations
+OWN = HOME + 0.3  # a person's start away from that of the demonstrations
 PERIOD_S = 0.01
 
 
 def along(
     clock: TaskClock, *parts: tuple[str, float, np.ndarray], period_s: float = PERIOD_S
 ) -> np.ndarray:
-    """The clock (T, CLOCK_SIZE) while the hands move or rest for these times at these positions."""
+    """The clock (T, CLOCK_SIZE) while the hands move or rest at these positions for these times."""
     state = np.zeros(CLOCK_SIZE)
     out = []
     for activity, lasts_s, hands in parts:
@@ -60,34 +60,33 @@ def along(
         (WAITS, [("move", 1.0, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 1.9),
         (RUNS, [("move", 20.0, AWAY)], 5.1),  # it ends with the longest demonstration
         (RUNS, [("move", 1.0, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 3.9),
-        (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # it returns by itself
-        # a hesitation
+        (RUNS, [("move", 1.0, AWAY), ("rest", 0.5, HOME)], 0.0),  # a rest at the start resets it
+        # the rest is too short to reset the clock
         (RUNS, [("move", 1.0, AWAY), ("rest", 0.2, HOME), ("move", 1.0, AWAY)], 2.1),
-        # not where demonstrations begin
+        # the rest is not where demonstrations begin
         (RUNS, [("move", 20.0, AWAY), ("rest", 60.0, HOME + 0.2)], 5.1),
-        # where this person began
+        # the rest is where this person began
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN + 0.02)], 0.0),
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, AWAY), ("rest", 0.5, AWAY + 0.2)], 1.4),
         # a pause before leaving
         (RUNS, [("rest", 0.5, OWN), ("move", 1.0, OWN), ("rest", 0.5, OWN)], 1.4),
-        # first seen in motion
+        # the hands were in motion when first seen
         (RUNS, [("move", 1.0, OWN), ("move", 1.0, AWAY), ("rest", 0.5, OWN)], 2.4),
         # the task was over
         (RUNS, [("move", 4.5, AWAY), ("rest", 60.0, AWAY), ("move", 1.0, AWAY)], 0.9),
-        # too short a rest
+        # the task was over, but the rest is too short
         (RUNS, [("move", 4.5, AWAY), ("rest", 1.0, AWAY), ("move", 1.0, AWAY)], 5.1),
     ],
 )
 def test_clock_counts_from_first_motion(
     clock: TaskClock, parts: list[tuple[str, float, np.ndarray]], seconds: float
 ) -> None:
-    """A clock counts from the first motion."""
     assert along(clock, *parts)[-1, CLOCK_S] == pytest.approx(seconds, abs=0.06)
 
 
 @pytest.mark.parametrize("clock", [RUNS, WAITS])
 def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
-    """Its rate and change are its derivatives."""
+    """Rate and change of a clock equal finite differences."""
     series = along(
         clock, ("move", 1.0, AWAY), ("rest", 0.5, AWAY), ("move", 1.0, AWAY), period_s=1e-3
     )
@@ -101,7 +100,7 @@ def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
 
 @pytest.mark.parametrize("rate_hz", [24, 100, 500])
 def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
-    """A clock is learned as it counts live, at any rate."""
+    """This holds at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
     speeds = np.where(times > 1.0, 0.3, 0.0)
     stillness = np.where(times > 1.0, 0.0, 1.0)
@@ -113,7 +112,7 @@ def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
 
 
 def test_task_begins_again_once_in_a_rest() -> None:
-    """The task begins again once in each rest where it begins."""
+    """The task restarts once in each rest at its start."""
     rows = RUNS.rows(np.stack([HOME, AWAY]))
     state = np.zeros(CLOCK_SIZE)
     begun = []
@@ -124,7 +123,7 @@ def test_task_begins_again_once_in_a_rest() -> None:
     assert np.flatnonzero(begun).tolist() == pytest.approx([50 + RUNS.home_s / PERIOD_S], abs=1)
     for speed, hands in [(0.3, AWAY)] * 50 + [
         (0.0, AWAY)
-    ] * 300:  # a segment begins anew, but not the task
+    ] * 300:  # the segment restarts, the task does not
         assert not count(hands, speed, 0.0, PERIOD_S, 1, rows, state)
     assert state[CLOCK_S] == 0.0
 
@@ -153,7 +152,7 @@ def test_numbers_of_no_clock_are_refused() -> None:
 
 
 def clock(skill: StoredSkill) -> TaskClock | None:
-    """The clock that is an input of a skill's model, if there is one."""
+    """The clock among the inputs of a skill's model; None without a clock."""
     assert isinstance(skill.model, HandsKMP | SegmentedKMP)
     return skill.model.clock if skill.model.is_timed else None
 
@@ -167,7 +166,7 @@ def clock(skill: StoredSkill) -> TaskClock | None:
 def test_learn_takes_a_clock_for_a_timetable(
     kind_of_takes: Callable[..., list[Demonstration]], says: str, late_s: float, error_mm: float
 ) -> None:
-    """Learn takes a clock for a timetable and for nothing else."""
+    """`learn` uses a clock for a timetable, and for no other task."""
     demonstrations = kind_of_takes(6, timetable=True)
     skill = learn(demonstrations)
     figures = figures_of(skill)
@@ -198,7 +197,7 @@ def test_learn_takes_a_clock_for_a_timetable(
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.thorough
 def test_every_round_is_predicted_as_the_first(kind: str) -> None:
-    """With rests of 0.5 to 6 s where the take begins, also after half a round was broken off."""
+    """Rests at the start of the take last 0.5 to 6 s; one round is broken off halfway."""
     skill, asked = learned(kind)
     take = left_out("asked", "", asked)
     rounds = [*predicted_rounds(skill, take), *predicted_rounds(skill, take, broken_share=0.5)]
@@ -210,7 +209,7 @@ def test_every_round_is_predicted_as_the_first(kind: str) -> None:
 
 
 def test_each_segment_restarts_the_clock() -> None:
-    """A clock starts anew in each segment with the next motion."""
+    """It restarts with the first motion in the segment."""
     rows = np.tile(RUNS.numbers, (2, 1))
     state = np.zeros(CLOCK_SIZE)
     seconds = []

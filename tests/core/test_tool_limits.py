@@ -1,4 +1,6 @@
-"""What the joints leave to the tool: against joint motion that is computed here, and by hand."""
+"""The tool limits that follow from the joints' limits, against joint motion computed here and by
+hand.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,7 @@ def test_limit_uses_all_that_is_planned(name: str) -> None:
 
 
 def test_frame_meets_its_binding_limit() -> None:
-    """A frame meets the one limit of which it uses most."""
+    """The binding limit of a frame is the one of which it uses the largest share."""
     settings = Settings()
     frames = np.repeat(blank(frame_layout(7)).reshape(1), 6)
     frames["mode"] = Mode.FOLLOW

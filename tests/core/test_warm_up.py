@@ -1,5 +1,5 @@
-"""After `warm_up`, nothing is left for a loop to compile: in a process of its own, for a compiled
-function remembers what it has been compiled for.
+"""After `warm_up`, a loop compiles nothing. Each test has its own process, as a function stays
+compiled.
 """
 
 from __future__ import annotations
@@ -82,12 +82,11 @@ def done_in_a_process(script: str, *arguments: str) -> str:
 
 
 def test_warm_up_leaves_nothing_to_compile() -> None:
-    """A rehearsal leaves nothing to compile."""
     assert "identical" in done_in_a_process(REPLAYED, str(RECORDINGS / "golden.mcap"))
 
 
 def test_other_kind_of_skill_compiles_nothing() -> None:
-    """A skill of another kind than the shipped one compiles nothing anew."""
+    """The skill is of another kind than the shipped one."""
     done_in_a_process(
         OF_ANOTHER_KIND,
         *(str(RECORDINGS / name) for name in ("soldering.npz", "experiments/as-paper.npz")),

@@ -1,4 +1,4 @@
-"""The workspace: a target outside is brought in, with the motion that leads no further out."""
+"""The workspace: a target outside is clamped to it, and its motion leads no further out."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def numbers(size: int) -> st.SearchStrategy[Vector]:
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(numbers(3), numbers(3), numbers(3))
 def test_clamped_target_is_reachable(p: Vector, v: Vector, a: Vector) -> None:
-    """A clamped target is in the reachable region and leads no further out."""
+    """Its motion leads no further out."""
     v = v.clip(-1e6, 1e6)
     a = a.clip(-1e6, 1e6)
     position, velocity, acceleration, clamped = clamp(p, v, a, box=EVERYWHERE, reach=REACH)

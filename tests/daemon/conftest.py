@@ -1,4 +1,4 @@
-"""What the tests of the daemon share: a skill worker, and cells that only answer requests."""
+"""Fixtures of the daemon's tests: a skill worker, and cells that only answer requests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thirdhand.daemon.skill_worker import SkillWorker
 
 @pytest.fixture(scope="session")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    """A listening session and one connected to it."""
+    """A listening session and a session connected to it."""
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as near,
         open_session(connect=endpoints(near)) as far,
@@ -28,7 +28,7 @@ def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
 
 @pytest.fixture
 def router() -> Iterator[zenoh.Session]:
-    """A router, by which nodes of ROS 2 meet a daemon; they close with it."""
+    """A router that connects ROS 2 nodes with a daemon; the nodes close with it."""
     with open_session(listen=["tcp/127.0.0.1:0"], more={"mode": "router"}) as session:
         yield session
         ZenohSession.get_instance().close()
@@ -45,7 +45,7 @@ def skill_worker() -> Iterator[SkillWorker]:
 def opened(
     sessions: tuple[zenoh.Session, zenoh.Session], skill: Skill, tmp_path: Path
 ) -> Iterator[Callable[[SkillWorker], Cell]]:
-    """Opens a cell; closes it."""
+    """Open a cell, and close it after the test."""
     with contextlib.ExitStack() as closing:
         yield lambda skill_worker: closing.enter_context(
             contextlib.closing(Cell(*sessions, skill, skill_worker, tmp_path))

@@ -20,14 +20,14 @@ PAGE = (ROOT / "docs" / "operate.md").read_text(encoding="utf-8")
 
 
 def commands(title: str) -> list[str]:
-    """The commands of the block of the page that follows this heading."""
+    """The commands in the page's block below this heading."""
     block = re.search(rf"^### {title}$.*?^```sh\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     assert block is not None
     return block[1].splitlines()
 
 
 def run_in(root: Path, command: str) -> None:
-    """Run a command of the page with this folder in the place of the root of the file system."""
+    """Run a command of the page with this folder as the root of the file system."""
     done = subprocess.run(
         command.replace("sudo ", "").replace("-C /", f"-C {root}"),
         shell=True,
@@ -41,7 +41,6 @@ def run_in(root: Path, command: str) -> None:
 
 
 def test_cell_is_restored_by_the_commands_of_the_page(tmp_path: Path) -> None:
-    """A cell is restored from its backup by the commands of the page."""
     backup = commands("Back up")
     restore = commands("Restore")
     assert len(backup) + len(restore) <= 4

@@ -1,6 +1,4 @@
-"""The clock: deadlines kept in phase, skipped where they were missed, and the figures that tell how
-well.
-"""
+"""The clock: deadlines stay in phase and are skipped if missed; figures of its punctuality."""
 
 from __future__ import annotations
 
@@ -29,8 +27,8 @@ WALL_NS = 1_800_000_000_000_000_000
 
 
 class FakeClock:
-    """A clock that moves when it is told to, when someone sleeps (by more than was asked), and by a
-    little with each look.
+    """A clock that advances when set, during a sleep (longer than requested), and a little at each
+    reading.
     """
 
     def __init__(self, *, oversleep_ns: int = 0, look_ns: int = 0) -> None:
@@ -38,7 +36,7 @@ class FakeClock:
         self.oversleep_ns = oversleep_ns
         self.look_ns = look_ns
         self.slept_s: list[float] = []
-        self.set_by_ns = 0  # of the system clock
+        self.set_by_ns = 0  # step of the system clock
 
     def wall_ns(self) -> int:
         return WALL_NS + self.now + self.set_by_ns
@@ -97,7 +95,7 @@ def test_sleep_ends_before_the_deadline_and_spinning_reaches_it() -> None:
 
 
 def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
-    """What so many deadlines are stamped with."""
+    """The stamps of the next deadlines."""
     stamps_ns = []
     for _ in range(count):
         deadlines.wait()
@@ -106,7 +104,7 @@ def stamps(clock: FakeClock, deadlines: Deadlines, count: int) -> list[int]:
 
 
 def test_stamps_grow_by_the_time_between_deadlines() -> None:
-    """Stamps grow by what lies between deadlines whatever is missed."""
+    """Missed deadlines count too."""
     clock = FakeClock(oversleep_ns=300_000)
     deadlines = clock.deadlines()
     assert set(np.diff(stamps(clock, deadlines, 10))) == {PERIOD_NS}
@@ -114,12 +112,11 @@ def test_stamps_grow_by_the_time_between_deadlines() -> None:
     before = deadlines.stamp_ns
     deadlines.wait()
     assert deadlines.stamp_ns - before == 98 * PERIOD_NS
-    # the deadline's time, not that of waking
+    # the time of the deadline, not of waking up
     assert deadlines.stamp_ns == WALL_NS + clock.now - 300_000
 
 
 def test_stamps_grow_while_a_set_back_clock_catches_up() -> None:
-    """Stamps grow while a system clock that was set back catches up."""
     clock = FakeClock()
     deadlines = clock.deadlines()
     before = stamps(clock, deadlines, 5)[-1]
@@ -132,12 +129,12 @@ def test_stamps_grow_while_a_set_back_clock_catches_up() -> None:
 
 
 def test_stamps_follow_a_drifting_clock_without_a_jump() -> None:
-    """Stamps are drawn to a system clock that drifts without a jump."""
+    """The system clock drifts; stamps approach it without a jump."""
     clock = FakeClock()
     deadlines = clock.deadlines()
     stamps(clock, deadlines, 5)
     for _ in range(3000):
-        clock.set_by_ns += 1_000  # 500 parts in a million, the most that it is ever slewed by
+        clock.set_by_ns += 1_000  # 500 parts in a million, the largest slew of a clock
         before = deadlines.stamp_ns
         deadlines.wait()
         assert abs(deadlines.stamp_ns - before - PERIOD_NS) <= 1_000
@@ -145,7 +142,7 @@ def test_stamps_follow_a_drifting_clock_without_a_jump() -> None:
 
 
 def test_suspended_machine_has_missed_nothing() -> None:
-    """The monotonic clock stands still meanwhile, and the system clock does not."""
+    """During the suspension only the system clock advances."""
     clock = FakeClock()
     deadlines = clock.deadlines()
     before = stamps(clock, deadlines, 5)[-1]
@@ -170,14 +167,14 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
     reports = []
     for k in range(100):
         clock.now += 100_000_000
-        # slewed by 500 parts in a million
+        # besides a step, the clock is slewed by 500 parts in a million
         clock.set_by_ns += round(set_by_s * 1e9) * (k == 50) + 50_000
         reports.append(system.set_by())
     assert [(k, text) for k, text in enumerate(reports) if text] == [(50, words)]
 
 
 def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
-    """The next tick is prepared where there is time and the deadline kept."""
+    """It is prepared only if there is time."""
     clock = FakeClock()
     prepared = []
     start = clock.now
@@ -187,10 +184,10 @@ def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
         prepared.append(clock.now - start)
         clock.now += 200_000
 
-    deadlines.wait(prepare)  # the first deadline is now: no time
+    deadlines.wait(prepare)  # the first deadline is now, so there is no time
     assert deadlines.wait(prepare) == (1, 0)
     assert prepared == [PERIOD_NS - PREPARE_NS]
-    clock.now = start + 2 * PERIOD_NS - PREPARING_NS  # this tick ended late
+    clock.now = start + 2 * PERIOD_NS - PREPARING_NS  # the previous tick ended late
     assert deadlines.wait(prepare) == (2, 0)
     assert len(prepared) == 1
     clock.oversleep_ns = PREPARE_NS - PREPARING_NS  # another thread held the interpreter lock
@@ -199,13 +196,13 @@ def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
 
 
 def test_work_beside_the_loop_is_done_while_it_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work beside the loop is done while the loop sleeps for long enough."""
+    """Work beside the loop is done if the loop sleeps for long enough."""
     monkeypatch.setattr(clock_module, "NO_TICK_S", 60.0)
     clock = FakeClock()
     deadlines = clock.deadlines()
     deadlines.wait()
     deadlines.wait()
-    clock.now -= BESIDE_NS  # as before the end of its sleep
+    clock.now -= BESIDE_NS  # the loop would still sleep
     deadlines.between_ticks()  # returns at once
     clock.now += 1
     thread = threading.Thread(target=deadlines.between_ticks, daemon=True)
@@ -222,7 +219,7 @@ def test_work_beside_the_loop_is_done_while_it_sleeps(monkeypatch: pytest.Monkey
 def test_an_interrupted_reading_of_the_clocks_is_no_step() -> None:
     clock = FakeClock()
 
-    waits_ns = iter([0, 40 * READ_NS, 0])  # for a processor
+    waits_ns = iter([0, 40 * READ_NS, 0])  # waiting times for a processor
 
     def wall_ns() -> int:
         clock.now += next(waits_ns)

@@ -1,4 +1,4 @@
-"""The clutch over Zenoh: a switch in another process, which releases it, or dies while pressed."""
+"""The clutch over Zenoh: another process presses it, then releases it or is killed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ with connect(sys.argv[1]) as cell:
 
 
 def switch(daemon: Daemon) -> subprocess.Popen[str]:
-    """A pressed clutch in a process of its own, released by a line on its input."""
+    """A process that presses the clutch until it reads a line."""
     return subprocess.Popen(
         [sys.executable, "-c", SWITCH, daemon.endpoint], stdin=subprocess.PIPE, text=True, cwd=ROOT
     )
@@ -47,7 +47,7 @@ def is_following(status: dict[str, Any]) -> bool:
 
 @pytest.mark.timeout(120)
 def test_arm_holds_in_the_tick_of_a_release(tmp_path: Path) -> None:
-    """The arm holds in the tick in which a release arrives and after a silence."""
+    """The arm holds after a silence too."""
     records = tmp_path / "records"
     with (
         serving(
@@ -91,7 +91,7 @@ def test_arm_holds_in_the_tick_of_a_release(tmp_path: Path) -> None:
         if kind == "clutch"
     ]
     assert heard.count(False) == 1
-    # as a reader of the recording has it: the last message, and when it becomes stale
+    # from the recording: the last message, and the time at which it becomes stale
     newest = False
     until = -1
     for step in steps:
@@ -102,6 +102,6 @@ def test_arm_holds_in_the_tick_of_a_release(tmp_path: Path) -> None:
             until = step.tick + 150
         is_pressed = newest and step.tick < until
         expected = {Reason.NONE, Reason.NO_HANDS} if is_pressed else {Reason.CLUTCH}
-        # by the operator at the end
+        # the operator's hold at the end
         assert Reason(step.frame["reason"]) in expected | {Reason.OPERATOR}, step.tick
         assert (step.frame["mode"] == Mode.FOLLOW) <= is_pressed, step.tick

@@ -1,4 +1,4 @@
-"""Requests to correct the tool: refused with a reason, carried out in a hold alone, and undone."""
+"""Requests to correct the tool: refused with a reason, carried out only in a hold, and undone."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ ADD = {"op": "add"}
 
 @pytest.fixture(scope="module")
 def taught(skill: Skill) -> Skill:
-    """The shipped skill as the cell has it, with the via-points of the nominal scene."""
+    """The cell's skill: the shipped one with the via-points of the nominal scene."""
     return adapted(skill, VIA_POINTS, tolerance=0.05)
 
 
 @pytest.fixture
 def held(cell: Cell, taught: Skill) -> Cell:
-    """A cell whose arm holds, with the hands halfway to the handover, and was led away."""
+    """A cell whose arm holds with the hands halfway to the handover, and was led away by hand."""
     cell.client.add(VIA_POINTS)
     state = cell.state
     hands = taught.model.hands
@@ -96,7 +96,7 @@ def test_corrections_are_refused_with_the_reason(held: Cell, taught: Skill) -> N
 def test_a_correction_is_made_in_its_own_hold_alone(
     held: Cell, monkeypatch: pytest.MonkeyPatch, field: str, value: int
 ) -> None:
-    """The hold ends while the correction is computed, and another one may have begun."""
+    """The hold ends while the correction is computed; another hold may have begun."""
     monkeypatch.setattr(held, "keep", lambda file: held.state.__setitem__(field, value))
     assert held.refusal("correct", ADD).startswith(
         "the hold ended while this was computed; nothing was changed"
@@ -111,7 +111,7 @@ def test_corrections_are_undone_in_turn_with_what_they_replaced(held: Cell) -> N
         "correction-1",
         ("start", "handover"),
     )
-    # the segment of the hold, whatever the hand did that led
+    # the segment at the hold, not that of the leading hand's motion
     assert held.kinds()[-2:] == ["skill", "segment"]
     points = held.client.via_points()
     held.state["measured"][0] += 0.1

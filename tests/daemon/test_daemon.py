@@ -1,5 +1,5 @@
-"""The daemon as its users meet it: a process on Zenoh, hands in, joint commands out, requests
-answered, everything recorded.
+"""The daemon as a process on Zenoh: hands in, joint commands out, requests answered, everything
+recorded.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def following(status: dict[str, Any]) -> bool:
 
 @pytest.mark.quick
 def test_a_session_from_start_to_end(tmp_path: Path) -> None:
-    """Hands are followed, lost, and followed again; via-points are taught; SIGTERM ends it all, and
-    what was recorded replays identically.
+    """Hands are followed, lost, and followed again; via-points are taught; SIGTERM ends the daemon,
+    and its recording replays identically.
     """
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
@@ -96,7 +96,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
 
 
 def test_at_most_four_samples_a_tick_are_taken(tmp_path: Path) -> None:
-    """They are recorded in their order, and replayed identically."""
+    """The samples are recorded in their order, and replayed identically."""
     records = tmp_path / "records"
     period_ns = 20_000_000
     bursts = (3, 1, 3, 2, 3, 30, 3)
@@ -132,7 +132,9 @@ def test_at_most_four_samples_a_tick_are_taken(tmp_path: Path) -> None:
 
 
 def test_via_points_survive_a_restart(tmp_path: Path) -> None:
-    """After the daemon has ended, and after it was killed: its lock keeps nobody out either."""
+    """They survive an end and a kill of the daemon; the lock of a killed daemon keeps no other one
+    out.
+    """
     with serving(tmp_path, "--joints", "assumed") as daemon:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})
@@ -165,7 +167,7 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_request_to_many_keys_is_refused(shared_daemon: Any) -> None:
-    """A request to many keys at once is refused by all but the status."""
+    """Only the status answers a selector of many keys."""
     shared_daemon.client.ask("hold")
     replies = list(shared_daemon.session.get("thirdhand/*", timeout=10))
     assert sum(reply.ok is not None for reply in replies) == 1
@@ -250,7 +252,7 @@ def test_a_via_point_is_taught_from_where_hands_and_tool_are(
 
 
 def test_position_of_the_tool_comes_from_the_joints(skill: Skill) -> None:
-    """Where the tool is is told by the joints while the arm tells them."""
+    """The tool's position follows from the measured joints while the arm reports them."""
     settings = Settings()
     urdf = robot_description(Settings())
     controller = Controller(settings, skill, urdf=urdf)

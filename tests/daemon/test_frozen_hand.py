@@ -1,4 +1,6 @@
-"""A hand that its tracker has lost and goes on publishing is held; a program's hand may rest."""
+"""The arm holds for a hand that its tracker has lost but still publishes; a program's hand may
+rest.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ TURNED = (0.0, 0.0, 0.0, 1.0)
 
 
 def refused(positions: Vector, rate_hz: float, *, unit_m: float = 1.0) -> Vector:
-    """Times [s] of the samples (T, 3) [m] that are refused as frozen."""
+    """Times [s] of those samples (T, 3) [m] that are refused as frozen."""
     hand = FrozenHand()
     times = np.arange(len(positions)) / rate_hz
     poses = (
@@ -29,16 +31,16 @@ def refused(positions: Vector, rate_hz: float, *, unit_m: float = 1.0) -> Vector
 
 
 def measured(seconds: float, rate_hz: float, at: tuple[float, ...] = LEFT, seed: int = 0) -> Vector:
-    """Samples of a hand that rests, with a tracker's noise."""
+    """Samples of a resting hand with a tracker's noise."""
     return at + 2e-4 * np.random.default_rng(seed).standard_normal((round(seconds * rate_hz), 3))
 
 
 @pytest.mark.parametrize("unit_m", [1.0, 1e-3])
 @pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
 def test_loss_of_a_tracked_hand_is_noticed(rate_hz: float, unit_m: float) -> None:
-    """Each loss of a tracked hand is noticed after half a second."""
+    """Each loss is detected after half a second."""
     lost = round(2.0 * rate_hz)
-    # the last pose again and again, or one of the tracker's own
+    # a lost hand has its last pose, or a default pose of the tracker
     for default in (None, (0.25, -0.25, 0.1)):
         tracked = measured(3.0, rate_hz)
         pieces = [tracked, np.tile(tracked[-1] if default is None else default, (lost, 1))]
@@ -53,7 +55,7 @@ def test_loss_of_a_tracked_hand_is_noticed(rate_hz: float, unit_m: float) -> Non
 
 
 def program(rate_hz: float, *, begins_at_rest: bool) -> Iterator[Vector]:
-    """A hand that a program moves for a second and lets rest for two, exactly."""
+    """A hand that a program moves for one second and rests for two, without noise."""
     path = np.linspace(0.0, 0.2, round(rate_hz))
     for k in range(0 if begins_at_rest else 1, 6):
         along = np.full(round(2 * rate_hz), 0.2 * (k // 2)) if k % 2 == 0 else 0.2 * (k // 2) + path
@@ -68,7 +70,7 @@ def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
         )
     assert not len(refused(np.tile(LEFT, (1000, 1)), rate_hz))
     share = np.linspace(0.0, 1.0, round(3 * rate_hz))
-    # with the least jerk, and no rest before
+    # a minimum-jerk reach without a rest before it
     along = 0.4 * (10 * share**3 - 15 * share**4 + 6 * share**5)
     stop = np.concatenate([along[1:], np.full(round(2 * rate_hz), along[-1])])
     assert not len(refused(np.outer(stop, (1.0, 0.5, 0.0)), rate_hz))
@@ -76,7 +78,7 @@ def test_hands_that_a_program_lets_rest_are_accepted(rate_hz: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [15.0, 60.0, 250.0])
 def test_hands_that_begin_with_an_exact_rest_are_accepted(rate_hz: float) -> None:
-    """As those of a page, which stop at once and go on with a leap, or of a bench with noise."""
+    """Hands of a web page stop at once and continue with a leap; hands of a bench have noise."""
     count = round(3 * rate_hz)
     dragged = LEFT + np.outer(np.linspace(0.0, 0.4, count + 1)[1:], (1.0, 0.0, 0.0))
     for moves in (dragged, measured(3.0, rate_hz)):
@@ -88,7 +90,7 @@ def test_hands_that_begin_with_an_exact_rest_are_accepted(rate_hz: float) -> Non
 
 def test_noise_is_never_frozen() -> None:
     assert not len(refused(measured(30.0, 100.0), 100.0))
-    coarse = np.round(measured(30.0, 100.0), 3)  # of a tracker that reports whole millimetres
+    coarse = np.round(measured(30.0, 100.0), 3)  # a tracker that reports whole millimetres
     assert not len(refused(coarse, 100.0))
 
 

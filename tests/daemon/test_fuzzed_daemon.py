@@ -1,5 +1,5 @@
-"""A running daemon under spoilt bytes on all its input keys at once, between legal ones: what it
-recorded replays bit for bit, and kept every bound.
+"""A running daemon receives damaged bytes on all its input keys at once, between legal messages:
+its recording replays bit for bit, and every bound was kept.
 """
 
 from __future__ import annotations

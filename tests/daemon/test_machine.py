@@ -1,6 +1,4 @@
-"""A machine that is too busy: told from one that keeps time, and remembered as of when the arm
-stopped.
-"""
+"""A machine that is too busy is detected, and remembered from the time at which the arm stopped."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ FOLLOWS = (Mode.FOLLOW, Reason.NONE)
 
 
 class Watched:
-    """A machine of which 500 ticks a second are told, each tenth of one."""
+    """A machine at 500 ticks a second, of which each tenth is reported."""
 
     def __init__(self, folder: Path) -> None:
         self._pressure = folder / "cpu"
@@ -60,7 +58,7 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
 
 
 def test_busy_machine_is_the_cause_of_timing_incidents_only() -> None:
-    """It is the cause of what time decides and of nothing else."""
+    """It is not named with other incidents."""
     evidence = Evidence(busy="the loop was up to 45 ms late")
     for reason in Reason:
         blamed = explained(reason, evidence).why.startswith(

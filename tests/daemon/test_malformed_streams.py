@@ -1,4 +1,4 @@
-"""Malformed messages of every stream that a cell receives: counted and named in the same way."""
+"""Malformed messages of all input streams are counted and named in the same way."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ SOURCES = {"hands/left": "left hand", "hands/right": "right hand", "joints/state
 @pytest.mark.timeout(120)
 @pytest.mark.thorough
 def test_malformed_messages_are_counted_by_stream(tmp_path: Path) -> None:
-    """Malformed messages of every stream are counted and named."""
     keys = {key: channels.key("thirdhand", key) for key in HEARD} | {"camera": "camera"}
     with serving(tmp_path, "--joints", "state", network=EVERY_INPUT) as daemon:
         before = daemon.client.status()

@@ -1,4 +1,4 @@
-"""Eight daemons and their clients on one Zenoh router, also as ROS 2 sees them."""
+"""Eight daemons and their clients on one Zenoh router, and as ROS 2 sees them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NAMES = tuple(f"lab/bench{i}" for i in range(1, 9))
 
 
 class Lab(NamedTuple):
-    """A router's endpoint, a session that is its client, and the process of eight daemons."""
+    """A router's endpoint, a client session of it, and the process of eight daemons."""
 
     endpoint: str
     session: zenoh.Session
@@ -101,7 +101,7 @@ def test_play_succeeds_only_where_the_daemon_counts_the_hands(
 
 @contextlib.contextmanager
 def _answering(lab: Lab, key: str, answer: bytes) -> Iterator[None]:
-    """Something that answers on a key as a storage does, as long as the context lasts."""
+    """A queryable that answers on a key as a Zenoh storage does, while the context lasts."""
     queryable = lab.session.declare_queryable(
         key, lambda query: query.reply(key, answer), complete=True
     )
@@ -109,12 +109,12 @@ def _answering(lab: Lab, key: str, answer: bytes) -> Iterator[None]:
     queryable.undeclare()
 
 
-# --- as ROS 2 sees it ----------------------------------------------------------------------------
+# --- ROS 2 ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def ros(lab: Lab) -> Iterator[dict[str, Any]]:
-    """Where a ROS 2 node finds the domain."""
+    """Host and port at which a ROS 2 node finds the domain."""
     yield port(lab.endpoint, ROS2_DOMAIN)
     ZenohSession.get_instance().close()
 
@@ -162,7 +162,7 @@ def test_ros2_moves_the_hands_and_hears_the_commands(lab: Lab, ros: dict[str, An
 def test_a_daemon_that_ends_is_gone_from_every_list(
     lab: Lab, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The last test here: all of them end."""
+    """This must be the file's last test: all daemons end."""
     lab.daemons.kill()
     lab.daemons.wait()
     until(lambda: not cells(lab.session))
@@ -203,7 +203,7 @@ def test_what_is_safe_goes_before_a_zenoh_configuration(lab: Lab, tmp_path: Path
                     or came
                 )
             )
-    assert set(came) == {"cell/hands/left"}  # and not elsewhere
+    assert set(came) == {"cell/hands/left"}  # not on other keys
     with pytest.raises(
         UnreachableError, match=r"nobody answers at tcp/127\.0\.0\.1:1: is a daemon, `thirdhand rec"
     ):

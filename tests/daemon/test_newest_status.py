@@ -1,5 +1,5 @@
-"""A status that comes after a request was answered shows what that request did, whatever way it
-comes.
+"""Each status that arrives after the answer to a request shows the request's effect, published or
+queried.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def shown(status: dict[str, Any], request: str, reply: dict[str, Any]) -> bool:
-    """Whether a status shows what a request did."""
+    """True if a status shows the effect of a request."""
     if request in ("hold", "resume", "reset"):
         return status["tick"] >= reply["tick"] and (status["reason"] == "operator") == (
             request == "hold"
@@ -67,7 +67,7 @@ def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -
     for round_ in range(ROUNDS if way != "published" else 4):
         for request, body in REQUESTS if round_ == 0 else REQUESTS[:5]:
             if request == "reset":
-                continue  # there is no fault; it is answered like the others
+                continue  # without a fault, `reset` has no effect to show
             reply = daemon.client.ask(request, body)
             if way == "queryable":
                 (answer,) = daemon.session.get("thirdhand/status", timeout=10.0)
@@ -84,10 +84,10 @@ def test_what_a_request_did_is_in_every_later_status(daemon: Daemon, way: str) -
                     request
                 )
                 status = published[before]
-                if request != "segment":  # which the hands tell anew
+                if request != "segment":  # the hands soon determine the segment again
                     assert all(shown(message, request, reply) for message in published[before:]), (
                         request
                     )
             assert shown(status, request, reply), (request, status)
-            time.sleep(0.013 * round_ % 0.1)  # at every phase of the published ones
+            time.sleep(0.013 * round_ % 0.1)  # at any phase of the published statuses
     subscriber.undeclare()

@@ -27,7 +27,7 @@ TAKES = " ".join(sorted(map(str, RECORDINGS.glob("demonstration-[1-5].mcap"))))
 
 
 def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Every request to a daemon, one of them in a hold for hands in a segment of its task."""
+    """Every request to a daemon; one of them in a hold with the hands in a segment of the task."""
     client = daemon.client
     first = VIA_POINTS[0]
     yield "add", lambda: client.add(VIA_POINTS)
@@ -48,7 +48,7 @@ def requests_of(daemon: Daemon, hands: Tracker) -> Iterator[tuple[str, Callable[
 
 
 def look_for_a_way_out() -> None:
-    """Compute what the skill worker computes for an arm that is stuck."""
+    """Plan a way out in this process, as the skill worker does for an arm that is stuck."""
     skill = shipped_skill()
     settings = Settings()
     with contextlib.closing(SkillWorker()) as worker:
@@ -60,7 +60,7 @@ def look_for_a_way_out() -> None:
 
 
 def commands_in(folder: Path) -> Iterator[str]:
-    """Every command that may compile; some read the files of those before them."""
+    """Every command that may compile; some read files that earlier commands wrote."""
     visited = [folder / f"visit-{number}.mcap" for number in range(1, 7)]
     for number, path in enumerate(visited, 1):
         write_demonstration(path, visits(number))

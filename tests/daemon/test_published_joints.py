@@ -1,5 +1,5 @@
-"""A running daemon and joint states as robots publish them: the arm is found among whatever else
-its topic carries, and what is missing is named.
+"""A running daemon and joint states as robots publish them: the arm is found among other content of
+its topic, and missing joints are named.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 def state(*names: str, velocity: tuple[float, ...] | None = None, **others: float) -> JointState:
-    """A state of joints of the arm at its posture, and of `others`."""
+    """A joint state of arm joints at the arm's posture, and of `others`."""
     named = {name: AT[name] for name in names} | others
     unmeasured = (NAN,) * len(named)
     velocities = unmeasured if velocity is None else velocity
@@ -38,7 +38,7 @@ def state(*names: str, velocity: tuple[float, ...] | None = None, **others: floa
 
 @contextlib.contextmanager
 def published(daemon: Daemon, messages: Callable[[int], list[JointState]]) -> Iterator[None]:
-    """Within it messages are published every 4 ms, given how often that was."""
+    """A context in which `messages(k)` are published every 4 ms, k = 0, 1, ..."""
     publisher = daemon.session.declare_publisher("thirdhand/joints/state")
     ended = threading.Event()
 

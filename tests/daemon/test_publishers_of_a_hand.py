@@ -1,4 +1,4 @@
-"""Two trackers that publish one hand: the samples of the first count, until it is silent."""
+"""Two trackers that publish one hand: the first one counts until it is silent."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def cell() -> Iterator[tuple[CellStreams, Arrivals, zenoh.Session]]:
 
 
 def received_by(streams: CellStreams, arrivals: Arrivals, put: Put, message: bytes) -> list[float]:
-    """The x [m] of the samples that the cell accepts when a tracker publishes a message."""
+    """The x [m] of the samples that the cell accepts after a tracker has published a message."""
     before = arrivals.count
     accepted: list[float] = []
 
@@ -86,11 +86,11 @@ def test_second_publisher_is_refused(
     first: Callable[[zenoh.Session], Put],
     second: Callable[[zenoh.Session], Put],
 ) -> None:
-    """However near its samples are, and however they are stamped."""
+    """Its samples are refused even if they are near, and with any stamps."""
     streams, arrivals, session = cell
     put = first(session)
     put_other = second(session)
-    until(lambda: put(sample(0.4)) or list(streams.receive()))  # it is connected
+    until(lambda: put(sample(0.4)) or list(streams.receive()))  # until it is connected
     put(sample(0.45))
     until(lambda: 0.45 in [event.value.position[0] for event in streams.receive()])
     others = arrivals.others
@@ -99,11 +99,11 @@ def test_second_publisher_is_refused(
         assert received_by(streams, arrivals, put_other, sample(0.501)) == []
     assert arrivals.others == others + 20
 
-    # What cannot be decoded is of no publisher: it takes the place of none.
+    # A message that cannot be decoded does not make its publisher the accepted one.
     assert received_by(streams, arrivals, put_other, b"nonsense") == []
     assert received_by(streams, arrivals, put, sample(0.5)) == [0.5]
 
-    # Once the first one is silent, the second one is heard.
+    # Once the first publisher is silent, the second one is accepted.
     until(
         lambda: received_by(streams, arrivals, put_other, sample(0.7)) == [0.7],
         within_s=20 * TAKEOVER_S,
@@ -115,14 +115,14 @@ def test_publisher_is_heard_until_it_is_silent() -> None:
     sole = SolePublisher()
     assert not sole.is_other("one", 10.0)
     assert sole.is_other("other", 10.0 + 0.99 * TAKEOVER_S)
-    assert not sole.is_other("one", 10.0 + 2 * TAKEOVER_S)  # a late one is still the same
+    assert not sole.is_other("one", 10.0 + 2 * TAKEOVER_S)  # the same publisher after a pause
     assert sole.is_other("other", 10.0 + 2.99 * TAKEOVER_S)
     assert not sole.is_other("other", 10.0 + 3.01 * TAKEOVER_S)
     assert sole.is_other("one", 10.0 + 3.02 * TAKEOVER_S)
 
 
 def test_messages_of_every_channel_are_named() -> None:
-    """Publisher numbers its messages, from which a receiver counts the lost ones."""
+    """A publisher numbers its messages, so that receivers can count losses."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         came: list[zenoh.Sample] = []
         subscriber = session.declare_subscriber("cell/**", came.append)

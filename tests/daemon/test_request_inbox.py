@@ -1,5 +1,5 @@
-"""Who holds the arm follows from the ticks that the core completes, whether a request is withdrawn,
-late, taken with others, or taken by a tick that fails.
+"""The holders of the arm follow from the ticks that the core completes, whether a request is
+withdrawn, late, taken with others, or taken by a tick that fails.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TICKS = st.lists(st.tuples(st.lists(ORDERS, max_size=2), RARELY, RARELY), min_si
 
 
 class Cell(Loop):
-    """The core, and the inbox of its requests."""
+    """The core and the inbox of its requests."""
 
     def __init__(self, skill: Skill) -> None:
         super().__init__(Settings(), skill)
@@ -38,7 +38,7 @@ class Cell(Loop):
         self.tick()
 
     def tick(self, *events: Event, fails: bool = False) -> None:
-        """One tick with these events and the requests that wait."""
+        """One tick with these events and the waiting requests."""
         taken = self.inbox.take(self.controller.state)
         self.inbox.answer(None if fails else self.step(*events, *taken))
 
@@ -79,7 +79,7 @@ def test_a_resume_ends_what_it_may_end_and_a_hold_is_obeyed(
     opened: Callable[[], Cell], ticks: list[tuple[list[tuple[str, str, bool]], bool, bool]]
 ) -> None:
     cell = opened()
-    holders: set[str] = set()  # as the core took them
+    holders: set[str] = set()  # the holders by the ticks of the core
     is_led = has_failed = False
     for orders, leads, fails in ticks:
         requests = []
@@ -100,7 +100,7 @@ def test_a_resume_ends_what_it_may_end_and_a_hold_is_obeyed(
                 may_end = not is_led and (not by or holders == {by})
                 assert is_refused != may_end or (is_refused and has_failed)
                 holders = holders if is_refused else set()
-        has_failed = (has_failed or fails) and bool(holders)  # what that tick did is unknown
+        has_failed = (has_failed or fails) and bool(holders)  # the tick's effect is unknown
         if not fails:
             is_led = leads
             holders |= {BY_HAND} if is_led else set()

@@ -1,5 +1,5 @@
-"""Requests: checked, refused whole with a reason, or carried out through the inbox and answered
-with the tick that took them.
+"""Requests are checked and refused as a whole with a reason, or carried out through the inbox and
+answered with their tick.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def test_places_are_added_listed_replaced_removed_and_cleared(cell: Cell) -> Non
 
 
 def test_reply_warns_of_a_missed_via_point(cell: Cell) -> None:
-    """A reply warns of a via point that is missed and only then."""
+    """There are no other warnings."""
     assert cell.client.add(VIA_POINTS).warnings == ()
     tool = [HANDOVER.tool[0], HANDOVER.tool[1] + 0.2, HANDOVER.tool[2]]
     reply = cell.client.ask("via_points", add(point(name="loose", tool=tool, std=0.2)))
@@ -104,7 +104,7 @@ def test_what_the_loop_adopts_is_what_a_recording_keeps(cell: Cell, skill: Store
     (event,) = cell.taken
     expected = adapted(skill, VIA_POINTS, tolerance=0.04)
     assert event.payload == cell.kept[0] == expected.file
-    assert type(event.value) is Skill  # without its file, which a recording has beside it
+    assert type(event.value) is Skill  # the recording has the skill's file separately
     assert event.value.digest == expected.digest
 
 
@@ -124,7 +124,7 @@ def test_via_points_that_cannot_be_saved_are_not_taught(cell: Cell) -> None:
 
 
 def test_unsaved_via_points_are_reported(cell: Cell, skill: Skill) -> None:
-    """Via points in force whose file cannot be replaced are reported."""
+    """The via-points are in force, but their file cannot be replaced."""
     SavedViaPoints(cell.settings).path(skill).mkdir(parents=True)
     (warning,) = cell.client.add(VIA_POINTS).warnings
     assert warning.startswith("the via-points end at a restart: they cannot be saved (")
@@ -234,7 +234,7 @@ def test_a_hold_that_is_not_understood_holds(taught_cell: Cell, payload: Any) ->
 def test_skill_is_loaded_by_name_and_keeps_its_via_points(
     cell: Cell, skill: StoredSkill, name: str
 ) -> None:
-    """A skill is loaded by name and via points stay with what they were taught to."""
+    """Via-points stay with the skill that they were taught to."""
     cell.client.add(VIA_POINTS)
     assert len(cell.client.load_skill(name).points or ()) == len(VIA_POINTS)
     other = with_file(replace(skill, learned_from="other demonstrations"))
@@ -263,7 +263,7 @@ def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
         cell.client.add(VIA_POINTS)
     monkeypatch.undo()
     setattr(cell, state, state == "running")
-    cell.client.ask("hold")  # taken after whatever else waits
+    cell.client.ask("hold")  # taken after all other waiting requests
     assert cell.kinds() == ["hold"]
     assert cell.names() == []
     assert [point.name for point in cell.client.add(VIA_POINTS[:1]).points or ()] == [HANDOVER.name]
@@ -293,7 +293,7 @@ def test_a_skill_that_no_tick_adopted_is_not_adopted_later(
 def test_a_skill_is_loaded_from_its_folder_only(
     cell: Cell, skill: Skill, tmp_path: Path, name: str
 ) -> None:
-    """What lies elsewhere is not loaded, however it is named; nor is told where it is."""
+    """A file elsewhere is not loaded under any name, and its path is not revealed."""
     outside = tmp_path / "elsewhere"
     outside.mkdir()
     for path in (
@@ -352,7 +352,7 @@ def test_skill_out_of_reach_is_refused(
     skill_worker: SkillWorker,
     tmp_path: Path,
 ) -> None:
-    """A skill out of reach is refused and one of which a part is comes with a warning."""
+    """A skill that is partly out of reach is loaded with a warning."""
     positions = skill.tool_positions
     half = Reach(min_x=float(np.quantile(positions[:, 0], 0.4)))  # 40 % are nearer to the base
     for reach, is_refused in ((FAR_LEFT, True), (half, False)):
@@ -390,7 +390,7 @@ def test_a_skill_out_of_reach_is_not_served(
 
 
 def with_residual_risk(skill: StoredSkill, accepted_by: str) -> StoredSkill:
-    """The skill, as if its gate held 3 % of hands swapped."""
+    """The skill with a gate that holds only 3 % of exchanged hands."""
     risk = {"residual": ["the gate holds 3.0 % of hands swapped"], "accepted_by": accepted_by}
     figures = msgspec.json.encode(msgspec.json.decode(skill.figures) | risk).decode()
     return decoded(with_file(replace(skill, figures=figures)).file, origin="skill")
@@ -403,7 +403,7 @@ def test_residual_risk_must_be_accepted(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A skill with a residual risk is served only if somebody accepted it."""
+    """Otherwise the skill is not served."""
     refusal = (
         "not served: nobody has accepted its residual risk: the gate holds 3.0 % of hands swapped. "
         "Who takes"
@@ -434,7 +434,7 @@ def test_residual_risk_must_be_accepted(
 
 
 class SlowWorkshop(SkillWorker):
-    """A skill worker in this process that adapts when it is let."""
+    """A skill worker in this process that waits for permission to adapt."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -470,7 +470,7 @@ def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suff
 
 
 def test_named_hold_is_ended_by_its_name_only(cell: Cell) -> None:
-    """Who holds by a name ends that hold and no hold of others."""
+    """Other holds remain."""
     mine = {"by": "me"}
     for name in ("me", "you"):
         cell.client.hold(name)

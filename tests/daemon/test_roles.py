@@ -1,5 +1,5 @@
-"""Who may do what on a network: certificates by the commands in docs/access.md, and real sessions
-of each role that try everything.
+"""Rights of each role on a network: certificates made by the commands in docs/access.md, and a real
+session of each role that tries everything.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ INPUTS = (
 )
 OUTPUTS = tuple(channel.key for channel in channels.CHANNELS if channel.direction == "out")
 REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
-DOMAIN = 3  # of ROS 2
-PATIENCE_S = 1.0  # what is refused is only seen by waiting
+DOMAIN = 3  # ROS 2 domain
+PATIENCE_S = 1.0  # a refusal is only seen by waiting
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def keys(suffixes: Iterable[str]) -> set[str]:
 
 
 class Guarded:
-    """A session in the daemon's place: takes in, publishes and answers as a daemon does."""
+    """A session in the daemon's place, which receives, publishes and answers as a daemon does."""
 
     def __init__(self, secrets: Path, revoked: tuple[str, ...] = ()) -> None:
         self.session = open_session(
@@ -128,7 +128,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         passed_on: set[str] = set()
         forged: list[str] = []
 
-        def hear(sample: zenoh.Sample) -> None:  # its own words it hears too
+        def hear(sample: zenoh.Sample) -> None:  # a session hears its own messages too
             got.update([str(sample.key_expr)] if bytes(sample.payload) == b"out" else [])
             passed_on.update(
                 [str(sample.key_expr)] if bytes(sample.payload) == b"from the bench" else []
@@ -154,7 +154,7 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
             guarded.publish()
             time.sleep(0.05)
         daemon_ids = {str(guarded.session.zid())}
-        until(lambda: living(session, CELL) == daemon_ids | {"f00"})  # its own words it hears too
+        until(lambda: living(session, CELL) == daemon_ids | {"f00"})  # it hears its own token too
         assert living(observer, CELL) == (daemon_ids | {"f00"} if name == ROUTER else daemon_ids)
         listed = session.liveliness().get(ros2.all_tokens(DOMAIN), timeout=5.0)
         assert len({str(reply.ok.key_expr) for reply in listed if reply.ok}) == 1 + len(TOPICS)
@@ -171,12 +171,12 @@ def test_a_role_can_do_its_own_and_nothing_else(guarded: Guarded, secrets: Path,
         else set()
     )
     assert forged == []
-    assert answered == (len(REQUESTS) if role.asks else 1)  # the status is for all
+    assert answered == (len(REQUESTS) if role.asks else 1)  # all roles may read the status
     assert guarded.asked == ({full[key] for key in REQUESTS} if role.asks else {full["status"]})
 
 
 def test_certificate_is_revoked_by_its_name(secrets: Path) -> None:
-    """Sessions of two trackers and two operators; of each the second was revoked."""
+    """There are two trackers and two operators; the second of each is revoked."""
     daemon = Guarded(secrets, revoked=("tracker-2", "operator-2"))
     revoked: set[bytes] = set()
     with contextlib.ExitStack() as closing:
@@ -217,12 +217,12 @@ def test_certificate_is_revoked_by_its_name(secrets: Path) -> None:
         assert Client(sessions["operator"], CELL).ask("hold") == {}
     assert revoked == {b"out", b"tracker"}
     assert b"out" in got["operator"]
-    # but its own words
+    # except its own messages
     assert [got[name] - {name.encode()} for name in ("tracker-2", "operator-2")] == [set(), set()]
 
 
 def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
-    """A subject without a name would be everybody."""
+    """A subject without a name would match everybody."""
     access = access_control(CELL, names("tracker"))["access_control"]
     assert all(subject["cert_common_names"] for subject in access["subjects"])
     assert "tracker" not in [subject["id"] for subject in access["subjects"]]
@@ -233,7 +233,7 @@ def test_what_is_revoked_whole_lets_nobody_in_by_default() -> None:
 
 @pytest.mark.thorough
 def test_refusals_name_the_certificate_and_its_fault(tmp_path: Path) -> None:
-    """Some have expired, and one is of another authority."""
+    """Two certificates have expired, and one is of another authority."""
     certificates = make_certificates(tmp_path, expired="daemon-8 operator-8")
     other = make_certificates(tmp_path / "other")
     shutil.copytree(other / "operator", certificates / "operator-9")
@@ -259,7 +259,7 @@ def test_refusals_name_the_certificate_and_its_fault(tmp_path: Path) -> None:
         ("daemon-8", certificates / "operator", "the certificate of the daemon .* has expired"),
     ):
         with open_session(listen=["tls/127.0.0.1:0"], certificate=certificates / daemon) as session:
-            for timeout_s in (0.3, None):  # with None, other errors are waited for
+            for timeout_s in (0.3, None):  # None waits through other errors
                 with pytest.raises(CertificateError, match=words):
                     open_session(
                         connect=endpoints(session), certificate=client or "", timeout_s=timeout_s
@@ -283,7 +283,7 @@ def test_refusals_name_the_certificate_and_its_fault(tmp_path: Path) -> None:
 
 
 def test_nobody_passes_for_the_daemon(secrets: Path) -> None:
-    """A role's certificate is no daemon's: clients do not talk to who listens with it."""
+    """Clients refuse a listener whose certificate is that of another role."""
     with (
         open_session(listen=["tls/127.0.0.1:0"], certificate=secrets / "operator") as false,
         pytest.raises(CertificateError, match="is that of another role"),

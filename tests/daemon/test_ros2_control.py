@@ -1,5 +1,5 @@
-"""An arm behind ros2_control: its controllers are commanded, and its joint states heard, on the
-topics that the settings name; whatever ends the commands, a stop goes before.
+"""An arm behind ros2_control: commands and joint states use the topics that the settings name.
+However the commands end, a stop comes first.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ state = "{{state}}"
 def test_controllers_follow_and_are_left_at_rest(
     tmp_path: Path, router: zenoh.Session, ends: str
 ) -> None:
-    """Stopped while it moves, and with a loop that fails for good while it moves."""
+    """The daemon is stopped, or its loop fails for good, while the arm moves."""
     (endpoint,) = endpoints(router)
     (tmp_path / "driven.toml").write_text(CONFIGURATION.format(router=endpoint, state=tmp_path))
     positions = list[Any]()
@@ -62,7 +62,7 @@ def test_controllers_follow_and_are_left_at_rest(
     states = ROS2Publisher(STATES, **typed("sensor_msgs/msg/JointState"), **port(endpoint, DOMAIN))
 
     def as_the_arm(*_: Any) -> bool:
-        """Stands where the newest command has it, and says so."""
+        """Publish the positions of the newest command as the arm's state."""
         q = positions[-1].data if positions else np.array(Settings().arm.posture)[::-1]
         none = np.empty(0)
         states.publish(
@@ -99,7 +99,7 @@ def test_controllers_follow_and_are_left_at_rest(
     time.sleep(0.2)
     np.testing.assert_allclose(positions[-1].data, ways[-1].points[0].positions)
     steps = np.abs(np.diff([message.data for message in positions[-40:]], axis=0))
-    # without a jump; a busy machine loses one message or two
+    # no jump, where a busy machine may lose one or two messages
     assert steps.max() < 3 * 1.6 / RATE_HZ
     for node in (*heard, states):
         node.close()

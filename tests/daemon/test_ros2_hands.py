@@ -1,6 +1,6 @@
-"""Hands that are frames of /tf, as nodes of rmw_zenoh publish them: two trackers, each with its
-mapping, are followed amid many other frames; malformed, foreign and stale frames are refused as
-hands of any tracker are; the recording replays exactly.
+"""Hands that are frames of /tf, as nodes of rmw_zenoh publish them. Two trackers, each with its
+mapping, are followed among many other frames; malformed, foreign and stale frames are refused; the
+recording replays exactly.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ OTHERS = [Transform("base_link", f"link_{i}", (0.1, 0.2, 0.3), STRAIGHT) for i i
 
 
 def of_left(at: Vector3 = LEFT, turn: Quaternion = STRAIGHT, parent: str = "world") -> Transform:
-    """The left wrist in frame `world`, which stands at x = 0.5 m."""
+    """The left wrist in frame `world`, whose origin is at x = 0.5 m."""
     return Transform(parent, "left_wrist", (at[0] - 0.5, at[1], at[2]), turn)
 
 
@@ -66,7 +66,7 @@ class Wrists:
     def __init__(self, at: str) -> None:
         self.node = ROS2Publisher("/tf", **typed(KIND), **port(at, DOMAIN))
         self.session = open_session(connect=[at])
-        self.times = 1  # each message of the left wrist is preceded by so many of other frames
+        self.times = 1  # messages of other frames before each one of the left wrist
         self._end, self._thread = threading.Event(), threading.Thread(target=self._publish)
         self._thread.start()
 
@@ -97,7 +97,7 @@ class Wrists:
 
 
 def bad() -> dict[str, bytes]:
-    """A message for each cause of a rejection."""
+    """One message for each cause of a rejection."""
     now_ns = time.time_ns()
     sound = cdr.encode_transforms(now_ns, [of_left()])
     return {
@@ -119,7 +119,7 @@ MALFORMED = (
 
 @pytest.mark.thorough
 def test_hands_are_found_among_many_frames(tmp_path: Path, router: zenoh.Session) -> None:
-    """Frames are hands amid many others and bad ones are refused."""
+    """Bad frames are refused."""
     (endpoint,) = endpoints(router)
     (tmp_path / "tf.toml").write_text(CELL.format(router=endpoint, state=tmp_path))
     serve = ("--config", str(tmp_path / "tf.toml"), "--record", str(tmp_path / "records"))
@@ -169,7 +169,7 @@ def assert_refused(daemon: Daemon, session: zenoh.Session) -> None:
 
 
 def test_demonstrations_are_captured_of_frames_too(tmp_path: Path) -> None:
-    """Behind certificates: a tracker publishes them, and a recorder hears them."""
+    """With certificates of a tracker and of a recorder."""
     settings = parse(CELL.format(router="tcp/127.0.0.1:1", state=tmp_path), origin="tf.toml")
     topics = [*ros2.of_settings(settings.ros2)]
     right = Transform("/mocap", "/right_wrist", (1.0, 2.0, 3.0), STRAIGHT)

@@ -1,5 +1,5 @@
-"""What RViz and rqt show of a cell: its description and fixed frames, latched, its frames and its
-diagnostics, on the topics that the settings name.
+"""Topics that RViz and rqt show of a cell: description and fixed frames (latched), moving frames
+and diagnostics, named by the settings.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def key(topic: str) -> str:
 
 
 class LikeRmw:
-    """A subscriber of a latched topic as rmw_zenoh declares it; what it was told."""
+    """A subscriber of a latched topic as rmw_zenoh declares it, and its messages."""
 
     def __init__(self, session: zenoh.Session, topic: str) -> None:
         self.told: list[bytes] = []
@@ -101,7 +101,7 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(
                 lambda: as_the_arm() and daemon.client.ask("status")["reason"] == "no_hands",
                 "no arm",
             )
-            listening = [  # after all that is latched was published
+            listening = [  # all latched messages have been published before
                 listen("/robot_description", "std_msgs/msg/String", qos=latched),
                 listen("/tf_static", "tf2_msgs/msg/TFMessage", qos=latched),
                 listen("/tf", "tf2_msgs/msg/TFMessage"),
@@ -119,12 +119,12 @@ def test_rviz_and_rqt_are_told_whether_they_come_before_or_after(
             began = time.monotonic()
             count = len(heard["/tf"])
             until(lambda: as_the_arm() and len(heard["/tf"]) >= count + 10, "frames ended")
-            assert time.monotonic() - began > 0.5  # ten a second: the loop shares the interpreter
+            assert time.monotonic() - began > 0.5  # ten a second, as the loop needs time
             held = heard["/diagnostics"][-1].status[0]
             frames = heard["/tf"][-1].transforms
             with Tracker(daemon.session) as hands:
 
-                def is_at_fault() -> bool:  # as the arm does not follow
+                def is_at_fault() -> bool:  # a fault, as the arm does not follow
                     away = 0.06 * np.sin(3.0 * time.monotonic())
                     hands.left = (0.92 + away, -0.3, 0.08)
                     hands.right = (0.92 + away, 0.3, 0.08)
@@ -168,7 +168,7 @@ def as_told(one: Any) -> Transform:
 
 
 def placed(transforms: list[Transform], frame: str) -> np.ndarray:
-    """Where a frame is in frame `base`, as a 4 x 4 matrix, along the parents."""
+    """The pose of a frame in frame `base` as a 4 x 4 matrix, along its parents."""
     placement = pin.SE3.Identity()
     above = {transform.child: transform for transform in transforms}
     while frame != "base":
@@ -185,7 +185,7 @@ def placed(transforms: list[Transform], frame: str) -> np.ndarray:
 
 
 def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
-    """Where Pinocchio has the tool, likewise."""
+    """The tool's pose by Pinocchio, as a 4 x 4 matrix."""
     model = pin.buildModelFromXML(robot_description(settings))
     data = model.createData()
     pin.framesForwardKinematics(model, data, joints)
@@ -195,7 +195,7 @@ def kinematics(settings: Settings, joints: np.ndarray) -> np.ndarray:
 
 
 def test_latched_topics_are_delivered_with_certificates(tmp_path: Path) -> None:
-    """An observer, and not a tracker."""
+    """An observer receives them, a tracker does not."""
     settings = parse(f"network.ros2_domain = {DOMAIN}\n{VIEWED}", origin="cell.toml")
     topics = list(ros2.of_settings(settings.ros2))
     failures: list[str] = []

@@ -1,4 +1,6 @@
-"""Saved state: via-points and the segment of the task survive a restart, whole or not at all."""
+"""Saved state: via-points and the segment of the task survive a restart, completely or not at
+all.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ def test_failed_save_leaves_the_old_files(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What cannot be saved leaves the old files and nothing else."""
+    """No other files remain."""
     monkeypatch.setattr(mesh_cover, "CAPSULE_CACHE", tmp_path)
     taught = adapted(skill, POINTS, tolerance=0.03)
     keep(saved, taught)
@@ -81,7 +83,7 @@ def test_failed_save_leaves_the_old_files(
 def test_unsuitable_saved_via_points_are_set_aside(
     saved: SavedViaPoints, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Via points that this skill cannot go through are set aside."""
+    """Via-points that this skill cannot reach are set aside."""
 
     def refuse(*_: object) -> str:
         raise SkillError("they would bend it too much")
@@ -106,7 +108,7 @@ def test_a_bit_that_flips_in_the_file_changes_nothing_or_is_told(
 
 
 def another_arm(folder: Path, change: tuple[str, str]) -> Settings:
-    """A cell's settings whose arm is the shipped one with something changed in its description."""
+    """Settings of a cell with the shipped arm, whose description differs in one text."""
     urdf = folder / "own.urdf"
     text = WAM.read_text()
     assert change[0] in text
@@ -137,14 +139,14 @@ def test_two_arms_with_one_skill_and_one_folder_keep_their_own(
     assert other.read(skill) is None
     keep(other, adapted(skill, POINTS[:1], tolerance=0.03))
     assert (saved.read(skill), other.read(skill)) == ((POINTS[:2], 0.03), (POINTS[:1], 0.03))
-    other.path(skill).replace(saved.path(skill))  # nor by the file's name
+    other.path(skill).replace(saved.path(skill))  # a file of the other cell under this cell's name
     assert saved.read(skill) is None
 
 
 def test_unreachable_saved_via_points_are_set_aside(
     saved: SavedViaPoints, skill: Skill, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Whatever the change leaves in reach is in force; and all once the arm is as it was."""
+    """Via-points within the changed reach are in force; all of them once the reach is as before."""
     keep(saved, adapted(skill, POINTS, tolerance=0.03))
     tools = np.array([point.tool for point in POINTS])
     settings = Settings(cell="lab/bench2")
@@ -168,7 +170,7 @@ def test_unreachable_saved_via_points_are_set_aside(
             assert added.tolerance == 0.03
             assert stat.S_IMODE(aside.stat().st_mode) == 0o600
         caplog.clear()
-    # none replaced another
+    # no file was replaced
     assert len(list(saved.path(skill).parent.glob("out-of-reach-*.json"))) == 3
     assert saved.read(skill) == (POINTS, 0.03)
 
@@ -191,7 +193,7 @@ def test_it_is_kept_for_its_skill_and_for_a_while(
     assert SavedSegment(settings).read(skill) == "handover"
     others = replace(skill, learned_from="others")
     assert saved.read(others) == ""
-    for loaded in (others, skill):  # a skill may be loaded at a via-point that another one has too
+    for loaded in (others, skill):  # two skills may have a via-point of the same name
         saved.keep(loaded, ("handover", "glass"), 0.9)
         assert SavedSegment(settings).read(loaded) == "handover"
     file = tmp_path / "lab/bench2/segment.json"
@@ -204,7 +206,7 @@ def test_it_is_kept_for_its_skill_and_for_a_while(
 
 
 def damage(path: Path, how: str | bytes) -> None:
-    """Puts something in a file's place that cannot be used."""
+    """Replace a file by something that cannot be used."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if how == "a folder":
         path.mkdir()
@@ -236,7 +238,7 @@ REASONS: dict[str | bytes, tuple[str, ...]] = {
 def test_wrong_thing_in_place_of_a_saved_file_is_set_aside(
     how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Whatever is in the place of a saved file is set aside and reported."""
+    """It is reported too."""
     folder = state_folder(settings)
     saved_points = SavedViaPoints(settings)
     segment = folder / "segment.json"
@@ -252,13 +254,13 @@ def test_wrong_thing_in_place_of_a_saved_file_is_set_aside(
         assert f"is kept as {aside}" in caplog.text
         assert os.path.lexists(aside)
         assert not isinstance(how, bytes) or aside.read_bytes() == how
-    assert saved_points.read(skill) is None  # once is enough
+    assert saved_points.read(skill) is None  # the second reading finds no file
     SavedSegment(settings).keep(skill, ("handover", "glass"), 0.9)
     assert SavedSegment(settings).read(skill) == "handover"
 
 
 def test_daemon_starts_with_a_damaged_state(tmp_path: Path, skill: Skill) -> None:
-    """A daemon starts beside a damaged state and keeps its own again."""
+    """It saves its state again."""
     settings = Settings(files=Files(state=str(tmp_path / "state")))
     folder = state_folder(settings)
     points = SavedViaPoints(settings).path(skill)

@@ -1,5 +1,5 @@
-"""Clocks that are set while the daemon serves: its own by libfaketime, which leaves the monotonic
-clock alone, and the tracker's.
+"""Clocks that are set while the daemon serves: its own by libfaketime, which does not change the
+monotonic clock, and the tracker's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from support.cell_commands import succeeded
 from thirdhand.contract import cdr
 
 LIBRARY = next(iter(glob.glob("/usr/lib/*/faketime/libfaketimeMT.so.1")), "")
-OFFSETS_S = (0.3, 0.0, 3600.0, 0.0, 10 * 365 * 86_400.0)  # of the clock: set ahead and back in turn
+OFFSETS_S = (0.3, 0.0, 3600.0, 0.0, 10 * 365 * 86_400.0)  # the clock is set ahead and back in turn
 RATE_HZ = 100
 # libfaketime refuses the call by which Python's sleep waits on the monotonic clock. Each process of
 # Python first imports sitecustomize, where sleep is replaced.
@@ -69,7 +69,7 @@ def test_a_daemon_whose_clock_is_set_follows_on_and_says_so(
         monkeypatch.setenv(name, value)
     arguments = ("--joints", "assumed", "--rate", str(RATE_HZ), "--record", str(records))
     with serving(tmp_path, *arguments) as daemon:
-        monkeypatch.undo()  # what is started from here on has the true clock
+        monkeypatch.undo()  # processes started from here on have the true clock
         commands = Commands(daemon.session)
         with Tracker(daemon.session):
             follows(daemon, 0)

@@ -1,4 +1,4 @@
-"""Foreign images come to the scribe beside the loop; what is no image is counted."""
+"""Foreign images reach the scribe beside the loop; messages that are no image are counted."""
 
 from __future__ import annotations
 

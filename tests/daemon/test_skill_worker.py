@@ -1,5 +1,5 @@
-"""The skill worker: skills made by another process, the same to the bit as if made here, and errors
-that come back with their words.
+"""The skill worker: another process makes the same skills to the bit as this one, and errors come
+back with their words.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ SOLDERING = RECORDINGS / "soldering.npz"
 
 
 def process_of(worker: SkillWorker) -> int:
-    """The process id of a skill worker that runs."""
+    """The process id of a running skill worker."""
     pid = worker.start().pid
     assert pid is not None
     return pid
 
 
 def is_there(pid: int) -> bool:
-    """Whether a process exists, be it as a zombie."""
+    """True if a process exists, also as a zombie."""
     return Path(f"/proc/{pid}").exists()
 
 
@@ -56,7 +56,7 @@ def assert_same_bits(one: Skill, other: Skill) -> None:
 
 
 def bits(value: object) -> bytes:
-    """The bytes of numbers, and of those in a tuple."""
+    """The bytes of arrays and numbers, and of those in a tuple."""
     if isinstance(value, tuple):
         return b"".join(map(bits, value))
     return b"" if value is None else np.asarray(value).tobytes()
@@ -66,7 +66,7 @@ def bits(value: object) -> bytes:
 def test_adaptation_there_gives_the_same_bits(
     skill_worker: SkillWorker, skill: Skill, count: int
 ) -> None:
-    """A skill adapted there predicts the same bits as one adapted here."""
+    """A skill that the worker adapted predicts the same bits as one adapted in this process."""
     adapted_skill = skill_worker.adapt(skill, VIA_POINTS[:count], tolerance=0.05)
     assert_same_bits(adapted_skill, adapted(skill, VIA_POINTS[:count], tolerance=0.05))
     assert adapted_skill.via_points == VIA_POINTS[:count]
@@ -76,7 +76,6 @@ def test_adaptation_there_gives_the_same_bits(
 def test_errors_come_back_and_do_not_end_the_process(
     skill_worker: SkillWorker, skill: Skill, tmp_path: Path
 ) -> None:
-    """Errors come back with their words and do not end the process."""
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     with pytest.raises(SkillError, match=r"tolerance is -1 m; 0 or more accepted"):
@@ -98,7 +97,7 @@ def test_a_killed_process_is_replaced_at_the_next_request(
     skill_worker.load(SOLDERING)
     started = process_of(skill_worker)
     os.kill(started, signal.SIGKILL)
-    # until it is dead; the skill worker finds that out itself
+    # the skill worker itself detects that its process is dead
     os.waitid(os.P_PID, started, os.WEXITED | os.WNOWAIT)
     assert_same_bits(skill_worker.load(SOLDERING), skill)
     assert process_of(skill_worker) != started
@@ -106,7 +105,7 @@ def test_a_killed_process_is_replaced_at_the_next_request(
 
 
 def test_closing_leaves_no_process(skill: Skill) -> None:
-    """Closing leaves no process and its skills and may be repeated."""
+    """The skills remain usable, and closing may be repeated."""
     skill_worker = SkillWorker()
     skill_worker.close()
     adapted_skill = skill_worker.adapt(skill, VIA_POINTS, tolerance=0.05)
@@ -142,7 +141,7 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(
 
 
 def test_time_of_a_request_counts_from_its_arrival(skill_worker: SkillWorker) -> None:
-    """The time of a request counts from its arrival and not from its turn."""
+    """It does not count from the start of its processing."""
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 
         def late(left_s: float) -> None:

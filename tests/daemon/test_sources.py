@@ -1,4 +1,4 @@
-"""What is told of hands and arm: rates, clocks, and what was rejected and why, in words."""
+"""Status of hands and arm: rates, clocks, and rejected samples with their causes, in words."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def resting_hands(stamp_ns: int) -> list[tuple[str, PoseStamped]]:
 
 
 class Cell:
-    """A controller and its sources, told message by message, a tick each."""
+    """A controller and its input monitor, which receive messages tick by tick."""
 
     def __init__(self, skill: Skill, settings: Settings | None = None) -> None:
         self.settings = settings or Settings()
@@ -63,8 +63,8 @@ class Cell:
         late_ns: int = 0,
         at_ns: int | None = None,
     ) -> None:
-        """One tick, in whose inbox messages are by source; they arrive at a time, or so much later
-        than their stamps.
+        """One tick with messages by source; they arrive at a given time, or with a delay after
+        their stamps.
         """
         index = next(self.ticks)
         for source, message in messages:
@@ -198,7 +198,7 @@ def test_hands_that_come_too_seldom_are_told_how_often(skill: Skill, rate_hz: in
 
 @pytest.mark.parametrize("named_twice", JOINT_NAMES)
 def test_joint_named_twice_is_refused(skill: Skill, named_twice: str) -> None:
-    """With two positions it is nowhere: the arm would seem to have left its command."""
+    """A joint with two positions would seem to have left its command."""
     cell = Cell(skill)
     for k in range(1, 100):
         state = joints(k, (*POSTURE, 1.0), (*JOINT_NAMES, named_twice))
@@ -229,9 +229,8 @@ class Clock:
             self.now_ns += 2_000_000
 
 
-@pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # of the publisher's clock from the daemon's
+@pytest.mark.parametrize("apart_s", [-3600, 0, 5])  # publisher's clock minus the daemon's
 def test_delayed_samples_are_distinguished_from_a_clock_step(skill: Skill, apart_s: int) -> None:
-    """Samples that were held up are told from a clock that stepped."""
     held = Clock(skill)
     stepped = Clock(skill)
     for clock in (held, stepped):
@@ -284,7 +283,7 @@ def test_a_clock_that_was_set_back_is_told_from_a_second_source(
 
 
 def test_first_rejection_is_logged_and_others_are_counted(skill: Skill) -> None:
-    """The first of each kind is logged at once and the others are counted."""
+    """This holds for each kind of rejection."""
     cell = Cell(skill)
     for k in range(30):
         cell.tell(("left", pose(k + 1, frame="camera")))
@@ -321,7 +320,7 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
 
 
 def test_hold_names_the_missing_sample_and_the_remedy(skill: Skill) -> None:
-    """A hold names whose sample it lacks and why and what to do."""
+    """It names the source, the cause and the remedy."""
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
     for k in range(200):
@@ -356,7 +355,7 @@ def test_hold_names_the_missing_sample_and_the_remedy(skill: Skill) -> None:
     ("unit", "reported"), [("mm", "m"), ("cm", "m"), ("m", "mm"), ("m", "cm"), ("cm", "mm")]
 )
 def test_wrong_unit_explains_the_hold(skill: Skill, unit: str, reported: str) -> None:
-    """Hands in another unit are explained by the unit while the arm holds."""
+    """The hands' positions are in another unit."""
     settings = Settings(hands=HandSettings(unit=unit))  # type: ignore[arg-type]
     cell = Cell(skill, settings)
     for k in range(100):
@@ -377,7 +376,7 @@ def test_wrong_unit_explains_the_hold(skill: Skill, unit: str, reported: str) ->
 
 @pytest.mark.parametrize("batch_ticks", [60, 100, 150])
 def test_batches_of_samples_get_their_setting(skill: Skill, batch_ticks: int) -> None:
-    """Hands that arrive in batches are told the setting for that."""
+    """The hint names the setting for hands that arrive in batches."""
     cell = Cell(skill)
     period_ns = S // 500
     waiting: list[tuple[str, PoseStamped]] = []

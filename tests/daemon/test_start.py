@@ -1,5 +1,5 @@
-"""The start of a daemon: it answers at once what it does and how far it is, by what is compiled,
-and is waited for as long as it gets further.
+"""The start of a daemon: it reports its progress at once, and clients wait as long as it
+progresses.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thirdhand.settings.network import Network
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
-    """A cell whose daemon has begun to start, and where it listens."""
+    """A cell whose daemon is starting, and the daemon's endpoint."""
     network = Network(listen=("tcp/127.0.0.1:0",))
     files = Files(state=str(tmp_path))
     with starting(Settings(cell="lab/bench", network=network, files=files)) as start:
@@ -36,7 +36,7 @@ def started(tmp_path: Path) -> Iterator[tuple[Startup, str]]:
 def test_starting_daemon_answers_with_its_progress(
     started: tuple[Startup, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every request to a daemon that starts is answered with how far it is."""
+    """Every request is answered with the progress of the start."""
     start, endpoint = started
     with open_session(connect=[endpoint]) as session:
         client = Client(session, "lab/bench")
@@ -63,7 +63,7 @@ def test_starting_daemon_answers_with_its_progress(
 
 
 def test_start_with_progress_is_waited_for_longer(started: tuple[Startup, str]) -> None:
-    """A start that gets further is waited for longer than one that does not."""
+    """A start without progress is waited for less long."""
     sleeping = threading.Event()
     with open_session(connect=[started[1]]) as session:
         client = Client(session, "lab/bench")
@@ -73,14 +73,14 @@ def test_start_with_progress_is_waited_for_longer(started: tuple[Startup, str]) 
         def go_on() -> None:
             for name in modules:
                 sleeping.wait(0.25)
-                sys.modules[name] = sys  # one more that is imported
+                sys.modules[name] = sys  # one more imported module
             reports.append("all")
 
         thread = threading.Thread(target=go_on)
         thread.start()
         with pytest.raises(StartingError):
             client.wait_until_ready(timeout_s=1.0)
-        assert reports  # 2 s, of which each went on
+        assert reports  # 2 s, during which the start progressed
         thread.join()
         for name in modules:
             del sys.modules[name]
@@ -110,7 +110,6 @@ def test_a_service_that_gets_no_further_is_not_waited_for(
     ["status", "doctor", "hold", "status --all", "follow simulated --wait 1", "via-points list"],
 )
 def test_missing_listener_is_reported_before_heavy_imports(command: str) -> None:
-    """That nobody listens is told before anything heavy is imported."""
     arguments = [*command.split(), "--connect", f"tcp/127.0.0.1:{launch.free_port()}"]
     code = (
         f"import sys\nfrom thirdhand.command_line import main\ncode = main({arguments})\nassert "

@@ -1,5 +1,5 @@
-"""What a daemon survives, and how it ends: parts that fail, signals, a second daemon of its cell,
-and what its children do when it is killed.
+"""Survival and end of a daemon: failing parts, signals, a second daemon of its cell, and its child
+processes when it is killed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from thirdhand.recordings.replay import replay
 
 
 def children(pid: int) -> list[int]:
-    """The processes that a process has started and that are still there."""
+    """The child processes of a process that still run."""
     done = subprocess.run(
         ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False
     )
@@ -39,7 +39,7 @@ def until_gone(pids: list[int], within_s: float) -> None:
 
 
 def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
-    """A part that fails is a fault that is said and all goes on."""
+    """The fault is reported, and the other parts continue."""
     records = tmp_path / "records"
 
     def is_at_fault(status: dict[str, Any]) -> bool:
@@ -65,7 +65,7 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
         }.items():
             daemon.until(lambda status: status["mode"] == "follow")
             fail(tmp_path, name, "once")
-            with contextlib.suppress(UnreachableError):  # it is not answered, and that is all
+            with contextlib.suppress(UnreachableError):  # the request is not answered
                 provoke()
             daemon.until(is_at_fault)
             assert f"{name} is sabotaged" in daemon.log.read_text()
@@ -73,7 +73,7 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
             daemon.client.ask("reset")
             daemon.client.ask("resume")
         daemon.until(lambda status: status["mode"] == "follow")
-        assert daemon.end() == 1  # the recording is not complete, and says so
+        assert daemon.end() == 1  # the recording is incomplete, and its last line says so
         assert daemon.log.read_text().endswith("ticks are not recorded\n")
     (recording,) = records.glob("*.mcap")
     result = replay(recording)
@@ -82,7 +82,7 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:
-    """One that has no folder for its lock, and is served all the same."""
+    """The daemon has no folder for its lock, and serves nevertheless."""
     (tmp_path / "state").write_text("a file where a folder is needed")
     with serving(
         tmp_path, "--joints", "assumed", before=SABOTAGE.format(folder=str(tmp_path))
@@ -118,14 +118,14 @@ def test_a_lock_that_is_a_link_or_a_pipe_is_left_alone(tmp_path: Path) -> None:
 )
 @pytest.mark.one_case
 def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: list[int]) -> None:
-    """`resume` is asked all the while: nobody cancels the stop of a daemon that ends."""
+    """`resume` is requested all the time, but nobody can cancel the stop of a daemon that ends."""
     records = tmp_path / "records"
     with (
         serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon,
         Tracker(daemon.session) as tracker,
     ):
         daemon.until(lambda status: status["mode"] == "follow")
-        tracker.left = (0.8, -0.25, 0.2)  # so that the arm moves
+        tracker.left = (0.8, -0.25, 0.2)  # moves the arm
         ended = threading.Event()
 
         def resume() -> None:
@@ -144,19 +144,19 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
         asking.join(20)
         log = daemon.log.read_text()
         assert "Traceback" not in log
-        assert "did not come to rest" not in log  # the time-out of the stop
+        assert "did not come to rest" not in log  # the stop did not time out
     (recording,) = records.glob("*.mcap")
     last = log.splitlines()[-1]
     assert last.endswith(
         f" ended: the daemon of cell thirdhand; its newest recording is {recording}"
     )
-    assert "operator" not in log  # its own stop is nobody's hold, which `resume` would end
+    assert "operator" not in log  # its own stop is no operator's hold, which `resume` would end
     result = replay(recording)
     assert result.exact, result.text()
 
 
 def test_paused_daemon_counts_what_it_missed(tmp_path: Path) -> None:
-    """A daemon that was paused counts what it missed and goes on."""
+    """The daemon continues."""
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session):
         before = daemon.until(lambda now: now["mode"] == "follow")
         daemon.process.send_signal(signal.SIGSTOP)
@@ -170,8 +170,8 @@ def test_paused_daemon_counts_what_it_missed(tmp_path: Path) -> None:
 
 
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
-    """Nor where Zenoh does not show it the first; a daemon of another cell does. That a cell is
-    free once its daemon has ended or was killed: test_via_points_survive_a_restart.
+    """This holds even if Zenoh does not show it the first daemon. A daemon of another cell starts.
+    That a cell is free after the end of its daemon is tested in test_via_points_survive_a_restart.
     """
     with serving(tmp_path, "--joints", "assumed") as daemon:
         arguments = (
@@ -206,7 +206,7 @@ def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
 
 
 def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
-    """A killed workshop changes nothing and a killed daemon leaves no child."""
+    """A killed daemon leaves no child process."""
     records = tmp_path / "records"
     with serving(tmp_path, "--joints", "assumed", "--record", str(records)) as daemon:
 
@@ -215,13 +215,13 @@ def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
                 pid: Path(f"/proc/{pid}/comm").read_text().strip()
                 for pid in children(daemon.process.pid)
             }
-            assert len(names) == 3  # with the process that forks them
+            assert len(names) == 3  # one is the process that forks the others
             assert set(names.values()) >= {"scribe", "skill worker"}
             return next(pid for pid, name in names.items() if name == "skill worker")
 
         taught = teach(daemon, 3)
         tick = daemon.client.status().tick
-        # It also computes the limits of the tool, and is killed while it does nothing else.
+        # The worker also computes the tool's limits. Kill it when it has nothing else to do.
         daemon.until(lambda status: status["tick"] > tick and status["tool_limits"])
         first = skill_worker()
         os.kill(first, signal.SIGSTOP)
@@ -233,7 +233,7 @@ def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
             teach(daemon, 5)
         killing.join()
         assert daemon.client.ask("via_points", {"op": "list"})["points"] == taught
-        with contextlib.suppress(RefusedError):  # a process that starts beside others may be late
+        with contextlib.suppress(RefusedError):  # the new process may start late on a busy machine
             teach(daemon, 5)
         assert len(teach(daemon, 5)) == 5
 
@@ -241,7 +241,7 @@ def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
         started = children(daemon.process.pid)
         assert busy != first
         daemon.until(lambda status: status["tick"] > 600)
-        os.kill(busy, signal.SIGSTOP)  # it hears of nothing
+        os.kill(busy, signal.SIGSTOP)  # it cannot notice the daemon's end
         daemon.process.kill()
         daemon.process.wait()
         until_gone([pid for pid in started if pid != busy], 20)
@@ -252,7 +252,7 @@ def test_killed_skill_worker_changes_nothing(tmp_path: Path) -> None:
 
 
 def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
-    """The via-points in force once these are taught."""
+    """The via-points in force after teaching this number of them."""
     others = {"right": [0.98, 0.32, 0.06], "tool": [0.62, -0.28, 0.3], "std": 0.01}
     points = [
         {"name": f"p{i}", "left": [0.6 + 0.02 * i, -0.28, 0.3], **others} for i in range(count)
@@ -268,7 +268,7 @@ def teach(daemon: Daemon, count: int) -> list[dict[str, Any]]:
 )
 @pytest.mark.one_case
 def test_arm_does_not_depend_on_readers_of_the_output(tmp_path: Path, streams: str) -> None:
-    """An arm that works does not depend on who reads standard output."""
+    """The readers of standard output and standard error end."""
     (tmp_path / "cell.toml").write_text(f'[files]\nstate = "{tmp_path}"\n')
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = (
@@ -302,7 +302,9 @@ def test_arm_does_not_depend_on_readers_of_the_output(tmp_path: Path, streams: s
 
 
 def test_a_child_at_work_ends_with_its_parent(tmp_path: Path) -> None:
-    """A child that never looks at its socket, and a parent's thread that ends before it does."""
+    """The child never reads its socket; the parent's thread that started it ends before the
+    parent.
+    """
     (tmp_path / "busy.py").write_text(
         "import time\nfrom thirdhand.process import child\n"
         "def run(channel):\n    child.end_with_parent()\n    while True: time.sleep(0.01)\n"

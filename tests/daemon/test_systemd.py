@@ -1,5 +1,5 @@
-"""The daemon under a service manager: the notifications that systemd gets, the watchdog of the
-loop, restarts that do not follow by themselves, and the unit in examples/.
+"""The daemon under a service manager: notifications to systemd, the watchdog of the loop, restarts
+that follow hands only after `resume`, and the unit in examples/.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ controller.Controller.step = step
 
 
 class Manager:
-    """A service manager's end of the notifications."""
+    """The service manager's socket for notifications."""
 
     def __init__(self, path: Path) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.socket.bind(str(path))
 
     def heard(self, seconds: float, until: str = "\n") -> list[str]:
-        """The assignments that arrive within this time, or until one of them arrives."""
+        """The assignments that arrive within this time, at most up to the expected one."""
         assignments = list[str]()
         end = time.monotonic() + seconds
         while until not in assignments and (left := end - time.monotonic()) > 0:
@@ -58,7 +58,7 @@ class Manager:
 
 @pytest.fixture
 def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
-    """The manager of the daemons that the test starts."""
+    """The manager that daemons of the test notify."""
     systemd = Manager(tmp_path / "notify")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", str(round(2e6 * PING_S)))
@@ -68,7 +68,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 
 @pytest.mark.thorough
 def test_pings_follow_the_loop(manager: Manager, tmp_path: Path) -> None:
-    """Pings follow the loop and a restart follows no hand before resume."""
+    """After a restart, hands are followed only after `resume`."""
     mark = tmp_path / "mark"
     arguments = ("--joints", "assumed")
     before = STANDS_STILL.format(mark=str(mark))
@@ -85,7 +85,7 @@ def test_pings_follow_the_loop(manager: Manager, tmp_path: Path) -> None:
         manager.heard(3 * PING_S)  # a ping for the last tick may be under way
         tick = daemon.client.ask("status")["tick"]
         assert "WATCHDOG=1" not in manager.heard(8 * PING_S)
-        assert daemon.client.ask("status")["tick"] == tick  # all but the loop goes on
+        assert daemon.client.ask("status")["tick"] == tick  # everything but the loop continues
         mark.unlink()
         assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
 
@@ -116,10 +116,10 @@ own_answers.DEAF_AFTER_S, own_answers.ASK_EVERY_S = 1.5, 0.3
 
 @pytest.mark.thorough
 def test_unresponsive_daemon_stops_its_pings(manager: Manager, tmp_path: Path) -> None:
-    """A daemon that answers nobody pings no longer and the log reports it."""
+    """A daemon that answers no request stops its pings, and logs this."""
     mark = tmp_path / "mark"
     with serving(tmp_path, "--joints", "assumed", before=DEAF.format(mark=str(mark))) as daemon:
-        for _ in range(10):  # more than two of its own requests
+        for _ in range(10):  # longer than two of the daemon's requests to itself
             assert manager.heard(20, "WATCHDOG=1")[-1] == "WATCHDOG=1"
         mark.touch()
         while "WATCHDOG=1" in manager.heard(8 * PING_S, "WATCHDOG=1"):
@@ -136,7 +136,7 @@ def test_unresponsive_daemon_stops_its_pings(manager: Manager, tmp_path: Path) -
 
 
 def engaged_by_resume(daemon: Daemon) -> None:
-    """Check that the arm holds, with both hands in sight, until an operator's resume."""
+    """Assert that the arm holds, with both hands in sight, until an operator's `resume`."""
     daemon.until(
         lambda now: len(now["hand_age_ms"]) == 2 and max(now["hand_age_ms"].values()) < 100
     )
@@ -152,7 +152,7 @@ def engaged_by_resume(daemon: Daemon) -> None:
 
 
 def commands() -> dict[str, list[str]]:
-    """The commands of the unit by the name of their setting, as words."""
+    """The commands of the unit by their setting, split into words."""
     lines = (line.partition("=") for line in UNIT.read_text(encoding="utf-8").splitlines())
     return {name: value.split() for name, _, value in lines if name.startswith("Exec")}
 
@@ -164,7 +164,7 @@ def test_the_commands_of_the_unit_are_commands_of_this_version() -> None:
         "thirdhand.cli.serve.serve",
     ]
     assert options["ExecStart"].hold
-    # it does not see the check's exit code
+    # this setting would not apply to the check's exit code
     assert "RestartPreventExitStatus" not in UNIT.read_text(encoding="utf-8")
     assert {str(parsed.config) for parsed in options.values()} == {"/etc/thirdhand/%i.toml"}
 
@@ -178,7 +178,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     program.chmod(0o755)
     unit = tmp_path / UNIT.name
     text = UNIT.read_text(encoding="utf-8").replace(commands()["ExecStart"][0], str(program))
-    # the second one is refused, so the tool reads the file
+    # the refusal of the second text shows that the tool reads the file
     for spoilt in ("", "WatchdogSec=soon\n"):
         unit.write_text(text.replace("[Install]", f"{spoilt}[Install]"))
         done = subprocess.run(
@@ -192,7 +192,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 
 
 def test_full_disk_ends_no_daemon(manager: Manager, tmp_path: Path) -> None:
-    """A full disk ends no daemon and is said by the check and by who teaches."""
+    """The check and the request to teach report the full disk."""
     with small_disk(tmp_path / "disk", "8m") as disk:
         filled = disk / "filled"
         (disk / "state").mkdir()
@@ -220,6 +220,6 @@ def test_full_disk_ends_no_daemon(manager: Manager, tmp_path: Path) -> None:
             filled.unlink()
             Client(daemon.session).add(Scene().via_points())
             daemon.until(lambda now: now["scribe"]["state"] == "recording", 30)
-            assert daemon.end() == 1  # the recording lacks ticks, which its last line counts
+            assert daemon.end() == 1  # the recording lacks ticks, counted in the last line
             assert daemon.log.read_text().endswith("ticks are not recorded\n")
         assert len(list((disk / "state" / "thirdhand").glob("via-points-*.json"))) == 1

@@ -1,7 +1,7 @@
 """Attacks on a running daemon, each by another process: floods, idle connections, large messages.
 
-The arm's loop, the status and `hold` go on through all of them. What is asserted of time is far
-from tight: this runs on machines that are busy.
+The arm's loop, the status and `hold` go on through all of them. Limits of time are generous, as
+tests run on busy machines.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ with open_session(connect=[f"tcp/127.0.0.1:{near.getsockname()[1]}"]) as session
 
 @contextlib.contextmanager
 def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
-    """Another process that attacks until the context ends; what it said when it was in place."""
+    """A process that attacks until the context ends; yields its first line of output."""
     code = (
         "import sys, time\nendpoint, *arguments = sys.argv[1:]\nfrom thirdhand.client import "
         f"open_session\n{script}"
@@ -161,7 +161,7 @@ def attack(script: str, daemon: Daemon, *arguments: str) -> Iterator[str]:
 
 
 def holds_s(daemon: Daemon, during_s: float = 1.5) -> list[float]:
-    """How long holds took to be in force, the longest last; the status goes on meanwhile."""
+    """Sorted times [s] until holds were in force; asserts that the status continues meanwhile."""
     took = []
     end = time.monotonic() + during_s
     first = daemon.client.status().tick
@@ -174,7 +174,7 @@ def holds_s(daemon: Daemon, during_s: float = 1.5) -> list[float]:
 
 
 def peak_mib(pid: int) -> float:
-    """The most memory that a process has had."""
+    """The peak memory of a process [MiB]."""
     (line,) = (
         line
         for line in Path(f"/proc/{pid}/status").read_text().splitlines()
@@ -184,7 +184,7 @@ def peak_mib(pid: int) -> float:
 
 
 def is_welcome(daemon: Daemon) -> bool:
-    """Whether a new client is served."""
+    """True if a new client is served."""
     end = time.monotonic() + 30.0
     while time.monotonic() < end:
         with (
@@ -237,7 +237,7 @@ def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kin
 
 
 def test_hold_does_not_wait_for_a_slow_client(daemon: Daemon) -> None:
-    """Hold does not wait for a client that asks on and reads no answer."""
+    """That client sends requests and reads no answers."""
     with attack(NOTHING_READ, daemon) as report:
         assert report == "begun"
         took = holds_s(daemon, 4.0)
@@ -262,9 +262,9 @@ def network_threads(pid: int) -> dict[int, int]:
 
 
 def test_hold_does_not_wait_for_a_busy_machine(daemon: Daemon) -> None:
-    """What answers took longest for: Zenoh's threads, behind other processes. The same daemon with
-    these threads as they are and made ordinary, in turn, beside processes that only compute; the
-    client is put before them, so that it does not wait itself.
+    """Most of the delay was that of Zenoh's threads, which waited for a processor. The daemon runs
+    beside processes that only compute, with the priority of these threads raised and normal in
+    turn. The client has the raised priority, so that it does not wait itself.
     """
     ahead = network_threads(daemon.process.pid)
     if not any(ahead.values()):
@@ -293,13 +293,12 @@ def test_hold_does_not_wait_for_a_busy_machine(daemon: Daemon) -> None:
         for thread in ahead:
             put(thread, AHEAD_NICE)
     slow = {nice: sorted(times)[9 * len(times) // 10] for nice, times in took.items()}
-    # Some schedulers let who slept go first as it is: then there is nothing to be gained, and both
-    # are the same but for noise.
+    # Some schedulers run threads first that have slept. Then both priorities differ by noise only.
     assert slow[AHEAD_NICE] < max(1.25 * slow[0], AT_ONCE_S), slow
 
 
 def put(thread: int, nice: int) -> None:
-    """Gives a thread its niceness, while it is there."""
+    """Set a thread's niceness, if the thread still exists."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, thread, nice)
 
@@ -343,7 +342,7 @@ def test_large_messages_are_not_taken_in(daemon: Daemon) -> None:
 
 
 def test_commands_come_on_while_a_large_message_is_sent(daemon: Daemon) -> None:
-    """As another process hears them, with and without such a message in turn."""
+    """Another process receives the commands, with and without large messages in turn."""
     heard: list[float] = []
     daemon.until(lambda status: status["tick"] > 0)
     listening = daemon.session.declare_subscriber(

@@ -1,4 +1,6 @@
-"""A daemon whose arm is stuck says so, finds a way out in the skill worker and goes it."""
+"""A daemon whose arm is stuck reports it; the skill worker plans a way out, and the arm follows
+it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ import pytest
 
 from support.cell import Tracker, serving
 
-STUCK = [1.66, 0.73, 1.61, -0.13, 0.1, -0.97, -2.26]  # [rad] joints come to their ends from there
+STUCK = [1.66, 0.73, 1.61, -0.13, 0.1, -0.97, -2.26]  # [rad] from here, joints reach their ends
 
 
 @pytest.mark.thorough

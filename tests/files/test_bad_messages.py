@@ -1,4 +1,4 @@
-"""Recordings in which single messages are bad: these are lost and counted, and nothing else is."""
+"""Recordings with single bad messages: only these are lost, and they are counted."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BAD: dict[str, Callable[[bytes], bytes]] = {
 
 
 def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = range(10, 11)) -> Path:
-    """A copy of a recording in which some messages of a topic, by their indices, are bad."""
+    """A copy of a recording in which the messages of a topic with these indices are bad."""
     path = source.with_name("spoiled.mcap")
     messages = Messages(source)
     count = 0

@@ -1,5 +1,5 @@
-"""Takes in which a track is wrong for a while: what is learned is what the clean rest teaches, the
-stretches are named with their times, and a take without enough of the rest is refused.
+"""Takes in which a track is wrong for a while: the skill is learned from the clean samples, wrong
+stretches are named with their times, and a take with too few clean samples is refused.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.demonstration_reader import MIN_USABLE_SHARE, read_demonstration
 
 SEEDS = 3
-OFF_M = 0.02  # of positions within a stretch of less than 0.5 s, which is bridged
+OFF_M = 0.02  # largest error of positions in a bridged stretch, which is shorter than 0.5 s
 # [s] clean samples that may be lost with the bad ones
 SLOW_TO_SETTLE = {
     spoiled.two_sources: 2.2,
@@ -30,9 +30,9 @@ LOST_S = 0.5
 
 @pytest.fixture(scope="module")
 def clean() -> list[Demonstration]:
-    """Takes at 25, 50 and 100 Hz: of hands that circle, by a script, and of modelled people.
+    """Takes at 25, 50 and 100 Hz: circling hands, a script, and modelled people.
 
-    The tool of these rests to the last bit; here it has the noise of a tracker.
+    Their tools rest exactly, so a tracker's noise is added.
     """
     files = ("demonstration-1.mcap", "people/demonstration-9.mcap", "people/demonstration-6.mcap")
     takes = [circling(1, apart_m=0.03), *(read_demonstration(RECORDINGS / name) for name in files)]
@@ -53,7 +53,7 @@ def read_back(path: Path, streams: Streams, said: list[str] | None = None) -> De
 
 
 def named(said: list[str]) -> list[tuple[str, float, float]]:
-    """The stretches that were named: stream, begin and end [s]."""
+    """The stretches named in the output: stream, begin and end [s]."""
     stretches = re.findall(
         r"(hands/left|hands/right|tool/pose) (\d+\.\d\d) to (\d+\.\d\d) s: ", " ".join(said)
     )
@@ -65,7 +65,7 @@ def named(said: list[str]) -> list[tuple[str, float, float]]:
 def test_wrong_stretch_is_named_and_left_out(
     spoil: spoiled.Spoil, clean: list[Demonstration], tmp_path: Path
 ) -> None:
-    """A stretch that is wrong is named and left out and the rest is as it was."""
+    """Samples outside the stretch are unchanged."""
     for number, take in enumerate(clean):
         for seed in range(SEEDS):
             random = np.random.default_rng([number, seed])
@@ -114,7 +114,7 @@ def test_a_take_without_enough_of_the_rest_is_refused(
 
 
 def test_short_stretch_is_bridged(clean: list[Demonstration], tmp_path: Path) -> None:
-    """A short stretch is bridged and a longer one than unseen ms is not."""
+    """A stretch longer than `unseen_ms` is not bridged."""
     take = clean[1]
     for lasts_s, begins in ((0.4, ()), (0.6, (300,))):
         streams = streams_of(take)

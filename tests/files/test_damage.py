@@ -1,5 +1,5 @@
-"""Damaged files: whatever byte is wrong is noticed, damage is told from a cut, and what follows it
-is read.
+"""Damaged files: any wrong byte is detected, damage is distinguished from a cut, and the messages
+behind it are read.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(scope="module")
 def frames(whole: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[int, bytes]:
-    """Its frames, by their ticks."""
+    """The frames of `whole` by their ticks."""
     _, steps = read(tmp_path_factory.mktemp("frames") / "a.mcap", whole)
     return {step.tick: encode(step.frame) for step in steps if step.frame is not None}
 
@@ -78,7 +78,9 @@ def read(path: Path, data: bytes) -> tuple[Recording, list[Step]]:
 def test_what_follows_a_damaged_chunk_is_read(
     tmp_path: Path, whole: bytes, frames: dict[int, bytes], which: int, at: int
 ) -> None:
-    """Wherever in a chunk, its head included: at most its ticks are missing, and that is said."""
+    """The damage is anywhere in a chunk or in its header: at most its ticks are missing, and they
+    are reported.
+    """
     recording, steps = read(tmp_path / "a.mcap", flipped(whole, chunks(whole)[which][0] + at, 0x11))
     assert not recording.truncated
     assert len(recording.faults) >= 1
@@ -87,7 +89,7 @@ def test_what_follows_a_damaged_chunk_is_read(
     assert all(encode(step.frame) == frames[step.tick] for step in steps if step.frame is not None)
     missing = sorted(set(range(COUNT)) - set(read_ticks))
     assert missing == (list(range(missing[0], missing[-1] + 1)) if missing else [])
-    # what is wrong there, only the checksum over all data knows
+    # errors at these bytes show only in the checksum of all data
     assert missing or at in (1, 17, 28)
     assert len(missing) <= 60
     if missing and missing[-1] < COUNT - 1:
@@ -175,7 +177,7 @@ def test_nothing_is_learned_or_played_from_damage_in_silence(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("kind", ["damaged", "cut"])
 def test_drawing_names_what_is_missing(tmp_path: Path, whole: bytes, kind: str) -> None:
-    """A drawing says what replay says is missing and shows the rest."""
+    """The drawing names the same gap as a replay, and shows all other ticks."""
     path = tmp_path / "a.mcap"
     remarks = list[str]()
     start, end = chunks(whole)[5]

@@ -1,5 +1,5 @@
-"""Demonstrations and hands read from MCAP files, ours and other recorders': found by their topics'
-ends, brought to common stamps.
+"""Demonstrations and hands read from MCAP files of this service and of others: found by the ends of
+topic names, and brought to common stamps.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _swaying(count: int) -> np.ndarray:
 
 
 def test_demonstration_is_written_and_read_unchanged(tmp_path: Path) -> None:
-    """A demonstration comes back as it was and gives the same bytes."""
+    """Written again, it gives the same bytes."""
     stamps = START_NS + np.arange(200) * 10_000_000
     poses = _swaying(200)
     write_demonstration(tmp_path / "a.mcap", Demonstration(stamps, *poses), cell="north/3")
@@ -47,7 +47,7 @@ def test_demonstration_is_written_and_read_unchanged(tmp_path: Path) -> None:
 
 
 def test_streams_are_mapped_by_the_tracker_of_their_frame(tmp_path: Path) -> None:
-    """Hands of a tracker in millimetres that is turned by 90 degrees, beside a tool in `base`."""
+    """The hands' tracker reports millimetres and is turned by 90 degrees; the tool is in `base`."""
     stamps = START_NS + np.arange(50) * 10_000_000
     path = tmp_path / "a.mcap"
     left, right, tool = _swaying(50)
@@ -89,7 +89,6 @@ def test_streams_are_mapped_by_the_tracker_of_their_frame(tmp_path: Path) -> Non
 
 
 def test_gripper_comes_back_at_the_tools_stamps(tmp_path: Path) -> None:
-    """A gripper comes back with its demonstration at the tools stamps."""
     stamps = START_NS + np.arange(50) * 10_000_000
     poses = _swaying(50)
     closure = np.linspace(0.0, 1.0, 50)
@@ -102,7 +101,7 @@ def test_gripper_comes_back_at_the_tools_stamps(tmp_path: Path) -> None:
 def _streams(
     path: Path, streams: dict[str, tuple[np.ndarray, np.ndarray]], *, frame: str = "base"
 ) -> None:
-    """Writes poses as any ROS 2 recorder would: each topic at its own stamps."""
+    """Write poses as a ROS 2 recorder does, each topic at its own stamps."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
@@ -136,7 +135,6 @@ def _line(stamps: np.ndarray, slope: float) -> np.ndarray:
 
 
 def test_streams_are_brought_to_the_stamps_of_the_tool(tmp_path: Path) -> None:
-    """Streams with stamps of their own are brought to those of the tool."""
     left = np.arange(0, 1000, 7) * 1_000_000
     right = np.arange(30, 900, 11) * 1_000_000
     tool = np.arange(0, 1000, 5) * 1_000_000

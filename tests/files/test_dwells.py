@@ -1,4 +1,4 @@
-"""What a take tells of via-points never reached, of rests elsewhere, and of hands not seen."""
+"""Remarks on a take: via-points never reached, rests elsewhere, and unseen hands."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def listed(taken: Demonstration, path: Path) -> Summary:
 
 
 def test_missed_via_point_is_named_with_its_distance(taken: Demonstration, tmp_path: Path) -> None:
-    """A via point that was never reached is named with how near the tool came."""
+    """The distance is the nearest that the tool came to the via-point."""
     vise = msgspec.structs.replace(
         taken.via_points[0], name="vise", tool=(0.5, 0.0, 0.9), follow="none"
     )
@@ -50,8 +50,8 @@ def test_missed_via_point_is_named_with_its_distance(taken: Demonstration, tmp_p
 
 
 def test_rest_far_from_all_via_points_is_noted(taken: Demonstration) -> None:
-    """A rest far from all via points may be one that is not named."""
-    # on the way to the glass, as fast as it goes
+    """Such a rest may be a via-point that was not named."""
+    # on the way to the glass, at the highest speed
     middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))
     period_ns = round(1e9 * taken.period_s)
     lasts = round(0.8 / taken.period_s)

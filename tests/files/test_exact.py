@@ -1,5 +1,5 @@
-"""Sessions with each kind of skill replay bit for bit on other kinds of processors: with every
-kernel of OpenBLAS, without vector units, and without fused multiply-add in the C library.
+"""Sessions with each kind of skill replay bit for bit on other kinds of processors: every kernel of
+OpenBLAS, no vector units, and no fused multiply-add in the C library.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PROCESSORS = {
     "Zen": {"OPENBLAS_CORETYPE": "Zen"},
     "no AVX-512 in NumPy": {"NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX"},
     "no FMA in the C library": {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2"},
-    "generic": {"NUMBA_CPU_NAME": "generic"},  # compiles all anew
+    "generic": {"NUMBA_CPU_NAME": "generic"},  # compiles all functions again
 }
 REPLAYED = """
 import sys
@@ -51,7 +51,7 @@ for name in sys.argv[1:]:
 
 
 def corrected() -> tuple[Skill, Demonstration]:
-    """The shipped skill with a via-point of its own name, which pulls the tool, and a take."""
+    """The shipped skill with an additional via-point that attracts the tool, and a take."""
     skill = skill_in(RECORDINGS / "soldering.npz")
     _, take = learned("cyclic")
     middle = skill.hands.mean(axis=0)
@@ -64,7 +64,7 @@ def corrected() -> tuple[Skill, Demonstration]:
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Recordings of hands with noise, unseen for a while, with a hold; one for each kind."""
+    """A recording for each kind of skill: noisy hands that are unseen for a while, and a hold."""
     folder = tmp_path_factory.mktemp("sessions")
     out = [RECORDINGS / "golden.mcap"]
     settings = msgspec.structs.replace(ASSUMED, rate_hz=CORE_HZ)

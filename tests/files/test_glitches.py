@@ -1,4 +1,4 @@
-"""A glitch of a tracker costs its own samples, and not what is before or after it."""
+"""A tracker's glitch costs only its own samples, none before or after it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LASTS_S = 12.0
 
 
 def track(seed: int) -> Track:
-    """A hand that reaches there and back, and rests, with a tracker's noise."""
+    """A hand that reaches back and forth with rests, and a tracker's noise."""
     random = np.random.default_rng(seed)
     seconds = np.arange(0.0, LASTS_S, 1.0 / RATE_HZ)
     share = np.clip((np.abs((seconds % 6.0) - 3.0) - 1.0) / 1.0, 0.0, 1.0)[:, None]

@@ -1,5 +1,5 @@
-"""Takes in formats of others: ROS 1 and compressed messages in MCAP, CSV of Motive, C3D, arrays by
-the page of the documents; and what is not read is refused with what to do.
+"""Takes in other formats: ROS 1 and compressed messages in MCAP, CSV of Motive, C3D, and arrays as
+documented. Other files are refused with a remedy.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def test_ros_1_and_compressed_messages_are_read(
     take: Demonstration,
     tmp_path: Path,
 ) -> None:
-    """Messages of ros 1 and compressed ones are read from mcap."""
+    """Both are read from MCAP files."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -104,7 +104,7 @@ def test_ros_1_and_compressed_messages_are_read(
 def motive(
     path: Path, take: Demonstration, *, unit: str = "Millimeters", rotation: str = "Quaternion"
 ) -> Path:
-    """A take as Motive exports it: rotation and position of each body, and a marker of each."""
+    """A take as Motive exports it: rotation, position and a marker of each body."""
     types, names, kinds, axes = [["", label] for label in ("Type", "Name", "", "")]
     axes[:] = ["Frame", "Time (Seconds)"]
     columns = []
@@ -140,7 +140,7 @@ def motive(
 
 
 def test_bodies_and_gaps_of_motive_are_read(take: Demonstration, tmp_path: Path) -> None:
-    """Bodies of motive are read and gaps are those of the file."""
+    """The gaps are those of the file."""
     path = motive(tmp_path / "a.csv", take)
     remarks = list[str]()
     got = read_demonstration(path, settings=CAPTURE, say=remarks.append)
@@ -186,7 +186,7 @@ def test_wrong_frames_of_motive_are_refused(
     take: Demonstration,
     tmp_path: Path,
 ) -> None:
-    """Frames of motive that are none are refused with what to do."""
+    """Invalid numbers of frames are refused with a remedy."""
     path = motive(tmp_path / "a.csv", take)
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
     head = next(i for i, row in enumerate(rows) if row[0] == "Frame") + 1
@@ -219,7 +219,7 @@ def test_markers_of_c3d_are_read_as_unturned(take: Demonstration, tmp_path: Path
 
 
 def test_damaged_c3d_file_is_refused(take: Demonstration, tmp_path: Path) -> None:
-    """A c3d file that is cut or names two markers alike is refused."""
+    """The file is cut, or has two markers of the same name."""
     for labels, words in (
         (list(NAMES.values()), "was cut: it holds .* of .* frames"),
         (["RightHand"] * 3, "RightHand 2"),

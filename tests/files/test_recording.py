@@ -1,5 +1,5 @@
-"""Recordings: what was written comes back bit for bit, cut files are read up to the cut, other ROS
-2 tools read all of it.
+"""Recordings: messages come back bit for bit, cut files are read up to the cut, and other ROS 2
+tools read every message.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_step_after_a_gap_brings_state_and_skill(tmp_path: Path) -> None:
-    """After a gap the next step says how many are missing and brings state and skill."""
+    """That step has the number of missing ticks too."""
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):
             recorder.write(tick, frame, time_ns=at_ns(tick.index))
@@ -124,7 +124,7 @@ def test_a_note_may_not_pose_as_what_a_replay_needs(tmp_path: Path) -> None:
 
 
 def test_event_of_unknown_kind_is_refused(tmp_path: Path) -> None:
-    """An event of a kind that nobody knows is refused with its tick."""
+    """The error names the tick."""
     file = McapFile(tmp_path / "a.mcap", joints=7)
     with Recorder(tmp_path / "b.mcap", settings=CELL, skill=SKILL) as recorder:
         recorder.close()

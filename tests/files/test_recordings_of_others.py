@@ -1,5 +1,5 @@
-"""Demonstrations read from what other recorders wrote: bags with poses in arrays, trees of frames
-and joint states, in a tracker's axes and unit, by clocks that differ.
+"""Demonstrations read from recordings of others: bags with poses in arrays, trees of frames and
+joint states, in a tracker's axes and unit, with different clocks.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def bag(
 
 
 def moving(make: Any, *arguments: Any) -> list[Any]:
-    """A message for each of STAMPS, made of its stamp and how far the way has gone."""
+    """A message for each of STAMPS, made of its stamp and the distance covered by then."""
     return [
         make(stamp, *arguments, distance_m)
         for stamp, distance_m in zip(STAMPS.tolist(), WAY.tolist(), strict=True)
@@ -133,7 +133,7 @@ def test_arrays_and_trees_are_read_from_bags(tmp_path: Path, plugin: StoragePlug
     if plugin is StoragePlugin.SQLITE3:
         with contextlib.closing(
             sqlite3.connect(file)
-        ) as recorder:  # one that was killed, before its metadata
+        ) as recorder:  # a recorder that was killed before it wrote metadata
             recorder.execute("PRAGMA journal_mode = WAL")
             recorder.execute("DELETE FROM messages WHERE timestamp > ?", (int(STAMPS[20]),))
             recorder.commit()
@@ -187,7 +187,7 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
 def test_unread_type_is_refused_with_accepted_types(
     kind: str, encoding: str, read: Callable[[Path], object], tmp_path: Path
 ) -> None:
-    """Hands of a type that is not read are refused with it and with the types accepted."""
+    """The refusal names both."""
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = McapWriter(stream)
         writer.start()
@@ -213,7 +213,9 @@ def test_odometry_of_a_tracker_is_read_as_poses(tmp_path: Path) -> None:
 
 
 def test_streams_are_found_by_name_and_brought_to_base(tmp_path: Path) -> None:
-    """Of a motion capture in millimetres, y up, the arm's base 1 m before its origin."""
+    """The streams are of a motion capture in millimetres with y up, the arm's base 1 m before its
+    origin.
+    """
     y_up = Rotation.from_euler("x", 90, degrees=True)
     frames = moving(
         lambda stamp, way: tree(
@@ -245,7 +247,7 @@ def test_streams_are_found_by_name_and_brought_to_base(tmp_path: Path) -> None:
 
 
 def test_tool_is_found_from_joint_states(tmp_path: Path) -> None:
-    """The tool is found from joint states and clocks that differ do not count."""
+    """The clocks differ, without effect."""
     settings = Settings()
     begin_ns = STAMPS[0]
     joints = np.array(settings.arm.posture) + np.outer(WAY, np.ones(7))
@@ -254,7 +256,7 @@ def test_tool_is_found_from_joint_states(tmp_path: Path) -> None:
         i = int(np.argmin(np.abs(WAY - way)))
         return made(
             "sensor_msgs/msg/JointState",
-            header=header(stamp - begin_ns, ""),  # the arm's clock began with it
+            header=header(stamp - begin_ns, ""),  # the arm's clock began at 0
             name=list(settings.joints.names[::-1]),
             position=joints[i, ::-1].copy(),
             velocity=np.zeros(0),
@@ -295,7 +297,7 @@ def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
 
 
 def test_recording_of_a_daemon_is_a_demonstration() -> None:
-    """The golden session: with a dropout, spoilt samples, and no `tool/pose`."""
+    """The golden session has a dropout, bad samples, and no `tool/pose`."""
     remarks: list[str] = []
     got = read_demonstration(RECORDINGS / "golden.mcap", say=remarks.append)
     assert re.search(

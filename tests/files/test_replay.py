@@ -1,5 +1,5 @@
-"""Replay: the golden session and what was recorded are decided alike, bit for bit, from any state
-and with any number of BLAS threads.
+"""Replays of the golden session and of other recordings give the same frames bit for bit, from any
+state and with any number of BLAS threads.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ GOLDEN = RECORDINGS / "golden.mcap"
 
 
 def test_golden_session_replays_with_two_blas_threads() -> None:
-    """The golden session replays bit for bit also with two blas threads asked for."""
+    """The replay is the same bit for bit."""
     two = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2")
     done = thirdhand("replay", str(GOLDEN), timeout=110, env=os.environ | two)
     assert (done.returncode, done.stdout) == (0, "10000 ticks, 10000 frames identical\n"), (
@@ -177,7 +177,7 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
 
 
 def test_cut_is_forbidden_only_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
-    """A cut is told and only forbidden where exactness is asked for."""
+    """Otherwise the cut is reported."""
     data = recorded.read_bytes()
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[: len(data) * 2 // 3])
@@ -199,7 +199,7 @@ def test_refreshing_an_unchanged_session_changes_nothing(recorded: Path, tmp_pat
 
 @pytest.fixture
 def checked(recorded: Path, tmp_path: Path) -> Path:
-    """The short session, as the golden one is kept."""
+    """The short session in the form of the golden one: frames as checksums."""
     path = tmp_path / "checked.mcap"
     path.write_bytes(recorded.read_bytes())
     refresh(path)
@@ -210,7 +210,7 @@ def checked(recorded: Path, tmp_path: Path) -> Path:
 def test_recording_of_checksums_becomes_one_of_frames(
     recorded: Path, checked: Path, tmp_path: Path
 ) -> None:
-    """A recording of checksums becomes one of frames bit for bit."""
+    """The frames are the same bit for bit."""
     output = tmp_path / "whole.mcap"
     done = told("replay", str(checked), "--exact", "--output", str(output))
     assert (done.returncode, done.stdout.strip()) == (0, "1000 ticks, 1000 frames identical")
@@ -228,7 +228,7 @@ def test_recording_of_checksums_becomes_one_of_frames(
 
 
 def test_change_at_a_checksum_is_found_and_named(checked: Path, tmp_path: Path) -> None:
-    """A change where a checksum alone is kept is found and named."""
+    """The frame of that tick is not recorded."""
     recording = Recording.open(checked)
     steps = list(recording.steps(whole=False))
     path = tmp_path / "changed.mcap"

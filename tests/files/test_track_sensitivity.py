@@ -1,8 +1,8 @@
-"""How much each constant by which takes are judged matters: it is halved and doubled, over takes
-that are spoilt in every kind, and over takes that are clean.
+"""Sensitivity of the constants that judge takes: each is halved and doubled, over takes with every
+kind of fault, and over clean takes.
 
-Beside each constant stand the shares that were measured so, with recorded hands among the takes: of
-bad samples that were missed, and of clean samples that were removed.
+Beside each constant in the code stand the shares measured in this way, with recorded hands too:
+missed bad samples, and removed clean samples.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import demonstrate
 
 NAMES = ("left", "right", "tool")
-OFF_M = 0.005  # what is farther than this from the truth is bad
+OFF_M = 0.005  # samples farther than this from the truth are bad
 SEEDS = 2
 CHECK = ("MAX_HAND_MPS2",)
 OFFSETS = (
@@ -40,12 +40,12 @@ OFFSETS = (
     "MAX_JUMP_S",
 )
 AROUND = {"USUAL_PERCENTILE": (60, 90), "HALF_WINDOW": (2, 8)}
-INTAKE = "_intake_verdicts"  # what takes longest, and is the same whatever these constants are
+INTAKE = "_intake_verdicts"  # the slowest part, which does not depend on these constants
 SETTINGS = Settings()
 
 
 class Shares(NamedTuple):
-    """Of bad samples those that were missed, and of clean samples those that were removed."""
+    """The shares of bad samples that were missed, and of clean samples that were removed."""
 
     missed: float
     removed: float
@@ -64,7 +64,7 @@ def tracked(take: Demonstration, noise_m: float, seed: int) -> Demonstration:
 
 
 def clean_takes() -> list[Demonstration]:
-    """Takes at 25 to 240 Hz: of hands that circle, by a script, and of modelled people."""
+    """Takes at 25 to 240 Hz: circling hands, a script, and modelled people."""
     simulated = [
         tracked(demonstrate(Scene(), seed=seed, rate_hz=hz), 5e-4, seed)
         for seed, hz in ((1, 30), (2, 240))
@@ -80,7 +80,7 @@ def clean_takes() -> list[Demonstration]:
 
 
 def checked(streams: Streams) -> Iterator[tuple[str, np.ndarray]]:
-    """Each stream, and which of its samples (N,) are retained."""
+    """Each stream, and True for its samples (N,) that are retained."""
     tracks = [
         track_check.sound(Track(spoiled.KEYS[name], name, *streams[name], "base"))  # type: ignore[arg-type]
         for name in NAMES
@@ -155,7 +155,7 @@ def test_a_jump_of_2_to_3_cm_is_found_and_nothing_else_is(rate_hz: int) -> None:
 @pytest.mark.timeout(600)
 @pytest.mark.thorough
 def test_each_constant_matters(clean: list[Demonstration], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each constant matters and none is better halved or doubled."""
+    """No constant is better when halved or doubled."""
     cases = [
         (take, spoilt(take, spoil, 100 * number + seed)[0])
         for spoil in (*spoiled.SPOILS, *spoiled.SUBTLE)

@@ -1,4 +1,4 @@
-"""Adapting a primitive: which points give way, what stays, and what is said of misses."""
+"""Adapting a primitive: replaced points, unchanged predictions, and warnings of misses."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_tolerance_is_exclusive_and_takes_nearest():
     assert list(primitive.adapt([[0.49]], point, tolerance=2).inner.changes.replaced) == [0]
 
 
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two of them are near each other
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # two via-points are near each other
 @properties
 @given(seeds, st.floats(0, 3), representations)
 def test_order_of_via_points_does_not_matter(seed, tolerance, representation):

@@ -1,4 +1,4 @@
-"""A prior mean that goes with the input: the same as learning what is left of it, on every path."""
+"""An affine prior mean is the same as learning the outputs minus that mean, for every solution."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,12 @@ from kmp.solution import mean_of
 from support.primitives import KERNELS, curve
 
 POSITIONS = AffineMean([[0.5, -1.0, 2.0], [1.5, 0.25, -0.75]], [0.3, -0.2])
-# the rates' offset is the values' slope
+# offsets of the rates equal slopes of the values
 OVER_TIME = AffineMean([[0.5], [-1.5], [0.0], [0.0]], [0.3, -0.2, 0.5, -1.5])
 
 
 def at(prior, points):
-    """The prior mean of functionals, written down as it stands."""
+    """The prior mean of functionals by its definition."""
     if points.directions is None:
         return points.inputs @ prior.matrix.T + prior.offset
     of_values = points.inputs @ prior.matrix.T + prior.offset
@@ -30,7 +30,9 @@ def at(prior, points):
 
 
 def both(kernel, representation, how):
-    """A primitive over an affine mean, and the same over none of what is left of the outputs."""
+    """A primitive with an affine prior mean, and one without, fitted to the outputs minus that
+    mean.
+    """
     kernel = KERNELS[kernel]
     s, reference = curve(kernel)
     prior = OVER_TIME if kernel.channels == 2 else POSITIONS
@@ -73,7 +75,7 @@ def test_equals_learning_the_remainder(kernel, representation, how):
     for s in queries:
         v, a = np.random.default_rng(2).normal(size=(2, len(s)))
         for motion, left in (
-            # compiled, where Numba is
+            # compiled if Numba is installed
             (primitive.predict_motion(s, v, a), remainder.predict_motion(s, v, a)),
             (
                 primitive.inner.query.motion(s, v, a, covariance=True),

@@ -1,4 +1,4 @@
-"""What is compiled calculates as plain Python does, operation by operation, on every CPU."""
+"""Compiled functions calculate as plain Python does, operation by operation, on every CPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ numba = pytest.importorskip("numba")
 
 
 def total(left, right):
-    """A sum of products, as vector units would add it up in another order, or fuse it."""
+    """A sum of products, which vector units would reorder or fuse."""
     out = 0.0
     for k in range(len(left)):
         out += left[k] * right[k]
@@ -27,7 +27,7 @@ def total(left, right):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_sums_keep_order_and_products_are_rounded(seed):
-    """1e16 apart, so that any other order and any product that is not rounded gives other bits."""
+    """The terms differ by 1e16, so that another order or an unrounded product gives other bits."""
     random = np.random.default_rng(seed)
     left, right = random.normal(size=(2, 1001)) * 10.0 ** random.integers(-8, 9, (2, 1001))
     assert compiled(total)(left, right) == total(left, right)
@@ -69,7 +69,9 @@ print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex
 
 @pytest.mark.thorough
 def test_bits_are_those_of_a_plain_cpu():
-    """Not rounded: the golden session, whose states are, is replayed so at length."""
+    """Results are not rounded here. The golden session, whose states are rounded, is replayed on
+    such a CPU too.
+    """
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")
     }
@@ -94,7 +96,7 @@ print(skill.mean([[0.5]]), skill.jacobian([0.5]))
 
 
 def test_first_compilation_is_announced_once(tmp_path):
-    """The first compilation is announced once and what is cached is not."""
+    """Loading from the cache is not announced."""
     command = [sys.executable, "-c", FIRST]
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
@@ -120,7 +122,7 @@ def test_exponentials_are_exact_to_one_unit():
     assert result[-3:].tolist() == [1.0, 0.0, 0.0]
 
 
-# to compilations, of which a start reports
+# code that listens to compilations, to report them during a start
 LISTENS = r"from numba.core import (dispatcher, )?event"
 
 

@@ -129,7 +129,6 @@ def checkout(tmp_path: Path) -> Checkout:
 
 
 def test_same_sources_elsewhere_are_served(checkout: Checkout, tmp_path: Path) -> None:
-    """A cache serves the same sources in another folder."""
     assert checkout.result() == [20.0, 2]
     checkout.change("apart.py", "", "# imported by nobody")
     assert checkout.result() == [20.0, 0]
@@ -155,14 +154,16 @@ def test_change_compiles_anew(
 
 
 def test_processes_of_other_types_do_not_mix(checkout: Checkout) -> None:
-    """Each names its first record type alike; the last process loads what both have compiled."""
+    """Both processes give their first record type the same name; the last process loads the code of
+    both.
+    """
     assert checkout.run(LENGTHS, "6") == [6]
     assert checkout.run(LENGTHS, "7") == [7]
     assert checkout.run(LENGTHS, "7", "6") == [7, 6]
 
 
 def test_forked_processes_do_not_mix(checkout: Checkout) -> None:
-    """They go on where one process was when it was forked."""
+    """Forked processes continue from the counters of their parent."""
     checkout.run(FORKED, "6", "7")
     assert checkout.run(LENGTHS, "7", "6") == [7, 6]
 
@@ -178,7 +179,6 @@ def test_damaged_files_are_compiled_anew(checkout: Checkout) -> None:
 
 
 def test_full_disk_leaves_no_partial_files(checkout: Checkout) -> None:
-    """A full disk is left without parts of files."""
     full = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
     assert checkout.run(full + CALLED) == [20.0, 2]
     assert [path for path in checkout.cache.rglob("*") if path.is_file()] == []

@@ -10,7 +10,7 @@ T = np.linspace(0, 2, 50)[:, None]
 PATH = np.hstack([np.sin(3 * T), np.cos(2 * T)])
 REFERENCE = Gaussians.of(PATH, deviation=0.03)
 WHERE = np.linspace(0, 2, 41)[:, None]
-LOW = LinearConstraints(WHERE, np.tile([0.0, 1.0], (41, 1)), np.full(41, -0.2))  # stay above -0.2
+LOW = LinearConstraints(WHERE, np.tile([0.0, 1.0], (41, 1)), np.full(41, -0.2))  # output 1 >= -0.2
 SIDE = LinearConstraints(WHERE, np.tile([-2.0, 0.5], (41, 1)), np.full(41, -1.6))
 
 
@@ -31,7 +31,7 @@ def violation(skill, constraints=LOW):
 
 
 def test_constraints_are_obeyed():
-    """They are violated without and obeyed with them."""
+    """The unconstrained mean violates them."""
     assert violation(base()) > 0.3
     skill = base().constrained(LOW)
     assert violation(skill) < 1e-9
@@ -78,7 +78,7 @@ def test_mean_has_least_cost():
 
 
 def test_speed_and_rates_can_be_limited():
-    """A speed can be limited and rates among the outputs too."""
+    """Limits apply to the speed of values, and to rates among the outputs."""
     slow = LinearConstraints(
         WHERE, np.tile([-1.0, 0.0], (41, 1)), np.full(41, -1.5), np.ones((41, 1))
     )
@@ -107,7 +107,7 @@ def test_via_points_and_constraints_in_any_order():
 
 
 def test_low_rank_is_solved_anew():
-    """A low-rank primitive is solved densely for constraints."""
+    """The new solution is dense."""
     via = [[0.1]], Gaussians.of([0.3, 0.9], deviation=0.01)
     dense, low = (
         base(representation).adapt(*via, tolerance=0) for representation in ("dense", "low_rank")

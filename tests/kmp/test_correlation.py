@@ -1,4 +1,4 @@
-"""Correlation adaptation: equation (11), and that rewards grow while via-points are kept."""
+"""Correlation adaptation: equation (11); rewards grow while via-points are kept."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ T = np.linspace(0, 2, 60)[:, None]
 
 
 def letter(representation="dense"):
-    """A planar curve whose outputs are strongly tied to each other."""
+    """A planar curve with strongly correlated outputs."""
     mean = np.hstack([np.sin(2 * T), np.cos(3 * T)])
     tied = 0.02 * np.array([[1.0, 0.95], [0.95, 1.0]])
     primitive = KMP.fit(
@@ -42,7 +42,6 @@ def test_neutral_correlation_changes_nothing(representation):
 
 
 def test_covariances_are_those_of_equation_11():
-    """The covariances are those of equation 11."""
     correlation = Correlation(
         basis().centres, 0.3, np.random.default_rng(0).uniform(0.5, 2, size=(5, 2))
     )
@@ -57,7 +56,7 @@ def test_covariances_are_those_of_equation_11():
 
 
 def test_negative_factor_flips_signs():
-    """A factor below zero flips signs and through zero the covariances stay positive definite."""
+    """The covariances stay positive definite where the factor passes 0."""
     primitive = letter()
     before = primitive.base.reference.covariance
     for factor in (-2.0, -0.05, -0.02, 0.0, 0.02, 0.05, 2.0):
@@ -73,7 +72,6 @@ def test_negative_factor_flips_signs():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rewards_grow_and_via_point_is_met(seed):
-    """Rewards grow and the via-point is still met."""
     primitive = letter()
     result = improve(
         primitive,

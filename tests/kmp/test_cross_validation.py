@@ -1,4 +1,4 @@
-"""Held-out groups in closed form are predicted as by regression on the other points."""
+"""Predictions of held-out groups in closed form equal those of a regression on the other points."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_residuals_are_those_without_the_group():
 
 
 def test_covariances_are_those_without_the_group():
-    """Covariances are those without the group and without a point's own noise."""
+    """A point's own noise is not in them."""
     roots = 0.3 * RANDOM.normal(size=(20, 3, 3)) + np.eye(3)
     scatter = roots @ roots.transpose(0, 2, 1)
     by_ratio = held_out_covariances(KERNEL, scatter, RATIOS, GROUP)
@@ -54,7 +54,6 @@ def test_covariances_are_those_without_the_group():
 
 
 def test_first_good_candidate_is_preferred():
-    """The first candidate that is good enough is preferred."""
     assert preferred("abc", [3.0, 1.1, 1.0], 1.2) == "b"
     with pytest.raises(ValueError, match="at least the least score, 1"):
         preferred("abc", [3.0, 1.1, 1.0], 0.9)

@@ -72,7 +72,7 @@ def test_kernel_of_derivatives(name):
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 @pytest.mark.parametrize("kernel", ["one length", "a length an input"])
 def test_taught_jacobian_is_met(representation, kernel):
-    """A taught Jacobian is the one at its input, and the via-point is still met."""
+    """The via-point is met too."""
     primitive = taught(base(representation, kernel))
     np.testing.assert_allclose(primitive.jacobian(PLACE[0]), FOLLOW[0], atol=1e-5)
     np.testing.assert_allclose(primitive.mean(PLACE), TRUTH(S[:1]), atol=1e-5)
@@ -85,7 +85,7 @@ def test_taught_jacobian_is_met(representation, kernel):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_mean_and_covariance_are_naive_ones(representation):
-    """Mean and covariance are those of the naive solution."""
+    """They equal those of `support.primitives.naive`."""
     primitive = taught(base(representation), deviation=0.1)
     queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
     mean, joint = naive(primitive, queries)
@@ -114,7 +114,7 @@ def test_velocity_is_taught_and_replaces_no_point(representation):
 
 @pytest.mark.parametrize("kernel", ["periodic", "velocity"])
 def test_derivative_over_time_is_met(kernel):
-    """Over time a derivative can be taught too."""
+    """The input is time."""
     t = np.linspace(0, 2.4, 50)[:, None]
     w = 2 * np.pi / 2.5
     mean = np.hstack([np.sin(w * t), w * np.cos(w * t)])

@@ -1,4 +1,4 @@
-"""kmp as a distribution of its own: what it needs and holds, and that it serves without Numba."""
+"""kmp as a distribution of its own: requirements and content, and its use without Numba."""
 
 import json
 import shutil
@@ -80,7 +80,6 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
 
 
 def test_requirements_agree_with_project():
-    """Its requirements are those of the project."""
     whole, alone = (
         tomllib.loads((ROOT / path).read_text())
         for path in ("pyproject.toml", "kmp/pyproject.toml")
@@ -92,7 +91,6 @@ def test_requirements_agree_with_project():
 
 
 def test_predicts_the_same_without_numba(wheel, tmp_path):
-    """Without Numba, kmp predicts the same."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
     code = WITHOUT_NUMBA.format(site=str(tmp_path), libraries=sysconfig.get_path("purelib"))

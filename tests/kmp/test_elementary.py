@@ -1,4 +1,4 @@
-"""Elementary functions are as exact as their module says."""
+"""Elementary functions have the accuracy that their module states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ RANDOM = np.random.default_rng(0)
     ids=["exp", "log", "sin", "cos", "atan2"],
 )
 def test_errors_are_a_few_units_in_last_place(ours, theirs, arguments):
-    """Their errors are a few units in the last place."""
     for row in arguments.tolist():
         assert ours(*row) == pytest.approx(theirs(*row), rel=4 * 2.0**-52, abs=0.0)
 
@@ -38,7 +37,7 @@ def test_their_errors_are_below_1e_15(ours, theirs):
 
 
 def test_values_at_ends():
-    """Their ends are those of the functions."""
+    """Values at the ends of the ranges equal those of the true functions."""
     assert (exp(0.0), exp(-math.inf), exp(math.inf), log(1.0)) == (1.0, 0.0, math.inf, 0.0)
     assert math.isnan(exp(math.nan))
     assert [atan2(y, x) for y, x in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0))] == [

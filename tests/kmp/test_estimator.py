@@ -1,4 +1,4 @@
-"""The estimator by scikit-learn's own rules, and as part of its pipelines and searches."""
+"""The estimator passes scikit-learn's own checks, and works in its pipelines and searches."""
 
 import warnings
 
@@ -20,7 +20,7 @@ Y = np.stack([np.sin(2 * X[:, 0]) * X[:, 1], 100 + 50 * np.cos(X[:, 1])], axis=1
 @pytest.mark.parametrize("components", [None, 2])
 def test_scikit_learns_own_checks_pass(components):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SkipTestWarning)  # of checks that need other packages
+        warnings.simplefilter("ignore", SkipTestWarning)  # some checks need other packages
         check_estimator(KMPRegressor(components=components))
 
 
@@ -37,7 +37,6 @@ def test_learns_any_unit_with_deviation():
 
 
 def test_works_in_pipelines_and_searches():
-    """It is found in pipelines and searches."""
     pipeline = make_pipeline(StandardScaler(), KMPRegressor(ell=1.0))
     assert cross_val_score(pipeline, X, Y[:, 0], cv=3).min() > 0.9
     search = GridSearchCV(KMPRegressor(), {"ell": [0.001, 0.5], "noise": [0.05, 0.2]}, cv=3).fit(

@@ -1,4 +1,4 @@
-"""What holds for every type: to a file and back, read-only arrays, and a short repr."""
+"""Properties of every type: storage in a file, read-only arrays, and a short repr."""
 
 import copy
 import dataclasses
@@ -57,7 +57,7 @@ RATED = Gaussians(np.hstack([np.sin(S[:, :1]), np.cos(S[:, :1])]), R.covariance)
 
 
 def used(representation, kernel=K, inputs=S, reference=R):
-    """An adapted primitive that remembers all that it was asked for once."""
+    """An adapted primitive whose cached properties are all set."""
     options = {
         "kernel": kernel,
         "lambda_mean": 1.0,
@@ -118,7 +118,7 @@ VALUES = [
 
 
 def same(a, b):
-    """Whether two values are the same, bit for bit."""
+    """True if two values are the same bit for bit."""
     if isinstance(a, KMP):
         stored = isinstance(b, KMP) and same(named_arrays.to_arrays(a), named_arrays.to_arrays(b))
         return stored and same_bits(a, b, a.inputs[:5] + 0.1)
@@ -182,7 +182,7 @@ def test_arrays_are_read_only_in_every_copy(value):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_pickle_leaves_factors_out(representation):
-    """A pickle leaves out the factors and the copy makes them again."""
+    """The copy computes them again."""
     primitive = used(representation)
     restored = pickle.loads(pickle.dumps(primitive))
     dropped = {"mean_factor", "covariance_factor"}
@@ -202,7 +202,7 @@ def test_every_public_type_is_tested():
 
 
 def test_other_values_are_refused(tmp_path):
-    """A stored value that is no primitive is reported as such, and unknown kinds are refused."""
+    """The error names the stored kind; unknown kinds are refused too."""
     kmp.save(tmp_path / "value", R, input_unit="m", output_unit="m")
     with pytest.raises(
         ValueError, match="the stored value: Gaussians given, KMP needed: take `value`"

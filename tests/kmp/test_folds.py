@@ -1,4 +1,4 @@
-"""A fold shares work among hyper-parameters, and predicts what a primitive fitted so does."""
+"""A fold shares work among hyper-parameters, and predicts as a primitive with each of them."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def fold(dimensions, outputs, rates=False):
 
 CASES = [
     (fold(1, 3), GaussianKernel(3.0)),
-    (fold(1, 2), GaussianKernel(900.0)),  # of too many features
+    (fold(1, 2), GaussianKernel(900.0)),  # a kernel with too many features
     (fold(2, 2), GaussianKernel([3.0, 0.5])),
     (fold(1, 2, rates=True), VelocityKernel(2.0)),
     (fold(1, 1, rates=True), VelocityKernel(300.0)),

@@ -1,4 +1,4 @@
-"""Normal distributions as a value: what is refused, and the rules of affine maps and products."""
+"""Normal distributions as values: refusals, affine maps and products."""
 
 import pickle
 from types import ModuleType
@@ -70,7 +70,6 @@ def test_invalid_covariance_is_refused(second, says):
 @properties
 @given(seeds)
 def test_affine_map_and_inverse_cancel(seed):
-    """An affine map and its inverse cancel."""
     value = some(4, 3, seed)
     random = np.random.default_rng(seed)
     rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]

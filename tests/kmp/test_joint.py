@@ -1,4 +1,4 @@
-"""Several queries together: their joint covariance, trajectories drawn, Jacobians in a batch."""
+"""Several queries together: joint covariance, sampled trajectories, Jacobians in a batch."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_joint_covariance_is_the_naive_one(skill):
 
 
 def test_trajectories_have_mean_and_covariance():
-    """Trajectories have the mean and the joint covariance and follow from the seed."""
+    """They follow from the seed."""
     skill = fitted()
     drawn = skill.sample(QUERIES, 20_000, seed=3)
     joint = skill.predict_joint(QUERIES)
@@ -84,7 +84,7 @@ def test_a_rhythmic_skill_has_no_seam(representation):
     via = primitive.adapt(
         [[2 * np.pi - 0.02]], Gaussians.of([[0.2, 0.9]], deviation=1e-4), tolerance=0.06
     )
-    assert list(via.inner.changes.replaced) == [0]  # the nearest round the circle
+    assert list(via.inner.changes.replaced) == [0]  # the nearest point across the seam
     a = np.zeros((1, 1))
     b = np.full((1, 1), 2 * np.pi)
     for skill in (primitive, via):

@@ -1,4 +1,4 @@
-"""The kernels: their axioms, and what one query asks of them against finite differences."""
+"""The kernels: their axioms, and their derivatives against finite differences."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -40,7 +40,7 @@ def test_ell_for_each_input(seed):
 @properties
 @given(seeds, ells)
 def test_velocity_kernel_has_derivatives(seed, ell):
-    """The velocity kernel is the kernel with its derivatives by finite differences."""
+    """They equal finite differences of the kernel."""
     random = np.random.default_rng(seed)
     h = 1e-4
     k = VelocityKernel(ell)

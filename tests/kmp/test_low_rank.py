@@ -1,4 +1,4 @@
-"""The low rank solution against the dense one, and what is said when the rank is reached."""
+"""The low rank solution against the dense one, and the warning when the rank is reached."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ STD = 0.02
 
 
 def tube(seed, count):
-    """Hands that move along a path, with scatter, and a tool that goes with them."""
+    """Hands that move along a path with scatter, and a tool that follows them."""
     random = np.random.default_rng(seed)
     t = random.uniform(size=count)
     path = np.stack(
@@ -76,14 +76,14 @@ def agree(dense, low, queries, within=1e-6):
 @properties
 @given(seeds, st.sampled_from([None, 5.0]))
 def test_equals_dense_within_data(seed, lambda_covariance):
-    """Within the data it is the dense solution to a micrometre."""
+    """The difference is a micrometre at most."""
     dense, low = both(seed, lambda_covariance=lambda_covariance)
     assert (dense.representation, low.representation) == ("dense", "low_rank")
     assert len(low.inner.solution.centres) < 300
     agree(dense, low, np.concatenate([dense.inputs[:20], tube(seed + 7, 20)[0]]))
 
 
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some via-points are near each other
 @properties
 @given(
     seeds,
@@ -134,7 +134,9 @@ def test_hidden_covariance_is_refused(variance, representation):
 
 
 def correlated(seed, count, outputs, spread):
-    """A path over time with its rates, and correlations: deviations of 10 mm to 10 mm / spread."""
+    """A path over time with its rates and correlated outputs; deviations are 10 mm to 10 mm /
+    spread.
+    """
     random = np.random.default_rng(seed)
     t = np.linspace(0, 2, count)[:, None]
     half = np.arange(2, 2 + outputs // 2)
@@ -144,14 +146,13 @@ def correlated(seed, count, outputs, spread):
     return t, Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2)
 
 
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are surer than the data is smooth
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some deviations are too small
 @pytest.mark.parametrize(
     "one", [GaussianKernel(8.0), PeriodicKernel(2.0, 3.0), VelocityKernel(8.0)], ids=repr
 )
 @pytest.mark.parametrize("outputs", [2, 4, 6])
 @pytest.mark.parametrize("spread", [1.0, 30.0, 300.0])
 def test_correlated_outputs_with_any_kernel(one, outputs, spread):
-    """Correlations of any outputs count with any kernel."""
     t, reference = correlated(outputs, 150, outputs, spread)
     dense, low = of_both(t, reference, kernel=one, lambda_mean=10.0)
     backward = Gaussians(reference.mean[::-1], reference.covariance[::-1])
@@ -162,7 +163,7 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
         (primitive.adapt(*via, tolerance=0.02) for primitive in (dense, low, reordered)),
     ):
         error = np.linalg.norm(b.mean(t) - a.mean(t), axis=1).max()
-        # The same points in another order differ by what rounding does to the dense solution.
+        # The order of the points changes the dense solution by rounding only.
         rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
         assert error < max(1e-5, 2.0 * rounding)
         assert error <= b.error_bound_at_points
@@ -176,7 +177,7 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
     "one", [GaussianKernel(8.0), PeriodicKernel(8.0, 2.0), VelocityKernel(8.0)], ids=repr
 )
 def test_rank_decides_over_time(one):
-    """Over time, the rank decides on the representation, not the number of points alone."""
+    """Over time, the rank decides on the representation, not only the number of points."""
     t, reference = correlated(0, 240, 4, 3.0)
     automatic = KMP.fit(t, reference, kernel=one, lambda_mean=10.0)
     dense = KMP.fit(t, reference, kernel=one, lambda_mean=10.0, representation="dense")
@@ -236,14 +237,14 @@ def test_the_error_bound_holds(seed, left, adapted):
     assert dense.error_bound == dense.error_bound_at_points == 0
 
 
-# the rate wanted is another than the neighbours'
+# the taught rate differs from the neighbours'
 @pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 @pytest.mark.parametrize("ell", [2.0, 8.0, 200.0])
 @pytest.mark.parametrize("count", [12, 60])
 def test_derivatives_are_features_too(count, ell):
     """Derivatives of values and rates are features too."""
     t = np.linspace(0, 2, count)[:, None]
-    # of value and rate: rate and acceleration
+    # derivatives of value and rate are rate and acceleration
     along = np.where(np.arange(count) % 3 == 0, 1.0, 0.0)[:, None]
     values = np.hstack([np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t)])
     mean = np.where(along > 0, values[:, 1:], values[:, :2])

@@ -1,4 +1,4 @@
-"""Orientation: the tangent space against SciPy, signs, angular velocity, via-points."""
+"""Orientation: tangent space against SciPy, signs, angular velocity, via-points."""
 
 import numpy as np
 import pytest
@@ -117,7 +117,6 @@ def test_via_points_of_either_sign_are_met():
 
 
 def test_via_point_may_fix_angular_velocity():
-    """A via-point can fix the angular velocity or leave it free."""
     primitive = skill(velocity=True)
     omega = np.array([[0.5, -0.3, 0.8]])
     desired = (Rotation.from_rotvec([0.1, -0.1, 0.1]) * path(np.array([0.7]))).as_quat()
@@ -136,7 +135,6 @@ def test_via_point_may_fix_angular_velocity():
 
 
 def test_covariance_is_of_world_rotations():
-    """The covariance is of small rotations in the world."""
     model = skill(velocity=False)
     q, covariance = model.predict([[0.7], [0.9]])
     same(q, model.mean([[0.7], [0.9]]))

@@ -1,4 +1,4 @@
-"""What `plot` draws: the predictions' very numbers, in axes of its own or given ones."""
+"""Drawings of `plot` have exactly the predicted numbers, in new or given axes."""
 
 import sys
 
@@ -27,7 +27,7 @@ def _closed():
 
 
 def drawn(axes, label):
-    """What has that label in the legend."""
+    """The artist with this label in the legend."""
     return next(artist for artist in axes.get_children() if artist.get_label() == label)
 
 
@@ -70,7 +70,7 @@ def test_via_points_replace_references():
 
 
 def test_region_in_a_plane():
-    """In a plane the region is that of the ellipses."""
+    """The region consists of the ellipses of the covariances."""
     [axes] = ADAPTED.plot(T, plane=(1, 0), output_unit="m")
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("output 1 [m]", "output 0 [m]")
     prediction = ADAPTED.predict(T)
@@ -97,7 +97,7 @@ def test_region_in_a_plane():
 
 
 def test_missing_matplotlib_is_named(monkeypatch):
-    """Without Matplotlib the extra is named."""
+    """The error names the extra."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'kmp\[plot\]'"):
         PLAIN.plot()

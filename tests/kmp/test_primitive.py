@@ -1,4 +1,4 @@
-"""The primitive: equations (8) and (9) against a naive solution, covariance, files, refusals."""
+"""The primitive: equations (8) and (9) against a naive solution, covariance, refusals."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -24,7 +24,7 @@ from support.primitives import (
 @properties
 @given(seeds, st.sampled_from([1, 2, 3]), st.sampled_from([None, 5.0]), st.booleans())
 def test_mean_and_covariance_are_naive_ones(seed, outputs, lambda_covariance, adapted):
-    """Mean and covariance are those of the naive solution."""
+    """They equal those of `support.primitives.naive`."""
     prior = np.arange(outputs) + 0.5
     primitive = skill(seed, lambda_covariance=lambda_covariance, prior_mean=prior, outputs=outputs)
     if adapted:
@@ -41,7 +41,6 @@ def test_mean_and_covariance_are_naive_ones(seed, outputs, lambda_covariance, ad
 
 
 def test_batches_equal_single_queries():
-    """Many queries are predicted in batches as in one."""
     queries = np.random.default_rng(0).normal(size=(600, 4))
     primitive = skill()
     prediction = primitive.predict(queries)
@@ -51,11 +50,11 @@ def test_batches_equal_single_queries():
         )
 
 
-@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some are near each other
+@pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")  # some via-points are near each other
 @properties
 @given(seeds, st.sampled_from([0.001, 0.1, 1.0]), representations)
 def test_covariance_is_positive_definite(seed, spread, representation):
-    """The covariance is symmetric and positive definite even where all is known."""
+    """It is symmetric too, and holds at the data."""
     random = np.random.default_rng(seed)
     inputs = spread * random.normal(size=(20, 2))
     exact = Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1)))
@@ -72,7 +71,7 @@ def test_covariance_is_positive_definite(seed, spread, representation):
 
 @pytest.mark.parametrize("lambda_covariance", [1e-2, 1.0])
 def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
-    """A covariance that rounding would hide is refused and the remedy works."""
+    """The remedy works."""
     inputs, reference = database()
     sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
     primitive = KMP.fit(
@@ -106,7 +105,7 @@ def test_far_away_is_the_prior(representation):
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_refitted_to_own_reference_is_the_same(count):
-    """Refitted to its own reference it is the same bit for bit."""
+    """A primitive fitted again to its own reference is the same bit for bit."""
     primitive = skill(lambda_covariance=5.0).adapt(*via(1, count), tolerance=1.5)
     queries = np.random.default_rng(2).normal(size=(3, 4))
     assert same_bits(primitive.refitted(primitive.base.reference), primitive, queries)
@@ -158,8 +157,8 @@ def test_uncertainty_has_two_parts(seed, representation):
     np.testing.assert_allclose(parts.variability + parts.distance, total, rtol=1e-6, atol=1e-7)
     for part in (parts.variability, parts.distance):
         assert (np.linalg.eigvalsh(part) > -1e-12).all()
-    assert np.abs(parts.distance[:3]).max() < 1e-6  # at the data, all is the demonstrations'
-    np.testing.assert_allclose(parts.variability[-1], 0, atol=1e-9)  # far away, nothing is
+    assert np.abs(parts.distance[:3]).max() < 1e-6  # at the data: only variability
+    np.testing.assert_allclose(parts.variability[-1], 0, atol=1e-9)  # far away: distance only
     np.testing.assert_allclose(parts.distance[-1], 15 * np.eye(3), rtol=1e-9)
 
 
@@ -234,7 +233,7 @@ extended = pytest.mark.skipif(
 
 
 def solved(matrix, right):
-    """matrix^-1 right by a Cholesky factor in extended precision, refined once."""
+    """matrix^-1 `right`, by a Cholesky factor in extended precision, refined once."""
     n = len(matrix)
     factor = matrix.copy()
     for j in range(n):
@@ -260,7 +259,7 @@ def blocks(kernel, a, b):
 
 
 def exact(primitive, queries):
-    """Equations (8), (9) and the covariance of IJRR 2019 as they stand, in extended precision."""
+    """Equations (8), (9) and the covariance of IJRR 2019 by definition, in extended precision."""
     s = primitive.inputs.astype(wide)
     kernel = primitive.kernel
     n, o = primitive.reference.mean.shape
@@ -297,7 +296,7 @@ def hands():
 @pytest.mark.parametrize("ell", [0.5, 20.0, np.array([0.5, 1, 2, 0.5, 1, 2])])
 @pytest.mark.parametrize("adapted", [False, True])
 def test_nine_digits_in_extended_precision(lambda_covariance, ell, adapted):
-    """Mean and covariance have nine digits."""
+    """This holds for mean and covariance."""
     inputs, reference = hands()
     primitive = KMP.fit(
         inputs,
@@ -333,6 +332,6 @@ def check(primitive, queries):
         assert np.linalg.norm(
             (predicted_covariance - covariance).astype(float)
         ) <= 1e-9 * np.linalg.norm(covariance.astype(float))
-    near = slice(0, -3)  # and where the covariance is small, in its own right
+    near = slice(0, -3)  # relative to the covariance where that is small
     error = np.linalg.norm((together.covariance - covariance)[near].astype(float))
     assert error <= 1e-9 * np.linalg.norm(covariance[near].astype(float))

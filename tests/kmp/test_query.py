@@ -46,7 +46,7 @@ def moving(skill):
 
 def test_one_call_equals_the_others(skill, monkeypatch):
     """One call gives the results of the separate calls, bit for bit."""
-    monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as where Numba is not installed
+    monkeypatch.setattr("kmp.loops.query.AVAILABLE", False)  # as without Numba
     s, v, a = moving(skill)
     prediction = skill.predict_motion(s, v, a)
     batch = skill.predict(s[None])
@@ -63,7 +63,7 @@ def test_one_call_equals_the_others(skill, monkeypatch):
 
 
 def test_compiled_loops_equal_plain_ones(skill):
-    """Compiled loops give the same but for rounding."""
+    """The difference is rounding."""
     motion = moving(skill)
     prediction = skill.predict_motion(*motion)
     plain = skill.inner.query.motion(*motion, covariance=True)

@@ -1,4 +1,4 @@
-"""Superposition by priority, and frames that move with the task."""
+"""References by superposition, by frames that move with the task, and by Gaussian processes."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def learned(velocity=False):
 def test_frames_carry_skill_to_new_places():
     """Start and goal frames carry the skill to new places."""
     skill, t = learned()
-    # none of them demonstrated
+    # none of these places was demonstrated
     start = np.array([-0.6, 0.5])
     goal = np.array([1.5, -0.6])
     path = skill.placed([CoordinateFrame.at(start), CoordinateFrame.at(goal)]).mean(t)
@@ -141,7 +141,7 @@ def within(normals, wanted):
 
 
 def judged(offset):
-    """Errors and shares (S, 2) at a demonstration that was left out: the process, the mixture."""
+    """Errors and shares (S, 2) on a left-out demonstration, for the process and the mixture."""
     errors = []
     shares = []
     for seed in SEEDS:
@@ -156,7 +156,7 @@ def judged(offset):
 
 
 def test_process_knows_common_offsets():
-    """Demonstrations that are shifted as a whole are recognised."""
+    """The demonstrations are shifted as a whole."""
     errors, shares = judged(offset=0.15)
     assert np.exp(np.mean(np.log(errors[:, 0] / errors[:, 1]))) < 0.65
     assert 0.8 < shares[:, 0].mean() <= 1
@@ -164,7 +164,7 @@ def test_process_knows_common_offsets():
 
 
 def test_common_offsets_are_correlated():
-    """Outputs that are off together are correlated."""
+    """Common offsets of several outputs are correlated."""
     random = np.random.default_rng(0)
     t = np.linspace(0, 1, 50)[:, None]
     takes = []

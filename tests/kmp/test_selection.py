@@ -25,7 +25,7 @@ def unseen_rmse(learned):
 
 
 def is_of(score, primitive):
-    """Whether the score is of a primitive's parameters."""
+    """True if a score belongs to the parameters of a primitive."""
     return (
         np.array_equal(score.ell, primitive.kernel.ell)
         and score.lambda_mean == primitive.lambda_mean
@@ -33,16 +33,14 @@ def is_of(score, primitive):
 
 
 def test_choice_is_as_good_as_best_tried():
-    """What is chosen is as good as the best of all that was tried and predicts a new
-    demonstration.
-    """
+    """The chosen primitive predicts a new demonstration too."""
     learned = chosen()
     best = learned.scores[0]
     assert best.rmse == min(score.rmse for score in learned.scores)
     mine = [score.rmse for score in learned.scores if is_of(score, learned.primitive)]
     assert min(mine) <= 1.03 * best.rmse
     ratio = np.asarray(learned.primitive.kernel.ell) / np.asarray(best.ell)
-    np.testing.assert_allclose(ratio, ratio[0])  # all lengths are made shorter together
+    np.testing.assert_allclose(ratio, ratio[0])  # all lengths are scaled by one factor
     assert ratio[0] > 1 - 1e-9
     assert best.rmse < 1.1 * learned.regression_rmse
     scored = [score for score in learned.scores if score.negative_log_likelihood is not None]
@@ -213,7 +211,6 @@ def test_the_gradient_is_the_differences(points, kernel):
 
 
 def test_likelihood_is_that_of_scipy():
-    """It is the density of the normal that SciPy gives."""
     points, kernel = CASES[0]
     value, _, signal = negative_log_likelihood(points, np.zeros(2), kernel, 0.7)
     total = np.kron(kernel(points.inputs, points.inputs), np.eye(2))
@@ -228,7 +225,7 @@ def test_likelihood_is_that_of_scipy():
 
 
 def test_likelihood_finds_irrelevant_input():
-    """An uninformative input is detected, and the prediction improves without it."""
+    """The prediction improves without that input."""
     options = {"components": 16, "seed": 0, "count": 80, "criterion": "likelihood"}
     separate, shared = (
         kmp.learn(driven_by_hands(), scales=scales, **options) for scales in ("each", "one")

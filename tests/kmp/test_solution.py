@@ -1,4 +1,4 @@
-"""What every solution must be, whichever way it was found."""
+"""Properties of every solution, dense or low rank."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def primitive(request):
 
 
 def test_solution_is_stored_with_base(primitive):
-    """Each is stored with what its base needs."""
+    """Adapted solutions are stored with the arrays of their base."""
     assert set(primitive.inner.solution.to_arrays()) == set(
         primitive.base.inner.solution.to_arrays()
     )
@@ -77,7 +77,7 @@ def test_equal_pivots_are_refused():
 
 
 def leaning(count):
-    """Covariances that tell the outputs apart."""
+    """Covariances that couple the outputs."""
     return np.tile([[0.01, 0.004], [0.004, 0.02]], (count, 1, 1))
 
 
@@ -95,7 +95,7 @@ def test_outputs_solved_as_one_change(first):
     options = {"kernel": GaussianKernel(0.05), "lambda_mean": 1.0, "representation": "dense"}
     base = KMP.fit(S, REFERENCE if first == "alike" else mixed, **options)
     points = Gaussians(np.ones((3, 2)), tilted if first == "alike" else alike)
-    # in the place of those that tell them apart
+    # these replace the points with coupled outputs
     where = S[:3] + 0.01 if first == "alike" else S[37:]
     adapted = base.adapt(where, points, tolerance=0.0 if first == "alike" else 1e-6)
     assert (base.inner.solution.distinct, adapted.inner.solution.distinct) == (
@@ -175,7 +175,7 @@ def assert_same(one, other, queries):
 
 @pytest.mark.parametrize("case", CASES)
 def test_extended_is_fit_of_all_points(case):
-    """It is the fit of all points and keeps its via-points."""
+    """Via-points are kept."""
     (inputs, reference), options = CASES[case]
     options = {"lambda_mean": 0.7} | options
     whole = KMP.fit(inputs, reference, **options)
@@ -203,7 +203,7 @@ def test_extended_is_fit_of_all_points(case):
 
 
 def test_extended_keeps_constraints():
-    """Derivatives and constraints are moved too."""
+    """Derivatives are kept too."""
     (inputs, reference), options = CASES["two inputs"]
     directions = np.zeros((60, 2))
     directions[[5, 50]] = [1.0, 0.5]

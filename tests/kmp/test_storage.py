@@ -15,7 +15,7 @@ def saved(folder):
 
 
 def test_foreign_file_is_refused(tmp_path):
-    """A file of another kind is refused with its name."""
+    """The error names the file."""
     (tmp_path / "text").write_text("no")
     with pytest.raises(ValueError, match=r"text: not an \.npz file that `kmp\.save` wrote"):
         kmp.load(tmp_path / "text")
@@ -45,7 +45,7 @@ def test_foreign_file_is_refused(tmp_path):
 
 
 def test_cut_file_is_refused(tmp_path):
-    """A file that is cut or of one array is refused with its name."""
+    """The error names the file, which is cut or has one array only."""
     part = tmp_path / "part.npz"
     data = saved(tmp_path).read_bytes()
     for size in (0, 3, 100, len(data) // 2, len(data) - 1):
@@ -63,7 +63,6 @@ def test_cut_file_is_refused(tmp_path):
 
 
 def test_changed_numbers_are_refused(tmp_path):
-    """Numbers that were changed are refused."""
     part = tmp_path / "part.npz"
     arrays = dict(np.load(saved(tmp_path)))
     np.savez(part, **(arrays | {"weights": 2 * arrays["weights"]}))

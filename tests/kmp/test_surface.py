@@ -1,4 +1,6 @@
-"""Points by deviation, defaults, files, several goals: what users of other libraries expect."""
+"""Features that users of other libraries expect: points by deviation, defaults, files, several
+goals.
+"""
 
 import re
 import subprocess
@@ -11,7 +13,7 @@ import kmp
 from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
 from support.paths import ROOT
 
-# points of other deviations are near
+# some via-points have neighbours of other deviations
 pytestmark = pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
 
 T = np.linspace(0, 2, 80)[:, None]
@@ -51,7 +53,6 @@ def test_normals_of_means_and_deviations():
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 @pytest.mark.parametrize("lambdas", [(0.1, None), (10.0, 0.01), (0.01, 100.0)])
 def test_zero_deviation_is_met(representation, lambdas):
-    """A deviation of 0 is met as exactly as rounding allows."""
     skill = fitted(representation, lambda_mean=lambdas[0], lambda_covariance=lambdas[1])
     place = skill.mean([[1.0]]) + 0.1
     through = skill.adapt([[1.0]], Gaussians.of(place, deviation=0))
@@ -92,7 +93,7 @@ def test_named_least_variance_is_accepted(representation, rates, lambda_covarian
 
 
 def test_default_tolerance_replaces_nearest():
-    """The default tolerance replaces the nearest point of an even reference."""
+    """The reference is evenly spaced."""
     skill = fitted()
     assert skill.spacing == pytest.approx(2 / 79)
     for t in (0.0, 0.5003, 1.01, 2.0):
@@ -132,7 +133,7 @@ def test_other_lambda_keeps_the_mean(representation, changed):
 
 
 def test_estimator_is_loaded_when_needed():
-    """The estimator is found when it is needed and not before."""
+    """It is not imported before."""
     code = (
         "import sys, kmp; assert 'sklearn' not in sys.modules; kmp.KMPRegressor(); assert "
         "'sklearn' in sys.modules"
@@ -145,7 +146,7 @@ def test_estimator_is_loaded_when_needed():
 
 
 def test_blocks_of_queries_have_same_means():
-    """Means of many queries are the same in blocks."""
+    """Many queries are computed in blocks."""
     skill = with_rates()
     queries = np.linspace(-1, 3, 1001)[:, None]
     whole = skill.mean(queries)

@@ -14,10 +14,10 @@ BLOCKS = [
 
 
 def test_tutorial_runs_as_it_stands():
-    """The tutorial runs as it stands and shows what it says."""
+    """Its output is the printed one."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:
-        # so that a failure names the page's line
+        # a failure then names the page's line
         code = compile("\n" * line + block, str(PAGE), "exec")
         exec(code, names)
 

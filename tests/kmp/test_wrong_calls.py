@@ -1,7 +1,7 @@
-"""Every public call of the package, given what is wrong in each of its arguments, one at a time.
+"""Every public call of the package, with wrong values for one argument at a time.
 
-It ends in a ValueError that names the argument and what is accepted, in words that are not
-NumPy's. What may be legal, such as huge numbers, may work instead.
+Each call ends in a ValueError that names the argument and the accepted values, in words that are
+not NumPy's. Calls that may be legal, such as those with huge numbers, may also succeed.
 """
 
 import inspect
@@ -58,12 +58,12 @@ IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts":
 
 
 def regressor(*, ell, lambda_mean, lambda_covariance, noise, components, random_state):
-    """scikit-learn has a parameter checked where it is used."""
+    """scikit-learn checks a parameter when it is used, so the estimator is fitted too."""
     arguments = locals()
     return kmp.KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
 
 
-# What each public callable is rightly called with.
+# Right arguments of each public callable.
 RIGHT = {
     Gaussians: {"mean": R.mean, "covariance": R.covariance},
     Gaussians.of: {"mean": R.mean, "deviation": np.ones(2)},
@@ -210,7 +210,7 @@ RIGHT = {
         "output_unit": "m",
     },
 }
-# Not here: `others` of a product, which are many; what is chosen as NumPy would; what is any truth.
+# Not tested: the variable arguments `others`, indices as in NumPy, and arguments used as booleans.
 LEFT_OUT = {
     ("product", "others"),
     ("take", "index"),
@@ -238,7 +238,7 @@ OF_THE_KERNEL = {
 }
 
 OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "direction", "offset"}
-WRONG_COLUMNS = {0, 1}  # places in the second list of `wrong_arrays`: one column more, and none
+WRONG_COLUMNS = {0, 1}  # indices in the second list of `wrong_arrays`: one column more, none
 OPTIONAL = {
     "lambda_covariance",
     "prior_mean",
@@ -247,7 +247,7 @@ OPTIONAL = {
     "velocity_covariance",
 }
 WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
-LONGEST = 450  # characters of a message
+LONGEST = 450  # [characters] of a message
 NO_NUMBERS = [
     None,
     "text",
@@ -292,7 +292,7 @@ ACCEPTED = re.compile(r"\b(needed|needs?|must|enough|[Gg]ive|[Dd]ivide|[Ff]it|ta
 
 
 def wrong_arrays(array):
-    """What is no array of this shape, and what may be one that works."""
+    """Values that are wrong for an array of this shape, and values that may work."""
     spoilt = np.array(array, dtype=float)
     spoilt.flat[0] = np.inf
     wrong = [
@@ -333,7 +333,7 @@ def wrong_arrays(array):
 
 
 def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
-    """What is wrong for an argument like this, and what may be right."""
+    """Values that are wrong for an argument like this, and values that may work."""
     if name in {"seed", "random_state"}:
         return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
     if name in WHOLE:
@@ -387,19 +387,21 @@ def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
 
 
 def calls():
-    """Each call (what, the argument, all arguments' names, how, whether it must fail)."""
+    """Each call: function, name of the argument, right arguments, wrong value, and True if it must
+    fail.
+    """
     for function, right in RIGHT.items():
         for name, value in right.items():
             wrong, other = wrong_values(name, value)
-            # which names its matrix
+            # CoordinateFrame names its matrix
             must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame
             for candidate in wrong:
                 if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(
                     candidate, float
                 ):
-                    continue  # one for all inputs
+                    continue  # one number for all inputs is right
                 if function is regressor and name == "components" and candidate is None:
-                    continue  # each sample is a point
+                    continue  # None: each sample is a reference point
                 if candidate is None and (
                     (name in OPTIONAL and function != ONE.with_lambda_covariance)
                     or function == ONE.plot
@@ -414,13 +416,13 @@ def calls():
 
 
 def fault(function, name, right, value, must_fail):
-    """What is wrong with how this call ends; None if nothing."""
+    """The fault of a call's result or error; None if there is none."""
     call = f"{getattr(function, '__qualname__', function)}({name}={str(value)[:60]!r})"
     try:
         function(**(right | {name: value}))
     except ValueError as error:
         message = str(error)
-        near = [*right, "lost in rounding", "to working precision"]  # what only shows with all else
+        near = [*right, "lost in rounding", "to working precision"]  # faults of combinations
         named = any(re.search(rf"\b{word}\b", message) for word in ([name] if must_fail else near))
         if not named:
             return f"{call} does not name it: {message[:150]}"
@@ -474,7 +476,7 @@ def public():
 
 
 def test_every_public_argument_is_tested():
-    """Every argument of every public callable is among them."""
+    """All are in `RIGHT` or left out explicitly."""
     tested = {(function.__name__, name) for function, right in RIGHT.items() for name in right}
     lacking = [
         (of, name, parameter)

@@ -1,4 +1,4 @@
-"""What the tests of learning share: demonstrations, and skills learned from them once."""
+"""Fixtures of the tests of learning: demonstrations, and skills learned from them once."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def taught() -> list[Demonstration]:
 
 @pytest.fixture(scope="session")
 def learned(taught: list[Demonstration]) -> Skill:
-    """A skill of three demonstrations, a function of the hands' positions."""
+    """A skill of three demonstrations, as a function of the hands' positions."""
     return learn(taught[:3], name="soldering", ell=8.0)
 
 
 @pytest.fixture(scope="session")
 def coarse(taught: list[Demonstration]) -> Skill:
-    """One of two, from few points."""
+    """A skill of two demonstrations, with few points."""
     return quickly(taught[:2])
 
 
 @pytest.fixture(scope="session")
 def aimed(learned: Skill) -> Skill:
-    """The skill of three, taught the scene's via-points."""
+    """The skill of three demonstrations, adapted to the scene's via-points."""
     return adapted(learned, VIA_POINTS, tolerance=0.05)

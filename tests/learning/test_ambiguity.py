@@ -1,4 +1,6 @@
-"""Contradictions between demonstrations: told from fine motion by the tracker's noise."""
+"""Contradictions between demonstrations are distinguished from fine motion by the tracker's
+noise.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ def judged(demonstrations: list[Demonstration]) -> Figures:
 @pytest.mark.parametrize("noise_m", [0.0, 0.0002, 0.001, 0.003])
 @pytest.mark.parametrize("every", [1, 2])
 def test_tracker_noise_is_found(noise_m: float, every: int) -> None:
-    """A tracker's noise is estimated from takes, however the hands move."""
+    """The estimate does not depend on the hands' motion."""
     moving = [circling(seed, noise_m=noise_m).every(every) for seed in range(3)]
     assert tracker_noise_m(moving) == pytest.approx(noise_m, rel=0.15, abs=2e-4)
 
@@ -36,7 +38,7 @@ def test_fine_motion_is_legal_if_tracked_well() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0005])
 def test_opposite_ways_are_refused(noise_m: float) -> None:
-    """Takes that go opposite ways are refused however good the tracker."""
+    """This holds for any tracker."""
     figures = judged(
         [fine(seed, noise_m, sign) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))]
     )

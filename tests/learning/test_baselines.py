@@ -1,4 +1,4 @@
-"""Baselines: exact where they fit, and judged by what they have not seen."""
+"""Baselines: exact where they fit, and judged on held-out demonstrations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def take(person: int, hands: np.ndarray, tool: np.ndarray) -> Take:
 
 
 def test_linear_function_is_found() -> None:
-    """A linear function is found from the others."""
+    """The other demonstrations determine it."""
     takes = [take(person, hands, hands @ SLOPE + OFFSET) for person, hands in enumerate(HANDS)]
     for errors in held_out_errors(takes, linear):
         assert errors == pytest.approx(np.zeros((50, 3)), abs=1e-9)
@@ -44,7 +44,7 @@ def test_look_up_uses_nearest_hands() -> None:
 
 
 def test_left_out_person_tells_nothing() -> None:
-    """Samples that are held out together do not predict each other."""
+    """Demonstrations that are held out together do not predict each other."""
     tools = [np.full((50, 3), float(number)) for number in range(3)]
     hands = [HANDS[0], HANDS[0], HANDS[0] + 1e-6]
     for persons, expected in ((range(3), [-1.0, 1.0]), ((0, 0, 1), [-2.0, -1.0])):

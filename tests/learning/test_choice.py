@@ -1,6 +1,4 @@
-"""Hyper-parameters chosen by leaving one demonstration out: the closed form, the choice, and how
-sure the skill then is of people it has not seen.
-"""
+"""Hyper-parameters chosen by leaving one demonstration out: the closed form and the choice."""
 
 from __future__ import annotations
 
@@ -34,7 +32,7 @@ def choice() -> DirectSelection:
 def test_residuals_are_those_of_left_out_fits(
     choice: DirectSelection, ridge_m: float | None
 ) -> None:
-    """The residuals left out are those of primitives and means fitted without."""
+    """They equal those of primitives and prior means that are fitted without the demonstration."""
     ell = 4.0
     noise = 0.1
     for group in range(4):
@@ -53,7 +51,6 @@ def test_residuals_are_those_of_left_out_fits(
 
 
 def test_choice_is_the_best_tried(choice: DirectSelection) -> None:
-    """The choice is as good as any that was tried."""
     parameters = choice.parameters()
     errors = {
         (ell, noise): rms(choice.residuals(ell, noise))

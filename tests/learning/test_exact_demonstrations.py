@@ -1,5 +1,5 @@
-"""Demonstrations that were made, without any noise, teach a skill that a tracker's noise does not
-hold.
+"""Synthetic demonstrations without noise teach a skill whose gate a tracker's noise does not
+trip.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.gate import FLOOR_M
 from thirdhand.workbench.learning.learn import learn
 
-NOISE_M = 0.002  # of a usual tracker
+NOISE_M = 0.002  # standard deviation of a usual tracker
 VIA_POINTS = tuple(
     ViaPoint(name, (x, 0.2, 0.2), (x, -0.2, 0.2), (x, 0.0, 0.4))
     for name, x in (("near", 0.4), ("far", 0.7))
@@ -21,7 +21,9 @@ VIA_POINTS = tuple(
 
 
 def along_a_line(number: int) -> Demonstration:
-    """Hands exactly through the via-points, each time at another speed, and the tool along."""
+    """Hands that pass exactly through the via-points at varying speed, and a tool that moves with
+    them.
+    """
     t = np.arange(0.0, 6.0, 0.02)
     share = np.clip((t - 1.0) / (1.5 + 0.4 * number), 0.0, 1.0)[:, None]
     ways = (
@@ -34,7 +36,7 @@ def along_a_line(number: int) -> Demonstration:
 
 
 def test_gate_is_above_noise() -> None:
-    """Between via-points the gate is no nearer than noise."""
+    """This holds for a task between via-points."""
     skill = learn([along_a_line(number) for number in range(3)])
     assert skill.threshold >= FLOOR_M
     random = np.random.default_rng(1)
@@ -46,7 +48,6 @@ def test_gate_is_above_noise() -> None:
 
 
 def test_covariance_is_above_noise() -> None:
-    """A covariance is never less than the tracker's noise."""
     takes = [
         take._replace(tool=(take.left + take.right) / 2)
         for take in (circling(seed, noise_m=0.0) for seed in range(4))

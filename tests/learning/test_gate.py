@@ -1,4 +1,4 @@
-"""The gate trips for hands off the demonstrations and for little else, and nothing opens it."""
+"""The gate holds for hands far from the demonstrations and seldom otherwise, whatever the takes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def skill_of_five() -> Skill:
 
 @pytest.fixture(scope="module")
 def unseen() -> list[Demonstration]:
-    """Demonstrations that no skill here knows."""
+    """Demonstrations of which no skill is learned."""
     return [take.every(20) for take in demonstrated(12)[6:]]
 
 
 def unrelated(one: Demonstration) -> Demonstration:
-    """Another task: hands and tool go other ways."""
+    """Demonstrations of another task, with other paths of hands and tool."""
     u = np.linspace(0.0, 1.0, len(one.tool))
     ways = (
         (0.5 + 0.2 * np.sin(7 * u), -0.2 + 0.3 * np.cos(5 * u), 0.5 + 0.1 * np.sin(9 * u)),
@@ -44,8 +44,8 @@ def unrelated(one: Demonstration) -> Demonstration:
 def test_unseen_people_pass_and_nonsense_is_held(
     skill_of_five: Skill, unseen: list[Demonstration], via_points: tuple
 ) -> None:
-    """Swapped hands where they are apart: while they meet over the board, at a via-point, they
-    are 9 cm from where they would be, and nothing tells.
+    """Exchanged hands are held for while they are apart. Where they meet over the board, at a
+    via-point, exchanging moves them by 9 cm only, which cannot be recognised.
     """
     skill = adapted(skill_of_five, via_points, tolerance=0.05)
     hands = np.concatenate([take.hands for take in unseen])
@@ -65,7 +65,7 @@ def test_gate_is_near_demonstrations(skill_of_five: Skill, unseen: list[Demonstr
 
 @pytest.mark.parametrize("components", [None, 5])
 def test_unrelated_tasks_do_not_open_gate(components: int | None) -> None:
-    """Two unrelated tasks do not open the gate."""
+    """The skill is learned from two tasks."""
     take = demonstrated(1)[0].every(8)
     skill = learn([take, unrelated(take)], components=components, points=60)
     assert skill.threshold <= (HIGHEST_GATE_M if components else CEILING_M)

@@ -1,5 +1,5 @@
-"""What the tool is learned to be a function of: the simplest that tells where it is, found by
-leaving demonstrations out, or people.
+"""The inputs of which the tool becomes a function: the simplest ones that predict it, found by
+leaving out demonstrations or people.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from thirdhand.workbench.learning.table import table
 from thirdhand_sim.lab.people.left_out import judged, left_out, predicted
 
 TIMES = np.arange(0.0, 6.0, 0.04)
-CARRIED = np.array([0.15, 0.0, 0.05])  # a tool, seen from the hand that it is fixed to
+CARRIED = np.array([0.15, 0.0, 0.05])  # the tool in the frame of its hand
 NOISE_M = 0.001
 
 
 def smooth(random: np.random.Generator, size: float) -> np.ndarray:
-    """Slow ways (T, 3)."""
+    """Slow paths (T, 3)."""
     rates = random.uniform(0.5, 1.2, (2, 3))
     phases = random.uniform(0.0, 6.0, (2, 3))
     return size * sum(
@@ -33,8 +33,8 @@ def smooth(random: np.random.Generator, size: float) -> np.ndarray:
 
 
 def shown(seed: int, kind: str, person: str = "") -> Demonstration:
-    """A take in which the tool goes with both hands, with the left one, or is fixed to that, or
-    goes its own way by the clock.
+    """A take in which the tool moves with both hands, with the left hand, fixed to the left hand,
+    or by the clock only.
     """
     random = np.random.default_rng(seed)
     left, right = (np.array([0.6, y, 0.3]) + smooth(random, 0.08) for y in (-0.2, 0.2))
@@ -63,7 +63,6 @@ def carried() -> StoredSkill:
 
 
 def test_both_hands_where_both_tell() -> None:
-    """If both hands are informative, the tool depends on both."""
     skill = learn([shown(seed, "both") for seed in range(5)], points=120)
     figures = figures_of(skill)
     assert skill.conductor is None
@@ -79,7 +78,7 @@ def test_both_hands_where_both_tell() -> None:
 
 
 def test_one_hand_where_it_tells_as_much() -> None:
-    """If one hand suffices, the other has no effect, and that is reported."""
+    """The other hand then has no effect, and that is reported."""
     skill = learn([shown(seed, "left") for seed in range(5)], points=120)
     figures = figures_of(skill)
     assert skill.conductor == 0
@@ -94,7 +93,7 @@ def test_one_hand_where_it_tells_as_much() -> None:
 
 
 def test_turned_hand_predicts_fixed_tool(carried: StoredSkill) -> None:
-    """A tool that is fixed to a turned hand is predicted by how that is turned."""
+    """The hand's orientation predicts a tool that is fixed to it."""
     figures = figures_of(carried)
     assert figures.taken == "orientations of the left hand"
     assert isinstance(carried.model, HandsKMP)
@@ -115,7 +114,7 @@ def test_turned_hand_predicts_fixed_tool(carried: StoredSkill) -> None:
 
 
 def test_persons_are_left_out_together() -> None:
-    """Takes of a person are left out together where two are named."""
+    """This happens if two persons are named."""
     takes = [shown(seed, "both", person) for seed, person in enumerate(("Ada", "Ada", "Bo", "Bo"))]
     assert persons(takes) == [0, 0, 1, 1]
     assert persons([take._replace(person="Ada") for take in takes]) == [0, 1, 2, 3]
@@ -126,4 +125,4 @@ def test_persons_are_left_out_together() -> None:
     )
     assert table(by_person).startswith("held out by person")
     assert not table(alone).startswith("held out by")
-    assert by_person.all.error_mm > alone.all.error_mm  # half as many are left to learn from
+    assert by_person.all.error_mm > alone.all.error_mm  # half of the takes remain to learn from

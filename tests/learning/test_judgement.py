@@ -1,4 +1,4 @@
-"""What a skill is judged by: good demonstrations pass, and what is wrong with others is said."""
+"""The judgement of a skill: good demonstrations pass, and faults of others are named."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thirdhand.workbench.learning.table import table
 
 
 def judged(demonstrations: list[Demonstration], **options: object) -> Figures:
-    """The figures of what is learned from these."""
+    """The figures of a skill learned from these demonstrations."""
     return figures_of(learn(demonstrations, points=80, **options))  # type: ignore[arg-type]
 
 
@@ -32,7 +32,7 @@ def with_tool(one: Demonstration, tool: np.ndarray) -> Demonstration:
 
 
 def test_good_demonstrations_are_safe(good: list[Demonstration]) -> None:
-    """Good demonstrations are judged safe and their errors told one by one."""
+    """Their errors are listed one by one."""
     figures = judged(good, names=["a", "b", "c", "d"])
     assert figures.unsafe == ()
     assert [row.name for row in figures.demonstrations] == ["a", "b", "c", "d"]

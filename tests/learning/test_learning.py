@@ -1,4 +1,4 @@
-"""Learning from demonstrations: what comes of it, deterministic, and what is refused."""
+"""Learning from demonstrations: results, determinism, and refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thirdhand.workbench.learning.pose import mean_orientation
 
 
 def test_held_out_demonstration_is_predicted(learned: Skill, taught: list[Demonstration]) -> None:
-    """A demonstration that was held out is predicted to some centimetres."""
+    """The error is a few centimetres."""
     assert error_m(learned, taught[3:]) < 0.035
 
 
@@ -24,7 +24,7 @@ def test_learning_is_deterministic(coarse: Skill, taught: list[Demonstration]) -
 
 
 def test_gate_passes_demonstrations_only(aimed: Skill, taught: list[Demonstration]) -> None:
-    """The gate lets demonstrations through and nothing far from them."""
+    """Hands far from the demonstrations are held for."""
     for take in taught:
         assert deviations(aimed, take.hands[::20]).max() <= aimed.threshold
         assert (
@@ -71,7 +71,6 @@ def test_unusable_demonstrations_are_refused(taught: list[Demonstration]) -> Non
 
 
 def test_resting_take_is_learned_with_others(taught: list[Demonstration]) -> None:
-    """A take in which the hands rest is learned from with others."""
     resting = taught[3].every(8)
     resting = resting._replace(
         left=np.tile(resting.left[0], (len(resting.left), 1)),

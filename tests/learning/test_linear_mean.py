@@ -1,4 +1,4 @@
-"""A linear mean beneath the primitive: chosen where it predicts clearly better, and as safe."""
+"""A linear prior mean of a primitive: chosen where it predicts clearly better, and as safe."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thirdhand.workbench.learning.choice import MAX_GAIN, RIDGE_M, selection_of
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import Evidence
 
-APART_M = 0.15  # the takes, from each other: a constant mean holds the tool back there
+APART_M = 0.15  # distance between takes, at which a constant mean attracts the tool
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +50,8 @@ def mean_of(skill: StoredSkill) -> AffineMean:
 
 
 def test_linear_mean_predicts_better(evidence: Evidence, choice: DirectSelection) -> None:
-    """Takes from all over the table are predicted better than over a constant and than by a
-    line.
+    """For takes all over the table, it is better than a constant mean and than the linear function
+    itself.
     """
     assert mean_of(evidence.skill).matrix.shape == (3, 6)
     error = rms(np.concatenate([fold.errors for fold in evidence.held_out]))
@@ -69,7 +69,6 @@ def test_linear_mean_predicts_better(evidence: Evidence, choice: DirectSelection
 
 
 def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Evidence) -> None:
-    """Gate holds where the mean extrapolates."""
     hands = np.concatenate([fold.take.hands[::20] for fold in evidence.held_out])
     for beside_m in (1.0, 2.0, 5.0):
         assert (
@@ -82,7 +81,7 @@ def test_gate_holds_where_mean_extrapolates(skill: StoredSkill, evidence: Eviden
 
 
 def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
-    """It moves the tool no farther than between via-points whatever was shown."""
+    """The tool moves at most `MAX_GAIN` times as far as the hands, for any demonstrations."""
     assert np.linalg.norm(mean_of(skill).matrix, 2) < MAX_GAIN
     random = np.random.default_rng(0)
     hands = random.normal(scale=0.1, size=(200, 6))
@@ -98,7 +97,6 @@ def test_gain_of_mean_is_limited(skill: StoredSkill) -> None:
 
 
 def test_file_serves_what_was_learned(skill: StoredSkill) -> None:
-    """It is stored and served as it was learned."""
     restored = decoded(skill.file, origin="a file")
     hands = skill.hands[::10] + 0.01
     np.testing.assert_array_equal(restored.mean(hands), skill.mean(hands))

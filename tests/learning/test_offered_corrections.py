@@ -1,5 +1,5 @@
-"""Corrections as via-points: of one segment, at a segment's end, of a skill without segments; their
-effect, what they replace, and what is proposed after several.
+"""Corrections as via-points: within a segment, at a segment's end, of a skill without segments;
+their effect, what they replace, and the offer after several corrections.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def tool_in(skill: Skill, hands: np.ndarray, segment: int) -> np.ndarray:
 def test_correction_moves_tool_in_its_segment(
     segmented: StoredSkill, segment: int, share: float
 ) -> None:
-    """A correction moves the tool in its segment and leaves the ends."""
+    """The ends of the segment do not move."""
     hands = hands_in(segmented, segment, share)
     correction = correction_at(segmented, hands, segment, tool_in(segmented, hands, segment) + UP)
     after, effect = corrected(segmented, correction.among(segmented.via_points), correction.point)
@@ -69,7 +69,8 @@ def test_correction_moves_tool_in_its_segment(
             after.mean(via_hands[None], [name]), segmented.mean(via_hands[None], [name]), atol=1e-4
         )
     assert effect.moved_m == pytest.approx(0.08, abs=1e-4)
-    # As its reach says: more than half of it remains nearer, and less than half farther away.
+    # By definition of the reach, more than half of the correction remains nearer, and less than
+    # half farther away.
     for distance_m, is_more in ((effect.reach_m - 0.03, True), (effect.reach_m + 0.03, False)):
         moved = hands + np.array([0, 0, -distance_m, 0, 0, 0])
         share_left = (
@@ -86,7 +87,7 @@ def test_correction_moves_tool_in_its_segment(
 def test_correction_at_an_end_teaches_via_point(
     segmented: StoredSkill, segment: int, share: float, name: str
 ) -> None:
-    """A correction at an end of a segment teaches that via-point anew."""
+    """The via-point at that end is replaced."""
     hands = hands_in(segmented, segment, share)
     correction = correction_at(segmented, hands, segment, tool_in(segmented, hands, segment) + UP)
     (before,) = correction.replaced
@@ -107,7 +108,7 @@ def test_correction_at_an_end_teaches_via_point(
 
 
 def test_repeated_corrections_are_offered(segmented: StoredSkill) -> None:
-    """Repeated corrections replace each other are counted and offered."""
+    """They replace each other and are counted."""
     hands = hands_in(segmented, 0, 0.5)
     skill = segmented
     for count in range(1, OFFERED_AFTER + 1):

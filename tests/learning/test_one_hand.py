@@ -1,4 +1,4 @@
-"""A task that one hand conducts: taken, learned and served without the other."""
+"""A task that one hand conducts: recorded, learned and served without the other hand."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from thirdhand.workbench.takes.demonstration_files import summary
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration, write_demonstration
 from thirdhand.workbench.takes.pose_streams import PoseTopic
 
-AT = (0.5, 0.2, 0.3)  # of the conducting hand, amid what was demonstrated
+AT = (0.5, 0.2, 0.3)  # conducting hand, amid the demonstrations
 Point = tuple[float, float, float]
-FAR: Point = (0.5, -1.4, 0.3)  # of the other, out of the arm's way
+FAR: Point = (0.5, -1.4, 0.3)  # other hand, away from the arm
 
 
 def led(seed: int, who: Hands = "left") -> Demonstration:
-    """A take in which the tool goes with one hand."""
+    """A take in which the tool moves with one hand."""
     take = circling(seed, apart_m=0.03)
     tool = take.tool.copy()
-    offset_m = 0.005 * np.random.default_rng(seed).normal(size=3)  # as people are
+    offset_m = 0.005 * np.random.default_rng(seed).normal(size=3)  # variation between people
     tool[:, :3] = take.left[:, :3] * [0.8, 0.8, 0.5] + [0.1, 0.05, 0.25] + offset_m
     return take._replace(right=take.left, tool=tool, conducts=who)
 
@@ -51,7 +51,7 @@ def conducting(skill: StoredSkill, at: tuple[float, ...], other: tuple[float, ..
 
 
 def test_take_of_one_hand_through_a_file(tmp_path: Path) -> None:
-    """A take of one hand goes to a file without the other and back."""
+    """The file has no other hand."""
     for side in ("left", "right"):
         write_demonstration(tmp_path / f"{side}.mcap", led(0, side)._replace(person="Ada"))  # type: ignore[arg-type]
         lines: list[str] = []
@@ -67,7 +67,7 @@ def test_take_of_one_hand_through_a_file(tmp_path: Path) -> None:
 
 
 def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
-    """The other hand makes no difference and the skill is judged without it."""
+    """The skill is judged without it."""
     figures = figures_of(skill)
     assert figures.unsafe == ()
     assert figures.all.error_mm < min(figures.all.other_mm.values())
@@ -96,7 +96,7 @@ def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
 
 
 def test_takes_with_via_points_of_one_hand() -> None:
-    """Takes of one hand that name their via-points are learned between these."""
+    """They are learned as a task between via-points."""
     takes = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
@@ -125,7 +125,9 @@ def streams_of_one(side: str, take: Demonstration) -> Streams:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
-    """It has no topic, no sample, or is never seen; and the other hand is given as both."""
+    """The absent hand has no topic, has no samples, is never seen, or has the other hand's
+    topic.
+    """
     take = circling(0)
     other = "right" if side == "left" else "left"
     path = tmp_path / "a.mcap"
@@ -154,7 +156,7 @@ def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
 
 
 def test_one_stream_for_both_hands_is_refused(tmp_path: Path) -> None:
-    """One stream for both hands whose name says neither is refused."""
+    """Its name does not say which hand it is."""
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
     topics = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))
@@ -173,7 +175,9 @@ def served(
     count: int = 1200,
     at: Point = FAR,
 ) -> Records:
-    """The frame of each tick, the other hand seen for some, the one until another."""
+    """The frame of each tick; the other hand is seen in [other_from, other_to), the conducting one
+    until `one_to`.
+    """
     side, other = ("left", "right") if skill.conductor == 0 else ("right", "left")
     ticks = []
     for k in range(count):
@@ -186,21 +190,21 @@ def served(
 def modes(
     skill: StoredSkill, *hands: int, one_to: int = 10_000, count: int = 1200
 ) -> list[tuple[int, int]]:
-    """Mode and reason of each tick of `served`."""
+    """Mode and reason in each frame of `served`."""
     records = served(skill, *hands, one_to, count=count)
     return list(zip(records["mode"].tolist(), records["reason"].tolist(), strict=True))
 
 
 def test_served_without_absent_hand(skill: StoredSkill) -> None:
-    """A skill runs without a hand that was never seen or has disappeared, but waits for one that
-    vanishes.
+    """A skill runs without the other hand if it was never seen or disappeared 5 s ago, and holds
+    before that.
     """
     follow = (Mode.FOLLOW, Reason.NONE)
     assert set(modes(skill, 0, 0)[5:]) == {follow}
     lost = modes(skill, 300, 600, count=3200)
-    assert set(lost[10:840]) == {follow}  # and both are seen
+    assert set(lost[10:840]) == {follow}  # also while both hands are seen
     assert set(lost[860:3090]) == {(Mode.HOLD, Reason.STALE_HAND)}
-    assert set(lost[3100:]) == {follow}  # 5 s after it was seen last
+    assert set(lost[3100:]) == {follow}  # 5 s after the other hand was last seen
     vanished = modes(skill, 300, 600, one_to=3150, count=3300)
     assert set(vanished[3210:]) == {(Mode.HOLD, Reason.STALE_HAND)}
     assert set(modes(skill, 0, 0, one_to=600)[660:]) == {(Mode.HOLD, Reason.STALE_HAND)}
@@ -209,7 +213,7 @@ def test_served_without_absent_hand(skill: StoredSkill) -> None:
 
 def test_arm_keeps_away_from_vanished_hand(skill: StoredSkill) -> None:
     """The arm keeps its distance from where a lost hand was last seen."""
-    goal_m = (0.5, 0.21, 0.4)  # where the tool is to go
+    goal_m = (0.5, 0.21, 0.4)  # the tool's target
     records = served(skill, 0, 50, count=3500, at=goal_m)
     assert set(records["mode"][2600:].tolist()) == {Mode.FOLLOW}
     assert records["hand_distance"].min() > ASSUMED.people.distance - 0.001

@@ -1,4 +1,4 @@
-"""What `learn` states does not depend on the order of the files, on chance, or on one bad take."""
+"""The results of `learn` do not depend on the order of the files, on chance, or on one bad take."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ def shown() -> list[Demonstration]:
 @pytest.mark.thorough
 @pytest.mark.parametrize("named", [True, False])
 def test_order_of_files_makes_no_difference(named: bool) -> None:
-    """The order of the files makes no difference."""
     demonstrations = [take if named else take._replace(via_points=()) for take in shown()]
     names = [f"take {number}" for number in range(len(demonstrations))]
     first = learn(demonstrations, names=names)
@@ -40,7 +39,7 @@ def test_sitting_is_held_out_together() -> None:
         for n in range(8)
     ]
     assert persons(later) == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert persons(later[:4]) == [0, 1, 2, 3]  # two sittings are too few
+    assert persons(later[:4]) == [0, 1, 2, 3]  # two sittings are too few to hold one out
 
 
 @pytest.mark.thorough

@@ -1,4 +1,4 @@
-"""Memory that learning needs: it may grow with the samples of all takes, not with their square."""
+"""Memory of learning: it may grow with the number of samples, not with its square."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from support.paths import ROOT
 
 WHOLE_MB = 400  # limit of the process's largest resident memory
-LEARNING_MB = 260  # limit of what learning adds to that of its imports
+LEARNING_MB = 260  # limit of the memory that learning adds to its imports
 # 150 samples last 3 s
 TAKES = 72
 SAMPLES = 150
@@ -39,7 +39,6 @@ print(before, peak_mb())
 @pytest.mark.timeout(300)
 @pytest.mark.thorough
 def test_many_takes_need_little_memory() -> None:
-    """Many takes are learned in little memory."""
     done = subprocess.run(
         [sys.executable, "-c", CODE],
         capture_output=True,

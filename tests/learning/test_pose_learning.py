@@ -1,4 +1,4 @@
-"""Orientation and gripper as they are learned, judged, taught with via-points and stored."""
+"""Orientation and gripper: learned, judged, taught with via-points and stored."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ START = Rotation.from_quat(TOOL_ORIENTATION)
 
 
 def turning(one: Demonstration, whole: Vector) -> Demonstration:
-    """A demonstration in which the tool turns by so much on the way to the board."""
+    """A demonstration in which the tool turns by an angle on its way to the board."""
     begin, end = SCENE.segments[2]
     share = np.clip((np.arange(len(one.tool)) * one.period_s - begin) / (end - begin), 0, 1)
     turned = (Rotation.from_rotvec(share[:, None] * whole) * START).as_quat()
@@ -36,7 +36,7 @@ def turning(one: Demonstration, whole: Vector) -> Demonstration:
 
 @pytest.fixture(scope="module")
 def shown() -> list[Demonstration]:
-    """Three demonstrations that turn the tool and tell of the gripper."""
+    """Three demonstrations in which the tool turns and the gripper moves."""
     return [
         turning(take.every(2), TURN)
         for take in demonstrations(SCENE, count=3, seed=1, gripper=True)
@@ -49,7 +49,7 @@ def posed(shown: list[Demonstration]) -> Skill:
 
 
 def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]) -> float:
-    """Between what is predicted for hands (6,) at rest, and an orientation."""
+    """The angle between the prediction for resting hands (6,) and an orientation."""
     prediction = at_rest(skill, hands).turn.orientation
     return float(
         np.degrees(
@@ -59,13 +59,12 @@ def angle_deg(skill: Skill, hands: Sequence[float], orientation: Sequence[float]
 
 
 def test_turn_of_120_degrees_is_learned(posed: Skill, shown: list[Demonstration]) -> None:
-    """A tool that turns by 120 degrees is learned."""
     figures = figures_of(posed)
     assert not any("orientation" in text for text in (*figures.unsafe, *figures.warnings))
     assert figures.orientation_error_deg < 5
     for row in (0, -1):
         take = shown[0]
-        # smoothed, not averaged: that would be 60
+        # an averaged orientation would be 60 degrees off
         assert angle_deg(posed, take.hands[row], take.tool[row, 3:]) < 15
     assert (START.inv() * Rotation.from_quat(shown[0].tool[-1, 3:])).magnitude() == pytest.approx(
         np.radians(120)
@@ -87,7 +86,7 @@ def test_via_points_teach_orientation_and_gripper(posed: Skill, skill: Skill) ->
     x, y, z, w = (Rotation.from_rotvec([0.0, -0.7, 0.0]) * START).as_quat().tolist()
     point = msgspec.structs.replace(VIA_POINTS[2], orientation=(x, y, z, w), gripper="open")
     hands = with_hands(point)
-    for base in (posed, skill, shipped_skill()):  # the last is between via-points
+    for base in (posed, skill, shipped_skill()):  # the last skill is between via-points
         taught = adapted(base, (*VIA_POINTS[:2], point), tolerance=0.05)
         assert angle_deg(taught, hands, (x, y, z, w)) < 1.0
         missed = in_force(taught)[2].missed_by_rad
@@ -137,20 +136,20 @@ def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
 
 @pytest.mark.parametrize("turn_deg", [200, 300, 400, 480])
 def test_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
-    """By each take alike, whichever signs its quaternions have."""
+    """The signs of each take's quaternions do not matter."""
     figures = figures_of(learn([spinning(seed, turn_deg) for seed in range(4)], points=60))
     assert figures.orientation_error_deg < 15
     assert figures.unsafe == ()
 
 
 def test_wrongly_learned_turns_are_unsafe() -> None:
-    """A tool whose turns are learned wrongly is unsafe."""
+    """Such a skill is unsafe."""
     figures = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
     assert any("up to 60° accepted: it turns by up to" in line for line in figures.unsafe)
 
 
 def spinning(seed: int, turn_deg: float) -> Demonstration:
-    """A take in which the tool turns as the hands go, some degrees otherwise in each."""
+    """A take in which the tool turns as the hands move; takes differ by some degrees."""
     random = np.random.default_rng(seed)
     t = np.arange(0.0, 8.0, 0.04)
     progress = 0.5 - 0.5 * np.cos(np.pi * t / 8)

@@ -1,4 +1,4 @@
-"""Tool positions out of reach: measured against `[reach]` and against what the joints allow."""
+"""Tool positions out of reach: compared with `[reach]` and with the joints' limits."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
 
 @pytest.mark.parametrize("arm", [*ARMS, "sliding"])
 def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
-    """No reachable place counts as out of reach, also at the joints' limits."""
+    """This holds at the joints' limits too."""
     cell = cell_with(arm, WIDE, tmp_path)
     lower = np.array(cell.joints.lower)
     upper = np.array(cell.joints.upper)
     random = np.random.default_rng(7)
     forward = Arm(cell, robot_description(cell))
     shares = random.uniform(size=(1500, len(lower)))
-    shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)  # half of the joints at a limit
+    shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)  # half of the joints are at a limit
     places = np.array([forward.at(q).position for q in lower + shares * (upper - lower)])
     inside = np.array([is_reachable(place, WIDE) for place in places])
     assert inside.mean() > 0.9
@@ -42,9 +42,8 @@ def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_unreachable_place_has_its_distance(arm: str, tmp_path: Path) -> None:
-    """A place that no posture reaches is out of reach by its distance."""
     cell = cell_with(arm, WIDE, tmp_path)
-    # no shipped arm is longer
+    # longer than any shipped arm
     shoulder = np.array(cell_of(arm).reach.centre)
     length = 1.0
     random = np.random.default_rng(3)
@@ -77,7 +76,7 @@ def test_distance_from_reach_is_exact() -> None:
     [
         ((0.0, 0.0, 0.0, 0.0), True, False),
         ((0.4, 0.4, 0.4, 0.0), True, True),
-        ((0.1, 0.1, 0.1, 0.1), True, False),  # each of them can be taught anew where the arm is
+        ((0.1, 0.1, 0.1, 0.1), True, False),  # each via-point can be taught again within reach
         ((0.1, 0.1, 0.1, 0.0), False, True),
         ((0.1, 0.1, 0.0, 0.0), False, False),
     ],
@@ -85,7 +84,7 @@ def test_distance_from_reach_is_exact() -> None:
 def test_skill_out_of_reach_is_refused(
     skill: StoredSkill, distances: tuple[float, ...], is_named: bool, is_refused: bool
 ) -> None:
-    """The via-points of a task have names, and may be taught anew."""
+    """Named via-points may be taught again, so they are refused less strictly."""
     judged = shipped_skill() if is_named else skill
     assert bool(judged.model.names) is is_named
     finding = out_of_reach(judged, np.array(distances), Settings())

@@ -1,4 +1,4 @@
-"""A skill of others that is refined by takes of whoever will work with it."""
+"""A skill of other people, refined by takes of the person who will work with it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from thirdhand.skills.stored_demonstrations import KEPT_HZ, packed, stored_demon
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.table import table
 
-HABIT_M = np.array([0.0, 0.0, 0.05])  # whoever works with the skill has the tool so much elsewhere
+HABIT_M = np.array([0.0, 0.0, 0.05])  # the user's tool differs by this offset
 
 
 def with_habit(one: Demonstration) -> Demonstration:
-    """The take with another way of the tool: a bow between its ends."""
+    """The take with another path of the tool: an arc between the same ends."""
     bow = np.sin(np.pi * np.linspace(0.0, 1.0, len(one.tool)))[:, None] * HABIT_M
     return one._replace(tool=np.hstack([one.tool[:, :3] + bow, one.tool[:, 3:]]))
 
 
 def missed_mm(skill: StoredSkill, one: Demonstration) -> float:
-    """The error for hands at rest along a take, root mean square."""
+    """The root mean square error for resting hands along a take."""
     errors: Vector = one.tool[:, :3] - skill.mean(one.hands)
     return 1000 * float(np.sqrt((errors**2).sum(axis=1).mean()))
 
@@ -54,7 +54,7 @@ def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
     )
     assert f"{figures.weight} is taken:" in table(figures)
     assert missed_mm(refined, mine[3]) < 0.5 * missed_mm(others, mine[3])
-    # The file suffices for the next one; takes of unnamed persons are then those of others.
+    # The file suffices for the next refinement; takes without a name then count as other people's.
     stored = stored_demonstrations(decoded(refined.file, origin="mine.npz"))
     assert sorted(entry.name for entry in stored) == [
         "a",
@@ -69,7 +69,9 @@ def test_own_takes_refine_a_skill(others: StoredSkill) -> None:
 
 @pytest.mark.thorough
 def test_earlier_takes_of_a_person_count() -> None:
-    """Takes of a task refine it; earlier ones of the same person count as that person's."""
+    """A task between via-points is refined twice; earlier takes of a person count as that
+    person's.
+    """
     takes = [take.every(3) for take in made("three", range(3))]
     takes = [take._replace(person=f"person {i // 2}") for i, take in enumerate(takes)]
     skill = learn(takes, name="others")

@@ -1,4 +1,4 @@
-"""What is said of how sure a prediction is holds on what was left out, at the moment."""
+"""The stated uncertainty of predictions holds on left-out demonstrations at each moment."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from thirdhand.workbench.learning.regions import (
 
 
 def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
-    """A demonstration by someone who errs as no normal says: by three times the covariance, with
-    heavy tails, and early or late.
+    """Errors on a demonstration that are not normal: three times the covariance, heavy tails, early
+    or late.
     """
     count = 150
     person = np.exp(0.3 * rng.normal())
@@ -42,7 +42,7 @@ def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
 
 @pytest.mark.parametrize("count", [6, 12, 40])
 def test_regions_hold_on_other_people(count: int) -> None:
-    """Regions contain the stated share on other people, at every level."""
+    """This holds for the share of every level."""
     held = []
     for seed in range(20):
         rng = np.random.default_rng([seed, count])
@@ -59,8 +59,8 @@ def test_regions_hold_on_other_people(count: int) -> None:
 
 
 def places(rng: np.random.Generator) -> TimedErrors:
-    """A demonstration with normal errors of 1 cm, and of 10 cm in a tenth of it, as its covariance
-    says but for its scale.
+    """Errors on a demonstration that are normal: 1 cm, and 10 cm in a tenth of the samples; the
+    covariance has another scale.
     """
     std = np.where(rng.random(150) < 0.1, 0.1, 0.01)
     covariance = std[:, None, None] ** 2 * np.eye(3)
@@ -70,7 +70,7 @@ def places(rng: np.random.Generator) -> TimedErrors:
 
 
 def test_unsure_where_wrong() -> None:
-    """A skill is unsure where it is wrong and rarely elsewhere."""
+    """It is rarely unsure elsewhere."""
     rng = np.random.default_rng(4)
     regions = calibrated([places(rng) for _ in range(12)], np.arange(12))
     asked = [places(rng) for _ in range(40)]
@@ -83,7 +83,6 @@ def test_unsure_where_wrong() -> None:
 
 
 def test_own_region_has_no_part_in_judgement() -> None:
-    """A demonstration is judged by regions that it had no part in."""
     rng = np.random.default_rng(2)
     usual = [apart(rng) for _ in range(12)]
     spoilt = [*usual[:4], apart(rng, times=30.0), *usual[5:]]
@@ -97,7 +96,7 @@ def test_own_region_has_no_part_in_judgement() -> None:
 
 
 def test_covariance_is_scaled_along_motion() -> None:
-    """A tool's covariance is scaled along its motion and reaches as far as its longest axis."""
+    """The covariance reaches as far as its longest axis."""
     rng = np.random.default_rng(3)
     out = np.empty((3, 3))
     for _ in range(50):
@@ -115,7 +114,7 @@ def test_covariance_is_scaled_along_motion() -> None:
 
 
 def test_unsure_flag_does_not_flicker() -> None:
-    """The flag for uncertainty is raised where the region is too large, and does not flicker."""
+    """The flag is raised where the region is too large."""
     settings = Settings()
     skill = shipped_skill()
     state = start_state(settings, skill)
@@ -123,7 +122,7 @@ def test_unsure_flag_does_not_flicker() -> None:
     state["hands"][:, 0] = skill.hands[0].reshape(2, 3)
 
     def told(times: float) -> bool:
-        """Whether it is, with regions that reach so many times as far as is told of."""
+        """The flag, for a region with this multiple of the limit."""
         state["covariance"] = np.eye(3) * (times * UNSURE_M) ** 2 / REGION_95
         segment = SkillStage(settings, replace(skill, regions=Regions(1.0)))
         segment.step(state, frame)
@@ -148,12 +147,12 @@ def test_unsure_flag_does_not_flicker() -> None:
 
 @pytest.fixture(scope="module")
 def learned() -> StoredSkill:
-    """A skill of six people, the fifth of whom is quick, at a task whose teacher reacts late."""
+    """A skill of six people, of whom the fifth is quick; the teacher reacts late."""
     return learn([take.every(4) for take in made("path", range(6), each=1)])
 
 
 def test_learned_regions_hold(learned: StoredSkill) -> None:
-    """The learned uncertainty includes the lag."""
+    """They include the teacher's lag."""
     figures = figures_of(learned)
     assert learned.regions.std_s > 0.0
     assert figures.all.within_50 == pytest.approx(50, abs=10)
@@ -165,9 +164,7 @@ def test_learned_regions_hold(learned: StoredSkill) -> None:
 
 
 def test_wrong_regions_in_file_are_refused(learned: StoredSkill) -> None:
-    """Without regions in its file, a skill has those of a normal distribution; invalid ones are
-    refused.
-    """
+    """A skill whose file has no regions has those of a normal distribution."""
     without = with_file(replace(learned, regions=NORMAL))
     assert decoded(without.file, origin="memory").regions == NORMAL
     for spoilt in (

@@ -1,5 +1,5 @@
-"""Tasks between via-points: what demonstrations tell of one, that it holds wherever these are, that
-a via-point may be visited twice, and what its file may hold.
+"""Tasks between via-points: learned from demonstrations, valid for other positions of the
+via-points, with a via-point that is visited twice, and stored in a file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def hands_at(point: ViaPoint, off: float = 0.0) -> np.ndarray:
 def moved(
     via_points: tuple[ViaPoint, ...], by: dict[str, tuple[float, float, float]]
 ) -> tuple[ViaPoint, ...]:
-    """The via-points with the tool elsewhere at some of them."""
+    """The via-points, some of them with another tool position."""
     return tuple(
         msgspec.structs.replace(p, tool=tuple(np.add(p.tool, by.get(p.name, (0, 0, 0))).tolist()))
         for p in via_points
@@ -67,7 +67,7 @@ def test_common_positions_of_a_hand_are_found(between: Skill) -> None:
 
 
 def test_tool_goes_to_its_via_points(between: Skill, shown: list[Demonstration]) -> None:
-    """The tool reaches its via-points, and moves with the hand that it follows."""
+    """The tool also moves with the hand that it follows."""
     for via_points in (
         shown[1].via_points,
         moved(shown[3].via_points, {"glass": (0.0, 0.1, 0.05)}),
@@ -84,7 +84,7 @@ def test_tool_goes_to_its_via_points(between: Skill, shown: list[Demonstration])
 
 
 def test_unusable_via_points_are_explained(shown: list[Demonstration]) -> None:
-    """Takes that cannot be learned between via-points are refused with a reason."""
+    """Such takes are refused with a reason."""
     assert task_of([take._replace(via_points=()) for take in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(via_points=shown[1].via_points[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]
@@ -116,7 +116,7 @@ def test_via_point_never_reached_is_named(shown: list[Demonstration]) -> None:
 
 
 def test_file_holds_segments_or_is_refused(between: Skill) -> None:
-    """Its file holds it exactly and what does not fit is refused."""
+    """The task comes back exactly; arrays that do not fit are refused."""
     back = decoded(between.file, origin="x.npz")
     hands = between.hands + 0.01
     assert back.mean(hands).tobytes() == between.mean(hands).tobytes()
@@ -138,7 +138,7 @@ def test_file_holds_segments_or_is_refused(between: Skill) -> None:
 
 
 def rms_mm(kind: str, skill: Skill) -> float:
-    """The error at the moment in four takes of other people, through the core."""
+    """The error of the core at each moment in four takes of other people."""
     total = 0.0
     count = 0
     for demonstration in made(kind, (6, 7)):
@@ -156,7 +156,7 @@ def cyclic() -> Skill:
 
 
 def test_via_point_is_visited_twice(cyclic: Skill) -> None:
-    """Once the hands left it, what was before tells which visit it is."""
+    """Once the hands have left it, the past distinguishes the visits."""
     assert cyclic.model.names == ("start", "left out", "work", "left out again")
     # a Gaussian process with 2 s of memory: 51, one without: 101
     assert rms_mm("cyclic", cyclic) < 50.0
@@ -174,14 +174,14 @@ def test_delay_of_teacher_is_learned(cyclic: Skill) -> None:
     figures = figures_of(cyclic)
     late_s = figures.delay_s
     std_s = figures.delay_std_s
-    # the mean of 0.09 to 0.34 s
+    # the teacher's delays are 0.09 to 0.34 s
     assert cyclic.model.delay_s == late_s == pytest.approx(0.22, abs=0.06)
     assert 0.0 < std_s < 0.2
     assert f"the teacher was {late_s:.2f} s late" in table(figures)
 
 
 def late_right(shown: Demonstration, by_s: float) -> Demonstration:
-    """The demonstration with a right hand that does all later."""
+    """The demonstration with a delayed right hand."""
     steps = round(by_s / shown.period_s)
     right = shown.right[np.maximum(np.arange(len(shown.right)) - steps, 0)]
     return shown._replace(right=right)
@@ -198,7 +198,7 @@ def without_follow(shown: Demonstration) -> Demonstration:
 
 @pytest.fixture(scope="module")
 def on_path() -> list[Demonstration]:
-    """The tool follows the left hand, whatever the right one does."""
+    """Takes in which the tool follows the left hand, independently of the right one."""
     return made("path", range(4))
 
 
@@ -211,7 +211,7 @@ def lead_of(shown: list[Demonstration]) -> tuple[int, Figures]:
 
 @pytest.mark.thorough
 def test_leading_hand(on_path: list[Demonstration]) -> None:
-    """Unless somebody shows it, the tool waits for the other hand."""
+    """Unless demonstrations show a leading hand, the tool waits for both hands."""
     free = [without_follow(take) for take in on_path]
     leads, figures = lead_of(free)
     assert leads == NONE
@@ -231,19 +231,18 @@ def test_where_it_waits_it_waits_to_the_end() -> None:
 
 @pytest.fixture(scope="module")
 def carried() -> StoredSkill:
-    """The tool is fixed to what the left hand carries."""
+    """A skill of a tool that is fixed to a part in the left hand."""
     return learn([without_follow(take) for take in made("heading", range(4))])
 
 
 @pytest.mark.thorough
 def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
-    """A tool that is fixed to what a hand carries turns with that hand."""
     figures = figures_of(carried)
     assert figures.taken == "orientation of the left hand"
     assert figures.tried_mm[figures.taken] < 0.6 * figures.tried_mm["positions"]
     assert isinstance(carried.model, SegmentedKMP)
     np.testing.assert_allclose(carried.model.task.levers, np.tile(CARRIED_M, (3, 1)), atol=0.004)
-    # without the orientation: 39; a Gaussian process told the via-points: 80
+    # without the orientation: 39; a Gaussian process with the via-points: 80
     assert rms_mm("heading", carried) < 22.0
     restored = decoded(carried.file, origin="a file")
     assert (
@@ -255,7 +254,7 @@ def test_carried_tool_turns_with_hand(carried: StoredSkill) -> None:
 
 @pytest.mark.thorough
 def test_carried_tool_has_velocity_of_turn(carried: StoredSkill) -> None:
-    """Its velocity is that of the turning hand and without orientation it moves only."""
+    """The velocity includes the hand's rotation; without orientations only its translation."""
     model = carried.model
     hands = model.hands[1].reshape(2, 3)
     belief = model.belief(model.hands[1])

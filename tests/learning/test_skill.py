@@ -1,4 +1,4 @@
-"""What a skill predicts: position, velocity, acceleration, and how sure it is."""
+"""Predictions of a skill: position, velocity, acceleration and covariance."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_prediction_has_derivatives_of_motion(aimed: Skill, t: float) -> None:
 
 
 def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> None:
-    """A prediction is rounded and its covariance is one."""
+    """The covariance is symmetric and positive definite."""
     random = np.random.default_rng(2)
     prediction = learned.predict(
         taught[4].hands[300].reshape(2, 3), random.normal(size=(2, 3)), random.normal(size=(2, 3))
@@ -44,6 +44,6 @@ def test_prediction_is_rounded(learned: Skill, taught: list[Demonstration]) -> N
         np.testing.assert_array_equal(value, np.round(value, 6))
     np.testing.assert_array_equal(prediction.covariance, prediction.covariance.T)
     assert np.linalg.eigvalsh(prediction.covariance).min() > 0
-    # of the primitive's covariance, not of held-out errors
+    # multiples of the primitive's covariance, not of held-out errors
     gate_m = learned.model.gates_m(taught[4].hands[300:301])[0]
     assert prediction.gate_m == pytest.approx(gate_m, rel=1e-4)

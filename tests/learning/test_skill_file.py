@@ -1,4 +1,4 @@
-"""A skill's file: the same to the bit after a trip, refused where it is not what was written."""
+"""A skill's file: it restores the same bits, and is refused if it was changed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ def predicted(skill: Skill, hands: Vector) -> tuple[Vector, ...]:
 def test_file_returns_same_bits(
     learned: Skill, via_points: tuple[ViaPoint, ...], taught: list[Demonstration]
 ) -> None:
-    """Saving and loading changes no bit."""
     sent = adapted(learned, via_points, tolerance=0.04)
     back = with_file(replace(decoded(sent.file, origin="a file"), file=b""))
     assert back.file == sent.file
@@ -80,7 +79,7 @@ def empty_archive() -> bytes:
     ],
 )
 def test_foreign_file_is_refused(garbage: bytes) -> None:
-    """A file that is no skill is refused by name."""
+    """The error names the file."""
     with pytest.raises(SkillError, match=r"nonsense\.npz: not a skill"):
         decoded(garbage, origin="nonsense.npz")
 
@@ -131,7 +130,7 @@ def test_foreign_file_is_refused(garbage: bytes) -> None:
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
 def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message: str) -> None:
-    """Values outside those of a skill are refused, with the accepted ones."""
+    """The error names the accepted values."""
     with pytest.raises(SkillError, match=r"^x\.npz: ") as caught:
         decoded(file_with(skill, **arrays), origin="x.npz")
     assert message in str(caught.value)
@@ -156,7 +155,7 @@ def test_flipped_bit_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -
 
 
 def test_large_archive_is_not_unpacked() -> None:
-    """A file that would unpack to too many bytes is not unpacked."""
+    """It would unpack to too many bytes."""
     out = io.BytesIO()
     with (
         zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -170,7 +169,7 @@ def test_large_archive_is_not_unpacked() -> None:
 
 
 def test_damaged_archive_is_told_apart(skill: Skill) -> None:
-    """A damaged archive is distinguished from a file that never was one."""
+    """Other files are refused as no archive."""
     random = Random(5)
     for _ in range(30):
         cut = skill.file[: random.randrange(4, len(skill.file))]
@@ -183,13 +182,13 @@ def test_damaged_archive_is_told_apart(skill: Skill) -> None:
 
 @pytest.mark.parametrize("name", ["", "  ", "a/b", "x" * 129])
 def test_invalid_name_is_refused(learned: Skill, name: str) -> None:
-    """A name that is empty or a path is refused."""
+    """The name is empty or a path."""
     with pytest.raises(SkillError, match="1 to 128 characters without / accepted"):
         decoded(with_file(replace(learned, name=name)).file, origin="a file")
 
 
 def test_too_many_arrays_are_refused(learned: Skill) -> None:
-    """An archive of too many arrays is refused at once."""
+    """The refusal is immediate."""
     out = io.BytesIO(learned.file)
     with zipfile.ZipFile(out, "a") as archive:
         for number in range(1000):

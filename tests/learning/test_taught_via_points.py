@@ -1,5 +1,5 @@
-"""Via-points: met, followed around, forgotten, refused where they contradict, told of where they
-are missed or moved.
+"""Via-points: met, followed in their neighbourhood, removed, refused if they contradict each other,
+and reported if missed or moved.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float
 
 
 def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
-    """Via-points are inserted into the base primitive, not into an adapted one."""
+    """They are not added to an adapted primitive."""
     anew = adapted(aimed, VIA_POINTS[1:], tolerance=0.05)
     assert anew.file == adapted(learned, VIA_POINTS[1:], tolerance=0.05).file
     assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file
@@ -57,7 +57,7 @@ EXACT = msgspec.structs.replace(HANDOVER, radius=0.0, std=0.0001)
 
 @pytest.mark.parametrize("hands", [0.0, 0.001, 0.01, 0.05])
 def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> None:
-    """Via-points that contradict each other are refused by name."""
+    """The error names them."""
     steep = 4.0 * hands + 0.001 + 0.0006
     with pytest.raises(
         SkillError, match=r"'handover' and 'twin' contradict each other: their hands are"
@@ -74,7 +74,7 @@ def test_contradicting_via_points_are_refused(skill: Skill, hands: float) -> Non
 
 
 def test_loose_via_points_contradict_less(skill: Skill) -> None:
-    """Via-points that are not exact contradict less and neighbourhoods more."""
+    """A larger deviation allows more; neighbourhoods allow less."""
     adapted(skill, (EXACT, moved(EXACT, "twin", hands=0.001, tool=0.05, std=0.02)), tolerance=0.05)
     twin = moved(EXACT, "twin", hands=0.05, tool=0.12)
     adapted(skill, (EXACT, twin), tolerance=0.05)
@@ -83,7 +83,6 @@ def test_loose_via_points_contradict_less(skill: Skill) -> None:
 
 
 def test_missed_and_moved_via_points_are_named(aimed: Skill) -> None:
-    """Via-points that are missed or moved are reported by name."""
     loose = moved(HANDOVER, "loose", hands=0.06, tool=0.2, radius=0.0, std=0.05)
     after = adapted(aimed, (*VIA_POINTS, loose), tolerance=0.05)
     missed = next(point.missed_by_m for point in in_force(after) if point.name == "loose")

@@ -1,4 +1,4 @@
-"""Verdicts: which figures are warned of, which are a residual risk, and which are refused."""
+"""Verdicts on figures: warned of, a residual risk, or refused."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ GATE = Gate(0.05, Caught(1.0, 1.0, 1.0), capped=False, floored=False)
 def found(
     frames: tuple[str, ...] = ("base",), takes: int = 4, error_mm: float = 20.0, **change: Any
 ) -> dict[str, str]:
-    """Texts and severities of figures that differ in these from good ones."""
+    """Texts and severities of good figures with these changes."""
     row = msgspec.structs.replace(GOOD, error_mm=error_mm, held=change.pop("held", 1.0))
     row = msgspec.structs.replace(row, predicted_mm=change.pop("expected_mm", row.predicted_mm))
     gate = GATE._replace(capped=change.pop("capped", False))
@@ -47,7 +47,6 @@ def found(
 
 
 def test_good_figures_have_no_remarks() -> None:
-    """Good figures cause no remark."""
     assert found() == {}
 
 

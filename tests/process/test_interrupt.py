@@ -17,7 +17,7 @@ from support.cell_commands import python
 from support.paths import RECORDINGS, ROOT
 
 SAID = "thirdhand: interrupted"
-DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # from when the process looks after interrupts
+DELAYS_S = (0.0, 0.1, 0.5, 1.5)  # since the process handles interrupts
 OTHERS = ("demo", "replay", "learn", "status", "play")
 GOLDEN = str(RECORDINGS / "golden.mcap")
 DEMONSTRATIONS = [str(RECORDINGS / f"demonstration-{number}.mcap") for number in range(1, 6)]
@@ -55,7 +55,7 @@ def wait_for(what: Callable[[], bool], timeout_s: float = 60.0) -> None:
 
 @pytest.fixture
 def nobody() -> Iterator[str]:
-    """An endpoint that takes connections in and never says a word: who connects there waits."""
+    """An endpoint that accepts connections and never answers, so that commands wait."""
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         listening.listen()
@@ -63,7 +63,7 @@ def nobody() -> Iterator[str]:
 
 
 def begun(arguments: list[str], said: Path) -> subprocess.Popen[bytes]:
-    """A command that runs and looks after interrupts: by a thread of its own, its second."""
+    """A running command that handles interrupts; a second thread shows that it does."""
     with said.open("wb") as errors:
         command = [sys.executable, "-m", "thirdhand", *arguments]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, cwd=ROOT)
@@ -96,7 +96,7 @@ main()
     ],
 )
 def test_interrupt_during_imports_leaves_no_traceback(module: str) -> None:
-    """At imports from the first line of the program on; Python's own come before that."""
+    """Any import after the first line of the program; Python's own imports come before."""
     code = f"import sys\nsys.path[:0] = {sys.path}\n" + INTERRUPTED_AT_AN_IMPORT.replace(
         "MODULE", module
     )
@@ -144,12 +144,11 @@ def test_an_interrupt_ends_a_command_with_one_line(
 
 @pytest.mark.thorough
 def test_interrupt_after_the_work_keeps_the_exit_code(tmp_path: Path) -> None:
-    """An interrupt after the work does not change the exit code."""
     output = tmp_path / "said"
     skill = tmp_path / "skill.npz"
     process = begun(["learn", *DEMONSTRATIONS, "--output", str(skill)], output)
     wait_for(skill.exists)
-    while process.poll() is None:  # also while the interpreter takes itself down
+    while process.poll() is None:  # also while the interpreter shuts down
         process.send_signal(signal.SIGINT)
         time.sleep(0.001)
     assert process.returncode in (0, 130)
@@ -184,7 +183,7 @@ def test_a_demo_that_is_ended_leaves_no_process_behind(
 
 
 def test_silent_bench_ends_with_its_parent(tmp_path: Path) -> None:
-    """A bench that prints would end with the pipe that nobody reads any more."""
+    """A bench that prints would end by its closed pipe anyway."""
     output = tmp_path / "said"
     with subprocess.Popen(["sleep", "600"]) as runs_it:
         bench = begun(
@@ -220,13 +219,13 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
 
 
 def test_early_interrupt_is_not_lost() -> None:
-    """An interrupt just before there is something to put away is not lost."""
+    """It arrives just before the code that cleans up is entered."""
     done = python(INTERRUPTED_JUST_BEFORE)
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 
 
 def test_an_interrupt_that_is_ignored_stays_so() -> None:
-    """As a shell starts what runs in its background."""
+    """A shell ignores interrupts for background commands."""
     code = (
         "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nfrom thirdhand.process "
         "import interrupt\n"

@@ -1,4 +1,4 @@
-"""Memory of the start: it is released, and what is used again works as before."""
+"""Memory of the start: it is released, and released code still works."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ print(used_mb, left_mb)
 
 
 def test_code_of_the_start_is_released_and_runs_again() -> None:
-    """Code that only the start used is released and runs again."""
     done = python(PROGRAM)
     assert done.returncode == 0, done.stderr
     used_mb, left_mb = map(float, done.stdout.split())

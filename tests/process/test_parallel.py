@@ -1,4 +1,4 @@
-"""Workers that are not there."""
+"""Clusters of workers that do not exist."""
 
 from __future__ import annotations
 

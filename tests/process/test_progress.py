@@ -1,4 +1,4 @@
-"""Progress: nothing of what is quick, lines where nobody watches, a bar on a terminal."""
+"""Progress: no output for quick steps, lines without a terminal, a bar on a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from thirdhand.process.progress import progress, steps
 
 
 def until_said(capsys: pytest.CaptureFixture[str], words: str) -> str:
-    """What was said on standard error until the words were."""
+    """Standard error up to these words."""
     text = ""
     wait = threading.Event()
     for _ in range(500):
@@ -57,7 +57,7 @@ def test_steps_are_named_as_they_begin_and_again_where_they_last(
 def test_on_a_terminal_a_bar_is_drawn_and_the_cursor_left_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ctrl-C ends a command at once: nobody would show a hidden cursor again."""
+    """Ctrl-C ends a command at once, so that a hidden cursor would stay hidden."""
     ours, theirs = pty.openpty()
     drawn = b""
     with os.fdopen(theirs, "w") as terminal:
@@ -70,7 +70,7 @@ def test_on_a_terminal_a_bar_is_drawn_and_the_cursor_left_alone(
     while True:
         try:
             drawn += os.read(ours, 4096)
-        except OSError:  # its other end is closed
+        except OSError:  # the other end of the terminal is closed
             break
     os.close(ours)
     assert b"reading" in drawn

@@ -62,7 +62,7 @@ def test_no_encoding_of_the_output_ends_in_a_traceback(
 def test_module_of_another_python_is_one_sentence(
     tmp_path: Path, command: str, variable: str
 ) -> None:
-    """A module of another python is one sentence with file and variable."""
+    """The sentence names the file and the variable."""
     module = tmp_path / "pinocchio" / "__init__.py"
     library = "libboost.so"
     module.parent.mkdir()
@@ -87,7 +87,7 @@ def test_module_of_another_python_is_one_sentence(
 def test_user_without_a_home_gets_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A user without a home needs a variable and gets no folder."""
+    """The error names the variable that is needed."""
     monkeypatch.setenv("HOME", "/home/me")
     for state, code, words in (
         (

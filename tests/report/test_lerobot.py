@@ -1,4 +1,4 @@
-"""A recording as a data set of LeRobot: what its loader reads, read back by its rules."""
+"""A recording as a data set of LeRobot: the files that its loader reads, read back by its rules."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LOST = range(3000, 3100)
 
 @pytest.fixture(scope="module")
 def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten seconds of the golden session, in which 0.2 s are missing."""
+    """Ten seconds of the golden session without 0.2 s of them."""
     path = tmp_path_factory.mktemp("gapped") / "gapped.mcap"
     old = Recording.open(golden)
     start, *steps = old.steps()
@@ -93,7 +93,7 @@ def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
     assert [episode["dataset_from_index"] for episode in rows[1:]] == [
         episode["dataset_to_index"] for episode in rows[:-1]
     ]
-    assert 170 < rows[0]["length"] < 180  # from when both hands had been seen
+    assert 170 < rows[0]["length"] < 180  # since both hands were seen
     for episode in rows:
         part = table.slice(episode["dataset_from_index"], episode["length"])
         assert set(part["episode_index"].to_pylist()) == {episode["episode_index"]}
@@ -147,8 +147,8 @@ def test_what_tells_of_it_is_as_the_loader_wants_it(data_set: Path) -> None:
 
 @pytest.fixture(scope="module")
 def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set of twice the first six seconds of the golden session, with a camera at 10 Hz whose
-    pictures brighten with time. After three seconds the clock is set ahead by an hour.
+    """A data set of the first six seconds of the golden session, twice, with a camera at 10 Hz
+    whose pictures brighten with time. After three seconds the clock is set ahead by an hour.
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
     path = tmp_path_factory.mktemp("filmed") / "filmed.mcap"
@@ -215,7 +215,7 @@ def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
     np.testing.assert_allclose(
         [time_s for time_s, _ in pictures], np.arange(len(pictures)) / fps, atol=1e-4
     )
-    # the tick of the first row, up to half a row
+    # tick of the first row, accurate to half a row
     began = 3000 - 1 - round((first["length"] - 1) / fps * 500)
     expected = [(began + row / fps * 500) // 50 * 2.5 for row in rows["frame_index"]]
     assert np.abs(np.array([level for _, level in pictures]) - expected).max() < 5.0
@@ -247,7 +247,7 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
 
 
 def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
-    """A recording of an arm that tells nothing of its joints."""
+    """A recording of an arm that does not report its joints."""
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(
         path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
@@ -263,7 +263,7 @@ def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URD
 def test_full_disk_leaves_nothing_behind(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """After a full disk nothing is left and the next try works."""
+    """The next attempt succeeds."""
     path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
     with small_disk(tmp_path / "disk", "24k") as disk:
         assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1

@@ -1,5 +1,5 @@
-"""What a recording tells: modes and reasons over the time, what led to holds and faults,
-via-points, limits, promptness; against sessions of which that is known.
+"""Reports of sessions whose content is known: modes and reasons over time, causes of holds and
+faults, via-points, limits, promptness.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PERIOD_S = SETTINGS.period_s
 PERIOD_NS = round(SETTINGS.period_s * 1e9)
 START_NS = 1_700_000_000_000_000_000
 FAULT_AT = 600  # ticks
-FIELDS: dict[str, Any] = {  # of a status, that the core knows nothing of
+FIELDS: dict[str, Any] = {  # fields of a status that do not come from the core
     "rate_hz": 500.0,
     "missed": 0,
     "realtime": True,
@@ -58,8 +58,8 @@ def stamp(tick: int) -> int:
 
 
 class Told:
-    """A session with resting hands and an arm that goes where it is told, until something happens
-    to it from tick `FAULT_AT` on; recorded as it goes, with a status ten times a second or without.
+    """A recorded session with resting hands and an arm that follows its commands until something
+    happens from tick `FAULT_AT` on; with a status ten times a second or without.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Told:
                     recorder.note("status", encode_json(self.said[-1]).decode(), stamp(k))
 
     def first(self, reason: str, *, after: int = 0) -> Status:
-        """The first status of a reason from a tick on."""
+        """The first status with a reason, from a tick on."""
         return next(
             status for status in self.said if status.reason == reason and status.tick >= after
         )
@@ -142,7 +142,7 @@ def session(golden: Path) -> Report:
 
 
 def test_stop_distance_is_compared_with_people(golden: Path) -> None:
-    """The distance of a stop is that of the measured tool and is compared with people."""
+    """It is measured at the tool, and compared with people's stops."""
     columns = read(Recording.open(golden))
     report = Report(columns)
     assert report.stop_mm is not None
@@ -166,21 +166,21 @@ def test_stop_distance_is_compared_with_people(golden: Path) -> None:
 
 
 def test_spans_of_a_session_name_what_happened(session: Report) -> None:
-    """The spans of a session follow each other and name what happened."""
+    """The spans follow each other without gaps."""
     ends = [span.start_s + span.lasts_s for span in session.spans]
     assert [span.start_s for span in session.spans] == pytest.approx([0.0, *ends[:-1]], abs=1e-9)
     assert ends[-1] == pytest.approx(session.lasts_s) == pytest.approx(SESSION_S, abs=0.05)
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
-    far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand comes back by a jump
+    far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand returns by a jump
     for reason, (begin_s, end_s) in {
-        # until then the tool does not depend on that hand
+        # within the first 0.45 s the tool does not depend on that hand
         Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: (AWAY_S[0], far_end_s),
     }.items():
         assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
-    # made in process, without a status: what the first frame of each holds
+    # The session has no status, so the words follow from the first frame of each hold.
     assert re.fullmatch(r"the left hand was last seen [34]\d\d ms ago", held[Reason.STALE_HAND].why)
     asked = held[Reason.OPERATOR]
     assert (asked.why, asked.remedy) == (
@@ -220,7 +220,7 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
 
 
 def test_via_points_are_met_while_the_hands_are_there(session: Report) -> None:
-    """Via points are met while the hands are there and told apart by when they were taught."""
+    """They are distinguished by the time at which they were taught."""
     by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
     first, second = [point for point in session.via_points if point.name == "handover"]
@@ -239,7 +239,7 @@ def test_via_points_are_met_while_the_hands_are_there(session: Report) -> None:
 def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(
     skill: Skill, tmp_path: Path
 ) -> None:
-    """Hands that rest where it was taught, and a tool that goes there."""
+    """The hands rest where the via-point was taught, and the tool moves toward it."""
     Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
     [point] = reported(tmp_path / "a.mcap").via_points
     frames = np.array(
@@ -292,7 +292,7 @@ def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(
 def test_fault_tells_cause_and_end(
     skill: Skill, tmp_path: Path, what: str, reason: Reason, why: str, about: str, statuses: bool
 ) -> None:
-    """A fault has the words of its status and tells what was before it and how it ended."""
+    """The fault has the words of its status, and what happened before it."""
     session = Told(skill, tmp_path / "a.mcap", what, statuses=statuses)
     report = reported(tmp_path / "a.mcap")
     fault = report.faults[0]
@@ -325,7 +325,7 @@ def test_before_a_fault_is_told_what_was_rejected_and_why(skill: Skill, tmp_path
 
 
 def test_waiting_is_no_hold_of_the_session(golden: Path) -> None:
-    """Waiting for hands and the end of a session are no holds of it."""
+    """The end of a session is no hold either."""
 
     def spans(*parts: tuple[float, Mode, Reason]) -> tuple[Span, ...]:
         timeline = []
@@ -387,7 +387,7 @@ def test_a_hold_has_the_words_of_the_first_status_in_it(skill: Skill, tmp_path: 
 
 
 def test_promptness_is_that_of_the_timings(skill: Skill, tmp_path: Path) -> None:
-    """Promptness is that of the timings and what is not recorded belongs to no mode."""
+    """Ticks that are not recorded belong to no mode."""
     Told(skill, tmp_path / "a.mcap", lost_at=700)
     report = reported(tmp_path / "a.mcap")
     assert report.missed == 3
@@ -405,7 +405,7 @@ def test_promptness_is_that_of_the_timings(skill: Skill, tmp_path: Path) -> None
 def test_names_have_no_effect_on_tables_and_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Names in a skill and of a file have no effect in tables and on the page."""
+    """The names are those in a skill and of a file."""
     path = tmp_path / "$\\frac$ <b>\x1b[31m.mcap"
     Told(decoded(wicked_skill(), origin="wicked"), path)
     html_path = tmp_path / "page.html"
@@ -429,7 +429,7 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_mm.largest > 400.0
     if far_ticks is None:
         assert report.lag_mm is None
-        # else a stop is the worst
+        # otherwise the largest error is that of a stop
         report.spans = tuple(span for span in report.spans if span.mode is Mode.FOLLOW)
         assert "did not reach the target" in verdict(report)
         return
@@ -441,7 +441,7 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
 
 @pytest.mark.thorough
 def test_ages_of_hands_advance_between_recorded_frames(golden: Path, tmp_path: Path) -> None:
-    """At most by what passed since the last frame; seen and unseen hands are the same."""
+    """Ages are too large by the time since the last frame at most; seen and unseen hands agree."""
     whole = read(Recording.open(golden))
     columns = read(Recording.open(thin(golden, tmp_path / "thin.mcap")))
     assert np.array_equal(columns.frames["tick"], whole.frames["tick"])

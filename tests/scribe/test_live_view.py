@@ -1,4 +1,4 @@
-"""The live view: frames for which it is too slow are a gap that shows; nothing else is left out."""
+"""The live view: frames for which it is too slow are a visible gap; nothing else is omitted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from thirdhand.scribe.protocol import ImageArrival, TickMessage
 from thirdhand.settings.config import WAM, RecordingSettings, Settings
 from thirdhand.viewer.stream import Viewer
 
-HELD_AT = MAX_WAITING_FRAMES + 300  # for one tick, within the gap
+HELD_AT = MAX_WAITING_FRAMES + 300  # a hold of one tick within the gap
 END = MAX_WAITING_FRAMES + 600
 
 
@@ -37,7 +37,7 @@ def received(*, first: int, end: int, skill_at: int = -1, skill: bytes = b"") ->
 
 
 def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[str, Any]]]:
-    """The rows that a live view draws, which is paused while it is fed."""
+    """The rows that a live view draws; it is paused while it receives messages."""
     view = LiveView(
         lambda: Viewer(
             urdf=WAM, settings=Settings(recording=RecordingSettings(also=("lens",))), rrd=path
@@ -51,7 +51,7 @@ def shown(path: Path, feed: Callable[[LiveView], None]) -> dict[str, list[dict[s
 
 
 def test_omitted_frames_are_a_gap_and_nothing_else(tmp_path: Path, skill: Skill) -> None:
-    """Frames that are left out are a gap in curves and log and nothing else is."""
+    """The gap is in curves and log."""
 
     def feed(view: LiveView) -> None:
         for message in received(first=0, end=END, skill_at=HELD_AT + 100, skill=skill.file):
@@ -86,8 +86,6 @@ def test_omitted_frames_are_a_gap_and_nothing_else(tmp_path: Path, skill: Skill)
 
 
 def test_frames_are_drawn_again_after_the_backlog(tmp_path: Path) -> None:
-    """Once all that waited is drawn new frames are drawn again."""
-
     def feed(view: LiveView) -> None:
         for message in received(first=0, end=HELD_AT):
             view.add(message)

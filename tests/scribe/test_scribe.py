@@ -1,5 +1,5 @@
-"""The scribe: what the loop tells is recorded whatever happens to the process, and whatever happens
-to it the loop does not notice.
+"""The scribe: messages of the loop are recorded whatever happens to the scribe's process, and the
+loop is not disturbed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SETTINGS = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
 
 @contextmanager
 def scribe(settings: Settings = SETTINGS, **where: Any) -> Iterator[Scribe]:
-    """A started scribe that is ended in any case."""
+    """A running scribe that is ended in any case."""
     writer = Scribe(settings, **where)
     try:
         writer.start(skill=SKILL, state=state_after(-1))
@@ -95,7 +95,7 @@ def test_what_is_told_is_recorded(tmp_path: Path) -> None:
         tuple((event.kind, event.payload) for event in tick.inbox) for tick, *_ in sent
     ]
     assert [encode(step.frame) for step in steps] == [encode(frame) for _, frame, _ in sent]
-    # the next one is due 10 s later
+    # the next state follows after 10 s
     assert [step.tick for step in steps if step.state is not None] == [49]
     assert [text for _, text, _ in recording.notes("requests")] == ["via_points add handover"]
 
@@ -119,7 +119,7 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
 
 
 def test_stopped_process_costs_ticks_but_no_time(tmp_path: Path) -> None:
-    """A stopped process costs ticks but no time and the recording tells of the gap."""
+    """The recording shows the gap."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         pid = writer.status()["pid"]
         os.kill(pid, signal.SIGSTOP)
@@ -160,7 +160,7 @@ def test_stopped_process_costs_ticks_but_no_time(tmp_path: Path) -> None:
 
 
 def test_killed_process_is_replaced_with_a_new_recording(tmp_path: Path) -> None:
-    """A killed process is started anew with a recording that stands alone."""
+    """The new recording can be read alone."""
     with scribe(recording=tmp_path / "a.mcap", restart_s=0.0) as writer:
         tell(writer, 20)
         killed = writer.status()["pid"]
@@ -171,7 +171,7 @@ def test_killed_process_is_replaced_with_a_new_recording(tmp_path: Path) -> None
         assert writer.ready(60)
         status = writer.status()
         assert status["pid"] != killed
-        # those not yet on disk
+        # lost: the ticks that were not yet on disk
         assert (status["alive"], status["restarts"], status["lost"]) == (True, 1, 20)
         assert status["errors"] == ["the scribe ended with code -9"]
     recording = Recording.open(tmp_path / "a-2.mcap")
@@ -183,7 +183,7 @@ def test_killed_process_is_replaced_with_a_new_recording(tmp_path: Path) -> None
 
 
 def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> None:
-    """Also where the process that it is forked from has to import all again."""
+    """The process from which the scribe is forked has to import everything first."""
     child.end_server()
     writer = Scribe(SETTINGS, folder=tmp_path)
     began = time.perf_counter()
@@ -197,7 +197,7 @@ def test_what_a_scribe_is_sent_before_it_exists_is_recorded(tmp_path: Path) -> N
 
 
 def test_everything_told_is_on_disk_when_the_loop_is_gone(tmp_path: Path) -> None:
-    """When the loops process is gone everything told is on disk."""
+    """The loop's process has ended."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         tell(writer, 300)
         pid = writer.status()["pid"]
@@ -213,7 +213,7 @@ def test_everything_told_is_on_disk_when_the_loop_is_gone(tmp_path: Path) -> Non
 
 
 def test_silent_process_is_replaced_and_its_gap_marked(tmp_path: Path) -> None:
-    """A silent process is replaced and what it had not written is marked."""
+    """The gap is what the process had not written."""
     with scribe(folder=tmp_path, restart_s=0.1, silent_s=1.0) as writer:
         tell(writer, 100)
         time.sleep(1.2)  # two flushes
@@ -249,8 +249,8 @@ def test_silent_process_is_replaced_and_its_gap_marked(tmp_path: Path) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("is_killed", [True, False])
 def test_lost_ticks_are_those_not_on_disk(tmp_path: Path, is_killed: bool) -> None:
-    """Thousands of ticks wait, and more reports come than the socket holds unless they are read.
-    One chunk may be on disk whose report a kill prevents.
+    """Thousands of ticks wait, and more reports arrive than the socket can hold unread. If the
+    process is killed, one chunk may be on disk without a report.
     """
     count = 12_000
     chunk = 60
@@ -287,7 +287,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.parametrize("how", ["running", "stopped"])
 def test_scribe_ends_with_its_daemon(tmp_path: Path, how: str) -> None:
-    """A scribe ends with its daemon and writes what it was told."""
+    """Everything that it received is written."""
     command = [sys.executable, "-c", DAEMON, str(tmp_path), how]
     path = os.pathsep.join(sys.path)
     environment = os.environ | {"PYTHONPATH": path}
@@ -304,7 +304,7 @@ def test_scribe_ends_with_its_daemon(tmp_path: Path, how: str) -> None:
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/a.mcap"])
 def test_unwritable_recording_spares_the_live_view(place: str) -> None:
-    """A recording that cannot be written is told and spares the live view."""
+    """The recording cannot be written, which is reported."""
     with scribe(recording=Path(place), live_port=0) as writer:
         tell(writer, 100)
         until(lambda: writer.supervise() or writer.status()["live"])
@@ -318,7 +318,7 @@ def test_unwritable_recording_spares_the_live_view(place: str) -> None:
 
 
 def test_no_process_without_anything_to_write() -> None:
-    """Without anything to write there is no process and nothing is lost."""
+    """Nothing is lost."""
     with scribe() as writer:
         tell(writer, 5)
         writer.note("requests", "x", 0)
@@ -365,7 +365,7 @@ def run(channel):
 
 @pytest.fixture
 def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Child]]:
-    """Children that compute for so long, and then do something, with a fork server of their own."""
+    """Children of an own fork server that compute for a time and then do something."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
     monkeypatch.setattr(child, "_server", server := child.ForkServer())
     started: list[Child] = []
@@ -389,7 +389,9 @@ def slow_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
 def test_progress_tells_a_child_that_is_slow_from_one_that_hangs(
     slow_child: Callable[..., Child],
 ) -> None:
-    """The slow one waits for its processor behind others. One hangs asleep, another one busily."""
+    """The slow child waits for a processor behind others. One hanging child sleeps, another
+    computes.
+    """
 
     def seconds_until_hung(one: Child, limit_s: float, most_s: float) -> float:
         progress = Progress(one)

@@ -1,5 +1,5 @@
-"""One recording after another: they join without a gap, the oldest make room, and what goes wrong
-with a disk or a folder is counted and ends by itself.
+"""Successive recordings: they join without a gap, the oldest ones are removed for room, and after
+faults of a disk or folder, losses are counted and recording continues by itself.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CELL = Settings(cell="hall/bench-1", rate_hz=50, recording=WHOLE)
 
 @pytest.fixture(scope="module")
 def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The recordings of one session, which went through the scribe's process."""
+    """The recordings that the scribe's process wrote of one session."""
     folder = tmp_path_factory.mktemp("rotated")
     settings = msgspec.structs.replace(ASSUMED, files=SMALL)
     controller = Controller(settings, skill, urdf=URDF)
@@ -65,7 +65,7 @@ def rotated(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[Path
 
 
 def test_recordings_rotate_without_losing_a_tick(rotated: list[Path]) -> None:
-    """Recordings rotate without losing a tick and each replays by itself."""
+    """Each recording replays by itself."""
     assert len(rotated) >= 3
     steps = [step for path in rotated for step in Recording.open(path).steps()]
     decided = [step for step in steps if step.frame is not None or step.checksum is not None]
@@ -93,7 +93,7 @@ def with_limits(**limits: float) -> Settings:
 
 
 def test_oldest_recordings_of_the_cell_make_room(tmp_path: Path) -> None:
-    """The oldest of this cells recordings make room and nothing else does."""
+    """Other files are not removed."""
     settings = with_limits()
     current = RecordingPaths(settings, str(tmp_path), None).next()
     assert current is not None
@@ -105,7 +105,7 @@ def test_oldest_recordings_of_the_cell_make_room(tmp_path: Path) -> None:
         tmp_path / name
         for name in ("hall-bench-1-20260101T000001Z.mcap", "north-20200101T000000Z.mcap")
     ]
-    write(spared[0], 3, settings=other)  # a name like ours, of another cell
+    write(spared[0], 3, settings=other)  # another cell's recording with a similar name
     spared += [
         tmp_path / name for name in ("hall-bench-1-notes.mcap", "hall-bench-1-20200101T000000Z.rrd")
     ]
@@ -113,7 +113,7 @@ def test_oldest_recordings_of_the_cell_make_room(tmp_path: Path) -> None:
         path.write_bytes(bytes(80_000))
     size_mb = old[0].stat().st_size / 1e6
     places = RecordingPaths(with_limits(keep_mb=3.5 * size_mb), str(tmp_path), None)
-    assert places.prune(current) == [old[0]]  # 4 recordings for 3.5
+    assert places.prune(current) == [old[0]]  # room for 3.5 of 4 recordings
     assert all(path.exists() for path in [*spared, current, *old[1:]])
     assert places.prune(current) == []
     assert places.keep_mb_left == pytest.approx(0.5 * size_mb, rel=0.05)
@@ -147,8 +147,8 @@ def test_a_clock_that_was_set_makes_no_recording_much_older(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A recording an hour, of which those of a day are kept; the clock was set before the last
-    `set_before` of them, and right again for the last `right_after`.
+    """There is one recording an hour, and those of a day are kept. The clock was set before the
+    last `set_before` of them, and right again for the last `right_after`.
     """
     settings = with_limits(keep_hours=24)
     now_s = 1.8e9
@@ -169,7 +169,7 @@ def test_a_clock_that_was_set_makes_no_recording_much_older(
 
 
 class Session:
-    """A scribe that is told ticks at 50 Hz or so, and supervised as the daemon does it."""
+    """A scribe that receives ticks at about 50 Hz, and is supervised as in the daemon."""
 
     def __init__(self, **where: Any) -> None:
         self.scribe = Scribe(CELL, restart_s=0.1, **where)
@@ -192,7 +192,7 @@ class Session:
         self.scribe.supervise()
 
     def until(self, what: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Tells ticks until something is true of the status."""
+        """Send ticks until a condition of the status holds."""
         deadline = time.monotonic() + 20.0
         while not what(status := self.scribe.status()):
             assert time.monotonic() < deadline, status
@@ -243,7 +243,7 @@ def test_growth_is_told_once_there_is_enough_of_it(
 
 
 def accounted(paths: list[Path], told: int) -> tuple[int, int]:
-    """The number of ticks in recordings, and of those that they say are missing."""
+    """The number of ticks in recordings, and the number that they report as missing."""
     steps = [
         step for path in paths for step in Recording.open(path).steps() if step.frame is not None
     ]
@@ -288,7 +288,7 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> No
 
 
 def test_removed_folder_is_made_again(tmp_path: Path) -> None:
-    """A folder that is removed is made again and what was in it counts as lost."""
+    """Its content counts as lost."""
     folder = tmp_path / "records"
     with session(folder=folder) as sender:
         sender.until(lambda status: status["sent"] > 200)
@@ -304,7 +304,7 @@ def test_removed_folder_is_made_again(tmp_path: Path) -> None:
 
 
 def test_moved_recording_is_ended_where_it_is(tmp_path: Path) -> None:
-    """A recording that is moved is ended where it is and nothing is lost."""
+    """Nothing is lost."""
     with session(folder=tmp_path) as sender:
         status = sender.until(lambda status: status["sent"] > 200)
         first = Path(status["recording"])

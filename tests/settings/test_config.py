@@ -1,4 +1,4 @@
-"""Settings: safe defaults, and errors that name the field and what is accepted."""
+"""Settings: safe defaults, and errors that name the field and the accepted values."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, acce
 
 
 def test_contradictions_are_reported_at_once() -> None:
-    """All contradictions between valid values are reported at once."""
+    """The values are valid by themselves."""
     text = """
     [reach]
     inner = 3
@@ -252,7 +252,7 @@ def test_endpoint_of_the_command_line_goes_first(monkeypatch: pytest.MonkeyPatch
 
 
 def test_daemon_listens_on_this_machine_only() -> None:
-    """A daemon listens on this machine only unless told otherwise."""
+    """This is the default."""
     network = Settings().network
     assert [is_local(endpoint) for endpoint in network.listen] == [True]
     assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)
@@ -282,7 +282,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     "number", [1e-308, -1e-308, 1e-10, 1e10, 1e300, -1e308, math.inf, math.nan]
 )
 def test_absurd_numbers_are_refused_everywhere(number: float) -> None:
-    """A number of a size that no cell has is refused everywhere."""
+    """No cell has numbers of such sizes."""
     usual = msgspec.json.decode(msgspec.json.encode(Settings()))
     paths = list(leaves(usual))
     assert len(paths) > 100
@@ -306,7 +306,7 @@ def test_absurd_numbers_are_refused_everywhere(number: float) -> None:
 def test_a_text_of_another_encoding_is_read_or_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str, words: str
 ) -> None:
-    """As editors of Windows write it: settings, a client's settings and a scene."""
+    """Editors of Windows write such settings, client settings and scenes."""
     path = tmp_path / "thirdhand" / "client.toml"
     path.parent.mkdir()
     path.write_text("# for the \u00e4rm\n", encoding=encoding)
@@ -451,7 +451,6 @@ network.listen = ["tcp/127.0.0.1:7448"]
 
 
 def test_file_of_several_cells_holds_shared_and_own_values(tmp_path: Path) -> None:
-    """A file of several cells holds what they share and what each has of its own."""
     path = tmp_path / "lab.toml"
     path.write_text(LAB, encoding="utf-8")
     first, second, third = (
@@ -482,7 +481,7 @@ def test_file_of_several_cells_holds_shared_and_own_values(tmp_path: Path) -> No
     ],
 )
 def test_unknown_cell_is_refused_with_the_known_ones(text: str, cell: str, words: str) -> None:
-    """A cell that a file does not have is refused with those that it has."""
+    """The error names the cells of the file."""
     with pytest.raises(SettingsError) as raised:
         parse(text, origin="lab.toml", cell=cell)
     assert words in str(raised.value)
@@ -504,5 +503,5 @@ def test_unknown_cell_is_refused_with_the_known_ones(text: str, cell: str, words
 def test_programs_reach_the_daemon_where_it_listens(
     network: dict[str, Any], endpoints: tuple[str, ...]
 ) -> None:
-    """Programs of this machine reach the daemon where it listens."""
+    """The programs run on the daemon's machine."""
     assert Network(**network).reached_at == endpoints

@@ -1,4 +1,6 @@
-"""Files that people name are read whole, or refused at once with the cause, whatever lies there."""
+"""Files given by users are read completely, or refused at once with the cause, whatever is at the
+path.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ LARGEST = 1000
 
 @pytest.fixture(autouse=True)
 def at_once() -> Iterator[None]:
-    """Whoever waits for a pipe or reads on and on fails."""
+    """Fail tests in which a reader waits for a pipe or reads without end."""
 
     def fail(*_: object) -> None:
         raise AssertionError("it waits for what no file holds")
@@ -31,7 +33,7 @@ def at_once() -> Iterator[None]:
 
 
 def odd(folder: Path, kind: str) -> Path:
-    """A path at which there is something that no file's content can be read from."""
+    """A path of something that has no content to read."""
     path = folder / "odd"
     if kind == "a pipe":
         os.mkfifo(path)

@@ -1,5 +1,5 @@
-"""Collision meshes are covered by capsules: what is inside, where files are looked for, and what
-is said of those that are not found.
+"""Capsules that cover collision meshes: points inside, search for files, and errors of missing
+files.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Points = NDArray[np.float64]
 
 
 def outside(points: Points, ends: Points, radius: float) -> float:
-    """How far the farthest of points (N, 3) is out of a capsule [m]."""
+    """The largest distance of points (N, 3) from a capsule [m]."""
     start = ends[0]
     span = ends[1] - ends[0]
     share = np.clip((points - start) @ span / max(span @ span, 1e-18), 0.0, 1.0)
@@ -61,7 +61,7 @@ def box(x: float, y: float, z: float) -> Points:
     )
 )
 def test_every_point_is_inside_a_capsule(points: Points) -> None:
-    """Flat ones, and one alone, too."""
+    """The points may be flat, or a single one."""
     capsule = np.array(capsule_around(points))
     ends = capsule[:6].reshape(2, 3)
     radius = float(capsule[6])
@@ -71,13 +71,13 @@ def test_every_point_is_inside_a_capsule(points: Points) -> None:
 
 
 def plain(points: Points) -> float:
-    """The volume of the capsule of the box around points, along its longest edge."""
+    """The volume of a capsule along the longest edge of the box around points."""
     *short, longest = sorted(np.ptp(points, axis=0))
     return volume(np.array(((0, 0, 0), (0, 0, longest))), float(np.hypot(*short)) / 2)
 
 
 def described(name: str, scale: str = "") -> str:
-    """The WAM, whose forearm has this mesh alone as its collision shape, turned and moved."""
+    """The WAM with this mesh, rotated and moved, as the only collision shape of its forearm."""
     begin = WAM.index('<link name="forearm">')
     end = WAM.index("</link>", begin)
     shape = (
@@ -97,7 +97,7 @@ def described(name: str, scale: str = "") -> str:
         ("package://linked/arm.stl", "linked/arm.stl", ""),
         # the folder above the URDF is the package
         ("package://my_arm/meshes/arm.stl", "meshes/arm.stl", ""),
-        ("package://other/arm.stl", "other/arm.stl", ""),  # beside that one
+        ("package://other/arm.stl", "other/arm.stl", ""),  # a package beside my_arm
         ("package://theirs/arm.stl", "ros/share/theirs/arm.stl", "ros/share"),
     ],
 )
@@ -129,7 +129,7 @@ def test_a_mesh_is_found_where_its_name_leads(
     text = robot_description(cell)
     assert "covered_by" not in description(urdf_path(cell), cover=False)
     (folder / file).unlink()
-    assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording has all that it needs
+    assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording needs no mesh files
     shape = next(candidate for candidate in Urdf(text).shapes if candidate.link == "forearm")
     points_m = points * 0.001 @ rotation(shape.rotation).T + shape.translation
     capsules = body_of(cell, text).capsules
@@ -139,7 +139,7 @@ def test_a_mesh_is_found_where_its_name_leads(
         if outside(points_m, capsule["ends"], capsule["radius"]) <= 1e-9
     ]
     assert [round(float(capsule["radius"]), 2) for capsule in mine] == [0.04]
-    assert capsules["radius"].max() < 0.2  # none by `link_radius`
+    assert capsules["radius"].max() < 0.2  # `link_radius` is not used
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_mesh_is_found_where_its_name_leads(
     ],
 )
 def test_missing_mesh_is_refused_by_its_name(tmp_path: Path, name: str, told: str) -> None:
-    """A mesh that is not found or is none is refused by its name."""
+    """A file that is no mesh is refused too."""
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(described(name))
@@ -190,7 +190,7 @@ def collada(points: Points, unit: str, node: str = "", up: str = "Z_UP") -> str:
 
 
 def around(shape: Shape, points: Points) -> float:
-    """How far the farthest of points in a link's frame is out of the capsule of a mesh [m]."""
+    """The largest distance of points in a link's frame from the capsule of a mesh [m]."""
     ends = np.reshape(shape.size[:6], (2, 3)) @ rotation(shape.rotation).T + shape.translation
     return outside(points, ends, shape.size[6])
 
@@ -208,7 +208,7 @@ TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
         ("a.stl", stl(LEG), ' scale="1 -1 1"', LEG * (1, -1, 1)),
         ("a.stl", stl(LEG), ' scale="-1 2 0.5"', LEG * (-1, 2, 0.5)),
         ("a.dae", collada(1000 * LEG, "0.001"), "", LEG),
-        # as RViz and MoveIt have it
+        # the result of RViz and MoveIt
         ("a.dae", collada(1000 * LEG, "0.001", QUARTER, "Y_UP"), "", TURNED),
         (
             "a.obj",
@@ -221,7 +221,7 @@ TURNED = LEG @ np.array(((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
 def test_mesh_has_the_size_and_direction_of_the_urdf(
     name: str, data: bytes | str, scale: str, expected: Points, tmp_path: Path
 ) -> None:
-    """A mesh has the size and direction that file and urdf say."""
+    """Unit and up axis of the file count too."""
     (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
     (tmp_path / "arm.urdf").write_text(described(name, scale))
     shape = next(
@@ -236,7 +236,6 @@ def test_mesh_has_the_size_and_direction_of_the_urdf(
 
 
 def test_each_mesh_of_a_link_has_its_capsule(tmp_path: Path) -> None:
-    """Each of several meshes of a link has a capsule of its own."""
     for name, points in (("a.stl", LEG), ("b.stl", LEG + np.array((0.2, 0.0, 0.0)))):
         (tmp_path / name).write_bytes(stl(points))
     second = '</collision><collision><geometry><mesh filename="b.stl"/></geometry></collision>'
@@ -310,7 +309,7 @@ def test_capsules_are_kept_and_found_anew_where_they_are_spoilt(
     (cache,) = (tmp_path / "home" / ".cache" / "thirdhand" / "capsules").iterdir()
     right = cache.read_text()
     cache.write_text(right.replace(right.split()[6], "0.5"))
-    assert found() != first  # it is what is taken
+    assert found() != first  # the file in the cache is used
     for spoilt in ("", "nan " * 7, "1 2 3", "1 2 3 4 5 6 -7", "\udcff"):
         cache.write_bytes(spoilt.encode(errors="surrogateescape"))
         assert found() == first

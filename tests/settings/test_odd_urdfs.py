@@ -1,5 +1,5 @@
-"""URDFs as the world writes them: each loads, with finite numbers alone, or is refused in one
-sentence that names what is wrong, in bounded time.
+"""Unusual URDFs: each loads with finite numbers only, or is refused in one sentence that names the
+fault, in bounded time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BOUND_S = 10.0
 
 
 def more(elements: str) -> str:
-    """The UR5 with more elements at its end."""
+    """The UR5 with more elements at the end of the file."""
     return UR5.replace("</robot>", f"{elements}</robot>")
 
 
@@ -40,7 +40,9 @@ def fixed(parent: str, child: str, name: str = "") -> str:
 
 
 def every(attribute: str, value: str | None) -> str:
-    """The UR5 with another value of each such attribute of a limit or axis, or without it."""
+    """The UR5 with another value for an attribute of all limits or axes, or without the
+    attribute.
+    """
     replaced = "" if value is None else f' {attribute}="{value}"'
     pattern = rf'(<(?:limit|axis)[^>]*?) {attribute}="[^"]*"'
     return re.sub(pattern, rf"\1{replaced}", UR5)
@@ -56,7 +58,9 @@ def chain_of(count: int) -> str:
 
 
 def tried(folder: Path, text: str | bytes) -> Settings:
-    """The cell of an arm, read in bounded time, and its core, which has finite numbers alone."""
+    """The cell of an arm; asserts that it is read in bounded time, and that its core has finite
+    numbers.
+    """
     start = time.process_time()
     try:
         cell = cell_in(folder, text)
@@ -216,7 +220,7 @@ LOADED = {
 def test_what_others_accept_moves_as_the_plain_one(text: str | bytes, tmp_path: Path) -> None:
     cell = tried(tmp_path, text)
     assert cell.joints.names[0] == "shoulder_pan_joint"
-    ElementTree.fromstring(robot_description(cell))  # any reader of XML accepts it
+    ElementTree.fromstring(robot_description(cell))  # readers of XML accept the description
     assert ArmModels(tmp_path / "arm.urdf", cell).body.capsules.shape
 
 
@@ -295,6 +299,5 @@ def spoilt(draw: st.DrawFn) -> bytes:
 def test_spoilt_description_is_refused_or_finite(
     tmp_path_factory: pytest.TempPathFactory, text: bytes
 ) -> None:
-    """A spoilt description is refused or has finite numbers alone."""
     with contextlib.suppress(SettingsError):
         tried(tmp_path_factory.getbasetemp(), text)

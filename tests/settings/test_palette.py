@@ -9,7 +9,7 @@ from thirdhand.workbench.report.page import MODE_COLOURS, TINT
 
 
 def channels(colour: str) -> palette.Colour:
-    """A colour from how it is written."""
+    """A colour's channels from its hexadecimal form."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 
@@ -18,6 +18,6 @@ def test_words_on_a_mode_are_read_in_the_banner_and_on_a_page() -> None:
     for mode, colour in BY_MODE.items():
         assert contrast((0, 0, 0), colour) >= LEAST_CONTRAST
         assert contrast((255, 255, 255), channels(MODE_COLOURS[mode])) >= LEAST_CONTRAST
-        if mode is not Mode.FOLLOW:  # only then a plot is tinted
+        if mode is not Mode.FOLLOW:  # plots are tinted in other modes
             tinted = [round(255 - TINT * (255 - value)) for value in channels(MODE_COLOURS[mode])]
             assert all(value >= paper for value, paper in zip(tinted, PAPER, strict=True))

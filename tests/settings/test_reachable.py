@@ -1,5 +1,5 @@
-"""The reach follows from the kinematics, however the arm is mounted; and what is configured beyond
-it is refused.
+"""The reach follows from the kinematics and the mounting of the arm; a configured reach beyond it
+is refused.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def mounted(text: str, xyz: str, rpy: str) -> str:
 
 
 def reached(cell: Settings, points: NDArray[np.float64]) -> float:
-    """The share of points (N, 3) [m] that the arm's inverse kinematics reach within 1 cm, by damped
-    least squares from several postures.
+    """The share of points (N, 3) [m] that the arm reaches within 1 cm, by damped least squares from
+    several postures.
     """
     arm = Arm(cell, robot_description(cell))
     lower = np.maximum(cell.joints.lower, -math.pi)
@@ -70,7 +70,7 @@ def reached(cell: Settings, points: NDArray[np.float64]) -> float:
 
 
 def targets(cell: Settings, count: int) -> NDArray[np.float64]:
-    """Places (N, 3) at which targets may be [m]."""
+    """Points (N, 3) of the default reach [m]."""
     reach = cell.reach
     random = np.random.default_rng(1)
     points = np.array(reach.centre) + reach.outer * random.uniform(-1.0, 1.0, (50 * count, 3))
@@ -88,7 +88,7 @@ def targets(cell: Settings, count: int) -> NDArray[np.float64]:
 def test_targets_of_the_default_reach_are_reached(
     mount: tuple[str, str] | None, tmp_path: Path
 ) -> None:
-    """All targets of a default reach are reached by inverse kinematics."""
+    """Inverse kinematics finds a posture for each."""
     cell = cell_in(tmp_path, mounted(UR5, *mount) if mount else UR5)
     assert cell.reach.outer > 0.85
     assert reached(cell, targets(cell, 60)) >= 0.95
@@ -96,7 +96,7 @@ def test_targets_of_the_default_reach_are_reached(
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_shipped_cells_have_the_reach_of_their_kinematics(arm: str) -> None:
-    """The shipped cells have a reach about as their kinematics give."""
+    """The numbers agree approximately."""
     cell = cell_of(arm)
     joints = cell.joints
     reach = cell.reach
@@ -139,7 +139,7 @@ def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
 def test_impossible_reach_is_refused(
     mount: tuple[str, str], reach: str, share: str, tmp_path: Path
 ) -> None:
-    """A reach that the arm has not is refused with what it has."""
+    """The error names the arm's reach."""
     with pytest.raises(
         SettingsError,
         match=rf"\[reach\]: the arm reaches {share} of it; at least .*By its kinematics",

@@ -1,4 +1,4 @@
-"""The URDF: chain, limits and link frames as Pinocchio has them; errors that say what would do."""
+"""The URDF: chain, limits and link frames equal Pinocchio's; errors name what is accepted."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_link_frames_are_where_another_implementation_has_them(
     data = model.createData()
     assert list(model.names)[1:] == names
     q = np.random.default_rng(1).uniform(-0.3, 0.3, len(names)) + around
-    # these are given by cosine and sine
+    # continuous joints have cosine and sine as coordinates
     turns = [joint.nq == 2 for joint in list(model.joints)[1:]]
     pairs = zip(turns, q.tolist(), strict=True)
     pin.framesForwardKinematics(
@@ -99,7 +99,7 @@ CHAIN = '<robot name="r"><link name="l0"/>{}</robot>'.format(
     | st.just((0, 1, 0, 1))
 )
 def test_newer_urdfs_are_read_as_by_every_reader(quaternion: tuple[float, ...]) -> None:
-    """Quaternions limits and rates of newer urdfs are those of every reader."""
+    """Quaternions, limits and rates equal those of other readers."""
     turn = np.array(quaternion) / np.linalg.norm(quaternion)
     origin = f'<origin xyz="1 0 0" quat_xyzw="{" ".join(map(repr, turn.tolist()))}"/><axis'
     text = readable(LIMITED.replace("<axis", origin).encode())

@@ -1,4 +1,4 @@
-"""Files and folders that are written whole or not at all."""
+"""Files and folders that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_failure_leaves_nothing_and_names_the_path(
     kind: str, error: BaseException, tmp_path: Path
 ) -> None:
     (tmp_path / "earlier").write_text("before")
-    (tmp_path / ".new.part").mkdir()  # of a process that was killed
+    (tmp_path / ".new.part").mkdir()  # left by a killed process
     for name in ("new", "earlier"):
         with pytest.raises(type(error)) as raised, whole(tmp_path / name) as part:
             _write_half(part if kind == "file" else part / "inside", error)

@@ -1,5 +1,5 @@
-"""Any arm at the bench: the shipped cells do the soldering task, their descriptions are those that
-others publish, and an arm that is elsewhere is scored by its joint states.
+"""Arms at the bench: the shipped cells do the soldering task, and their descriptions agree with
+those that others publish.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SCENE = Scene()
 
 @pytest.mark.parametrize("arm", ["franka", "ur5"])
 def test_shipped_arm_does_the_task(arm: str) -> None:
-    """A shipped arm does the task within its limits and away from the hands."""
+    """It keeps its limits, and its distance from the hands."""
     cell = cell_of(arm)
     near = []
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
@@ -74,7 +74,9 @@ def test_shipped_arm_does_the_task(arm: str) -> None:
 
 
 def test_franka_keeps_makers_velocity_limits() -> None:
-    """Who can stop before an end at `upper` with `acceleration` is at most so fast there."""
+    """A joint that can stop before its end with `acceleration` is within the maker's speed limit
+    there.
+    """
     limits = cell_of("franka").joints
     lower, upper, acceleration = (
         np.array(getattr(limits, name)) for name in ("lower", "upper", "acceleration")
@@ -91,7 +93,9 @@ def test_franka_keeps_makers_velocity_limits() -> None:
 
 
 def test_ur5_needs_half_of_its_torque() -> None:
-    """All joints about the posture, at full speed and acceleration, each the worse way round."""
+    """All joints have full speed and acceleration around the posture, each in the worse
+    direction.
+    """
     cell = cell_of("ur5")
     model = pin.buildModelFromXML(robot_description(cell))
     data = model.createData()
@@ -113,7 +117,7 @@ def test_ur5_needs_half_of_its_torque() -> None:
 def tips(
     text: str, names: tuple[str, ...], tip: str, postures: npt.NDArray[np.float64]
 ) -> list[pin.SE3]:
-    """Where a link is in postures (N, J) of some joints; others are at 0."""
+    """The pose of a link in postures (N, J) of some joints; the other joints are at 0."""
     model = pin.buildModelFromXML(text)
     data = model.createData()
     frame = model.getFrameId(tip)
@@ -143,7 +147,7 @@ def tips(
 def test_shipped_arm_moves_as_published(
     arm: str, file: str, theirs: tuple[str, ...], tip: str, stand: tuple[float, float, float]
 ) -> None:
-    """A shipped arm moves as the one that others describe."""
+    """Its kinematics equals that of a published description."""
     cell = cell_of(arm)
     names = cell.joints.names
     postures = np.random.default_rng(0).uniform(
@@ -170,7 +174,6 @@ UR5_MESHES = {f"{link}_link": f"ur5/collision/{link.replace('_', '')}.stl" for l
     ],
 )
 def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> None:
-    """A shipped arm's capsules cover the meshes that others publish."""
     cell = cell_of(arm)
     text = robot_description(cell)
     urdf = Urdf(text)
@@ -182,7 +185,7 @@ def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> No
         alone = [shape for shape in urdf.shapes if shape.link == link]
         points = triangles["f1"].reshape(-1, 3)
         beyond = np.inf
-        for shape in alone:  # a cylinder's; the capsules that the service keeps apart are larger
+        for shape in alone:  # as a cylinder; the service's capsules are larger
             local = (points - shape.translation) @ rotation(shape.rotation)
             sides = np.column_stack((np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])))
             beyond = np.minimum(
@@ -197,7 +200,7 @@ def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> No
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_described_cell_is_read_back(arm: str) -> None:
-    """A cell's status is read as it was published."""
+    """It comes back as published in the status."""
     boxes = (Box(centre=(0.5, 0.6, 0.1), half_size=(0.1, 0.1, 0.1)),)
     cell = msgspec.structs.replace(cell_of(arm), obstacles=Obstacles(boxes=boxes))
     assert parse(described(cell), origin="cell.toml") == cell

@@ -1,4 +1,4 @@
-"""The bench: physics that follow commands, a task that succeeds only when the tool is where it must
+"""The bench: physics that follow commands, a task that succeeds only if the tool is where it must
 be, and its channels on the network.
 """
 
@@ -38,8 +38,8 @@ STILL = (0.0,) * 7
 
 
 class Follower:
-    """Joint commands that bring the tool plate to a point: one damped least-squares step a tick,
-    posture in the null space.
+    """Joint commands that move the tool plate to a point: one damped least-squares step a tick,
+    with the posture in the null space.
     """
 
     def __init__(self, joints: tuple[float, ...]) -> None:
@@ -73,7 +73,7 @@ def test_opening_fingers_let_go() -> None:
         assert closures[-1] == pytest.approx(0.0, abs=1e-9)
         assert closures[len(closures) // 2] == pytest.approx(0.5, abs=0.02)
         assert held[2] > 0.2
-        # no hand was there to take it
+        # no hand took the board
         assert bench.world.pose(bench.world.board).position[2] == pytest.approx(0.0)
         assert not bench.events().handover.reached
 
@@ -97,7 +97,7 @@ def bench() -> Iterator[Bench]:
 
 
 def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[Observation]:
-    """A whole run in which the tool goes as it was taught, but `aside` [m] of it."""
+    """A whole run in which the tool moves on the teacher's path with an offset of `aside` [m]."""
     follower = Follower(bench.observe().joints)
     teacher = Teacher(SCENE, seed=1, clock=bench.script.clock)
     for _ in range(750):
@@ -113,7 +113,6 @@ def play(bench: Bench, *, aside: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
 
 @pytest.mark.quick
 def test_taught_path_does_the_task(bench: Bench) -> None:
-    """A tool that goes as taught does the task."""
     play(bench)
     events = bench.events()
     assert events.success
@@ -124,7 +123,7 @@ def test_taught_path_does_the_task(bench: Bench) -> None:
         10.3,
     ]
     world = bench.world
-    # it lies at the hand
+    # the board lies at the hand
     assert np.linalg.norm(np.subtract(world.pose(world.board).position, SCENE.soldering)) < 0.11
     assert np.linalg.norm(np.subtract(world.pose(world.glass).position, SCENE.carry)) < 0.06
     assert np.linalg.norm(np.subtract(world.pose(world.iron).position, SCENE.right_final)) < 0.06
@@ -152,7 +151,7 @@ def test_same_commands_give_same_run() -> None:
 
 
 def test_arm_brakes_without_commands(bench: Bench) -> None:
-    """The arm brakes twenty milliseconds after the last command."""
+    """It brakes 20 ms after the last command."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
@@ -168,7 +167,7 @@ def test_arm_brakes_without_commands(bench: Bench) -> None:
 
 
 def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
-    """An arm that finds its commands far ahead does not leap after them."""
+    """The commands are far ahead of the arm."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     speeds = []
@@ -182,13 +181,13 @@ def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
 
 
 def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
-    """Late messages of a restored network do not move the arm."""
+    """A restored network delivers them."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
         joints = joints + 0.002 * speed
         bench.step(tuple(joints), tuple(speed))
-    for _ in range(60):  # cut for 120 ms
+    for _ in range(60):  # the network is cut for 120 ms
         stood = np.array(bench.step().joints)
     late = [(joints + 0.002 * k * speed, speed) for k in range(1, 60)]
     late.append((late[-1][0], 0 * speed))  # the service had stopped by then
@@ -196,14 +195,14 @@ def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
         observation = bench.step(tuple(position), tuple(velocity))
         assert np.abs(np.array(observation.joints) - stood).max() < 2e-3
     assert bench.refused == 21
-    for k in range(100):  # who takes over begins where the arm stands
+    for k in range(100):  # a service that takes over begins at the arm's position
         observation = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
     assert observation.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
     assert bench.refused == 21
 
 
 def test_hands_return_the_way_they_went() -> None:
-    """Hands rest at their start until the script begins and come back the way they went."""
+    """Before the script begins, they rest at their start."""
     with Bench(HandScript(SCENE, seed=1, speed=20.0)) as bench:
         start = bench.observe().hands.left.position
         for _ in range(20):
@@ -232,7 +231,9 @@ def test_hands_return_the_way_they_went() -> None:
 
 
 class Service:
-    """Stands in for the daemon: holds the arm where it is, answering each hand sample at once."""
+    """A substitute for the daemon, which answers each hand sample at once with a command to stand
+    still.
+    """
 
     def __init__(self, session: zenoh.Session, cell: str) -> None:
         self.hands: dict[str, list[messages.PoseStamped]] = {"left": [], "right": []}
@@ -251,7 +252,7 @@ class Service:
         self.hands[str(sample.key_expr).rpartition("/")[2]].append(pose)
         if self.joints is not None:
             tick = len(self.hands["left"])
-            stamp_ns = 10_000_000 * tick  # of 100 Hz, however late this machine is
+            stamp_ns = 10_000_000 * tick  # 100 Hz, even if this machine is late
             command = messages.JointState(
                 stamp_ns, self.joints.names[::-1], self.joints.position[::-1], STILL
             )
@@ -268,7 +269,7 @@ def network() -> Iterator[tuple[zenoh.Session, str]]:
 
 
 def test_run_on_network_reports_latency(network: tuple[zenoh.Session, str]) -> None:
-    """A run on the network reports events and latency and leaves a hidden hand out."""
+    """Events are reported too, and a hidden hand is not published."""
     listening, endpoint = network
     service = Service(listening, "lab/bench")
     reports: list[RunReport] = []
@@ -291,7 +292,7 @@ def test_run_on_network_reports_latency(network: tuple[zenoh.Session, str]) -> N
     assert service.joints.names == JOINT_NAMES
     assert {pose.frame_id for pose in service.hands["left"]} == {"base"}
     assert 0 < report.answered <= report.hands
-    assert report.commands > report.hands  # one for each hand
+    assert report.commands > report.hands  # one answer for each hand
     assert 0.0 < report.latency_ms.p50 <= report.latency_ms.p99 <= report.latency_ms.max
     assert [line.split(":")[0] for line in lines[-3:]] == ["handover", "grasp", "carry"]
     left, right = ({pose.stamp_ns for pose in service.hands[hand]} for hand in ("left", "right"))
@@ -299,7 +300,6 @@ def test_run_on_network_reports_latency(network: tuple[zenoh.Session, str]) -> N
 
 
 def test_missing_commands_are_reported(network: tuple[zenoh.Session, str]) -> None:
-    """The bench says so when no command comes."""
     result = thirdhand("sim", "--connect", network[1], "--once", "--wait", "0.2")
     assert result.returncode == 1
     assert "no command on thirdhand/joints/command within 0.2 s" in result.stderr
@@ -307,7 +307,7 @@ def test_missing_commands_are_reported(network: tuple[zenoh.Session, str]) -> No
 
 
 def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
-    """It stands where the board is offered: that is met, and nothing else."""
+    """The arm stands where the board is offered, so that only this event succeeds."""
     listening, endpoint = network
     follower = Follower(Settings().arm.posture)
     for _ in range(1000):
@@ -362,7 +362,7 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
 def test_process_ends_on_signal_with_report(
     network: tuple[zenoh.Session, str], tmp_path: Path
 ) -> None:
-    """A process plays until it is asked to stop and leaves its reports."""
+    """It plays until then."""
     service = Service(network[0], "thirdhand")
     target = tmp_path / "report.json"
     arguments = (
@@ -393,7 +393,7 @@ def test_process_ends_on_signal_with_report(
 
 
 def test_exit_codes(tmp_path: Path) -> None:
-    """Bad usage and bad scenes have their exit codes."""
+    """Exit codes of bad usage and bad scenes."""
     (tmp_path / "scene.toml").write_text("glass = [0.5, 0.38, 0.5]")
     usage = thirdhand("sim", "--once", "--hands-rate", "7")
     assert usage.returncode == 2
@@ -414,7 +414,7 @@ def test_exit_codes(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_command_is_never_followed(payload: bytes) -> None:
-    """Bytes that are no command are counted and never followed."""
+    """Such bytes are counted."""
     commands = Commands(JOINT_NAMES)
     commands.receive(Sample(Bytes(payload)))  # type: ignore[arg-type]
     assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))
@@ -422,11 +422,11 @@ def test_invalid_command_is_never_followed(payload: bytes) -> None:
 
 
 def test_first_answer_counts_for_latency() -> None:
-    """Only the first command after each hand sample counts for the latency."""
+    """Later commands with the same sample do not count."""
     commands = Commands(JOINT_NAMES)
     payload = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, STILL, STILL))
     now = time.time_ns()
-    # the first is older than the counting
+    # the first stamp is older than the start of counting
     for stamp in (now - 10**10, now, now, now + 1, now, now + 1):
         attachment = Bytes(cdr.encode_attachment(messages.Attachment(1, 0, stamp)))
         commands.receive(Sample(Bytes(payload), attachment))  # type: ignore[arg-type]

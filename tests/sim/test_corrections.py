@@ -1,5 +1,5 @@
-"""A correction from end to end, by Zenoh with the bench's arm: it is held, led by hand, corrected,
-resumed, and the correction is undone.
+"""A correction from end to end, over Zenoh with the bench's arm: the arm is held, led by hand,
+corrected and resumed, and the correction is undone.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings
 
-RATE_HZ = 100  # a tick of 10 ms leaves a busy machine room for a simulated arm beside the daemon
-HALFWAY = (0.80, -0.31, 0.19)  # of the left hand, on its way to the handover
-# [rad] more than an arm may be off its command
+RATE_HZ = 100  # ticks of 10 ms leave time for the simulated arm on a busy machine
+HALFWAY = (0.80, -0.31, 0.19)  # left hand on its way to the handover
+# [rad] motion by hand, larger than the allowed error of an arm
 LED = np.array([0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0])
 NEAR_M = 0.004
 
 
 def has_arrived(status: dict[str, Any], at: Any = None) -> bool:
-    """True if the arm follows, has caught up and has its tool at a position [m], or its target."""
+    """True if the arm follows, and its tool is at a position [m], by default at its target."""
     at = status["target_m"] if at is None else at
     if status["mode"] != "follow" or "engaging" in status["flags"]:
         return False
@@ -36,7 +36,7 @@ def has_arrived(status: dict[str, Any], at: Any = None) -> bool:
 
 
 def move(tracker: Tracker, to: tuple[float, float, float]) -> None:
-    """Move the left hand, slowly enough for a tracker that is late."""
+    """Move the left hand slowly, as the tracker may be late."""
     start = np.array(tracker.left)
     pause = threading.Event()
     for share in np.linspace(0.0, 1.0, 40):
@@ -45,7 +45,7 @@ def move(tracker: Tracker, to: tuple[float, float, float]) -> None:
 
 
 def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
-    """The words in which the requests are refused."""
+    """The texts of the refusals."""
     words = []
     for request in requests:
         with pytest.raises(RefusedError) as error:
@@ -57,7 +57,7 @@ def refusals(daemon: Daemon, *requests: dict[str, Any]) -> str:
 @pytest.mark.timeout(900)
 @pytest.mark.thorough
 def test_correction_from_end_to_end(tmp_path: Path) -> None:  # noqa: PLR0915 - one session
-    """A correction moves the tool to where it was led, and undoing it moves it back."""
+    """The correction moves the tool to where it was led; undoing it moves the tool back."""
     settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
     records = tmp_path / "records"
     with (
@@ -76,7 +76,7 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:  # noqa: PLR0915 - 
         daemon.until(lambda s: bench.is_led_there and s["reason"] == "guided", 60)
         threading.Event().wait(1.0)
         tool = daemon.until(lambda s: s["guided"])["tool_measured_m"]
-        move(tracker, LEFT)  # the hand that leads; the correction belongs to the hands of the hold
+        move(tracker, LEFT)  # the leading hand; a correction uses the hands at the hold
         answer = told("correct", "--connect", daemon.endpoint)
         assert answer.returncode == 0, answer.stderr
         assert answer.stdout.startswith("correction-1 in force since tick "), answer.stdout

@@ -1,4 +1,4 @@
-"""One bench, two engines: the same scene with the same scores, whichever is installed."""
+"""One bench, two engines: the same scene with the same scores."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def played(engine: str) -> Rehearsed:
 
 
 def test_engines_give_same_scores() -> None:
-    """Both engines give the same scores and the arm goes the same way."""
+    """The arm's paths agree too."""
     if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{ENGINES[missing[0]]} is not installed")
     result, other = (played(name) for name in ENGINES)
@@ -62,7 +62,7 @@ def test_engines_give_same_scores() -> None:
 
 @pytest.mark.quick
 def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
-    """The arm follows moving commands within a millimetre."""
+    """This holds for moving commands."""
     start = np.array(bench.observe().joints)
     wrong = []
     for tick in range(1000):
@@ -70,8 +70,8 @@ def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
         position = start + 0.2 * (1 - np.cos(2 * t))
         velocity = np.full(7, 0.4 * np.sin(2 * t))
         observation = bench.step(tuple(position), tuple(velocity))
-        # Velocity fed forward: a command is where the arm starts the period, and it ends it one
-        # period on.
+        # Velocity is fed forward: the arm is at the commanded position at the start of a period,
+        # and one period further at its end.
         wrong.append(np.abs(np.array(observation.joints) - position - 0.002 * velocity).max())
     assert max(wrong) < 1e-4  # [rad]
 
@@ -79,20 +79,20 @@ def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
 def test_motors_are_no_stronger_than_described(bench: Bench) -> None:
     """The motors' efforts are those of the description."""
     start = np.array(bench.observe().joints)
-    for _ in range(20):  # no motor of 60 N m turns the stretched arm so fast within 40 ms
+    for _ in range(20):  # a motor of 60 N m cannot reach this speed of the stretched arm in 40 ms
         bench.world.follow(
             tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5)
         )
         bench.world.step()
     turned = np.array(bench.world.joints()[1])
-    assert turned[1] == pytest.approx(-1.76, abs=0.05)  # [rad/s] of 100 wanted
-    assert np.abs(np.delete(turned, 1)).max() < 0.05  # what is strong enough holds against it
+    assert turned[1] == pytest.approx(-1.76, abs=0.05)  # [rad/s], 100 are commanded
+    assert np.abs(np.delete(turned, 1)).max() < 0.05  # stronger motors hold their position
 
 
 def test_only_the_table_stops_the_arm(bench: Bench) -> None:
     world = bench.world
     tool = world.tool()[0].position
-    world.put(world.left, Pose(tool, LEVEL))  # a hand where the tool is pushes nothing
+    world.put(world.left, Pose(tool, LEVEL))  # a hand at the tool does not push it
     start = world.joints()[0]
     for _ in range(50):
         world.step()
@@ -104,16 +104,16 @@ def test_only_the_table_stops_the_arm(bench: Bench) -> None:
         world.follow(tuple(down), (0.0,) * 7)
         world.step()
     assert world.joints()[0][1] < down[1] - 0.5
-    assert world.tool()[0].position[2] > -0.05  # before the table's edge, on which the forearm lies
+    assert world.tool()[0].position[2] > -0.05  # the forearm lies on the table's edge
 
 
 def test_clearance_of_a_hand(bench: Bench) -> None:
-    """A hand is as far from the arm as its shape says."""
+    """The distance follows from the hand's shape."""
     world = bench.world
     assert world.clearance(world.left) == pytest.approx(0.603, abs=2e-3)
     assert world.clearance(world.left, within=0.3) == pytest.approx(0.3)
     x, y, z = world.tool()[0].position
-    world.put(world.left, Pose((x + 0.3, y, z - 0.3), LEVEL))  # it reaches back to the arm
+    world.put(world.left, Pose((x + 0.3, y, z - 0.3), LEVEL))  # its forearm reaches the arm
     assert world.clearance(world.left) < 0.3
 
 

@@ -1,6 +1,4 @@
-"""Evidence: where a result is from, when it is stale, which seeds it may use, and how all results
-are made anew.
-"""
+"""Evidence: origin of results, stale results, allowed seeds, and repetition of all experiments."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ class TestSeeds:
     """The table of seeds."""
 
     def test_seeds_are_disjoint(self) -> None:
-        """Nothing is evaluated on what it was tuned on or learned from."""
+        """No evaluation uses people or seeds of tuning or learning."""
         tuned = [stream for entry in EXPERIMENTS.values() for stream in entry.seeds.tuning.values()]
         assert tuned
         for name, experiment in EXPERIMENTS.items():
@@ -46,7 +44,7 @@ class TestSeeds:
                 assert not evaluated.overlaps(other), f"{name}: {evaluated} and {other}"
 
     def test_streams_overlap(self) -> None:
-        """Streams overlap where they share a seed and a number."""
+        """Random streams overlap if they share a seed and a number."""
         stream = Stream("scene", 1, range(10))
         assert stream.overlaps(stream._replace(numbers=range(9, 12)))
         assert not any(
@@ -66,7 +64,7 @@ class TestSeeds:
 
 
 class TestDigests:
-    """What a result depends on."""
+    """Digests of the code and data on which a result depends."""
 
     def test_core_digest_changes_with_decisions(self, tmp_path: Path) -> None:
         golden = Recording.open(recordings() / "golden.mcap")
@@ -81,7 +79,7 @@ class TestDigests:
         assert first == second != other
 
     def test_kmp_digest_changes_from_a_millionth_on(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """That of kmp changes from a millionth on."""
+        """Smaller changes leave the digest of kmp."""
         compute: Callable[[], str] = kmp_digest.__wrapped__
         outputs = list(evidence.kmp_outputs())
         was = compute()
@@ -92,7 +90,7 @@ class TestDigests:
             assert (compute() == was) == is_equal
 
     def test_learning_digest_is_that_of_shipped_skill(self, tmp_path: Path) -> None:
-        """To six digits: CPUs differ in the last ones."""
+        """Numbers are compared to six digits, as CPUs differ in the last ones."""
         path = tmp_path / "soldering.npz"
         takes = sorted((recordings() / "people").glob("*.mcap"))
         done = thirdhand("learn", *map(str, takes), "--output", str(path))
@@ -109,12 +107,12 @@ class TestDigests:
 
 
 def test_result_names_its_origin(tmp_path: Path) -> None:
-    """A result names its origin and a folder by its files."""
+    """A folder is named by its files."""
     np.savez(tmp_path / "a.npz", t=np.arange(3))
     options = Options(data=tmp_path, hands=tmp_path, share=0.5)
     result = origin("partners", options)
     assert set(result) == NAMED
-    assert set(result["options"]) == {"share", "data"}  # it heeds no hands
+    assert set(result["options"]) == {"share", "data"}  # this experiment has no option for hands
     assert set(result["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
     assert result["seeds"] == EXPERIMENTS["partners"].seeds.named()
     assert result["depends_on"] == tree()
@@ -125,7 +123,7 @@ def test_result_names_its_origin(tmp_path: Path) -> None:
 
 
 def test_result_is_stale_where_dependency_changed() -> None:
-    """A result is stale where what it depends on changed and only there."""
+    """Other changes do not make it stale."""
     digests = {"core": "1", "learning": "2", "kmp": "3"}
     result = {
         "commit": "12ab",
@@ -145,7 +143,7 @@ class TestAll:
 
     @pytest.fixture(autouse=True)
     def runs(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-        """How often each was run, and the error of the one that fails."""
+        """The number of runs of each experiment, and the error of the failing one."""
         counts: dict[str, Any] = {
             "letters": 0,
             "statistics": 0,
@@ -183,7 +181,7 @@ class TestAll:
         tmp_path: Path,
         capsys: pytest.CaptureFixture[str],
     ) -> None:
-        """Goes on after a failure and makes only what is missing the next time."""
+        """The next run makes only missing results."""
         runs["error"] = error
         assert main(["all", "--output", str(tmp_path), "--quiet"]) == 1
         assert f"statistics: {error}" in capsys.readouterr().err.replace("Traceback", "").replace(
@@ -214,7 +212,7 @@ class TestAll:
     def test_file_that_is_no_result_is_named(
         self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """A file that is no result is named and the others are made."""
+        """The other results are made."""
         runs["error"] = None
         (tmp_path / "letters.json").write_text("{")
         for command in ("stale", "all"):

@@ -1,5 +1,5 @@
-"""Each experiment at a reduced size makes its figures, numbers and recording, and the numbers bear
-out what it claims.
+"""Each experiment at a reduced size makes its figures, numbers and recording, and the numbers
+support its claim.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SHIPPED = ROOT / "recordings" / "experiments"
 
 @pytest.fixture(scope="module")
 def letters(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of letters as others record them."""
+    """A folder of letters in the format of others' recordings."""
     folder = tmp_path_factory.mktemp("letters")
     for name in "DG":
         np.savez(
@@ -62,7 +62,7 @@ def close_figures() -> Iterator[None]:
 
 
 def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
-    """The JSON of an experiment at a tenth of its size, once its files are there."""
+    """The JSON of an experiment at a tenth of its size; its files must exist."""
     assert (
         main([name, "--output", str(folder), "--share", "0.1", "--workers", "1", "--quiet", *more])
         == 0
@@ -75,15 +75,17 @@ def numbers(name: str, folder: Path, *more: str) -> dict[str, Any]:
 
 
 def follows_better(found: dict[str, Any]) -> bool:
-    """True if the tool follows closer and more smoothly than its rivals, and within its limit."""
+    """True if the service follows more closely and smoothly than its rivals, and within the speed
+    limit.
+    """
     rivals = found["by_follower"]
     ours = rivals["ours"]
     for rival in (name for name in rivals if not name.startswith("ours")):
         for group in ("clean", "recorded"):
             assert ours[group]["jerk_ratio"] < 0.7 * rivals[rival][group]["jerk_ratio"], rival
-            # a rival that does not follow is none
+            # rivals must follow
             assert rivals[rival][group]["error_rms_mm"] < 35, rival
-            if rival != "no smoothing":  # it is as near, and shakes
+            if rival != "no smoothing":  # this rival is as near, but shakes
                 assert ours[group]["error_rms_mm"] < rivals[rival][group]["error_rms_mm"], rival
     assert all(group["top_speed"] <= 0.8 + 1e-6 for group in ours.values())
     stops = ours["sudden stops"]
@@ -102,7 +104,7 @@ def keeps_separation(found: dict[str, Any]) -> bool:
 
 
 def meets_points(found: dict[str, Any]) -> bool:
-    """True if letters go through their desired points and stay as they were elsewhere."""
+    """True if letters pass through their desired points and do not change elsewhere."""
     summaries = found["model_summary"], found["recorded_summary"]
     misses = [summary["largest_miss_at_desired_points_cm"] for summary in summaries]
     return (
@@ -112,12 +114,12 @@ def meets_points(found: dict[str, Any]) -> bool:
 
 
 def is_stable_only_with_places(found: dict[str, Any]) -> bool:
-    """True if each method that is told its places reaches them, and regression alone does not."""
+    """True if each method with given via-points reaches them, and regression alone does not."""
     reached = {name: method["successes"] for name, method in found["methods"].items()}
     return reached["ours"] == reached["look_up"] == found["scenes"] == 1 and reached["gmr"] == 0
 
 
-CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's numbers
+CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # claims on the numbers of experiments
     "motion": follows_better,
     "letters": meets_points,
     "separation": keeps_separation,
@@ -128,7 +130,7 @@ CLAIMS: dict[str, Callable[[dict[str, Any]], bool]] = {  # of an experiment's nu
     "hands": lambda found: is_evidence(found["evidence_is_periods_skipped_at_most"]),
     "statistics": is_stable_only_with_places,
 }
-ELSEWHERE = {"motion-of-others", "sensitivity", "people", "partners", "faults"}  # or hours long
+ELSEWHERE = {"motion-of-others", "sensitivity", "people", "partners", "faults"}  # too long
 
 
 @pytest.mark.usefixtures("close_figures")
@@ -137,7 +139,7 @@ ELSEWHERE = {"motion-of-others", "sensitivity", "people", "partners", "faults"} 
 def test_experiment_bears_out_its_claim(
     name: str, tmp_path: Path, letters: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Experiment makes its files and bears out its claim."""
+    """Its files exist too."""
     monkeypatch.setattr(
         "thirdhand_sim.lab.statistics.TASK_SCENES", TASK_SCENES._replace(numbers=range(10))
     )
@@ -161,7 +163,7 @@ DRAWN = [
 
 
 def grey(path: Path) -> Array:
-    """A picture's brightness (N, M), each the mean of 8 by 8 pixels: fonts differ a little."""
+    """A picture's brightness (N, M) as means of 8 by 8 pixels, as fonts differ a little."""
     pixels = np.asarray(Image.open(path).convert("L"), float)
     height, width = (8 * (side // 8) for side in pixels.shape)
     return pixels[:height, :width].reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
@@ -171,7 +173,6 @@ def grey(path: Path) -> Array:
 @pytest.mark.usefixtures("close_figures")
 @pytest.mark.one_case
 def test_figures_are_of_shipped_numbers(name: str, tmp_path: Path) -> None:
-    """The shipped figures are of the shipped numbers."""
     shutil.copy(SHIPPED / f"{name}.json", tmp_path)
     assert main([name, "--output", str(tmp_path), "--redraw", "--quiet"]) == 0
     figures = list(tmp_path.glob("*.png"))
@@ -198,7 +199,7 @@ def test_random_scenes_are_within_reach_and_end(number: int) -> None:
 
 
 def test_missing_letters_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder without letters says what is needed."""
+    """The error says what is needed."""
     with pytest.raises(ExperimentError, match="demo00"):
         recorded(tmp_path)
     assert (
@@ -222,7 +223,7 @@ def test_missing_letters_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_missing_matplotlib_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without Matplotlib the command names the extra."""
+    """The error names the extra."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["letters", "--output", str(tmp_path)]) == 1
     assert "thirdhand[experiments]" in capsys.readouterr().err

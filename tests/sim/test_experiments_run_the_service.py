@@ -1,5 +1,5 @@
-"""What the experiments measure is what the service runs: the same hands make the same bits in a
-`Controller` of one's own as in each family of experiments.
+"""Experiments measure the service: for the same hands, each family of experiments gives the same
+bits as a separate `Controller`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ASSUMED = msgspec.structs.replace(
 
 
 def of_the_service(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> np.ndarray:
-    """The frames of a controller that no experiment had a hand in."""
+    """The frames of a controller without code of an experiment."""
     controller = Controller(settings, skill, urdf=robot_description(settings))
     return np.array([controller.step(tick) for tick in ticks])
 
@@ -57,7 +57,9 @@ def sample(side: str, at: list[float], stamp_ns: int) -> Event:
 
 @pytest.fixture(scope="module")
 def shown() -> SeenSession:
-    """A session in which the service holds too, and meets its limit of a target's acceleration."""
+    """A session in which the service also holds, and reaches its limit of the target's
+    acceleration.
+    """
     return seen(session(person("tuning", 0), 0, group="tuning", sigma_m=0.005))
 
 
@@ -68,7 +70,7 @@ def taught(shown: SeenSession) -> Skill:
 
 @pytest.fixture(scope="module")
 def wanted(shown: SeenSession, taught: Skill) -> np.ndarray:
-    """The service's frames, from what the trackers say in the order in which it comes."""
+    """The service's frames from the trackers' samples in the order of arrival."""
     inboxes: list[list[Event]] = [[] for _ in shown.times]
     for side, (stamps, samples) in zip(SIDES, shown.session.samples(), strict=True):
         for stamp, position in zip(stamps, samples, strict=True):
@@ -87,7 +89,7 @@ class TestPeople:
     def test_ours_is_what_the_controller_decides(
         self, shown: SeenSession, wanted: np.ndarray
     ) -> None:
-        """What is called ours is what the controller predicts and decides."""
+        """The rival "ours" is the controller's prediction and decision."""
         placed = LearnedByService(shipped_skill(), start=True).place(shown.session.told)
         frames = served(placed, shown)
         for name in (*PREDICTED, "mode", "reason", "setpoint", "tool"):
@@ -97,13 +99,12 @@ class TestPeople:
     def test_hands_are_those_of_the_controller(
         self, shown: SeenSession, wanted: np.ndarray
     ) -> None:
-        """Hands are estimated as the controller does."""
+        """The estimates equal the controller's."""
         assert shown.estimates[:, 0].tobytes() == wanted["hands"].tobytes()
         assert shown.estimates[:, 1].tobytes() == wanted["hand_velocities"].tobytes()
 
 
 def test_motion_follows_through_controller() -> None:
-    """Motion follows through the controller."""
     skill = shipped_skill()
     hands = stops(skill.hands.mean(axis=0), numbers=(0,), rate_hz=30, noise=0.002)[0]
     motion = followers.ours(skill, Settings())(hands)

@@ -1,5 +1,5 @@
-"""A cell whose parts are killed, frozen and cut off while its tool is fast: it stops as promised,
-and goes on.
+"""A cell whose parts are killed, frozen and cut off while its tool is fast: it stops within its
+bounds, and continues.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from thirdhand_sim.lab.load.faults import SHORT
 from thirdhand_sim.parts import CellPart
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.timed]
-BRAKE_MM = 40.0  # of a tool at up to 0.8 m/s that brakes 20 ms after the last command
+BRAKE_MM = 40.0  # a tool at up to 0.8 m/s brakes 20 ms after the last command
 
 
 @pytest.fixture(scope="module")
 def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The experiment's numbers of a few faults."""
+    """The experiment's numbers for a few faults."""
     folder = tmp_path_factory.mktemp("faults")
     assert main(["faults", "--output", str(folder), "--share", "0.1", "--quiet"]) == 0
     assert (folder / "faults.png").read_bytes()[:4] == b"\x89PNG"
@@ -40,20 +40,20 @@ def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", ["tracker frozen"])
 def test_silent_tracker_stops_the_arm(suffered: dict[str, Any], name: str) -> None:
-    """A tracker that is not heard stops the arm when its hands are stale."""
+    """The arm stops when the hands are stale."""
     fault = suffered["faults"][name]
     assert fault["reason"] == "stale_hand"
     assert 80 <= fault["hold_ms"] <= 120
     assert fault["rest_ms"] < 700
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
-    # the arm did as it was told
+    # the arm followed its commands
     assert fault["travelled_mm"] == pytest.approx(fault["commanded_mm"], abs=10)
     assert fault["lost_ticks"] == 0
 
 
 @pytest.mark.parametrize("name", ["network to the arm silent", "cable pulled"])
 def test_cut_network_leaves_no_arm_in_motion(suffered: dict[str, Any], name: str) -> None:
-    """A network that is cut leaves no arm in motion and nothing late moves it."""
+    """Late messages do not move the arm."""
     if name not in suffered["faults"]:
         pytest.skip("a network namespace is not allowed here")
     fault = suffered["faults"][name]
@@ -65,21 +65,21 @@ def test_cut_network_leaves_no_arm_in_motion(suffered: dict[str, Any], name: str
     assert fault["hold_ms"] <= 120
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
-    assert fault["fastest_m_per_s"] < 1.0  # also when all comes that was held back
+    assert fault["fastest_m_per_s"] < 1.0  # also when delayed messages arrive
     assert fault["lost_ticks"] == 0
 
 
 def test_killed_service_leaves_no_arm_in_motion(suffered: dict[str, Any]) -> None:
-    """A service that is killed leaves no arm in motion and its recording whole."""
+    """Its recording can be read."""
     fault = suffered["faults"]["service killed"]
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3
     assert fault["lost_ticks"] == 0
-    assert fault["moves_again_ms"] > 0  # begun anew, it goes on by itself
+    assert fault["moves_again_ms"] > 0  # after its restart it continues by itself
 
 
 def test_killed_router_stops_the_arm(suffered: dict[str, Any]) -> None:
-    """A router that is killed stops the arm and all meet again."""
+    """All processes connect again."""
     fault = suffered["faults"]["router killed"]
     assert fault["reason"] in ("stale_hand", "arm_error", "arm_silent")
     assert fault["hold_ms"] <= 120
@@ -88,15 +88,15 @@ def test_killed_router_stops_the_arm(suffered: dict[str, Any]) -> None:
 
 
 def test_killed_scribe_costs_ticks_and_no_motion(suffered: dict[str, Any]) -> None:
-    """A scribe that is killed costs ticks of the recording and no motion."""
+    """Only ticks of the recording are lost."""
     fault = suffered["faults"]["scribe killed"]
     assert fault["lost_ticks"] > 0
     assert fault["command_mean_gap_ms"] < 1.5 * fault["command_mean_gap_before_ms"]
-    assert suffered["unaccounted_ticks"] == 0  # what is neither recorded nor said to be lost
+    assert suffered["unaccounted_ticks"] == 0  # neither recorded nor reported as lost
 
 
 def test_relay_freezes_or_tears(tmp_path: Path) -> None:
-    """A frozen relay is silent and a killed one tears."""
+    """A frozen relay is silent; a killed one closes connections."""
     with socket.create_server(("127.0.0.1", 0)) as far_end:
         target = f"tcp/127.0.0.1:{far_end.getsockname()[1]}"
         with closing(CellPart("relay", target, "0")) as relay:

@@ -26,7 +26,7 @@ SCENE = Scene()
 
 
 def with_gripper(folder: Path) -> Settings:
-    """A cell whose arm has a gripper with <mimic>, and a wheel and a cart beside it."""
+    """A cell whose arm has a gripper with <mimic>, and further joints of a wheel and a cart."""
     posture = continuous_cell(folder).arm.posture
     return cell_in(
         folder, continuous_urdf().replace("</robot>", BEYOND + "</robot>"), posture=posture

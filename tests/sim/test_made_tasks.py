@@ -1,4 +1,4 @@
-"""Made tasks: people move as people do, and the tool comes to the places that are named."""
+"""Made tasks: hands move as people's do, and the tool reaches the named places."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.thorough
 
 
 def test_takes_follow_from_their_numbers() -> None:
-    """Takes are the same from the same numbers and differ between people takes and seeds."""
+    """Other people, takes or seeds give other takes."""
     for kind in TASK_KINDS[:3]:
         first, other = (takes(kind, people=(0, 1), each=2) for _ in range(2))
         assert [take.person for take in first] == [0, 0, 1, 1]
@@ -30,7 +30,7 @@ def test_takes_follow_from_their_numbers() -> None:
 
 @pytest.mark.parametrize("kind", TASK_KINDS)
 def test_hands_and_tool_move_as_people_do(kind: str) -> None:
-    """Hands move as hands do and the tool comes to the places."""
+    """The tool reaches its places."""
     for person in range(3):
         trial = run(kind, person, 0)
         times = np.arange(0.0, trial.lasts_s, 0.005)

@@ -1,4 +1,4 @@
-"""Skills on takes that are left out: what is judged, the rivals, recordings, and a reduced run."""
+"""Skills on left-out takes: predictions, rivals, judgements, and a reduced run."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def rms_mm(said: list[Predicted], asked: list[LeftOut]) -> float:
 
 
 def test_core_predicts_as_the_skill(shown: list[LeftOut]) -> None:
-    """The core predicts as the skill does where hands rest and each take anew."""
+    """This holds for resting hands, and the core starts anew with each take."""
     skill = learn([take.demonstration for take in shown])
     first, second = (predicted(skill, shown[0]) for _ in range(2))
     assert first.mean.tobytes() == second.mean.tobytes()
@@ -89,7 +89,7 @@ def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut
 
 @pytest.mark.timeout(120)
 def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reduced run has all methods and says what is refused."""
+    """It reports refusals."""
     pytest.importorskip("matplotlib")
     from thirdhand_sim.lab.partners import run
 
@@ -106,7 +106,7 @@ def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(ours["coverage"]) == len(LEVELS)
     assert 0.0 <= ours["held"] <= 0.2
     cyclic = result["made"]["cyclic"]["methods"]["service, told"]
-    # what it cannot learn or be told is refused with a reason, take by take or as a whole
+    # takes or skills that a method cannot use are refused with a reason, one by one or as a whole
     assert cyclic["takes"] + cyclic["refuses"] == 6
     assert bool(cyclic["reasons"]) == bool(cyclic["refuses"])
 
@@ -138,7 +138,7 @@ def beside(takes_: list[LeftOut], metres: float) -> list[LeftOut]:
 def test_judged_and_refused_as_the_command_does(
     metres: float, shown: list[LeftOut], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A skill is judged and refused as the command does."""
+    """The judgement equals that of the command `learn`."""
     moved = beside(shown, metres)
     files = [tmp_path / f"{take.name}.mcap" for take in moved]
     for path, take in zip(files, moved, strict=True):
@@ -162,7 +162,7 @@ def test_judged_and_refused_as_the_command_does(
 
 
 def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut]) -> None:
-    """A refused fold is left out of the means, and its error is listed separately."""
+    """Its error is listed separately."""
 
     def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
         predictions = left_out_by(RIVALS["mean"], takes_, tested, told=True)
@@ -194,7 +194,7 @@ def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut])
     )
     assert alone["in_spite_of_refusal"] == {"takes": 0}
     assert pooled["in_spite_of_refusal"]["takes"] == len(asked)
-    # the same takes elsewhere
+    # these are the same takes, moved
     assert pooled["in_spite_of_refusal"]["rms_mm"] == pytest.approx(alone["rms_mm"], rel=0.2)
     nothing = numbers_of([refused])["methods"]["service, told"]
     assert nothing["takes"] == 0

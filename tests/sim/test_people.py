@@ -1,5 +1,5 @@
-"""Modelled people and what is judged of skills on them: the hands, the trackers, the places, the
-rivals, and a reduced run of the comparison.
+"""Modelled people and the judgement of skills on them: hands, trackers, places, rivals, and a
+reduced run of the comparison.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def test_the_groups_share_nobody() -> None:
 
 @pytest.mark.parametrize("mistake", ["", *MISTAKES])
 def test_hands_come_to_their_places(mistake: str) -> None:
-    """Hands move as hands do and come to their places."""
+    """The hands reach their places."""
     for number in range(4):
         subject = person("tuning", number)
         scene = session(subject, 0, group="tuning")
@@ -68,7 +68,7 @@ def test_hands_come_to_their_places(mistake: str) -> None:
 
 
 class Still:
-    """A skill whose tool stays where it is, and that says it is far."""
+    """A skill whose tool does not move, and whose hands are always far."""
 
     depends_on = DependsOn.HANDS
 
@@ -87,36 +87,35 @@ class Still:
 
 
 class TestJudging:
-    """What is counted, on skills whose outcome is known."""
+    """Counts for skills whose outcome is known."""
 
     def test_teacher_succeeds(self, as_seen: SeenSession) -> None:
-        """The teacher succeeds and is on the way."""
+        """The teacher is on the path too."""
         judgement = judge(None, as_seen)
         assert judgement.success
         assert judgement.kept
         assert judgement.falsely_followed == 0.0
-        assert judgement.path_mm < 15  # what the places are perceived off by
+        assert judgement.path_mm < 15  # the errors with which people perceive places
 
     def test_still_tool_follows_falsely(self, as_seen: SeenSession) -> None:
-        """A tool that stays reaches its place alone and follows falsely."""
+        """It reaches only the place at which it stays."""
         judgement = judge(Still(as_seen.session.told.glass, far=False), as_seen)
         assert [event.reached for event in judgement.events] == [False, True, False]
         assert judgement.falsely_followed > 0.3
         assert judgement.inside[-1] == 1.0
 
     def test_skill_always_far_never_moves(self, as_seen: SeenSession) -> None:
-        """A skill that is always far holds and never moves."""
         judgement = judge(Still(as_seen.session.told.glass, far=True), as_seen)
         assert judgement.held == 1.0
         assert judgement.falsely_followed == 0.0
         assert not any(event.reached for event in judgement.events)
         assert all(event.held for event in judgement.events)
         due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
-        # stale and swapped hands are held for rightly
+        # holds for stale and swapped hands are right
         assert judgement.falsely_held == pytest.approx(1.0 - due)
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: SeenSession) -> None:
-        """By one that is not where the tracker says."""
+        """The true hand is at the tool, the tracked one is not."""
         unseen = replace(as_seen, hands=np.hstack([as_seen.tool, as_seen.hands[:, 3:]]))
         judgement = judge(None, unseen)
         assert judgement.too_near
@@ -129,7 +128,7 @@ class TestJudging:
 def test_skills_go_to_told_places(
     method: NoDemonstrations | LookUp | GaussianProcess | Service, run_of_tuning: Session
 ) -> None:
-    """Skills reach their via-points."""
+    """The places are the via-points."""
     places = run_of_tuning.places
     placed = method.learn(demonstrations(2)).place(places)
     hands = frames(places)[1:, :6]
@@ -144,7 +143,7 @@ def test_skills_go_to_told_places(
     np.testing.assert_allclose(mean(), frames(places)[1:, 6:], atol=0.008)
     if not isinstance(placed, Skill):
         np.testing.assert_allclose(placed.predict(Observed.resting(hands)).mean, mean(), atol=1e-9)
-    hands[:, 0] += 0.01  # only at the handover the tool goes with the left hand
+    hands[:, 0] += 0.01  # only at the handover the tool follows the left hand
     moved = mean() - frames(places)[1:, 6:]
     np.testing.assert_allclose(moved[:, 0], [0.01, 0.0, 0.0], atol=0.003)
 
@@ -159,7 +158,7 @@ def test_each_method_had_as_many_candidates() -> None:
 
 @pytest.mark.timeout(120)
 def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reduced comparison keeps the order that is stable."""
+    """Only the stable part of the order is compared."""
     pytest.importorskip("matplotlib")
     for table, value in (("PEOPLE_OF_GROUP", 3), ("SCENES_OF_GROUP", 2), ("BREAKING_SCENES", 2)):
         monkeypatch.setattr(
@@ -179,7 +178,7 @@ def test_reduced_comparison_keeps_order(tmp_path: Path, monkeypatch: pytest.Monk
     assert result["people"] == 3
     assert mean["teacher"]["success"] == 1.0
     assert mean["look_up"]["success"] >= mean["none"]["success"] > mean["gmr"]["success"]
-    # what demonstrations buy is the way between the places
+    # demonstrations improve the path between the places
     assert (
         mean["ours"]["path_rms_mm"] < mean["none"]["path_rms_mm"] < mean["look_up"]["path_rms_mm"]
     )

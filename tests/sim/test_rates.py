@@ -1,5 +1,5 @@
-"""The demo at any rate, with any arm and in both engines: the bench plays commands back at the pace
-at which the service gives them.
+"""The demo at any rate, with any arm and in both engines: the bench plays commands back at the
+service's rate.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from thirdhand_sim.network import BenchError
 from thirdhand_sim.script import HandScript
 
 RATES_HZ = (100, 250, 500, 700, 1000)
-LAG_TICKS = 2.0  # of the arm behind its command
-SPEED_RADPS = 0.75  # of the fastest joint in this scene, about
+LAG_TICKS = 2.0  # lag of the arm behind its command
+SPEED_RADPS = 0.75  # approximate speed of the fastest joint in this scene
 
 
 def done(rate_hz: int, arm: str, engine: str, bench_hz: int | None = None) -> Played:
@@ -50,7 +50,7 @@ def test_the_demo_succeeds_at_other_rates(rate_hz: int, arm: str, engine: str) -
 
 @pytest.mark.parametrize(("rate_hz", "bench_hz"), [(1000, 250), (100, 500)])
 def test_bench_follows_rate_of_service(rate_hz: int, bench_hz: int) -> None:
-    """A bench of another rate follows the service at its own pace."""
+    """The bench has another rate than the service."""
     assert_succeeded(done(rate_hz, "wam", "pybullet", bench_hz), rate_hz, bench_hz)
 
 
@@ -59,13 +59,13 @@ def test_bench_follows_rate_of_service(rate_hz: int, bench_hz: int) -> None:
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 @pytest.mark.thorough
 def test_demo_succeeds_with_every_arm(rate_hz: int, engine: str, arm: str) -> None:
-    """The demo succeeds at every rate with every arm in every engine."""
+    """This holds at every rate and in every engine."""
     assert_succeeded(done(rate_hz, arm, engine), rate_hz)
 
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_loop_at_50_hz_does_the_task(arm: str) -> None:
-    """At 50 Hz the loop does the task, and a follower says why it cannot."""
+    """A follower, which needs a faster loop, explains its refusal."""
     cell = cell_of(arm, rate_hz=50)
     run = rehearse(HandScript(SCENE, seed=1), lambda _: taught(), settings=cell)
     assert run.events.success

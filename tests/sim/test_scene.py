@@ -1,4 +1,4 @@
-"""The scene: what a file may say, and the places that follow from it."""
+"""The scene: its file, and the places that follow from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_an_empty_file_is_the_nominal_scene(tmp_path: Path) -> None:
 
 
 def test_file_moves_what_it_names(tmp_path: Path) -> None:
-    """A scene file moves the places that it names and those that depend on them."""
+    """Places that depend on them move too."""
     scene = load(tmp_path, "soldering = [0.70, 0.10, 0.08]\nseed = 7\n")
     assert scene.seed == 7
     assert scene.carry == pytest.approx((0.57, 0.10, 0.28))
@@ -43,7 +43,7 @@ def test_file_moves_what_it_names(tmp_path: Path) -> None:
     ],
 )
 def test_unplayable_file_is_refused(tmp_path: Path, text: str, words: list[str]) -> None:
-    """A file that cannot be played is refused in words."""
+    """The error is a sentence."""
     with pytest.raises(SceneError) as refused:
         load(tmp_path, text)
     assert all(word in str(refused.value) for word in words), str(refused.value)

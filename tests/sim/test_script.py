@@ -1,5 +1,5 @@
-"""Scripted hands and the teacher: smooth, repeatable, in phase with each other, and a function from
-hands to tool.
+"""Scripted hands and the teacher: smooth, repeatable and in phase; the tool is a function of the
+hands.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def test_places_are_passed_without_scatter() -> None:
 
 
 def test_seed_repeats_every_sample() -> None:
-    """The same seed repeats every sample and another does not."""
+    """Another seed gives other samples."""
     script, twin, other = (HandScript(SCENE, seed=seed) for seed in (1, 1, 2))
     times = np.arange(0.0, 2.0, 0.01)
     first = np.array([script.sample(t) for t in times])
@@ -65,7 +65,6 @@ def test_seed_repeats_every_sample() -> None:
 
 
 def test_tremor_has_size_and_band() -> None:
-    """Tremor has the size and the band that were asked for."""
     script = HandScript(SCENE, seed=4, tremor_rms=0.0015, noise_std=0.0)
     times = np.arange(0.0, 10.0, 0.01)
     shake = np.array([script.sample(t)[0][:3] - script.truth(t).left.position for t in times])
@@ -85,7 +84,7 @@ def test_hands_go_back_in_a_deep_pause() -> None:
     assert after[0] == pytest.approx(6.0 - 2 * (1.5 - 0.3))
     assert clock.elapsed(SCENE.duration_s) == pytest.approx(SCENE.duration_s + 2 * (1.5 - 0.3))
     assert clock.at(clock.elapsed(4.0))[0] == pytest.approx(4.0)
-    assert clock.elapsed(4.0) > 5.5  # for good
+    assert clock.elapsed(4.0) > 5.5  # when script time 4 s is passed for the last time
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The experiment `sensitivity`: tuned numbers as data, and what is made of the figures."""
+"""The experiment `sensitivity`: tuned numbers as data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand_sim.lab import sensitivity
 
-# Values that another limit of the shipped cell keeps from having an effect.
+# Values without an effect, as another limit of the shipped cell is reached first.
 BOUND_BY_SETTINGS = {"arm.position_gain_rate_share 2", "separation.planned_brake_limits 2"}
 CELL = Settings()
 SKILL = shipped_skill()
@@ -36,7 +36,9 @@ def test_tuned_number_reaches_constants() -> None:
 
 
 def test_tuned_number_is_read_by_core() -> None:
-    """The records of intake, decision and setpoint hold all their numbers, read or not."""
+    """For intake, decision and setpoint the digests do not show this, as their records hold all
+    numbers.
+    """
     sources = [
         path
         for path in (ROOT / "service" / "thirdhand" / "core").rglob("*.py")
@@ -53,7 +55,7 @@ def test_tuned_number_is_read_by_core() -> None:
 
 
 def test_number_changes_its_own_stages() -> None:
-    """A number changes what follows from it and no other controller."""
+    """Controllers with other tuning are not affected."""
     arm = TUNING.arm._replace(position_gain_per_s=25.0)
     tuned = constants(TUNING)
     changed = constants(TUNING._replace(arm=arm))

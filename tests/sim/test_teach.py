@@ -1,4 +1,4 @@
-"""Demonstrations: files that repeat to the byte and hold what was taught."""
+"""Demonstrations: files that are reproducible to the byte, and their content."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_file_of_a_demonstration(tmp_path: Path) -> None:
 
 
 def test_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Bad usage and failure have their exit codes."""
+    """Exit codes of bad usage and failure."""
     with pytest.raises(SystemExit, match="2"):
         teach.main(["--output", str(tmp_path), "--count", "0"])
     (tmp_path / "scene.toml").write_text("glas = [0, 0, 0]")

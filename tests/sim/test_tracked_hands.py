@@ -1,5 +1,5 @@
-"""The task with a person's hands: it follows the person, one hand after the other, and is scored as
-the scripted scene is.
+"""The task with a person's hands: it waits for the person, one hand after the other, and is scored
+like the scripted scene.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Player:
 
 
 def played(*, segments: int) -> tuple[TaskEvents, list[str], TrackedHands]:
-    """The events when a person goes to the first places only, what was shown, and the hands."""
+    """The events if a person moves to the first places only, the instructions shown, and the
+    hands.
+    """
     settings = msgspec.structs.replace(Settings(), rate_hz=100)
     controller = Controller(settings, taught(), urdf=robot_description(settings))
     hands = TrackedHands(SCENE, settings, timeout_s=TIMEOUT_S)
@@ -61,7 +63,7 @@ def played(*, segments: int) -> tuple[TaskEvents, list[str], TrackedHands]:
 
 
 def test_hands_in_turn_play_the_whole_task() -> None:
-    """One hand after the other plays the whole task."""
+    """The hands move one after the other."""
     events, labels, hands = played(segments=5)
     assert events.success
     assert max(event.error_mm for event in (events.handover, events.grasp, events.carry)) < 5.0

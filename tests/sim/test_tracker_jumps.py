@@ -1,4 +1,4 @@
-"""Jumps of a tracker are found in made hands whose truth is known, and quick motion is kept."""
+"""Jumps of a tracker are found in synthetic hands whose truth is known; quick motion is kept."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_jumps_are_taken_out_of_the_truth(
         wrong = np.zeros((len(t), 2), bool)
         wrong[run, 0] = True
         np.testing.assert_array_equal(repaired.wrong, wrong)
-        # A quarter of a second of a reach at 2 m/s that nobody has seen is known to 14 mm.
+        # An unseen quarter of a second of a reach at 2 m/s is reconstructed to 14 mm.
         assert off_mm(repaired.hands, true) < clean_mm + (
             14 if t[run][-1] - t[run][0] > 0.12 else 5
         )

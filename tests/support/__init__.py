@@ -1,1 +1,3 @@
-"""What tests of several modules share, imported as `support.<module>`; no test imports another."""
+"""Code that tests of several modules share, imported as `support.<module>`; no test imports
+another.
+"""

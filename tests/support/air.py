@@ -1,5 +1,5 @@
-"""How the code reads, by folder: `python -m tests.support.air` prints shares of parallel
-assignments, of local names that say nothing, and of functions with many branches.
+"""Readability of the code by folder: `python -m tests.support.air` prints shares of parallel
+assignments, of local names without meaning, and of functions with many branches.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ VAGUE = """
 
 
 class Air(NamedTuple):
-    """Where code is dense: `file:line name` of each place, and how many there could be."""
+    """Dense code: `file:line name` of each case, and the total numbers of assignments, names,
+    functions.
+    """
 
     parallel: list[str]
     assignments: int
@@ -66,7 +68,7 @@ def _stored(node: ast.AST) -> Iterator[str]:
 
 
 def air_of(folder: str) -> Air:
-    """How the code below a folder of the project reads."""
+    """The dense code below a folder of the project."""
     air = Air([], 0, [], 0, [], 0)
     vague_names = set(VAGUE.split())
     for path in sorted((ROOT / folder).rglob("*.py")):

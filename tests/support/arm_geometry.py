@@ -1,8 +1,8 @@
-"""Kinematics and distances of an arm, computed apart from the service's and for many postures at
+"""Kinematics and distances of an arm, independent of the service's code and for many postures at
 once: T postures, J joints, N capsules.
 
-The chain comes from the URDF. The capsules, which pairs of them are kept apart, and the boxes come
-from the settings; `tests/core/test_separation.py` checks that the capsules cover the links.
+The chain comes from the URDF. Capsules, the pairs of them that are kept apart, and boxes come from
+the settings; `tests/core/test_separation.py` checks that the capsules cover the links.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from thirdhand.core.separation.body import body_of
 from thirdhand.settings.config import Settings
 from thirdhand.settings.urdf import Urdf
 
-STEP_S = 1e-5  # of difference quotients
-SEARCH_STEPS = 30  # of a golden-section search, each 0.62 times as wide as the one before
+STEP_S = 1e-5  # step of difference quotients
+SEARCH_STEPS = 30  # each step of a golden-section search narrows the interval to 0.62
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 class ArmGeometry:
     """The arm of one cell.
 
-    `links` (N,): how many joints move each capsule; `radii` (N,) [m]; `pairs` (P, 2) of capsules
-    that are kept apart; `boxes` (B, 2, 3) [m]: lower and upper corners, the table first; `forearm`
-    (3,) [m]: from where a hand is tracked toward the elbow.
+    `links` (N,): number of joints that move each capsule; `radii` (N,) [m]; `pairs` (P, 2) of
+    capsules that are kept apart; `boxes` (B, 2, 3) [m]: lower and upper corners, the table first;
+    `forearm` (3,) [m]: vector from a tracked hand toward its elbow.
     """
 
     def __init__(self, settings: Settings, urdf: str) -> None:
@@ -72,7 +72,7 @@ class ArmGeometry:
         return capsules, origins + turned @ self._tool
 
     def tool_speeds(self, postures: Vector, velocities: Vector) -> Vector:
-        """Speeds (T,) [m/s] of the tool of joints that move so (T, J) [rad/s]."""
+        """Speeds (T,) [m/s] of the tool at postures (T, J) and joint velocities (T, J) [rad/s]."""
         before, after = (self.place(postures + step * velocities)[1] for step in (-STEP_S, STEP_S))
         return np.linalg.norm(after - before, axis=1) / (2.0 * STEP_S)
 
@@ -88,8 +88,8 @@ def between_points_and_segments(points: Vector, segments: Vector) -> Vector:
 
 
 def between_segments(first: Vector, second: Vector) -> Vector:
-    """Distances (T,) of segments (T, 2, 3): from an end of one to the other, or between points
-    inside both.
+    """Distances (T,) of segments (T, 2, 3): from an end to the other segment, or between inner
+    points.
     """
     ends = [between_points_and_segments(first[:, k], second) for k in (0, 1)]
     ends += [between_points_and_segments(second[:, k], first) for k in (0, 1)]
@@ -139,8 +139,8 @@ def segments_to_box(segments: Vector, box: Vector) -> Vector:
 
 
 def at_least(segments: Vector, centres: Vector, reach: Vector | float) -> Vector:
-    """Lower bounds (T,) of the distances of segments (T, 2, 3) from whatever reaches so far [m]
-    around centres (T, 3).
+    """Lower bounds (T,) of the distances of segments (T, 2, 3) from anything within `reach` [m] of
+    the centres (T, 3).
     """
     half = 0.5 * np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     return np.linalg.norm(segments.mean(axis=1) - centres, axis=1) - half - reach

@@ -1,5 +1,5 @@
-"""Cells with arms that we did not write, a Panda, its fingers locked, and a UR5 of six joints; and
-with the shipped one beside them.
+"""Cells with arms of other authors, a Panda with locked fingers and a UR5 of six joints, and with
+the shipped arm.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from thirdhand.settings.config import Settings, parse
 
 
 class Model(NamedTuple):
-    """An arm: its file among the robots, the link that carries the tool, and joints at the tool's
-    start [rad].
+    """An arm: its file in `example-robot-data`, the link that carries the tool, and the joints at
+    the tool's start [rad].
     """
 
     file: str
@@ -25,7 +25,7 @@ class Model(NamedTuple):
     posture: tuple[float, ...]
 
 
-# The postures have the tool where the demonstrations begin, 45 degrees down.
+# In these postures the tool is where demonstrations begin, and points 45 degrees down.
 MODELS = {
     "panda": Model(
         "panda.urdf", "panda_hand_tcp", (0.045, -0.527, -0.145, -2.885, 0.071, 3.138, 0.8)
@@ -35,7 +35,9 @@ MODELS = {
 
 
 def published(file: str) -> Path:
-    """A file of `example-robot-data`, by the end of its path; skips where that is not installed."""
+    """A file of `example-robot-data`, by the end of its path; skips if that package is not
+    installed.
+    """
     try:
         return next(
             Path(str(f.locate()))
@@ -47,7 +49,7 @@ def published(file: str) -> Path:
 
 
 def toml_of(model: Model, **changed: str) -> str:
-    """The settings of a cell with this arm; a line left empty is left out."""
+    """The settings of a cell with this arm; empty lines are omitted."""
     count = len(model.posture)
     lines = {
         "urdf": f"[arm]\nurdf = {json.dumps(str(published(model.file)))}",
@@ -61,5 +63,5 @@ def toml_of(model: Model, **changed: str) -> str:
 
 
 def cell_of(name: str) -> Settings:
-    """A cell with one of the models, or `wam`, whose arm is assumed to be at its posture."""
+    """A cell with one of the models, or `wam`, whose arm is assumed to be at its start posture."""
     return ASSUMED if name == "wam" else parse(toml_of(MODELS[name]), origin=name)

@@ -1,7 +1,7 @@
-"""The bounds of docs/bounds.md, each asserted from outside on the frames of a session.
+"""The bounds of docs/bounds.md, each computed from the frames of a session.
 
-A bound is a function that gives for each frame (T,) by how much it is passed, in the bound's own
-unit; at most 0 where it is kept. What follows from two frames counts for the later one.
+A bound is a function that returns its excess for each frame (T,), in the bound's own unit; at most
+0 where the bound is kept. A value of two frames counts for the later one.
 """
 
 from __future__ import annotations
@@ -18,60 +18,60 @@ from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import Settings
 
-ROUNDING = 1e-9  # of numbers in SI units, and relative
+ROUNDING = 1e-9  # absolute in SI units, and relative
 POSITION_ROUNDING_M = 1e-6
-AS_MEASURED_RAD = 1e-4  # a jump ends so near to where the arm is
+AS_MEASURED_RAD = 1e-4  # a jump ends within this distance of the measured joints
 SPEED_ROUNDING_MPS = 1e-6
 # the tool's speed in a stop, beyond its speed limit
 STOP_RISE = 1.01
 STOP_RISE_MPS = 0.01
-SLOW_RISE_MPS = 0.1  # the same, beyond its speed at the start of the stop
-BEHIND_M = 0.25  # the tool may be so far from its setpoint ...
-# ... or this and the way of the setpoint's stop: from there on it waits for the tool
+SLOW_RISE_MPS = 0.1  # the tool's speed in a stop, beyond its speed at the start
+BEHIND_M = 0.25  # the tool may be this far from its setpoint, or:
+# beyond this distance the setpoint stops and waits for the tool
 WAITING_M = 0.12
-OUTSIDE_M = 0.03  # the tool may leave the workspace so far
-SLIP_MPS = 0.01  # joints that start one after the other approach so fast
-RESTING_S = 0.6  # a hand that has been still for this time is at rest, also as it is estimated
-# error of a resting hand's estimate, beside 3 standard deviations of the tracker's noise
+OUTSIDE_M = 0.03  # the tool may leave the workspace by this distance
+SLIP_MPS = 0.01  # speed of approach of joints that start one after the other
+RESTING_S = 0.6  # after this time without motion, a hand's estimate rests too
+# error of a resting hand's estimate, plus 3 standard deviations of the tracker's noise
 ESTIMATE_M = 0.006
-# excess speed toward a hand at rest, and toward a hand as it is estimated
+# excess speed toward a hand at rest, and toward the estimate of a hand
 RESTING_MPS = 0.03
 ESTIMATED_MPS = 0.02
 # within this time an excess has fallen to this share, or is slow
 BRAKED_S = 0.12
 BRAKED_SHARE = 0.9
 SLOW_MPS = 0.05
-NEAR_M = 0.55  # a hand farther off allows any speed
-MOVING_MPS = 0.005  # slower capsules are not looked at
+NEAR_M = 0.55  # a more distant hand allows any speed
+MOVING_MPS = 0.005  # slower capsules are not checked
 # depth in a clearance; increase of the depth at the start
 PASSED_M = 0.005
 WORSE_M = 0.002
 OWN_CLEARANCE_M = 0.01
-EVERY = 4  # frames: clearances change slowly
-SETTLED_S = 6.0  # with the hands at rest, in which an arm comes to rest
-# at the end: of accelerations; in which a stuck tool is reported
+EVERY = 4  # [frames] between checks of clearances, which change slowly
+SETTLED_S = 6.0  # an arm comes to rest within this time after the hands
+# windows at the end of a session, for accelerations and for the report of a stuck tool
 LOOK_S = 0.5
 STUCK_S = 2.5
-# root mean square of all joints
+# root mean square acceleration of all joints
 AT_REST_RADPS2 = 0.05
 AT_REST_NOISY_RADPS2 = 0.3
 KEPT_BACK_RADPS2 = 0.5
 THERE_M = 0.01
 NET_MOTION_M = 0.004
-# a tool that is farther from its target is reported as stuck; a nearer one as kept away
+# farther from its target, a tool is reported as stuck; nearer, as kept away
 STUCK_M = 0.02
 
 
 @dataclass(frozen=True)
 class Session:
-    """What is judged, frame by frame (T,).
+    """Data of a session by which bounds are judged, frame by frame (T,).
 
-    `measured` (T, J): what the arm reported last [rad]; `boxes` (T, 2, 3): the skill's workspace
-    [m]; `receiving` (T, 2): a via-point lets the tool touch this hand. `hands` (T, 2, 3): where the
-    hands were [m], and `still_s` (T, 2): for how long; `noise_m`: their tracker's standard
-    deviation. `quiet_from`: the frame from which hands come to rest, an arm follows well, and
-    nothing else happens. `arm_follows`: it does so all the time; `deadlines_kept`: no tick is
-    missed.
+    `measured` (T, J): joints that the arm reported last [rad]; `boxes` (T, 2, 3): the skill's
+    workspace [m]; `receiving` (T, 2): a via-point lets the tool touch this hand. `hands` (T, 2, 3):
+    true hand positions [m], and `still_s` (T, 2): time for which they have rested; `noise_m`: their
+    tracker's standard deviation. `quiet_from`: the frame from which hands come to rest, the arm
+    follows well, and nothing else happens. `arm_follows`: the arm follows well all the time;
+    `deadlines_kept`: no tick is missed.
     """
 
     settings: Settings
@@ -89,7 +89,7 @@ class Session:
 
     @property
     def quiet_s(self) -> float:
-        """How long nothing but coming to rest has happened at the end."""
+        """Duration of the quiet part at the end."""
         return (len(self.frames) - self.quiet_from) * self.settings.period_s
 
     @cached_property
@@ -99,14 +99,16 @@ class Session:
 
     @cached_property
     def placed_on(self) -> Vector:
-        """The same (T - 1, N, 2, 3), of all frames but the last, STEP_S into the next motion."""
+        """Ends of the capsules (T - 1, N, 2, 3) [m] STEP_S after each frame but the last."""
         return self.geometry.place(
             self.frames["joints"][:-1] + STEP_S * self.frames["joint_velocities"][1:]
         )[0]
 
     @cached_property
     def tool_speeds(self) -> tuple[Vector, Vector]:
-        """Speeds (T,) of the tool [m/s]: now, and when all joint accelerations have come to 0."""
+        """Speeds (T,) of the tool [m/s]: now, and when all joint accelerations have decreased to
+        0.
+        """
         joints = self.frames["joints"]
         velocities = self.frames["joint_velocities"]
         accelerations = self.frames["joint_accelerations"]
@@ -120,12 +122,12 @@ Bound: TypeAlias = Callable[[Session], Vector]
 
 
 def _excess(count: int, value: Vector | float, allowed: Vector | float, where: Vector) -> Vector:
-    """By how much values pass what is allowed, where a condition holds; else 0."""
+    """The excess of values over the allowed ones where a condition holds; 0 elsewhere."""
     return np.where(where, np.broadcast_to(np.asarray(value) - allowed, count), 0.0)
 
 
 def _with_first(of_pairs: Vector) -> Vector:
-    """What follows from each two frames (T - 1,), for the later one (T,)."""
+    """Values of pairs of frames (T - 1,), assigned to the later frame (T,)."""
     return np.concatenate([[0.0], of_pairs])
 
 
@@ -134,7 +136,7 @@ def _commanded(session: Session) -> np.ndarray:
 
 
 def _pairs(where: np.ndarray) -> np.ndarray:
-    """Whether a condition holds at a frame and at the one before (T - 1,)."""
+    """True (T - 1,) if a condition holds at a frame and at the previous one."""
     return where[1:] & where[:-1]
 
 
@@ -143,7 +145,7 @@ def _following(session: Session) -> np.ndarray:
 
 
 def _jumps(session: Session) -> np.ndarray:
-    """Whether joints came to a frame (T - 1,) otherwise than by their velocities."""
+    """True (T - 1,) if joints moved to a frame by more than their velocities."""
     frames = session.frames
     dt = session.settings.period_s
     moved = np.diff(frames["joints"], axis=0)
@@ -216,7 +218,7 @@ def joints_that_move_are_commanded(session: Session) -> Vector:
 
 
 def _rise(session: Session, field: str, limit: float) -> Vector:
-    """By how much a norm rises beyond a limit; one that begins beyond it may come down."""
+    """The rise of a norm beyond a limit; a norm that begins beyond it may only decrease."""
     norm = _norms(session.frames[field])
     excess = norm[1:] - np.maximum(norm[:-1], limit) * (1.0 + ROUNDING) - ROUNDING
     return _with_first(np.where(_pairs(_following(session)), excess, 0.0))
@@ -227,7 +229,7 @@ def setpoint_speed_is_within_its_limit(session: Session) -> Vector:
 
 
 def setpoint_is_slow_while_it_engages(session: Session) -> Vector:
-    """A setpoint that begins faster than that may only come down."""
+    """A setpoint that begins faster than the engage speed may only slow down."""
     speed = _norms(session.frames["setpoint_velocity"])
     limit = session.settings.tool.engaging_speed
     excess = speed[1:] - np.maximum(speed[:-1], limit) * (1.0 + ROUNDING) - ROUNDING
@@ -257,7 +259,7 @@ def setpoint_does_not_jump(session: Session) -> Vector:
 
 
 def setpoint_passes_no_bound_of_its_own(session: Session) -> Vector:
-    """Which the service itself would call a fault."""
+    """The bounds whose violation the service reports as a fault."""
     return (session.frames["reason"] == Reason.SETPOINT).astype(float)
 
 
@@ -277,7 +279,7 @@ def setpoint_turning_acceleration_is_within_its_limit(session: Session) -> Vecto
 
 
 def _runs(session: Session) -> Iterator[slice]:
-    """Frames in which it follows without a pause, and in the same workspace."""
+    """Frames in which the arm follows without a pause and with the same workspace."""
     is_unchanged = np.concatenate(
         [[False], (session.boxes[1:] == session.boxes[:-1]).all(axis=(1, 2))]
     )
@@ -290,7 +292,7 @@ def _runs(session: Session) -> Iterator[slice]:
 
 
 def _outside(session: Session, point: str) -> Vector:
-    """How far a point is outside of the workspace and of the planes of the reach (T,) [m]; negative
+    """The distance (T,) [m] of a point outside the workspace and the planes of the reach; negative
     inside.
     """
     reach = session.settings.reach
@@ -300,7 +302,9 @@ def _outside(session: Session, point: str) -> Vector:
 
 
 def setpoint_stays_in_the_workspace(session: Session) -> Vector:
-    """Where following began there, at rest. One that begins outside moves no farther out."""
+    """This holds where following began at rest. A setpoint that begins outside moves no farther
+    out.
+    """
     outside = _outside(session, "setpoint")
     excess = np.zeros(len(session.frames))
     for run in _runs(session):
@@ -318,7 +322,7 @@ def tool_leaves_the_workspace_by_little(session: Session) -> Vector:
 
 
 def tool_is_near_its_setpoint(session: Session) -> Vector:
-    """Within BEHIND_M, or within WAITING_M and the way of a stop from the greatest speed."""
+    """Within BEHIND_M, or within WAITING_M plus the stopping distance from the largest speed."""
     gap = _norms(session.frames["tool"] - session.frames["setpoint"])
     tool = session.settings.tool
     v = tool.max_speed
@@ -337,15 +341,15 @@ def tool_speed_is_within_its_limit_while_following(session: Session) -> Vector:
 
 
 def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
-    """Below 1.01 times the greater of its speed and the speed it was coming to, plus 100 mm/s; and
-    always below 1.01 times its limit, plus 10 mm/s.
+    """Below 1.01 times the greater of its speed and the speed to which it was accelerating, plus
+    100 mm/s; and always below 1.01 times its limit, plus 10 mm/s.
     """
     speed, crest = session.tool_speeds
     following = _following(session)
     limit = STOP_RISE * session.settings.tool.max_speed + STOP_RISE_MPS
     allowed = np.full(len(speed), limit)
     is_over = ~session.frames["joint_velocities"].any(axis=1)
-    is_over |= session.frames["reason"] == Reason.BLOCKED  # or on a way out, which is no stop
+    is_over |= session.frames["reason"] == Reason.BLOCKED  # a way out is no stop
     stop_limit = limit
     for k in range(len(speed)):
         if following[k]:
@@ -357,7 +361,7 @@ def tool_hardly_speeds_up_in_a_stop(session: Session) -> Vector:
 
 
 def service_causes_no_fault_of_its_own(session: Session) -> Vector:
-    """Of a tool that is too fast, or of an arm that follows and is heard."""
+    """No fault for a tool that is too fast, and none of an arm that follows and reports."""
     frames = session.frames
     is_caused = frames["reason"] == Reason.TOOL_SPEED
     if session.deadlines_kept:
@@ -381,9 +385,8 @@ def allowed_speeds(distance: Vector, hand_speed: Vector | float, session: Sessio
 def _approaches(
     session: Session, side: int, capsule: int, hands: Vector
 ) -> tuple[np.ndarray, Vector, Vector, Vector, Vector]:
-    """Where a capsule moves near a hand (T - 1, 3): indices (K,) of the frames before; ends of the
-    capsule then and STEP_S later; distances [m], and speeds [m/s] toward the hand as if that
-    rested.
+    """Motion of a capsule near a hand (T - 1, 3): indices (K,) of the previous frames; ends of the
+    capsule then and STEP_S later; distances [m], and speeds [m/s] toward the hand as if it rested.
     """
     geometry = session.geometry
     frames = session.frames
@@ -409,7 +412,7 @@ def _moving_capsules(session: Session) -> np.ndarray:
 
 
 def arm_does_not_approach_a_resting_hand_too_fast(session: Session) -> Vector:
-    """Toward hands that truly rest, and are seen."""
+    """The hands truly rest, and are seen."""
     excess = np.zeros(len(session.frames))
     stale = session.settings.hands.stale_ms / 1000.0
     for side in (0, 1):
@@ -427,7 +430,7 @@ def arm_does_not_approach_a_resting_hand_too_fast(session: Session) -> Vector:
 
 
 def arm_brakes_where_it_approaches_a_hand_too_fast(session: Session) -> Vector:
-    """Toward hands as they are estimated, which may come faster than joints brake."""
+    """The hands are the estimated ones, which may approach faster than joints brake."""
     excess = np.zeros(len(session.frames))
     frames = session.frames
     ticks = max(1, int(BRAKED_S / session.settings.period_s))
@@ -475,7 +478,7 @@ def _with_contact(
 def _intrusion(
     session: Session, distances: Callable[[np.ndarray], Vector], clearance: float
 ) -> Vector:
-    """How far a clearance is passed, beside what was passed where the arm was last found. Given the
+    """The depth (T,) [m] in a clearance beyond the depth at the arm's last start, from the
     distances (K,) [m] at frames (K,).
     """
     commanded = _commanded(session)
@@ -507,7 +510,7 @@ def _intrusion_of_boxes(session: Session, boxes: Vector) -> Vector:
 def _distances_of_box(
     session: Session, box: Vector, capsule: int, clearance: float, frames: np.ndarray
 ) -> Vector:
-    """Distances (K,) of a capsule at frames (K,) from a box, or less where it is clear anyway."""
+    """Distances (K,) of a capsule at frames (K,) from a box, or lower bounds if these suffice."""
     ends = session.placed[frames, capsule]
     radius = session.geometry.radii[capsule]
     out = at_least(ends, box.mean(axis=0), 0.5 * float(np.linalg.norm(box[1] - box[0]))) - radius
@@ -536,7 +539,7 @@ def arm_keeps_clear_of_itself(session: Session) -> Vector:
 def _distances_of_pair(
     session: Session, first: int, second: int, clearance: float, frames: np.ndarray
 ) -> Vector:
-    """Distances (K,) of two capsules at frames (K,), or less where they are clear anyway."""
+    """Distances (K,) of two capsules at frames (K,), or lower bounds if these suffice."""
     ends = session.placed[frames, first]
     others = session.placed[frames, second]
     radii = session.geometry.radii[first] + session.geometry.radii[second]
@@ -574,8 +577,8 @@ def _net_motion_m(session: Session) -> float:
 
 def arm_comes_to_rest_with_the_hands(session: Session) -> Vector:
     """The root mean square of all joint accelerations, once the tool has been at its target for a
-    while. A tool that is kept back for as long hardly trembles. A target that moves is not judged:
-    a steep skill amplifies the noise of a tracker.
+    while. A tool that is kept away from its target for that time may tremble slightly. A moving
+    target is not judged, as a steep skill amplifies the tracker's noise.
     """
     settled = _last(session, SETTLED_S)
     if (
@@ -649,7 +652,7 @@ BOUNDS: tuple[Bound, ...] = (
 
 
 def broken(session: Session) -> list[str]:
-    """Each bound that is passed: which, by how much at most, and at which frame."""
+    """Each violated bound: its name, the largest excess, and its frame."""
     out = []
     for bound in BOUNDS:
         excess = bound(session)

@@ -1,7 +1,8 @@
-"""Tests that fail while the machine is busy are run again, and counted apart if they then pass.
+"""Tests that fail while the machine is busy are run again, and counted separately if they then
+pass.
 
-A process of the tests that waits for a processor as long as it has one shares it with others that
-these tests did not start: two workers and their daemons on two idle cores wait for a third of that.
+If a test process waits for a processor as long as it runs, the machine is busy with processes that
+the tests did not start: two workers and their daemons on two idle cores wait a third of that.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from pathlib import Path
 import pytest
 from _pytest.runner import runtestprotocol
 
-WAITING_SHARE = 0.5  # of the time in which a process could have run; see the module's text
+WAITING_SHARE = 0.5  # share of the time in which a process could run; see the module's docstring
 BUSY = "busy"
-# of the main thread [ns]: on a processor, and waiting for one
+# times of the main thread [ns]: running, and waiting for a processor
 SCHEDULED = Path("/proc/self/schedstat")
 
 
@@ -27,12 +28,12 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
-    """Count what passed when it was run again apart from what passed at once."""
+    """Count tests that passed in their second run separately."""
     return (BUSY, "B", "BUSY") if report.when == "call" and report.passed and note(report) else None
 
 
 def _reports(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
-    """The reports of a test; of its second run if the machine was too busy for the first one."""
+    """The reports of a test; those of its second run if the machine was too busy in the first."""
     before_ns = _scheduled_ns()
     reports = runtestprotocol(item, nextitem=nextitem, log=False)
     failures = [report for report in reports if report.failed]
@@ -56,7 +57,7 @@ def _reports(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.Tes
 
 
 def note(report: pytest.TestReport) -> str:
-    """Why a test that passed was run twice; empty if it was not."""
+    """The reason why a passed test was run twice; empty if it was run once."""
     return str(dict(report.user_properties).get(BUSY, ""))
 
 

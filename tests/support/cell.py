@@ -23,7 +23,7 @@ from thirdhand.contract import cdr, messages
 from thirdhand.daemon.launch import Launched, launched
 
 LISTENING = '[network]\nlisten = ["tcp/127.0.0.1:0"]\n'
-# where the hands rest [m]
+# positions of resting hands [m]
 LEFT = (0.98, -0.32, 0.06)
 RIGHT = (0.98, 0.32, 0.06)
 
@@ -39,7 +39,7 @@ def thirdhand(
 
 
 def told(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """A `thirdhand` command, run to its end in this process, which has imported all it needs."""
+    """A `thirdhand` command, run to its end in this process, which has its imports already."""
     out = io.StringIO()
     errors = io.StringIO()
     mask = os.umask(0o022)
@@ -49,14 +49,14 @@ def told(*arguments: str) -> subprocess.CompletedProcess[str]:
         except SystemExit as ended:
             code = int(ended.code or 0)
         finally:
-            os.umask(mask)  # `serve` sets its own
+            os.umask(mask)  # `serve` changes it
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), errors.getvalue())
 
 
 def until(
     what: Callable[[], Any], words: str = "it did not come to hold", *, within_s: float = 20.0
 ) -> Any:
-    """What a call returns, once that is true."""
+    """The first true value that a call returns."""
     end = time.monotonic() + within_s
     while not (value := what()):
         assert time.monotonic() < end, words
@@ -65,7 +65,7 @@ def until(
 
 
 def is_running(pid: int) -> bool:
-    """True if a process is there and has not ended."""
+    """True if a process exists and has not ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -81,16 +81,16 @@ class Daemon:
         self.session = session
         self.log = service.log
         self.client = Client(session)
-        self.end = service.stop  # the exit code after being asked to stop
+        self.end = service.stop  # stops the daemon; returns its exit code
 
     def until(
         self, what: Callable[[dict[str, Any]], bool], timeout_s: float = 15.0
     ) -> dict[str, Any]:
-        """The first status of which something is true."""
+        """The first status for which a condition holds."""
         end = time.monotonic() + timeout_s
         while not what(status := self.client.ask("status")):
             assert time.monotonic() < end, f"not within {timeout_s} s: {json.dumps(status)}"
-            time.sleep(0.01)  # the daemon and what it works with need the processor too
+            time.sleep(0.01)  # leave the processor to the daemon and its processes
         return status
 
 
@@ -102,8 +102,8 @@ def serving(
     network: str = LISTENING,
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Daemon]:
-    """A daemon of its own, with its files in a folder, on a free port; `before` it starts its
-    process runs that Python.
+    """A daemon on a free port with its files in a folder; its process first runs the Python code
+    `before`.
     """
     program = (
         ("-c", f"{before}\nfrom thirdhand.__main__ import main\nimport sys\nsys.exit(main())")
@@ -118,8 +118,8 @@ def serving(
 
 
 class Tracker:
-    """Publishes both hands at 100 Hz until closed; `left` and `right` may be moved, or None: not
-    seen. They are in a `frame`; its clock is `ahead_ns` ahead.
+    """Publishes both hands at 100 Hz until closed; `left` and `right` may be changed, or None for
+    an unseen hand. They are in a `frame`; the tracker's clock is `ahead_ns` ahead.
     """
 
     def __init__(self, session: zenoh.Session) -> None:

@@ -14,14 +14,14 @@ from support.paths import ROOT
 
 
 def assert_refused(code: int, words: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Assert exit code and words on standard error of a command; returns what it printed."""
+    """Assert exit code and words on standard error of a command; returns its standard output."""
     done = told(*arguments)
     assert (done.returncode, words in done.stderr) == (code, True), done.stderr
     return done
 
 
 def succeeded(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Assert that a command succeeds; returns what it printed."""
+    """Assert that a command succeeds; returns its standard output."""
     done = told(*arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     return done
@@ -29,7 +29,9 @@ def succeeded(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @contextlib.contextmanager
 def started(*arguments: str, within_s: float = 300, **more: Any) -> Iterator[subprocess.Popen[str]]:
-    """A `thirdhand` command as a process with pipes; it is killed at the end or after a time."""
+    """A `thirdhand` command as a process with pipes, killed at the end of the context or after a
+    time.
+    """
     command = [sys.executable, "-m", "thirdhand", *arguments]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     with subprocess.Popen(command, **({"text": True, "cwd": ROOT} | pipes | more)) as process:

@@ -1,4 +1,6 @@
-"""A headless Chromium, driven over its debugging pipe: opens a page, asks it, pictures it."""
+"""A headless Chromium, driven over its debugging pipe: opens a page, evaluates JavaScript, takes
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,7 @@ class Tab:
             message, _, self._rest = self._rest.partition(b"\0")
             answer = json.loads(message)
             if answer.get("id") == self._number:
-                return answer.get("result", {})  # nothing where the page is not there yet
+                return answer.get("result", {})  # empty if the page is not loaded yet
 
     def ask(self, expression: str) -> Any:
         """The value of an expression of JavaScript in the page."""
@@ -81,9 +83,9 @@ class Tab:
         return value
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """An event of the mouse at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`.
+        """Send a mouse event at a pixel: `Pressed`, `Moved`, `Released` or `Wheel`.
 
-        Its answer is not waited for: it comes with the next picture, which may be late.
+        The answer is not awaited: it comes with the next picture, which may be late.
         """
         button = {
             "button": "none" if kind == "Wheel" else "left",
@@ -104,7 +106,7 @@ class Tab:
         self._call("Page.bringToFront", {}, self._session)
 
     def picture(self, path: Path) -> None:
-        """Saves what the page shows as PNG."""
+        """Save a picture of the page as PNG."""
         reply = self._call("Page.captureScreenshot", {"format": "png"}, self._session)
         path.write_bytes(base64.b64decode(reply["data"]))
 
@@ -118,8 +120,8 @@ def opened(
     timeout_s: float = 60.0,
     before: str = "",
 ) -> Iterator[Tab]:
-    """A page of a browser of its own, whose files are in a folder; the script `before` runs ahead
-    of the page's own, also when it is loaded again.
+    """A page in a browser of its own, whose files are in a folder; the script `before` runs before
+    the page's own scripts, also after a reload.
     """
     reader, to = os.pipe()
     source, tell = os.pipe()

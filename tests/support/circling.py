@@ -1,4 +1,4 @@
-"""Takes of a tool that circles with the hands, to which it is linear but for a little lift."""
+"""Takes of a tool that circles with the hands: a linear function of them plus a small lift."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ GOES = np.array(
 
 
 def circling(seed: int, *, apart_m: float = 0.1, noise_m: float = 0.001) -> Demonstration:
-    """A take by a person of this seed: both hands circle about a place that is elsewhere by some
-    `apart_m` in each take, and the tool between them, lifted twice a round by 1 cm. The tracker
-    of hands and tool has white noise of `noise_m`, a standard deviation on each axis.
+    """A take by a person of this seed: both hands circle about a centre that differs by about
+    `apart_m` between takes. The tool circles between the hands, and is lifted twice a round by 1
+    cm. The tracker has white noise with standard deviation `noise_m` on each axis.
     """
     random = np.random.default_rng(seed)
     t = np.arange(0.0, LASTS_S, 1.0 / RATE_HZ)

@@ -36,8 +36,8 @@ SCENE = Scene()
 
 
 class Played(NamedTuple):
-    """How the task went, the largest joint error against the command [rad], and whether the service
-    followed from the script's beginning to its end.
+    """Events of the task, the largest joint error against the command [rad], and True if the
+    service followed during the whole script.
     """
 
     events: TaskEvents
@@ -46,7 +46,7 @@ class Played(NamedTuple):
 
 
 class Bytes:
-    """Bytes as Zenoh hands them over."""
+    """Bytes as in a Zenoh sample."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -56,7 +56,7 @@ class Bytes:
 
 
 class Sample(NamedTuple):
-    """A sample as Zenoh hands it over."""
+    """A substitute for a Zenoh sample."""
 
     payload: Bytes
     attachment: Bytes | None = None
@@ -69,7 +69,7 @@ def taught() -> Skill:
 
 
 def played(settings: Settings, engine: str | None = None, *, bench_hz: int | None = None) -> Played:
-    """One demo of the nominal scene; the bench's rate is the settings' unless another is given.
+    """One demo of the nominal scene; the bench has the rate of the settings by default.
 
     Raises BenchError.
     """

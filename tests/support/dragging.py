@@ -1,4 +1,4 @@
-"""A person at the page for a mouse: finds the hands on it, drags them and lifts them."""
+"""A person at the page for a mouse, who finds the hands on it, drags and lifts them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from support.chromium import Tab
 STEP_S = 0.016  # interval of a mouse's or a finger's events
 DRAG_S = 0.5  # duration of a drag
 ARRIVE_S = 10.0
-PIXEL_M = 0.01  # [m] a drag may end this far beside a point, because it goes from pixel to pixel
-WHEEL_M = 0.0002  # [m] that the page lifts a hand by a unit of the wheel
+PIXEL_M = 0.01  # [m] largest error of a drag, which moves from pixel to pixel
+WHEEL_M = 0.0002  # [m] lift of a hand by one unit of the wheel
 
 
 class Person:
@@ -24,7 +24,9 @@ class Person:
         self.tab = tab
 
     def hand(self, side: str, what: str = "at") -> tuple[float, float, float]:
-        """Where a hand is drawn, or with `aim` where it was dragged to [m]."""
+        """The position at which a hand is drawn, or with `aim` the one to which it was dragged
+        [m].
+        """
         x, y, z = self._found(f"hands.{side}.{what}")
         return x, y, z
 
@@ -41,9 +43,9 @@ class Person:
         return json.loads(self.tab.ask(f"JSON.stringify({expression})"))
 
     def drag(self, side: str, to: tuple[float, float, float]) -> None:
-        """Drag a hand to a point with the mouse, and turn the wheel until it is as high."""
+        """Drag a hand to a point with the mouse, and turn the wheel until the heights agree."""
         self.along(self.pixel(self.hand(side)), self.pixel(to), self.tab.mouse)
-        end = time.monotonic() + ARRIVE_S  # the page may still have events of the mouse to take in
+        end = time.monotonic() + ARRIVE_S  # the page may still process mouse events
         while math.dist(self.hand(side, "aim")[:2], to[:2]) > PIXEL_M and time.monotonic() < end:
             time.sleep(STEP_S)
         pixel = self.pixel(self.hand(side, "aim"))

@@ -1,6 +1,4 @@
-"""How an arm follows its commands and reports its joints: well, or in ways in which arms and their
-drivers fail.
-"""
+"""Simulated arms that follow commands and report joints well, or fail as arms and drivers do."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from thirdhand.contract.messages import JointState
 from thirdhand.core.frame import Event, Frame, Vector
 from thirdhand.settings.config import Settings
 
-# An arm that follows well is drawn as often as all others together.
+# An arm that follows well is as probable as all other kinds together.
 KINDS = ("lag", "noise", "jumps", "drift", "odd numbers", "gaps", "joint missing", "delay", "stall")
 WELL = "well"
 ODD_NUMBERS = (
@@ -55,12 +53,12 @@ class DrawnArm:
         self._velocities = frame["joint_velocities"]
 
     def events(self, tick: int, stamp_ns: int) -> list[Event]:
-        """Move by one tick; at most one joint state."""
+        """Move by one tick; returns at most one joint state."""
         kind = self.kind
         random = self._random
         target = self._commands[-1]
         count = len(self._names)
-        if kind == "delay":  # of 20 ticks
+        if kind == "delay":  # 20 ticks
             target = self._commands[-min(20, len(self._commands))]
         if kind == "stall" and int(tick / (0.9 * self._hz)) % 4 == 3:
             target = self._joints

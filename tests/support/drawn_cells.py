@@ -1,5 +1,5 @@
-"""Cells drawn at random: an arm, the loop's rate, the tool, limits, boxes, clearances and what is
-foreseen of hands.
+"""Cells drawn at random: arm, loop rate, tool, limits, boxes, clearances and assumptions on
+hands.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from thirdhand.settings.config import Box, Settings, parse
 
 XARM7 = Model("xarm7.urdf", "link7", (0.0, -0.3, 0.0, 1.2, 0.0, 1.5, 0.0))
 ENGAGE_SPEEDS_MPS = (0.01, 0.05, 0.15, 0.15, 0.4)
-ARMS = ("wam", "ur5", "franka", "panda", "wam", "xarm7")  # shipped ones, and two from other URDFs
+ARMS = ("wam", "ur5", "franka", "panda", "wam", "xarm7")  # shipped arms, and two of other URDFs
 RATES_HZ = (100, 125, 250, 333, 500, 500, 500, 1000)
 TOOLS_M = ((0.0, 0.0, 0.12), (0.05, 0.0, 0.1), (0.0, 0.0, 0.25), (0.15, -0.1, 0.05))
 BOX_CENTRES_M = np.array([[0.2, -0.6, 0.0], [0.9, 0.6, 0.5]])
@@ -24,7 +24,7 @@ BOX_CENTRES_M = np.array([[0.2, -0.6, 0.0], [0.9, 0.6, 0.5]])
 
 @cache
 def cell_with(arm: str) -> Settings:
-    """The cell before anything is drawn."""
+    """The cell with this arm, before settings are drawn."""
     if arm in ("panda", "xarm7"):
         return parse(toml_of({**MODELS, "xarm7": XARM7}[arm]), origin=arm)
     return shipped(arm)
@@ -110,7 +110,7 @@ def _box(random: np.random.Generator) -> Box:
 
 
 def changes(cell: Settings, arm: str) -> str:
-    """What was drawn of a cell, to be read in a failure."""
+    """The drawn settings of a cell, as text for failures."""
     default = msgspec.to_builtins(cell_with(arm))
     drawn = msgspec.to_builtins(cell)
     return ", ".join(

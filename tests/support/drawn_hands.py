@@ -1,7 +1,7 @@
-"""Two tables of small functions: how hands move, and how a tracker reports them.
+"""Two tables of small functions: motions of hands, and reports of a tracker.
 
-A motion yields where both hands are (2, 3) [m], tick by tick, for ever. A report turns where they
-are into samples of one tick. Any motion may meet any report.
+A motion yields the positions of both hands (2, 3) [m], tick by tick, without end. A report turns
+positions into samples of one tick. Any motion may be combined with any report.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from thirdhand_sim.script import HandScript
 Motion: TypeAlias = Iterator[Vector]
 Sample: TypeAlias = tuple[str, Vector]  # side, position [m]
 
-FASTEST_MPS = 1.2  # of a hand that chases the arm
+FASTEST_MPS = 1.2  # speed of a hand that chases the arm
 BEHIND_M = np.array([[-0.3, -0.2, 0.4], [-0.3, 0.2, 0.4]])  # the robot's base
-FAR_M = np.array([[4.99, 0.0, 0.0], [0.9, 4.9, 0.1]])  # 5 m are accepted
+FAR_M = np.array([[4.99, 0.0, 0.0], [0.9, 4.9, 0.1]])  # positions up to 5 m are accepted
 PHASES = np.arange(6.0).reshape(2, 3)
 
 
 class Surroundings:
-    """What a motion may go by: the arm as it was commanded last, and where the skill knows hands.
+    """Inputs of a motion: the last commanded arm, and the demonstrated hands.
 
-    `known` (M, 2, 3) [m]; `home` (2, 3) [m]: where the hands were at first; `hands` (2, 3) [m]:
-    where they are; `tool` and `elbow` (3,) [m].
+    `known` (M, 2, 3) [m]: demonstrated hands; `home` (2, 3) [m]: first position of the hands;
+    `hands` (2, 3) [m]: present position; `tool` and `elbow` (3,) [m].
     """
 
     def __init__(
@@ -45,46 +45,46 @@ class Surroundings:
         self.elbow = tool
 
     def place(self, scatter_m: float) -> Vector:
-        """Somewhere near hands that the skill knows (2, 3)."""
+        """A random position of both hands (2, 3) near a demonstrated one."""
         hands: Vector = self.known[self.random.integers(len(self.known))]
         return hands + self.random.normal(0.0, scatter_m, (2, 3))
 
     def size_m(self, least: float, most: float) -> float:
-        """A size between these, of which each order of magnitude is as probable."""
+        """A random size between these, with equal probability for each order of magnitude."""
         return float(np.exp(self.random.uniform(np.log(least), np.log(most))))
 
     def ticks(self, seconds: float) -> int:
-        """Ticks in a time, at least one."""
+        """The number of ticks in a time, at least one."""
         return max(1, round(seconds / self.period_s))
 
     def seconds(self) -> Iterator[float]:
-        """The time [s] since the start of a motion, tick by tick, for ever."""
+        """The time [s] since the start of a motion, tick by tick, without end."""
         tick = 0
         while True:
             yield tick * self.period_s
             tick += 1
 
     def reach(self, to: Vector, seconds: float) -> Motion:
-        """A minimum-jerk motion from where the hands are."""
+        """A minimum-jerk motion from the present position."""
         begin = self.hands
         for u in np.linspace(0.0, 1.0, self.ticks(seconds) + 1)[1:]:
             yield begin + u**3 * (10.0 - 15.0 * u + 6.0 * u * u) * (to - begin)
 
     def wait(self, seconds: float) -> Motion:
-        """Rest where the hands are."""
+        """Rest at the present position for a time."""
         hands = self.hands
         for _ in range(self.ticks(seconds)):
             yield hands
 
 
 def rest(around: Surroundings) -> Motion:
-    """Both hands rest where they are."""
+    """Both hands rest at their present positions."""
     while True:
         yield around.hands
 
 
 def reaches(around: Surroundings) -> Motion:
-    """Both hands reach from one known place to the next, without a pause."""
+    """Both hands reach from one known position to the next, without a pause."""
     while True:
         yield from around.reach(around.place(0.02), 0.45)
 
@@ -106,7 +106,7 @@ def wander(around: Surroundings) -> Motion:
 
 
 def fly(around: Surroundings) -> Motion:
-    """Straight at up to 3 m/s, to and fro between the sides of a box."""
+    """Straight motion at up to 3 m/s, reflected at the sides of a box."""
     lower = np.array([-0.5, -1.0, -0.2])
     upper = np.array([1.5, 1.0, 1.2])
     velocities = around.random.uniform(-1.7, 1.7, (2, 3))
@@ -117,7 +117,7 @@ def fly(around: Surroundings) -> Motion:
 
 
 def tremble(around: Surroundings) -> Motion:
-    """There and back by 0.5 to 100 mm at 1 to 12 Hz."""
+    """Oscillation by 0.5 to 100 mm at 1 to 12 Hz."""
     size_m = around.size_m(0.0005, 0.1)
     hz = around.random.uniform(1.0, 12.0)
     for t in around.seconds():
@@ -125,7 +125,7 @@ def tremble(around: Surroundings) -> Motion:
 
 
 def sines(around: Surroundings) -> Motion:
-    """8 cm at another frequency on each axis, up to 3.4 Hz."""
+    """Sines of 8 cm, with a different frequency of up to 3.4 Hz on each axis."""
     hz = np.array([[0.3, 0.5, 0.8], [1.3, 2.1, 3.4]])
     for t in around.seconds():
         yield around.home + 0.08 * np.sin(2 * np.pi * t * hz)
@@ -139,14 +139,14 @@ def jitter(around: Surroundings) -> Motion:
 
 
 def alternate(around: Surroundings) -> Motion:
-    """Two trackers up to 0.5 m apart, of which one or the other is heard."""
+    """Two trackers with a difference of up to 0.5 m, which alternate."""
     offset_m = 0.5 * around.size_m(0.004, 0.5) * np.sign(around.random.normal(size=(2, 3)))
     while True:
         yield around.home + around.random.choice((-1.0, 1.0)) * offset_m
 
 
 def leap(around: Surroundings) -> Motion:
-    """At once in another known place, twice a second."""
+    """Jumps to another known position, twice a second."""
     while True:
         hands = around.place(0.03)
         for _ in range(around.ticks(0.5)):
@@ -154,7 +154,7 @@ def leap(around: Surroundings) -> Motion:
 
 
 def leap_far(around: Surroundings) -> Motion:
-    """Up to 3 m away and back, each for 0.3 s."""
+    """Jumps of up to 3 m away and back, 0.3 s each."""
     while True:
         for offset_m in (around.random.uniform(-3.0, 3.0, (2, 3)), 0.0):
             for _ in range(around.ticks(0.3)):
@@ -189,7 +189,7 @@ def merge(around: Surroundings) -> Motion:
 
 
 def lift(around: Surroundings) -> Motion:
-    """The left hand rises by 1 m within 1 s, and is down again at once."""
+    """The left hand rises by 1 m within 1 s, and jumps down again."""
     for t in around.seconds():
         yield around.home + np.array([[0.0, 0.0, t % 1.0], [0.0, 0.0, 0.0]])
 
@@ -231,7 +231,7 @@ def _toward(around: Surroundings, goal: Vector) -> Vector:
 
 
 def thrust(around: Surroundings) -> Motion:
-    """The right hand is thrust at the tool within 0.35 s, stays, and goes back."""
+    """The right hand thrusts at the tool within 0.35 s, rests, and returns."""
     while True:
         back = around.hands
         yield from around.reach(
@@ -253,7 +253,7 @@ def pass_by(around: Surroundings) -> Motion:
 
 
 def hold_tool(around: Surroundings) -> Motion:
-    """The left hand is where the tool is."""
+    """The left hand is at the tool."""
     while True:
         yield np.array([around.tool + around.random.normal(0.0, 0.01, 3), around.hands[1]])
 
@@ -295,7 +295,7 @@ MOTIONS: tuple[Callable[[Surroundings], Motion], ...] = (
 
 
 def come_to_rest(around: Surroundings) -> Motion:
-    """Both hands reach for a known place within 1 s, and rest there."""
+    """Both hands reach for a known position within 1 s, and rest there."""
     if np.linalg.norm(around.hands - around.home) > 1.0:
         around.hands = around.home
     yield from around.reach(around.place(0.0), 1.0)
@@ -332,7 +332,7 @@ def losses(hands: Vector, seconds: float, random: np.random.Generator) -> Sequen
 
 
 def odd_numbers(hands: Vector, seconds: float, random: np.random.Generator) -> Sequence[Sample]:
-    """Three samples of ten hold tiny, huge or no numbers."""
+    """Three samples of ten have tiny or huge numbers, or NaN."""
     return [
         (side, random.choice(ODD_NUMBERS, 3) if random.random() < 0.3 else hand)
         for side, hand in both(hands, seconds, random)

@@ -1,5 +1,5 @@
-"""One session drawn from its seed: a cell, a skill, hands and an arm, requests, missed deadlines;
-then hands that rest. Played tick by tick, with all that is needed to judge it from outside.
+"""A session drawn from its seed: a cell, a skill, hands and an arm, requests, missed deadlines;
+then hands that rest. It is played tick by tick, with all data by which bounds are judged.
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ from thirdhand_sim.made_tasks import takes
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
-SEGMENTS = 7  # of a session, each with its motion and its report
+SEGMENTS = 7  # parts of a session, each with its own motion and report
 TRACKERS_HZ = (10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 240.0, 500.0)
 MISSED = (1, 2, 5, 30, 49, 50, 100, 250, 499, 3000)  # ticks
-WRONG_STAMPS_NS = (-(10**9), 10**9, 0, -2_000_000, 10**15)  # beside the right one
+WRONG_STAMPS_NS = (-(10**9), 10**9, 0, -2_000_000, 10**15)  # errors of wrong stamps
 LATEST_S = 0.09
-# of a way out: it takes; until the next; at most
+# searches for a way out: duration, time until the next one, largest number
 SEARCH_S = 0.3
 SEARCH_AGAIN_S = 2.0
 SEARCHES = 4
 # ticks
 ELBOW_LINK = 4
 ELBOW_EVERY = 10
-# mean time between press and release; ticks with a message
+# clutch: mean time between press and release, share of ticks with a message
 CLUTCH_S = (0.002, 0.05, 1.0)
 CLUTCH_SHARE = 0.9
-# from which the session is replayed, and for how many ticks
+# states from which the session is replayed, and ticks of each replay
 STATES = 2
 REPLAYED = 150
 
 
 class Played(NamedTuple):
-    """A session; the frames from which it comes out otherwise when it is played again from a kept
-    state; and what happens in it, in words.
+    """A session; the first differing frames of replays from kept states; and a description of the
+    session.
     """
 
     session: Session
@@ -70,9 +70,9 @@ class Played(NamedTuple):
 
 @cache
 def skills() -> dict[str, Skill]:
-    """Skills by name: shipped, with via-points at several positions, with random ones, without
-    segments, one of a made task, and two that are followed however far hands are from what was
-    demonstrated.
+    """Skills by name: shipped, with via-points at several positions, with random via-points,
+    without segments, one of a made task, and two without a limit of the distance from
+    demonstrations.
     """
     random = np.random.default_rng(5)
     base = shipped_skill()
@@ -90,7 +90,7 @@ def skills() -> dict[str, Skill]:
             by_name[f"{'taught' if moved else 'random'} {len(by_name)}"] = adapted(
                 base, points, tolerance=0.05 if moved else float(random.choice([0.05, 0.2]))
             )
-        except SkillError:  # via-points that contradict each other
+        except SkillError:  # the random via-points contradict each other
             continue
     return by_name | {
         f"{name}, anywhere": replace(by_name[name], threshold=math.inf)
@@ -99,7 +99,7 @@ def skills() -> dict[str, Skill]:
 
 
 def _moved(random: np.random.Generator) -> tuple[ViaPoint, ...]:
-    """The scene's via-points, all moved the same way by up to 1.5 cm."""
+    """The scene's via-points, all moved by the same offset of up to 1.5 cm."""
     offset_m = random.uniform(-0.015, 0.015, 3)
     return tuple(
         msgspec.structs.replace(
@@ -137,7 +137,7 @@ def _anywhere(random: np.random.Generator, skill: Skill) -> tuple[ViaPoint, ...]
 
 @cache
 def script_hands() -> Vector:
-    """Places of both hands (M, 2, 3) in the scripted task."""
+    """Positions of both hands (M, 2, 3) in the scripted task."""
     script = HandScript(Scene(), seed=0)
     return np.array(
         [[hand[:3] for hand in script.sample(t)] for t in np.linspace(0.0, script.duration_s, 25)]
@@ -173,7 +173,7 @@ def play(
 
 
 class _Player:
-    """A controller, its surroundings, and what has come of them so far."""
+    """A controller, its surroundings, and the session so far."""
 
     def __init__(
         self, random: np.random.Generator, settings: Settings, urdf: str, wild_ticks: int
@@ -268,7 +268,7 @@ class _Player:
             self.around.elbow = self.geometry.place(frame["joints"][None])[0][0, self.elbow, 0]
 
     def _remember(self, number: int, frame: Frame) -> None:
-        """Keep the frame, and of the state what is needed: a copy takes as long as a tick."""
+        """Keep the frame and a few states: copying a state takes as long as a tick."""
         self.skills.append(self.controller.skill)
         before = self.frames[-1] if self.frames else frame
         self.frames.append(frame)
@@ -290,7 +290,7 @@ class _Player:
         return self.index * (10**9 // self.settings.rate_hz) + 1
 
     def _hands(self, number: int, is_quiet: bool) -> list[Event]:
-        """Move the hands, and report them now or later."""
+        """Move the hands, and report them in this tick or later."""
         random = self.random
         around = self.around
         length = -(-self.quiet_from // SEGMENTS)
@@ -349,8 +349,8 @@ class _Player:
         return out
 
     def _clutch(self, is_quiet: bool) -> list[Event]:
-        """Pressed and released for `clutch_s` on average, and repeated in most ticks; pressed while
-        it is quiet.
+        """The clutch is pressed and released for `clutch_s` on average, with a message in most
+        ticks; in the quiet part it is pressed.
         """
         if self.random.random() < self.settings.period_s / self.clutch_s:
             self.is_pressed = not self.is_pressed
@@ -358,13 +358,13 @@ class _Player:
         return [clutch(self.is_pressed)] if is_quiet or self.random.random() < CLUTCH_SHARE else []
 
     def _requests_at_rest(self, number: int) -> list[Event]:
-        """The first skill again; an operator who resumes and resets."""
+        """Load the first skill again, and resume and reset."""
         since = number - self.quiet_from
         out = [Event("skill", b"", self.skill), order("resume")] if since == 0 else []
         return out + ([order("resume"), order("reset")] if since % 500 == 250 else [])
 
     def _look_for_a_way(self, number: int, frame: Frame, state: Record) -> None:
-        """As the daemon does where the tool is stuck."""
+        """Plan a way out as the daemon does for a stuck tool."""
         if self.searches == SEARCHES or (
             self.searches and number - self.asked < self.around.ticks(SEARCH_AGAIN_S)
         ):
@@ -391,7 +391,7 @@ class _Player:
         return out
 
     def session(self) -> Session:
-        """What is judged."""
+        """The data by which bounds are judged."""
         receiving = {
             skill.digest: [any(p.follow == side for p in skill.via_points) for side in SIDES]
             for skill in self.skills

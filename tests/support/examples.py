@@ -1,4 +1,4 @@
-"""Programs of examples/ as modules."""
+"""Import of the programs in examples/."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from support.paths import ROOT
 
 
 def example(name: str) -> ModuleType:
-    """An example as a module."""
+    """The module of an example."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None

@@ -1,5 +1,5 @@
-"""The bound of docs/bounds.md on a setpoint, what the targets' last motion explains: asserted from
-outside in every step.
+"""The bound of docs/bounds.md that the targets' last motion explains the setpoint, asserted in
+every step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RETURN_SHARE = 0.75 * TUNING.decision.progress_share
 
 
 def margin(tool: ToolSettings) -> float:
-    """[m] by which a setpoint may pass what the targets explain."""
+    """Distance [m] by which a setpoint may exceed the positions that the targets explain."""
     back = RETURN_SHARE * tool.max_speed
     stop_s = (tool.max_speed + back) / tool.stop_acceleration
     stop_s += (tool.acceleration + tool.stop_acceleration) / tool.stop_jerk
@@ -33,8 +33,9 @@ def margin(tool: ToolSettings) -> float:
 class Explained(SetpointGenerator):
     """A setpoint generator that asserts its bound.
 
-    On each side of each axis the setpoint stays below the greatest of the last targets, and of
-    those before, each as much less as there was time to come back from it; plus `margin`.
+    On each side of each axis the setpoint stays below the greatest of the last targets plus
+    `margin`. Earlier targets count too, less the distance that the setpoint could return since
+    then.
     """
 
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
@@ -46,7 +47,7 @@ class Explained(SetpointGenerator):
             (HULL_SPANS * max(1, round(HULL_TIME_S / (HULL_SPANS - 1) / settings.period_s)), 2, 3)
         )
         self._steps = -1
-        self.closest = np.inf  # [m] that a setpoint has come to its bound
+        self.closest = np.inf  # [m] smallest distance of a setpoint from its bound
 
     def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
         super().begin(state, setpoint, engages=engages)

@@ -8,14 +8,14 @@ import numpy as np
 
 from thirdhand.skills.demonstration import Demonstration
 
-# the left hand goes to and fro so far, and the tool so many times as far
+# amplitude of the left hand's motion, and the tool's motion as a multiple of it
 FINE_M = 0.015
 TIMES = 8.0
 
 
 def fine(seed: int, noise_m: float, way: float = 1.0, *, turned: bool = False) -> Demonstration:
-    """A take of the left hand moving by 15 mm, and the tool by 12 cm along it, or against it; or
-    turned by 90° as far.
+    """A take of the left hand moving by 15 mm, and the tool by 12 cm in the same, the opposite or,
+    if `turned`, a perpendicular direction.
     """
     random = np.random.default_rng(seed)
     t = np.arange(0.0, 10.0, 0.02)

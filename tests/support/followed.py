@@ -1,4 +1,4 @@
-"""Cells with other settings, and their sessions, whose frames hold every limit of the joints."""
+"""Cells with other settings, and sessions of them that keep every limit of the joints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thirdhand.settings.config import Settings, robot_description
 
 
 def changed(cell: Settings, **parts: Any) -> Settings:
-    """The cell with other parts; a mapping replaces only the fields that it names."""
+    """The cell with other settings; a mapping replaces only the fields that it names."""
     for name, part in parts.items():
         changed_part = replace(getattr(cell, name), **part) if isinstance(part, Mapping) else part
         cell = replace(cell, **{name: changed_part})
@@ -24,7 +24,7 @@ def changed(cell: Settings, **parts: Any) -> Settings:
 
 
 def followed(skill: Skill, ticks: Iterable[Tick], cell: Settings = ASSUMED) -> np.ndarray:
-    """The frames (T,) of a controller that steps through ticks, all within the joints' limits."""
+    """The frames (T,) of a controller that steps through ticks; asserts the joints' limits."""
     records = frames(Controller(cell, skill, urdf=robot_description(cell)), ticks)
     assert_limits_hold(records, cell)
     return records

@@ -1,13 +1,13 @@
-"""Commands that tests start, forked from a process that has imported and loaded what they need.
+"""Commands that tests start, forked from a process that has loaded their imports.
 
 `python -m thirdhand ...` and `python -m thirdhand_sim ...` cost two seconds of imports and
 rehearsal. `Popen` takes the place of `subprocess.Popen`, also in the service's own code. The
 process is a child of the one that starts it, with pipes, environment, folder and signals of its
-own. All else is started as ever: other programs, an environment that imports would read, and tests
-that are about starts.
+own. Other processes are started as usual: other programs, environments that imports read, and
+commands of tests of the start.
 
 The standard library's fork server gives a child neither pipes nor an environment, and its children
-are not children of this process, so they could neither be waited for nor told apart from others.
+are not children of this process, so they could neither be awaited nor distinguished from others.
 """
 
 from __future__ import annotations
@@ -90,7 +90,9 @@ def _module_of(args: Any) -> str | None:
 
 
 def _is_read_at_import(environment: dict[str, str]) -> bool:
-    """True if an environment differs from this process's first one in what imports read."""
+    """True if an environment differs from this process's first one in variables that imports
+    read.
+    """
     changed = {name for name, _ in environment.items() ^ _environment.items()}
     return any(name.startswith(READ_AT_IMPORT) for name in changed)
 
@@ -101,5 +103,5 @@ def use(is_on: bool) -> None:
 
 
 def close() -> None:
-    """End the server, if it was needed."""
+    """End the server, if it was started."""
     _server.close()

@@ -1,4 +1,4 @@
-"""A forked command: what it finds loaded, and how it becomes like a process that was started."""
+"""A forked command: its loaded modules, and the steps that make it like a started process."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run(channel: socket.socket) -> None:
     request = json.loads(message)
     channel.close()
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, 0)  # the server yields to others
+        os.setpriority(os.PRIO_PROCESS, 0, 0)  # the server has a lower priority
     if request["session"]:
         os.setsid()
     for number, stream in enumerate(streams):

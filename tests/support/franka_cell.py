@@ -17,8 +17,8 @@ from support.paths import ROOT
 from thirdhand.settings.config import JointSettings, Settings, parse
 
 PERIOD = 0.001  # [s]
-STANDS = np.array((0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785))  # where franky-sim begins
-# as published
+STANDS = np.array((0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785))  # start posture of franky-sim
+# limits published by the maker
 ACCELERATION = 10.0
 JERK = 5000.0
 Vector = npt.NDArray[np.float64]
@@ -58,7 +58,9 @@ def allowed(joints: Vector) -> tuple[Vector, Vector]:
 
 
 def assert_allowed(velocity: Vector, joints: Vector) -> None:
-    """Velocities (N, 7) written each millisecond from rest, with the arm at these joints (N, 7)."""
+    """Assert that velocities (N, 7), one a millisecond from rest, are allowed at these joints (N,
+    7).
+    """
     acceleration = np.diff(velocity, axis=0, prepend=0.0) / PERIOD
     jerk = np.diff(acceleration, axis=0, prepend=0.0) / PERIOD
     least, most = allowed(joints)
@@ -70,7 +72,7 @@ def assert_allowed(velocity: Vector, joints: Vector) -> None:
 
 
 class Robot:
-    """A simulated robot at an address; once it is ended, what it was told."""
+    """A simulated robot at an address; after its end, the commands that it received."""
 
     def __init__(self, address: str, file: Path) -> None:
         self.address = address
@@ -86,7 +88,7 @@ class Robot:
 
 @contextlib.contextmanager
 def robot(tmp_path: Path, *options: str) -> Iterator[Robot]:
-    """Within it there is a robot."""
+    """A context with a simulated robot."""
     script = ROOT / "tests" / "support" / "franka_robot.py"
     file = tmp_path / "cycles.npz"
     process = subprocess.Popen(
@@ -108,7 +110,7 @@ def robot(tmp_path: Path, *options: str) -> Iterator[Robot]:
 
 
 def franka_toml() -> str:
-    """Settings of a cell with that arm."""
+    """Settings of a cell with a Franka, as TOML."""
     spec = importlib.util.find_spec("franky_sim")
     assert spec is not None
     assert spec.origin is not None
@@ -128,5 +130,5 @@ jerk = {list(joints.jerk)}
 
 
 def cell() -> Settings:
-    """These settings."""
+    """The cell of `franka_toml`."""
     return parse(franka_toml(), origin="cell.toml")

@@ -1,8 +1,8 @@
-"""A Franka on a loopback address, by franky-sim, as a process of its own: what it was told each
-millisecond, and where its joints were, goes to a file once it is ended by its standard input.
+"""A Franka simulated by franky-sim on a loopback address, as a process of its own. Commands and
+joints of each millisecond are written to a file when its standard input ends.
 
-python tests/support/franka_robot.py FILE [--fast]: as fast as it is led, else in real time. Each
-millisecond lasts until it was told, so that none is missed on a busy machine.
+python tests/support/franka_robot.py FILE [--fast]: as fast as commands arrive, else in real time.
+Each millisecond lasts until its command has arrived, so that none is missed on a busy machine.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 from franky_sim import SimulationServer
 from franky_sim.mujoco_simulator import MujocoSimulator
 
-# that a command is waited for
+# time-outs of the first and of later commands
 FIRST_S = 0.002
 NEXT_S = 5.0
 
 
 def main(path: str, *, fast: bool) -> None:
-    """Runs until standard input ends."""
+    """Run until standard input ends."""
     cycles: list[tuple[bool, Any, Any]] = []
     commands: list[tuple[Any, bool]] = []
     ended = threading.Event()

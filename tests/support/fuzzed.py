@@ -1,5 +1,5 @@
-"""Legal hands, an arm and requests as bytes, many of them spoilt; and what a recording of a session
-with them must be.
+"""Legal hands, an arm and requests as bytes, many of them damaged; and the assertions on a
+recording of such a session.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from thirdhand.recordings.replay import replay, ticks
 from thirdhand.settings.config import robot_description
 from thirdhand.skills.skill_file import decoded
 
-QUIET_S = 1.0  # of every two, in which nothing is spoilt
+QUIET_S = 1.0  # in one second of every two nothing is damaged
 ASKED = ("hold", "resume", "reset", "via_points", "skill", "status")
-DECODERS = {"via_points": "via_points", "skill": "skill_request"}  # of the others: nothing
+DECODERS = {"via_points": "via_points", "skill": "skill_request"}  # other requests have no content
 REQUEST = {"via_points": b'{"op": "list"}', "skill": b'{"name": "soldering"}'}
 
 
 class Traffic:
     """Messages (key, bytes) for every moment: two hands that reach there and back at up to 1 m/s,
-    an arm that does as it is told, now and then a request; in every other second spoilt.
+    an arm that follows its commands, sometimes a request; damaged in every other second.
     """
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)
-        self.joints: Vector | None = None  # [rad] that the arm tells
+        self.joints: Vector | None = None  # [rad] reported by the arm
 
     def at(self, t: float, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-        """What is sent at a time [s] since the start, stamped so."""
+        """The messages at a time [s] since the start, stamped with it."""
         random = self._random
         hostile = t % (2.0 * QUIET_S) >= QUIET_S
         for side, home in zip(SIDES, (LEFT, RIGHT), strict=True):
@@ -74,8 +74,8 @@ class Traffic:
 
 
 def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
-    """Its frames (T,): they are what the core makes of the recorded bytes, bit for bit, and keep
-    every bound.
+    """Returns the recorded frames (T,): the core computes them from the recorded bytes bit for bit,
+    and they keep every bound.
     """
     result = replay(path)
     assert result.exact, result.text()
@@ -99,7 +99,7 @@ def assert_recorded_session_keeps_the_bounds(path: Path) -> np.ndarray:
         boxes=np.tile(skill.workspace, (count, 1, 1)),
         receiving=np.zeros((count, 2), bool),
         hands=np.zeros((count, 2, 3)),
-        # where the hands were is not recorded, only what was reported
+        # true hands are not recorded, only reported ones
         still_s=np.zeros((count, 2)),
         noise_m=0.0,
         quiet_from=count,

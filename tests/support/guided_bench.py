@@ -1,4 +1,4 @@
-"""The bench with an arm that a person may lead by hand, as its driver reports."""
+"""The bench with an arm that a person may lead by hand, which its driver reports."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ class GuidedBench:
         self._thread = threading.Thread(target=self._run)
 
     def lead(self, by: Vector) -> None:
-        """Lead the arm from where it is by so much (J,) [rad], and hold it there; its driver
-        reports that.
+        """Lead the arm from its present joints by an offset (J,) [rad], and hold it there; the
+        driver reports guiding.
         """
         self._goal = self._joints + by
 
     @property
     def is_led_there(self) -> bool:
-        """True once the arm is where it was led to."""
+        """True once the arm has reached the offset."""
         return self._goal is not None and bool(
             np.abs(self._goal - self._joints).max() < SETTLED_RAD
         )
 
     def let_go(self) -> None:
-        """End guiding: the arm stands where it is, and follows commands again."""
+        """End guiding: the arm rests, and follows commands again."""
         self._goal = None
 
     def _run(self) -> None:
@@ -68,7 +68,7 @@ class GuidedBench:
                         1.0, LED_RADPS * bench.period_s / max(float(np.abs(step).max()), 1e-9)
                     )
                     observation = bench.step(tuple((self._joints + step).tolist()))
-                    # it begins anew where the arm is let go
+                    # playback restarts where the arm was released
                     drive = Led(bench, bridge.commands, bridge.gripper)
                     bridge.commands.queued()
                 before = index

@@ -29,7 +29,7 @@ KNUCKLES = ("wrist", "index-finger-phalanx-proximal", "pinky-finger-phalanx-prox
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "thirdhand-tests"
 # Runs ahead of the page: a headset with two hands. In each frame `path(seconds)`, if it is set,
 # moves them, and `truth` gets a row: time [ms since 1970], side, position [m], quaternion x y z w.
-# The time is that of the frame, for which a headset gives its poses: a busy machine reaches the
+# The time is that of the frame, to which a headset's poses belong: a busy machine processes the
 # hands of a frame many milliseconds later.
 EMULATED = """
 ;(() => {
@@ -71,7 +71,7 @@ EMULATED = """
 
 
 def lacking() -> str:
-    """What a test with a headset lacks here; empty if nothing."""
+    """Programs that a test with a headset lacks on this machine; empty if none."""
     if chromium.PROGRAM is None:
         return "needs Chromium: on Debian, apt install chromium"
     if not _script().exists() and shutil.which("npm") is None:
@@ -88,7 +88,7 @@ def _script() -> Path:
 
 
 def _fetch() -> None:
-    """Fetch iwer into the cache, unless it is there."""
+    """Fetch iwer into the cache, unless it is there already."""
     if _script().exists():
         return
     CACHE.mkdir(parents=True, exist_ok=True)
@@ -135,7 +135,7 @@ class Served:
         self.ended = ""
 
     def end(self) -> str:
-        """End it; returns what it wrote to standard error at its end."""
+        """End the command; returns its last standard error."""
         self.process.send_signal(signal.SIGTERM)
         assert self.process.stderr is not None
         self.ended = self.process.stderr.read()
@@ -143,7 +143,7 @@ class Served:
         return self.ended
 
     def counts(self) -> tuple[int, int, int]:
-        """Messages published, lost and dropped as too late, once it has ended."""
+        """Messages published, lost and dropped as too late; after the end of the command."""
         matched = re.search(
             r"(\d+) messages with hands published, (\d+) lost, (\d+) too late", self.ended
         )
@@ -153,7 +153,7 @@ class Served:
 
 @contextlib.contextmanager
 def serving_hands(endpoint: str, home: Path, *arguments: str) -> Iterator[Served]:
-    """The command, connected to a Zenoh endpoint, with its token under a home folder."""
+    """The running command, connected to a Zenoh endpoint, with its token in a home folder."""
     command = [
         sys.executable,
         "-m",

@@ -1,8 +1,7 @@
-"""Whatever bytes come: each decoder answers them with a value or a refusal in words, never with
-anything else.
+"""Any bytes: each decoder returns a value or refuses them in words, and does nothing else.
 
 `python tests/support/hostile_bytes.py DECODER [RUNS]` searches with atheris, guided by coverage,
-in an environment that has it; `test_hostile_bytes` mutates the same seeds.
+if atheris is installed; `test_hostile_bytes` mutates the same seeds.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from thirdhand.contract.messages import (
     in_order,
 )
 
-LONGEST_WORDS = 600  # of a refusal, which is sent and logged
+LONGEST_WORDS = 600  # [characters] of a refusal, which is sent and logged
 NAMES = ("wam/base_yaw_joint", "b", "c")
 POSITION = (0.5, -0.1, 0.2)
 TURN = (0.0, 0.0, 0.0, 1.0)
@@ -48,21 +47,23 @@ POINT = (
 
 
 def _joints(data: bytes) -> Any:
-    """As the intake reads them."""
+    """Decode joints as the intake does."""
     message = cdr.decode_joints(data)
     in_order(message, NAMES)
     return message
 
 
 def _again(encode: Callable[..., bytes], decode: Callable[[bytes], Any], data: bytes) -> Any:
-    """What was read is written and read again: the same."""
+    """Assert that a decoded message, encoded and decoded again, is the same."""
     message = decode(data)
     assert repr(decode(encode(message))) == repr(message)
     return message
 
 
 def _transforms(data: bytes) -> Any:
-    """Of some frames the same is read as of all, and each is a pose that can be recorded."""
+    """Assert that reading some frames agrees with reading all, and that each pose can be
+    recorded.
+    """
     read = cdr.decode_transforms(data)
     subset = cdr.decode_transforms(data, ("b",))
     assert repr(subset) == repr([entry for entry in read if entry[0] == "b"])
@@ -128,9 +129,9 @@ _SEEDS: dict[str, list[bytes]] = {
 }
 _SEEDS["hands_of_transforms"] = _SEEDS["transforms"]
 _SEEDS["joints_in_order"] = _SEEDS["joints"][:2]
-# What was found: each once ended in another error, or is the smallest of what could.
+# Messages found by searches: each once caused another error, or is the smallest one that could.
 FOUND: dict[str, list[bytes]] = {
-    # seconds and nanoseconds that come to more than a stamp holds
+    # the sum of seconds and nanoseconds exceeds a stamp
     "joints": [
         _SEEDS["joints"][0][:4] + b"\xff\xff\xff\x7f\xff\xff\xff\xff" + _SEEDS["joints"][0][12:]
     ],
@@ -139,13 +140,13 @@ FOUND: dict[str, list[bytes]] = {
 
 
 def seeds(name: str) -> list[bytes]:
-    """Messages to begin with, and what was found before."""
+    """Messages from which mutation begins, with those found before."""
     return _SEEDS[name] + FOUND.get(name, [])
 
 
 def check(name: str, data: bytes) -> bool:
-    """Whether a decoder took the bytes. Raises AssertionError where it refuses them at length, and
-    whatever else it raises than a refusal.
+    """True if a decoder accepts the bytes. Raises AssertionError if its refusal is too long, and
+    any error of the decoder that is no refusal.
     """
     try:
         DECODERS[name](data)
@@ -193,9 +194,7 @@ HOSTILE_JSON: tuple[Any, ...] = (
 
 
 def mutated(name: str, data: bytes, random: Random) -> bytes:
-    """A message like this one, with something wrong; of a request mostly what it says, not its
-    syntax.
-    """
+    """The message with a random fault; in a request mostly a fault of content, not of syntax."""
     if name in REQUESTS and random.random() < 0.8:
         with contextlib.suppress(ValueError, RecursionError):
             return json.dumps(_spoilt(json.loads(data or b"{}"), random)).encode()
@@ -251,7 +250,7 @@ def _spoilt(value: Any, random: Random) -> Any:
 
 
 def search(name: str, runs: int) -> None:
-    """Searches with atheris; ends the process."""
+    """Search with atheris; ends the process."""
     folder = Path(f"/tmp/thirdhand-fuzz/{name}")
     folder.mkdir(parents=True, exist_ok=True)
     for i, seed in enumerate(seeds(name)):

@@ -1,5 +1,5 @@
-"""Sessions in process: the core, driven tick by tick by the bench or by hands alone,
-faster than real time.
+"""Sessions in process: the core, driven tick by tick by the bench or by hands only, faster than
+real time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thirdhand_sim.script import HandScript
 ASSUMED = msgspec.structs.replace(
     Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed")
 )
-# where the hands rest [m]
+# positions of resting hands [m]
 LEFT = (0.98, -0.32, 0.06)
 RIGHT = (0.98, 0.32, 0.06)
 
@@ -74,13 +74,13 @@ def led(
     first: int = 0,
     every: int = 5,
 ) -> Iterator[Tick]:
-    """Ticks while the hands are at positions (T, 2, 3) [m], of which a tracker samples some."""
+    """Ticks with the hands at positions (T, 2, 3) [m], some of which a tracker samples."""
     for k, positions in enumerate(hands, first):
         yield Tick(k, (*(seen(positions, k) if k % every == 0 else ()), *extra(k)))
 
 
 def ticks_of(script: HandScript, *, wait_s: float = 1.5, tail_s: float = 0.5) -> Iterator[Tick]:
-    """Ticks with the script's hands, which first rest at their start for a while."""
+    """Ticks with the script's hands, which rest at their start for a while."""
     hands_at = script_hands(script, wait_s=wait_s)
     return led(hands_at(k) for k in range(round((wait_s + script.duration_s + tail_s) / 0.002)))
 
@@ -119,8 +119,8 @@ def assert_limits_hold(seen: np.ndarray, cell: Settings = ASSUMED) -> None:
 
 
 class Loop:
-    """A controller and an arm that is where it was commanded, which reports its joints and their
-    velocities as `reports` says. The hands are where `hands` has them in a tick; None: unseen.
+    """A controller and an arm that is at its command, which reports its joints and their velocities
+    through `reports`. `hands` gives the positions of the hands in a tick; None: unseen.
     """
 
     def __init__(
@@ -137,11 +137,11 @@ class Loop:
 
     @property
     def frames(self) -> np.ndarray:
-        """All frames (T,) until now."""
+        """All frames (T,) so far."""
         return np.array([frame for _, frame in self.steps])
 
     def step(self, *events: Event, is_heard: bool = True) -> Frame:
-        """One tick; in every fifth the hands are seen."""
+        """One tick; the hands are sampled in every fifth tick."""
         k = self.index
         inbox = list(seen(self.hands(k), k)) if self.hands is not None and k % 5 == 0 else []
         if is_heard:
@@ -159,8 +159,8 @@ class Loop:
     def run(
         self, ticks: int, events: Mapping[int, Event] | None = None, *, every: int = 1
     ) -> np.ndarray:
-        """The frames of more ticks, with events by their ticks counted from here. The arm is heard
-        in every so many ticks, or never.
+        """The frames of further ticks, with events by the number of their tick in this run. The arm
+        reports every `every` ticks, or never.
         """
         events = events or {}
         for k in range(ticks):
@@ -172,12 +172,12 @@ class Loop:
 
 
 def stamp_ns(k: int) -> int:
-    """The stamp of what an arm reports in tick k."""
+    """The stamp of an arm's report in tick k."""
     return 10**12 + 2_000_000 * k
 
 
 def script_hands(script: HandScript, *, wait_s: float = 1.5) -> Callable[[int], Vector]:
-    """Positions of both hands (2, 3) [m] in each tick of 2 ms; first they rest for a while."""
+    """Positions of both hands (2, 3) [m] in each tick of 2 ms; at first they rest for a while."""
     return lambda k: np.array(script.sample(max(0.0, 0.002 * k - wait_s)))[:, :3]
 
 
@@ -188,7 +188,7 @@ def assert_replays(
     steps: list[tuple[Tick, Frame]],
     state: Record | None = None,
 ) -> None:
-    """Assert that ticks with their frames, recorded from a state on, replay identically."""
+    """Assert that ticks and frames, recorded from a state on, replay identically."""
     state = start_state(cell, skill) if state is None else state
     with Recorder(path, settings=cell, skill=skill.file, state=state) as recorder:
         for tick, frame in steps:

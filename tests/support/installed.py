@@ -1,4 +1,4 @@
-"""The distributions of this tree as they are installed, without pip: in folders of their own."""
+"""The distributions of this project, installed into folders without pip."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def unpacked(wheel: Path, site: Path) -> Path:
 
 
 def isolated(site: Path, code: str, *needs: str, **more: Any) -> subprocess.CompletedProcess[str]:
-    """A program run by an interpreter that has only the standard library, a folder of installed
-    packages, and links in it to the packages that it needs.
+    """A program, run by an interpreter with the standard library, a folder of installed packages,
+    and links to the packages that it needs.
     """
     for name in needs:
         spec = importlib.util.find_spec(name)

@@ -26,8 +26,8 @@ KINDS = (
 
 
 def takes(count: int, *, timetable: bool) -> list[Demonstration]:
-    """Hands that come at different speeds and then rest; the tool moves on while they rest, or goes
-    with the left hand.
+    """Hands that move at different speeds and then rest; the tool continues during the rest, or
+    moves with the left hand.
     """
     out = []
     times = np.arange(0.0, 7.0, 0.02)
@@ -54,7 +54,7 @@ def takes(count: int, *, timetable: bool) -> list[Demonstration]:
 
 
 def named(count: int, *, timetable: bool) -> list[Demonstration]:
-    """These takes, with the via-points at which they begin and end."""
+    """The takes with via-points at their begin and end."""
     out = []
     for take in takes(count, timetable=timetable):
         rows = [
@@ -71,7 +71,7 @@ def named(count: int, *, timetable: bool) -> list[Demonstration]:
 
 
 def learned(kind: str) -> tuple[Skill, Demonstration]:
-    """A skill of one kind, and a take that it was not learned from."""
+    """A skill of one kind, and a take that was not used in learning."""
     if kind in TASK_KINDS:
         *demonstrations, asked = (
             take.demonstration for take in made(kind, people=[0, 1, 2], each=2)

@@ -30,7 +30,7 @@ ROS2_DOMAIN = 7
 
 
 def main(folder: Path, endpoint: str, *cells: str) -> None:
-    """Serves the cells; each says its name once it is announced."""
+    """Serve the cells; each prints its name once it is announced."""
     skill = shipped_skill()
     skill_worker = SkillWorker()
     warm_up(Settings(), skill.for_loop(), urdf=robot_description(Settings()))

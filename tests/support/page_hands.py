@@ -1,4 +1,4 @@
-"""Messages of hands as a page sends them, and a server of a page in a test's own loop."""
+"""Messages of hands as a page sends them, and a page's server in the test's event loop."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PALM = (0.1, 1.0, -0.4, 0.0, 0.0, 0.6, 0.8, 0.12, 1.02, -0.5, 0.03, 0.0)
 
 
 def hands_message(**given: Any) -> bytes:
-    """A message of both hands, of now, except for what is given."""
+    """A message of both hands with the present time, unless other values are given."""
     values = {
         "magic": HANDS_MAGIC,
         "seen": 3,
@@ -40,7 +40,7 @@ def hands_message(**given: Any) -> bytes:
 
 
 class Heard:
-    """The poses of hands that a subscriber of its own session receives."""
+    """The poses of hands that a subscriber with its own session receives."""
 
     def __init__(self, session: zenoh.Session, cell: str = "thirdhand") -> None:
         self.poses: dict[str, list[PoseStamped]] = {"left": [], "right": []}
@@ -53,7 +53,7 @@ class Heard:
         self.poses[side].append(decode_pose(sample.payload.to_bytes()))
 
     async def until(self, side: str, count: int, within_s: float = 10.0) -> list[PoseStamped]:
-        """The poses of a hand, once there are so many."""
+        """The poses of a hand, once this number has arrived."""
         async with asyncio.timeout(within_s):
             while len(self.poses[side]) < count:
                 await asyncio.sleep(0.005)
@@ -62,7 +62,7 @@ class Heard:
 
 @contextlib.contextmanager
 def page_of_hands(**more: Any) -> Iterator[tuple[HeadsetPage, Heard]]:
-    """A page whose hands a subscriber hears, without a daemon."""
+    """A page and a subscriber of its hands, without a daemon."""
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
         open_session(connect=[endpoints(hearing)[0]]) as session,
@@ -80,7 +80,7 @@ def page_of_hands(**more: Any) -> Iterator[tuple[HeadsetPage, Heard]]:
 
 @contextlib.asynccontextmanager
 async def serving_page(page: HeadsetPage, host: str = "127.0.0.1") -> AsyncIterator[str]:
-    """Host and port of a page that is served meanwhile, until SIGTERM ends it."""
+    """Host and port of a page that is served during the context, ended by SIGTERM."""
     listening: asyncio.Future[Address] = asyncio.get_running_loop().create_future()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     server = asyncio.create_task(page.server.serve(Address(host, 0), listening.set_result))

@@ -1,4 +1,4 @@
-"""Primitives and via-points from a seed, and what they are compared with."""
+"""Primitives and via-points from a seed, and the naive solution for comparison."""
 
 import numpy as np
 from hypothesis import settings
@@ -59,7 +59,7 @@ def via(seed, count, inputs=4, outputs=3, std=1e-4):
 
 def naive(one, queries):
     """Mean (M, O) and joint covariance (M, O, M, O) by equations (8), (9) and that of IJRR 2019 for
-    values and derivatives, written down as they stand.
+    values and derivatives, by definition.
     """
     functionals = one.inner.solution.database.functionals
     outputs = one.reference.outputs

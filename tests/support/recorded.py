@@ -1,4 +1,4 @@
-"""A recording as the loop would have it written, and a drawing, read back."""
+"""A recording as the loop writes it, and reading of a drawing."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def at_ns(tick: int) -> int:
 
 
 def pose(stamp_ns: int, x: float) -> bytes:
-    """A hand's pose."""
+    """A hand's pose as CDR."""
     return cdr.encode_pose(
         messages.PoseStamped(stamp_ns, "base", (x, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0))
     )
 
 
 def state_after(tick: int) -> Record:
-    """A state that can be told from others."""
+    """A state that differs from those after other ticks."""
     state = blank(STATE)
     state["tick"] = tick
     state["measured"] = tick / 7
@@ -103,8 +103,8 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
 def write(
     path: Path, count: int = 300, *, settings: Settings = CELL
 ) -> list[tuple[Tick, Record, Record]]:
-    """Writes a recording with an initial state and a state every hundred ticks; returns what was
-    told.
+    """Write a recording with an initial state and a state every hundred ticks; returns its
+    content.
     """
     entries = list(ticks(count))
     with Recorder(path, settings=settings, skill=SKILL, state=state_after(-1)) as recorder:
@@ -124,7 +124,7 @@ def write(
 def tell(
     one: Scribe, count: int, *, first: int = 0, skill: bytes = SKILL
 ) -> list[tuple[Tick, Record, Record]]:
-    """Tells of ticks as the loop does; returns them."""
+    """Send ticks to the scribe as the loop does; returns them."""
     entries = list(ticks(count, first=first))
     for tick, frame, timing in entries:
         one.send(
@@ -148,8 +148,8 @@ def viewed(
     *,
     skill: bytes | None = None,
 ) -> dict[str, list[dict[str, Any]]]:
-    """The rows of a drawing of the shipped arm in so many ticks. `change` is called before each is
-    drawn, with viewer, tick and frame, and returns events that arrived in it, or None.
+    """The rows of a drawing of the shipped arm in this number of ticks. Before each tick is drawn,
+    `change` is called with viewer, tick and frame; it returns the tick's events or None.
     """
     viewer = Viewer(urdf=WAM, settings=Settings(), rrd=path, skill=skill)
     for tick, frame, timing in ticks(count):
@@ -159,7 +159,9 @@ def viewed(
 
 
 def drawn_ticks(path: Path, curve: str) -> list[int]:
-    """The ticks of a curve in a Rerun file, in order, without those that break it after a gap."""
+    """The ticks of a curve in a Rerun file, in order, without the rows that break it after a
+    gap.
+    """
     ticks: list[int] = []
     for chunk in rr.chunk.RrdReader(path).stream():
         rows = chunk.to_record_batch()
@@ -170,12 +172,12 @@ def drawn_ticks(path: Path, curve: str) -> list[int]:
 
 
 def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
-    """What of a column was logged, in order."""
+    """The logged values of a column, in order."""
     return [row[column] for row in rows if row.get(column) is not None]
 
 
 def views(container: Any) -> Iterator[Any]:
-    """The views in a part of an arrangement, and in the parts of that."""
+    """The views in a part of a blueprint, and in its parts."""
     for part in getattr(container, "contents", []):
         if hasattr(part, "origin"):
             yield part
@@ -184,7 +186,7 @@ def views(container: Any) -> Iterator[Any]:
 
 
 def thin(whole: Path, path: Path, *, spoilt: int | None = None) -> Path:
-    """A thin copy of a whole recording, in which the target of one tick may be another."""
+    """A thin copy of a whole recording; the target of one tick may be changed."""
     old = Recording.open(whole)
     start, *steps = old.steps()
     more: dict[str, Any] = {

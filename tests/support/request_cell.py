@@ -1,4 +1,4 @@
-"""Requests of one cell without its loop: what is asked goes through Zenoh, a thread takes it."""
+"""Requests of one cell without its loop: requests arrive by Zenoh, and a thread takes them."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Cell(CellState):
             channels.presence(self.settings.cell, str(near.zid()))
         )
         self.session = far
-        self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first compiles
+        self.client = Client(far, self.settings.cell, timeout_s=60.0)  # the first request compiles
         self.client.wait_until_ready()
 
     @property

@@ -1,4 +1,4 @@
-"""Nodes of ROS 2 beside a cell, and sessions behind certificates that may hear its topics."""
+"""ROS 2 nodes beside a cell, and sessions with certificates that may receive its topics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 def typed(kind: str) -> dict[str, str]:
-    """What a node knows of a type of messages."""
+    """The arguments of a node for a type of messages."""
     text, _ = TYPES.generate_msgdef(kind, ros_version=2)
     return {
         "msg_type": kind,
@@ -31,7 +31,7 @@ def typed(kind: str) -> dict[str, str]:
 
 
 def port(router: str, domain: int) -> dict[str, Any]:
-    """Where a node finds its domain, given a router's endpoint."""
+    """The arguments by which a node finds its domain, for a router's endpoint."""
     return {
         "domain_id": domain,
         "router_ip": "127.0.0.1",
@@ -40,7 +40,7 @@ def port(router: str, domain: int) -> dict[str, Any]:
 
 
 def header(types: dict[str, Any], frame: str = "") -> Any:
-    """A header of now, of a node's types."""
+    """A header with the present time, of a node's types."""
     second_ns = 10**9
     stamp = types["builtin_interfaces/msg/Time"](*divmod(time.time_ns(), second_ns))
     return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
@@ -50,7 +50,7 @@ def header(types: dict[str, Any], frame: str = "") -> Any:
 def guarded(
     folder: Path, cell: str, domain: int, topics: Sequence[ros2.Topic], *roles: str
 ) -> Iterator[tuple[zenoh.Session, ...]]:
-    """The session of a daemon behind certificates, and a client's session for each role."""
+    """The session of a daemon with certificates, and a client's session for each role."""
     secrets = make_certificates(folder)
     more = {**NETWORK_BOUNDS, **access_control(cell, (), domain, topics)}
     with contextlib.ExitStack() as closing:

@@ -1,10 +1,10 @@
-"""Parts of a daemon that fail when a test wants them to."""
+"""Parts of a daemon that fail on a test's request."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-# A part fails while a file of its name is in the folder, or "once" if that is what the file says.
+# A part fails while the folder has a file of its name; once only, if the file contains "once".
 SABOTAGE = """
 import pathlib
 from thirdhand.core import controller

@@ -1,4 +1,4 @@
-"""Setpoints led by targets, looked at from outside in each step."""
+"""Setpoints that follow targets, checked in each step."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from thirdhand.core.skill.model import Target
 from thirdhand.settings.config import Settings, ToolSettings
 
 PERIOD_S = 0.002
-TOOL = ToolSettings(engage_speed=0.0)  # at full speed from the start: engaging has tests of its own
+TOOL = ToolSettings(engage_speed=0.0)  # full speed from the start; engaging has its own tests
 BOX = np.array([[0.2, -0.6, 0.05], [1.0, 0.6, 0.8]])
 MIDDLE = np.array([0.6, 0.0, 0.4])
 FREE = np.zeros((3, 3, 7))  # no joint limits
 
 
 def at_rest(position: Vector | tuple[float, ...]) -> Vector:
-    """A motion (3, 3) that stands still at a position."""
+    """A motion (3, 3) at rest at a position."""
     return np.array([position, (0.0,) * 3, (0.0,) * 3])
 
 
@@ -30,9 +30,9 @@ def driven(
     costs: Vector = FREE,
     rate_hz: int = 500,
 ) -> tuple[Vector, Vector]:
-    """Setpoints (1 + T, 3, 3) led by targets (3, 3), one a tick, and what each step said.
+    """Setpoints (1 + T, 3, 3) that follow targets (3, 3), one a tick, and the results of the steps.
 
-    In each step the bounds are looked at from outside.
+    The bounds are asserted in each step.
     """
     generator = Explained(Settings(tool=tool, rate_hz=rate_hz))
     state = blank(STATE)

@@ -1,10 +1,10 @@
-"""Demonstrations for what learns from them: over time, by two inputs, by two hands in space."""
+"""Demonstrations for tests of kmp: over time, over two inputs, over two hands in space."""
 
 import numpy as np
 
 
 def driven_by_hands(seed=0, count=4):
-    """Two inputs of which only the first matters, on a long way; the second jitters."""
+    """Two inputs on a long path; only the first one matters, the second one jitters."""
     random = np.random.default_rng(seed)
     demonstrations = []
     for _ in range(count):
@@ -28,8 +28,8 @@ def over_time(velocity=False):
 
 
 def two_hands(seed, demonstrations=6, offset=0.0):
-    """Demonstrations: both hands' positions (100, 6) along a curve, a tool (100, 2) that goes with
-    them, off by so much in each demonstration.
+    """Demonstrations: both hands' positions (100, 6) along a curve, a tool (100, 2) that moves with
+    them, with an offset in each demonstration.
     """
     random = np.random.default_rng(seed)
     t = np.linspace(0, 1, 100)[:, None]
@@ -49,5 +49,5 @@ def two_hands(seed, demonstrations=6, offset=0.0):
 
 
 def off(mean, wanted):
-    """The error over the deviation of what was wanted."""
+    """The root mean square error divided by the deviation of the wanted values."""
     return np.sqrt(np.mean((mean - wanted) ** 2)) / wanted.std()

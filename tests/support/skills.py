@@ -1,4 +1,4 @@
-"""Skills looked at: their figures, predictions for hands at rest, and files with other arrays."""
+"""Access to skills: figures, predictions for hands at rest, and files with other arrays."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def at_rest(skill: Skill, hands: npt.ArrayLike, **more: Any) -> Prediction:
 
 
 def turns_of(rate: Vector, at_s: float, lag_s: float) -> Vector:
-    """Rows (TURNS, 2, 9) of the filters of hands that turn evenly at `rate` (3,) [rad/s]: each lags
-    by as much again.
+    """Rows (TURNS, 2, 9) of the filters of hands that turn evenly at `rate` (3,) [rad/s]; each
+    filter adds the same lag.
     """
     rows = [
         Rotation.from_rotvec(rate * (at_s - (i + 1) * lag_s)).as_matrix().ravel()

@@ -1,4 +1,4 @@
-"""Takes with a stretch in which the track of a hand, or of the tool, is wrong."""
+"""Takes with a stretch in which the track of a hand or of the tool is wrong."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def _moved(streams: Streams, name: str, mask: np.ndarray, by: np.ndarray) -> Non
 
 
 def jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The track is elsewhere, and moves there as it did."""
+    """The track has an offset of 25 to 80 cm."""
     direction = random.normal(size=3)
     _moved(streams, name, mask, random.uniform(0.25, 0.8) * direction / np.linalg.norm(direction))
 
 
 def small_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The track is elsewhere by what a fast hand moves in a few samples."""
+    """The track has an offset as large as a fast hand's motion in a few samples."""
     direction = random.normal(size=3)
     _moved(streams, name, mask, random.uniform(0.06, 0.25) * direction / np.linalg.norm(direction))
 
@@ -76,19 +76,19 @@ def small_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.
 def lasting_jump(
     streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator
 ) -> None:
-    """The same, and it stays there to the end."""
+    """The track has such an offset up to the end of the take."""
     end = np.arange(len(mask)) >= len(mask) - int(mask.sum())
     small_jump(streams, name, end, random)
 
 
 def slight_jump(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The track is elsewhere by less than the daemon takes for a jump."""
+    """The track has an offset that is too small for the daemon's jump gate."""
     direction = random.normal(size=3)
     _moved(streams, name, mask, random.uniform(0.02, 0.03) * direction / np.linalg.norm(direction))
 
 
 def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The track is elsewhere behind a few samples that are lacking, and returns likewise."""
+    """The track has an offset; a few samples are missing at its begin and end."""
     direction = random.normal(size=3)
     rows = np.flatnonzero(mask)
     seconds = streams[name].stamps_ns / 1e9
@@ -99,7 +99,7 @@ def dropout(streams: Streams, name: str, mask: np.ndarray, random: np.random.Gen
 
 
 def spikes(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """Each third sample is somewhere else each time."""
+    """Each third sample has another random offset."""
     rows = np.flatnonzero(mask)[::3]
     direction = random.normal(size=(len(rows), 3))
     streams[name].poses[rows, :3] += (
@@ -123,7 +123,7 @@ def zeros(streams: Streams, name: str, mask: np.ndarray, random: np.random.Gener
 
 
 def origin(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The tracker publishes its own origin."""
+    """The tracker publishes the position of its origin."""
     streams[name].poses[mask] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -138,13 +138,13 @@ def gap(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generat
 
 
 def swap(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """The tracker takes each hand for the other."""
+    """The tracker exchanges the hands."""
     left, right = (streams[side].poses for side in ("left", "right"))
     left[mask], right[mask] = right[mask], left[mask].copy()
 
 
 def two_sources(streams: Streams, name: str, mask: np.ndarray, random: np.random.Generator) -> None:
-    """Every other sample is of another tracker, which is 30 cm off."""
+    """Every other sample is of a second tracker, which is 30 cm off."""
     rows = np.flatnonzero(mask)[::2]
     streams[name].poses[rows, :3] += [0.0, 0.0, 0.3]
 

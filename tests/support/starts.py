@@ -11,7 +11,7 @@ from thirdhand.settings.config import Settings, robot_description
 
 
 def free_postures(cell: Settings, count: int, seed: int) -> list[Vector]:
-    """Postures within the limits in which the arm stands in nothing."""
+    """Postures within the limits in which the arm is clear of all obstacles."""
     random = np.random.default_rng(seed)
     separation = Separation(cell, robot_description(cell))
     drawn = (random.uniform(cell.joints.lower, cell.joints.upper) for _ in iter(int, 1))

@@ -30,7 +30,7 @@ def demonstrated(count: int, *, late: int = 0) -> list[Demonstration]:
 
 
 def quickly(taught: Sequence[Demonstration]) -> Skill:
-    """A coarse skill of two demonstrations, learned in no time."""
+    """A coarse skill of two demonstrations, which is learned fast."""
     return learn(taught, name="coarse", components=5, points=60)
 
 
@@ -47,10 +47,12 @@ def error_m(skill: Skill, held_out: Sequence[Demonstration]) -> float:
 
 
 def deviations(skill: Skill, hands: Vector) -> Vector:
-    """Standard deviations (T,) of the predictions for hands (T, 6) at rest [m], as the gate has."""
+    """Standard deviations (T,) [m] of the predictions for resting hands (T, 6), as used by the
+    gate.
+    """
     return np.array([at_rest(skill, row).gate_m for row in hands])
 
 
 def with_hands(point: ViaPoint, *, left: Sequence[float] = (0.0, 0.0, 0.0)) -> Vector:
-    """Hands (6,) at a via-point, the left one off by some metres."""
+    """Hands (6,) at a via-point, with an offset of the left one [m]."""
     return np.array([*(np.array(point.left) + left), *point.right])

@@ -1,8 +1,8 @@
-"""Which tests are `quick` and `thorough`, and the order in which files are begun.
+"""The tiers `quick` and `thorough` of tests, and the order of files.
 
-A test's tier stands beside it. `thorough` is run by `.ci/run` alone; so are all cases but the first
-of a test marked `one_case`. `quick` is every other test of a file that starts no process and plays
-no session, and a few that are marked so; a contributor runs these before each commit.
+Marks stand at the tests. Only `.ci/run` runs `thorough` tests, and more than the first case of
+tests marked `one_case`. `quick` are the other tests of files that start no process and play no
+session, and a few marked tests; contributors run these before each commit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ SLOW = re.compile(  # words of tests that start a process, open a session, play 
     r"\b(support\.cell|subprocess|chromium|sleep|golden|(serving|launched|open_session|told|main|Controller|Loop|Bench|learn|played"
     r"|replay)\(|mark\.(one_case|thorough|timed))"
 )
-REAL_STARTS = (  # these start each command as a user does
+REAL_STARTS = (  # tests in these files start each command as a user does
     "process/test_interrupt.py",
     "daemon/test_start.py",
     "daemon/test_systemd.py",
@@ -44,5 +44,5 @@ def is_quick_file(path: Path) -> bool:
 
 
 def order(file: str) -> int:
-    """The place of a file in the order in which files are begun: the longest first."""
+    """The rank of a file: the longest one runs first."""
     return (*LONGEST_FIRST, file).index(file)

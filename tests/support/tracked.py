@@ -1,4 +1,4 @@
-"""An intake alone, given hands and arms sample by sample."""
+"""An intake without the other stages, which receives hands and arms sample by sample."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Hands:
-    """An intake and its state, moved on tick by tick."""
+    """An intake and its state, advanced tick by tick."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Hands:
         return bool(is_fresh(as_array(self.state), side, stale_ticks))
 
     def heard(self) -> bool:
-        """Whether the arm has reported its joints lately enough."""
+        """True if the arm has reported its joints recently enough."""
         return bool(self.intake.step(copied(self.state), blank(FRAME), 0, []) & ARM_HEARD)
 
     def rejected(self) -> dict[Cause, int]:

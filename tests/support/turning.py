@@ -11,10 +11,10 @@ from thirdhand.settings.config import Settings, load
 
 ARMS = ROOT / "service" / "thirdhand" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
-# [rad] of the base's joint at the posture: the task takes it to both sides of pi
+# [rad] base joint at the start posture; the task moves it to both sides of pi
 NEAR_SEAM = math.pi - 0.02
 BASE = '<origin xyz="0 0 0.089159"/>'
-# What no command moves: a gripper with <mimic>, a wheel, things that float.
+# Joints without commands: a gripper with <mimic>, a wheel, floating objects.
 BEYOND = "".join(
     f'<link name="{name}"><collision><geometry><sphere '
     'radius="0.02"/></geometry></collision></link>'
@@ -42,8 +42,8 @@ def _kind(urdf: str, joint: str, kind: str) -> str:
 
 
 def continuous_urdf() -> str:
-    """The UR5, three of whose joints turn on and on; its base is turned, so that the first is near
-    pi at the posture.
+    """The UR5 with three continuous joints; its base is turned, so that the first joint is near pi
+    at the start posture.
     """
     urdf = (ARMS / "ur5.urdf").read_text(encoding="utf-8")
     for joint in CONTINUOUS:

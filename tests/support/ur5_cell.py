@@ -1,4 +1,4 @@
-"""Cells of a UR5 by a URDF and settings of their own."""
+"""Cells of a UR5 with their own URDF and settings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The shipped arm as tests need it: its joints' names, its description, and the layouts of what is
-recorded of it.
+"""The shipped arm for tests: joint names, description, and layouts of its recorded state and
+frame.
 """
 
 from __future__ import annotations

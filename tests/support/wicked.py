@@ -1,4 +1,4 @@
-"""A skill whose names hold all that a terminal, a table or a browser obeys."""
+"""A skill whose names contain control sequences of terminals, tables and browsers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WICKED = "a\nb\x1b[31mred\x07\u202egnirts\r<b>|`*_$x$"
 
 
 def wicked_skill() -> bytes:
-    """The file of the shipped skill, with such a name, such a take and such a warning."""
+    """The file of the shipped skill with such names of skill and take, and such a warning."""
     with np.load(RECORDINGS / "soldering.npz", allow_pickle=False) as archive:
         arrays = dict(archive)
     figures = msgspec.json.decode(str(arrays["figures"]))

@@ -1,5 +1,5 @@
-"""The server of hands from a browser, without a browser: what it publishes, and what it refuses
-with a reason while the hands of others are followed.
+"""The server of hands from a browser, without a browser: it publishes hands, and refuses bad
+messages with a reason while it accepts the hands of another page.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 NAN_PALM = (math.nan, *PALM[1:])
 NO_ROTATION = (*PALM[:3], 0.0, 0.0, 0.0, 0.5, *PALM[7:])
 DAY_MS = 86_400_000.0
-REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refused
+REFUSED: dict[str, tuple[Any, str]] = {  # a page's message, and the reason of its refusal
     "too short": (lambda: hands_message()[:-1], "119 bytes, 120 needed"),
     "too long for a websocket here": (lambda: bytes(300), ""),
     "another magic number": (lambda: hands_message(magic=1), "not a message of hands"),
@@ -71,7 +71,7 @@ REFUSED: dict[str, tuple[Any, str]] = {  # what a page sends, and why it is refu
 async def opened(
     page: HeadsetPage, at: str, *, token: str | None = None, **more: Any
 ) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
-    """A websocket to a page."""
+    """A websocket to the server of a page."""
     url = f"{page.server.scheme}://{at}/hands?token={page.server.token if token is None else token}"
     async with aiohttp.ClientSession() as session, session.ws_connect(url, **more) as socket:
         yield socket
@@ -88,7 +88,7 @@ async def reason(socket: aiohttp.ClientWebSocketResponse) -> tuple[int | None, s
 
 
 def test_hands_are_published_as_sent() -> None:
-    """Hands are published as they were sent and a prediction is stamped now."""
+    """Predicted hands get the present time as their stamp."""
 
     async def scenario() -> None:
         async with serving_page(page) as address, opened(page, address) as socket:
@@ -106,7 +106,7 @@ def test_hands_are_published_as_sent() -> None:
             assert before_ns <= second.stamp_ns <= time.time_ns()
             await socket.send_bytes(hands_message(epoch=3, number=5))
             assert (await heard.until("left", 3))[2].frame_id == "webxr3"
-            assert len(await heard.until("right", 1)) == 1  # it was seen once
+            assert len(await heard.until("right", 1)) == 1  # the right hand was visible once
             assert (page.hands.published, page.hands.lost) == (3, 3)
             held_up = time.time() * 1e3 - 2000
             await socket.send_bytes(hands_message(number=6, at_ms=held_up))
@@ -123,7 +123,7 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
         async with serving_page(page) as address, opened(page, address) as socket:
             await socket.send_bytes(PING.pack(PING_MAGIC, 12.5))
             while (answer := await socket.receive(10)).type != aiohttp.WSMsgType.BINARY:
-                # there is no daemon
+                # no daemon runs
                 assert json.loads(answer.data) == {
                     "status": {},
                     "objects": [],
@@ -142,7 +142,7 @@ def test_clocks_are_compared_by_pings_and_orders_are_answered() -> None:
 
 
 def test_refusals_have_a_reason() -> None:
-    """Each refusal has a reason and the hands of another page go on."""
+    """Meanwhile the hands of another page are published."""
 
     async def scenario() -> None:
         async with serving_page(page) as address, opened(page, address) as good:
@@ -185,7 +185,7 @@ def test_refusals_have_a_reason() -> None:
 
 
 def test_hands_pass_to_another_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hands pass to another page once the first has left or is silent."""
+    """The first page has left or is silent."""
     monkeypatch.setattr(browser_hands, "OWNER_S", 0.2)
     monkeypatch.setattr(browser_hands, "PAGE_SILENCE_S", 0.6)
 
@@ -237,12 +237,12 @@ def test_the_page_needs_the_token_and_names_nothing_elsewhere() -> None:
 
 
 def test_self_signed_certificate_serves_https(tmp_path: Path) -> None:
-    """A self signed certificate serves https under its name alone."""
+    """HTTPS works under the certificate's name only."""
     certificate = server_certificate("Localhost", tmp_path / "state")
     (file,) = (tmp_path / "state").iterdir()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     trusted = ssl.create_default_context(cafile=file)
-    trusted.check_hostname = False  # the connection is by address
+    trusted.check_hostname = False  # the client connects by address, not by name
 
     async def scenario() -> None:
         async with serving_page(page) as address:
@@ -257,7 +257,7 @@ def test_self_signed_certificate_serves_https(tmp_path: Path) -> None:
                 page, address, ssl=trusted, headers={"Host": "rebound.example"}
             ) as socket:
                 assert await reason(socket) == (4403, FOREIGN)
-            with pytest.raises(aiohttp.ClientError):  # HTTP where HTTPS is spoken
+            with pytest.raises(aiohttp.ClientError):  # HTTP to an HTTPS server
                 async with aiohttp.ClientSession() as session, session.get(f"http://{address}/"):
                     pass
 
@@ -283,7 +283,7 @@ def test_a_hundred_pages_at_once_leave_the_first_its_hands() -> None:
             await first.send_bytes(hands_message(number=1))
             await heard.until("left", 2)
             await others[0].close()
-            async with opened(page, address) as late:  # there is room again
+            async with opened(page, address) as late:  # a connection is free again
                 await late.send_bytes(PING.pack(PING_MAGIC, 0.0))
                 while (await late.receive(10)).type != aiohttp.WSMsgType.BINARY:
                     pass

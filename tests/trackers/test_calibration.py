@@ -1,5 +1,5 @@
-"""Calibrations in simulation: their accuracy by arm and tracker, what they refuse and why, and the
-command over Zenoh, whose settings a daemon then maps with.
+"""Simulated calibrations: accuracy by arm and tracker, refusals with their cause, and the command
+over Zenoh, whose result a daemon uses.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ CORNERS = bench_corners(Settings())
 
 @functools.cache
 def path_of(arm: str, seed: int) -> LedArm:
-    """The arm of a shipped cell as it is led."""
+    """The arm of a shipped cell, led along a path."""
     return led(cell_of(arm), 40.0, np.random.default_rng(seed))
 
 
@@ -86,7 +86,7 @@ def held_by(kind: str, *, arm: str = "wam", seed: int = 0) -> HeldTool:
 def test_a_held_tool_shows_where_the_tracker_is(
     arm: str, kind: str, median_mm: float, worst_mm: float
 ) -> None:
-    """And how accurately it does: errors are about as large as they are expected to be."""
+    """The true errors are about as large as the estimated ones."""
     errors = []
     shares = []
     for seed in SEEDS:
@@ -210,7 +210,7 @@ REFUSED: dict[str, tuple[Callable[[HeldTool], HeldTool], str]] = {
 def test_impossible_calibration_is_refused_with_its_cause(
     spoil: Callable[[HeldTool], HeldTool], words: str, kind: str
 ) -> None:
-    """What cannot be calibrated is refused with the likely cause."""
+    """The cause is the likely one."""
     with pytest.raises(CalibrationError, match=f"(?s)^.*({words})"):
         solve_held(spoil(held_by(kind)), CORNERS)
 
@@ -258,8 +258,8 @@ def test_points_that_show_nothing_are_refused() -> None:
 @pytest.mark.parametrize("noise_m", [0.001, 0.003, 0.008])
 @pytest.mark.one_case
 def test_pose_by_points_is_within_twice_its_accuracy(noise_m: float, missed_m: float) -> None:
-    """Points in the plane of the table and one to three above it, as the page asks for, of which
-    one may be missed. No left-handed tracker is taken for a right-handed one.
+    """As the page requires, points are in the table's plane, and one to three above it, of which
+    one may be missed. A left-handed tracker is recognised.
     """
     accepted = 0
     for seed in range(80):
@@ -288,13 +288,13 @@ def test_pose_by_points_is_within_twice_its_accuracy(noise_m: float, missed_m: f
     assert accepted >= (25 if missed_m == 0.3 else 70)
 
 
-# --- from streams to a hand and a tool ------------------------------------------------------------
+# --- streams of hands and tools -------------------------------------------------------------------
 
 BEGIN_NS = 10**18
 
 
 def led_of(held: HeldTool, side: str = "right", **hands: Any) -> LedTracks:
-    """The tracks of a held tool, and those of other hands."""
+    """The tracks of a held tool and of other hands."""
 
     def track(name: str, at_s: np.ndarray, poses: np.ndarray) -> Track:
         stamps = BEGIN_NS + np.rint(1e9 * at_s).astype(np.int64)
@@ -478,7 +478,7 @@ def test_the_settings_are_changed_and_nothing_else(
 
 
 def test_unchangeable_file_stays(tmp_path: Path) -> None:
-    """A file that cannot be changed stays and a record must be there."""
+    """The file keeps its content; writing needs a record too."""
     path = tmp_path / "cell.toml"
     path.write_text("rate_hz = 200\n")
     values = hand_settings(FOUND, "webxr") | {"unit": "miles"}
@@ -509,7 +509,7 @@ def test_the_ends_of_lines_remain(end: str, tmp_path: Path) -> None:
 
 
 def changed_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another program writes the file after it was read."""
+    """Let another program write the file after it was read."""
     real = cell_file.tomlkit.dumps
     path.write_text("rate_hz = 200\n")
     monkeypatch.setattr(
@@ -545,7 +545,7 @@ def test_unwritable_calibration_is_printed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A calibration that cannot be written is printed and the file stays."""
+    """The file keeps its content."""
     path = tmp_path / "cell.toml"
     prepare(path, monkeypatch)
     before = path.read_text() if path.is_file() else ""
@@ -556,7 +556,7 @@ def test_unwritable_calibration_is_printed(
     if path.is_file():
         assert path.read_text().replace("250", "200") == before
     assert not list(tmp_path.glob(".*"))
-    # said before the arm is led
+    # the command says so before the arm is led
     if path.is_symlink() or not path.is_file() or not path.stat().st_mode & 0o222:
         done = told(
             "calibrate", "--held", "--config", str(path), "--from", str(tmp_path / "none.mcap")
@@ -574,8 +574,8 @@ CHECKED = "hand at the tool: 1 mm (95 %: 2 mm); up to 11 mm accepted\n"
 def recording(
     path: Path, held: HeldTool, joints: np.ndarray, settings: Settings, frame: str = "mocap"
 ) -> None:
-    """A recording of both hands, of which the left one holds the tool, and of joint states. The
-    right one is in a frame of its own.
+    """A recording of both hands and joint states. The left hand holds the tool; the right hand is
+    in another frame.
     """
     messages = []
     for at_s, hand in zip(held.hand_s, held.hand, strict=True):
@@ -675,7 +675,7 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
 
 
 def test_frame_of_the_hand_names_the_calibrated_table(tmp_path: Path) -> None:
-    """The frame of the hand names the table that is calibrated and checked."""
+    """The calibrated and checked table of the settings is that of the frame."""
     cell = tmp_path / "cell.toml"
     led = str(tmp_path / "led.mcap")
     text = '[hands]\nframe = "webxr"\n[trackers.mocap]  # beside it\n'
@@ -758,7 +758,7 @@ def test_without_hands_or_arm_the_command_says_what_is_missing() -> None:
 
 
 def test_a_point_that_decides_the_sense_of_an_axis_is_no_outlier() -> None:
-    """Seven points in the plane of the table, and one above it that is wrong."""
+    """There are seven points in the table's plane, and a wrong one above it."""
     flat = np.array([[x, y, 0.0] for x in (0.4, 0.6, 0.8) for y in (-0.3, 0.3)] + [[0.7, 0.0, 0.0]])
     base = np.concatenate([flat, [[0.5, -0.2, 0.25]]])
     base[-1, 2] -= 0.2

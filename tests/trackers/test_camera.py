@@ -1,4 +1,4 @@
-"""Hands of a camera: palms found in a picture, and the model that MediaPipe loads."""
+"""Hands of a camera: palms found in a picture, and MediaPipe's model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ HAS_MEDIAPIPE = importlib.util.find_spec("mediapipe") is not None
 
 
 def seen(turn: Rotation, centre: Array, length: float = LENGTH_M) -> tuple[Array, Array, Array]:
-    """Points in the picture (21, 2), the hand's shape (21, 3), the palm's true position (3,)."""
+    """Points in the picture (21, 2), the hand's shape (21, 3), and the palm's true position
+    (3,).
+    """
     shape = np.zeros((21, 3))
     shape[list(PALM)] = turn.apply(length * AVERAGE_PALM)
     points = shape + centre
@@ -75,7 +77,7 @@ def test_points_that_are_no_palm_are_no_hand(spoil: Callable[[Array], Array]) ->
     not HAS_MEDIAPIPE, reason="MediaPipe is not installed: pip install 'thirdhand[camera]'"
 )
 def test_missing_camera_and_bad_model_are_refused(tmp_path: Path) -> None:
-    """A camera that is not there and a file that is no model are refused."""
+    """The camera is missing, or the file is no model."""
     with pytest.raises(CameraError, match="no camera 63"):
         next(pictures("63"))
     (tmp_path / "model.task").write_bytes(b"nothing")

@@ -1,5 +1,5 @@
-"""The page for a headset, in a headless browser whose headset is emulated: poses and stamps as the
-daemon sees them, hands out of sight, recentring, a slow network, and a server that starts again.
+"""The page for a headset in a headless browser with an emulated headset: poses and stamps as the
+daemon receives them, hands out of sight, recentring, and a slow network.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MOVING = """path = t => {
 }"""
 STILL = """path = () => ({left: {position: [-.25, 1, -.4], quaternion: [0, 0, 0, 1]},
                           right: {position: [.25, 1, -.4], quaternion: [0, 0, 0, 1]}})"""
-# In front of a bench of 0.75 m; the browser of a busy machine draws few pictures.
+# The headset is in front of a bench of 0.75 m; on a busy machine the browser draws few pictures.
 CELL = (
     '[hands]\nframe = "webxr"\nbase_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, '
     "0.5]\nstale_ms = 1000.0\n"
@@ -51,14 +51,14 @@ CELL = (
 
 @pytest.fixture
 def hearing() -> Iterator[tuple[zenoh.Session, str]]:
-    """A session without a daemon, and its endpoint."""
+    """A session in the daemon's place, and its endpoint."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:
         yield session, endpoints(session)[0]
 
 
 def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Array, Array]:
-    """Errors of the poses that were received against the nearest in the truth: [m], [rad], and of
-    their stamps [s].
+    """Errors of the received poses [m] and [rad], and of their stamps [s], against the nearest true
+    poses.
     """
     rows = np.array(
         [
@@ -88,7 +88,7 @@ def sent(tab: Tab) -> int:
 
 
 def send_more(tab: Tab, count: int) -> None:
-    """Wait until the page has sent that many further messages of hands."""
+    """Wait until the page has sent this number of further messages of hands."""
     tab.until(f"link.sent >= {sent(tab) + count}")
 
 
@@ -96,14 +96,14 @@ def send_more(tab: Tab, count: int) -> None:
 def test_poses_and_stamps_are_accurate(
     hearing: tuple[zenoh.Session, str], tmp_path: Path, record_property: Any
 ) -> None:
-    """Poses are within a millimetre and a tenth of a degree and stamps are right."""
+    """Poses are accurate to a millimetre and a tenth of a degree."""
     session, endpoint = hearing
     heard = Heard(session)
     with headset.serving_hands(endpoint, tmp_path) as served:
         with headset.worn(served.url, tmp_path) as tab:
             tab.ask(MOVING)
             send_more(tab, 20)
-            # Stamps are as precise as half of the quickest round trip: 0.6 ms on an idle machine.
+            # Stamps are accurate to half of the shortest round trip: 0.6 ms on an idle machine.
             tab.until(f"link.isReady && link.clock_ms < {MAX_STAMP_ERROR_MS}")
             precise_ms = tab.ask("performance.timeOrigin + performance.now()")
             send_more(tab, 150)
@@ -159,7 +159,7 @@ def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
 
 
 class Stalling:
-    """A connection to a server that can be stalled: what is sent then arrives later."""
+    """A connection to a server that can be stalled: data sent meanwhile arrives later."""
 
     def __init__(self, to: int) -> None:
         self.flows = threading.Event()
@@ -190,7 +190,7 @@ class Stalling:
 
 @pytest.mark.thorough
 def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Path) -> None:
-    """Behind a slow network hands are dropped and none arrives late."""
+    """The network is slow; no hand arrives late."""
     session, endpoint = hearing
     heard = Heard(session)
     with headset.serving_hands(endpoint, tmp_path) as served:
@@ -202,7 +202,7 @@ def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Pa
             tab.ask(STILL)
             send_more(tab, 10)
             network.flows.clear()
-            tab.until("link.dropped > 10")  # no more is sent from the first one on
+            tab.until("link.dropped > 10")  # after the first dropped message, none is sent
             stalled = sent(tab)
             time.sleep(0.5)
             assert sent(tab) == stalled
@@ -212,19 +212,19 @@ def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Pa
             dropped = int(tab.ask("link.dropped"))
         served.end()
         _, lost, late = served.counts()
-    assert lost >= dropped - 1  # the last ones may have no successor
-    assert late > 0  # what was on its way during the stall
+    assert lost >= dropped - 1  # the last messages may have no successor
+    assert late > 0  # messages in transit during the stall
     ages_s = [
         (arrived - pose.stamp_ns) / 1e9
         for side in ("left", "right")
         for arrived, pose in zip(heard.arrived_ns[side], heard.poses[side], strict=True)
     ]
-    assert max(ages_s) < 2.0  # the server drops from 0.5 s on; more only by a busy machine
+    assert max(ages_s) < 2.0  # the server drops after 0.5 s; the rest is for busy machines
 
 
 @pytest.mark.thorough
 def test_daemon_follows_hands_until_they_are_raised(tmp_path: Path) -> None:
-    """A daemon follows hands until they are raised and again once they pinch there."""
+    """The daemon follows again once the raised hands pinch."""
     at_work = STILL.replace(".25, 1, -.4", ".32, .8, -.46")
     raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]")  # fingers up
     one_raised = at_work.replace("[0, 0, 0, 1]", "[.7071, 0, 0, .7071]", 1)
@@ -242,12 +242,13 @@ def test_daemon_follows_hands_until_they_are_raised(tmp_path: Path) -> None:
         assert (x - 1.45, y, z + 0.75) == pytest.approx((palm[2], palm[0], palm[1]), abs=0.005)
         assert status["sources"]["left"]["frame"] == "webxr"
         tab.until("link.summary.headline === 'follow'")
-        assert tab.ask("flatHands.isArmed") is True  # hands at work gave no sign
+        assert tab.ask("flatHands.isArmed") is True  # working hands are no sign
         tab.ask(raised)
         daemon.until(lambda now: now["mode"] == "hold" and now["reason"] == "operator", TIMEOUT_S)
         tab.until("link.summary.headline === 'hold: operator request' && raisedPinch.isOffered")
         assert "pinch with both hands" in tab.until("board.text")
-        # Pinching at work, with one hand raised, or raised without a pinch ends no hold.
+        # Pinching at work or with one hand raised, and raising without a pinch, do not end the
+        # hold.
         for path, pinch in ((at_work, 1), (one_raised, 1), (raised, 0)):
             tab.ask(f"{path}; pinched({pinch})")
             send_more(tab, 10)
@@ -259,7 +260,7 @@ def test_daemon_follows_hands_until_they_are_raised(tmp_path: Path) -> None:
         tab.ask(f"{at_work}; pinched(0)")
         tab.until("flatHands.isArmed")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
-        # Somebody else holds too: the pinch does not end that hold.
+        # The pinch does not end a hold of another person.
         tab.ask(raised)
         tab.until("raisedPinch.isOffered")
         Client(daemon.session).hold()
@@ -271,7 +272,7 @@ def test_daemon_follows_hands_until_they_are_raised(tmp_path: Path) -> None:
         tab.ask("document.getElementById('resume').click()")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
         tab.ask("device.position.set(.3, 1.6, .2); device.recenter()")
-        # the move alone may be a reason
+        # the reason may briefly be another one, caused by the motion
         status = daemon.until(lambda now: now["reason"] == "stale_hand", TIMEOUT_S)
         assert status["rejected"]["wrong_frame"] > 0
         assert tab.ask("document.getElementById('frame').textContent") == "webxr1, not calibrated"

@@ -1,5 +1,5 @@
-"""Hands that a person drags on a page: a real browser with mouse, wheel and fingers, the command
-that serves the page, a running daemon, and the demo that is played on it.
+"""Hands that a person drags on a page: a real browser with mouse and wheel, the command that serves
+the page, a running daemon, and corrections.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.fixture(scope="module")
 def url(daemon: Daemon) -> Iterator[str]:
-    """The address that `thirdhand hands --mouse` prints; it ends by SIGTERM without an error."""
+    """The address that `thirdhand hands --mouse` prints; SIGTERM ends the command without an
+    error.
+    """
     arguments = ("hands", "--mouse", "--listen", "127.0.0.1:0", "--connect", daemon.endpoint)
     with started(*arguments, within_s=5 * TIMEOUT_S) as server:
         yield server.stdout.readline().strip()
@@ -76,7 +78,7 @@ def until_arrived(
 
 @pytest.mark.thorough
 def test_hands_begin_at_the_first_via_point(daemon: Daemon, url: str, tmp_path: Path) -> None:
-    """Hands begin at the skills first via point and are published as they are drawn."""
+    """They are published at the positions at which they are drawn."""
     received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         status = daemon.until(lambda status: status["mode"] == "follow")
@@ -98,7 +100,7 @@ def test_hands_begin_at_the_first_via_point(daemon: Daemon, url: str, tmp_path: 
         newest = received.poses["left"][-1]
         assert (newest.frame_id, newest.orientation) == (BASE, HAND_ORIENTATION)
         assert abs(time.time_ns() - newest.stamp_ns) < 1e9
-        # The mouse jumped through the bench within half a second; the hand did not.
+        # The mouse moved too fast, within half a second; the hand did not.
         path = np.array(
             [[pose.stamp_ns / 1e9, *pose.position] for pose in received.poses["left"][begun:]]
         )
@@ -120,14 +122,16 @@ def test_hands_begin_at_the_first_via_point(daemon: Daemon, url: str, tmp_path: 
 
 
 def pressed(tab: Tab, button: str) -> str:
-    """The answer to a button."""
+    """The answer shown after a button is pressed."""
     tab.ask(f"at('{button}').click()")
     tab.until("!at('answer').textContent.endsWith(' ...') && at('answer').textContent !== ''")
     return str(tab.ask("at('answer').textContent"))
 
 
 def corrected(tab: Tab) -> str:
-    """The answer to a correction, pressed again while a busy browser sends the hands too late."""
+    """The answer to the button for a correction, pressed again while a busy browser sends hands too
+    late.
+    """
     answers: list[str] = []
 
     def is_answered() -> bool:
@@ -139,7 +143,7 @@ def corrected(tab: Tab) -> str:
 
 
 def wait_for_the_skill_worker(daemon: Daemon) -> None:
-    """Wait until the skill worker has imported all it needs, which takes long on a busy machine."""
+    """Wait until the skill worker has finished its imports, which takes long on a busy machine."""
     for _ in range(5):
         with contextlib.suppress(RefusedError, UnreachableError):
             daemon.client.clear()
@@ -163,7 +167,7 @@ def resting_tool(daemon: Daemon) -> tuple[float, float, float]:
 def test_correction_by_dragging_is_made_and_undone(
     daemon: Daemon, url: str, tmp_path: Path
 ) -> None:
-    """In a hold the tool is dragged to where it belongs and the correction undone."""
+    """In a hold the tool is dragged to its right position; then the correction is undone."""
     with person_at(url, tmp_path, timeout_s=5 * TIMEOUT_S) as person:
         tab = person.tab
         wait_for_the_skill_worker(daemon)
@@ -207,7 +211,7 @@ def test_correction_by_dragging_is_made_and_undone(
 
 
 def test_hidden_page_sends_nothing(daemon: Daemon, url: str, tmp_path: Path) -> None:
-    """A hidden page sends nothing and its hands wait where they were."""
+    """The hands stay where they are."""
     received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         daemon.until(lambda status: status["mode"] == "follow")
@@ -230,7 +234,7 @@ def test_the_page_and_its_hands_need_the_token(url: str, tmp_path: Path) -> None
     for query in ("", "?token=guessed"):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(url.partition("?")[0] + query, timeout=TIMEOUT_S)
-    # a page that was open when another token was made: its socket is refused, and it says why
+    # a page with an old token: its socket is refused, and it shows the reason
     stale = "history.replaceState(null, '', '?token=guessed')"
     with chromium.opened(url, tmp_path, size=(1200, 800), timeout_s=TIMEOUT_S) as tab:
         tab.until("typeof link !== 'undefined'")

@@ -1,4 +1,4 @@
-"""Pinches: when the clutch is pressed, and how far a person wants the gripper closed."""
+"""Pinches: press of the clutch, and the wished closure of the gripper."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from thirdhand.client import Watch, endpoints, open_session
 from thirdhand.workbench.trackers.pinch import Pinches
 
-# distance of thumb and index tip of the left hand, None where it is not seen: whether the clutch is
-# pressed
+# distances of thumb and index tip of the left hand (None: not seen), and the expected states of the
+# clutch
 LEFT_M = {
     "parted": ([0.09], [False]),
     "pinched": ([0.09, 0.03, 0.019], [False, False, True]),
@@ -24,8 +24,8 @@ CLOSURES = [(0.10, 0.0), (0.08, 0.0), (0.05, 0.5), (0.02, 1.0), (0.0, 1.0)]
 
 
 def said(pinches: Pinches, distances_m: dict[str, float], watch: Watch) -> Any:
-    """What is heard of the distances. They are published again until something is, as a page does:
-    a message that cannot be sent at once is dropped.
+    """The first message that follows the distances. They are published repeatedly, as by a page,
+    because a message that cannot be sent at once is dropped.
     """
     for stamp_ns in range(20):
         pinches.publish(distances_m, stamp_ns)
@@ -38,7 +38,6 @@ def said(pinches: Pinches, distances_m: dict[str, float], watch: Watch) -> Any:
 def test_left_hand_clutches_and_right_hand_grips(
     left_m: list[float | None], pressed: list[bool]
 ) -> None:
-    """The left hand presses the clutch and the right one closes the gripper."""
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
         Watch(hearing, "bench", "clutch", timeout_s=2) as clutch,

@@ -1,5 +1,5 @@
-"""Demonstrations taken over Zenoh: what came is what is written, the tool is found from the joints,
-rest ends a take and is left out, and what was taken is shown, trimmed and deleted.
+"""Demonstrations recorded over Zenoh: received samples are written, the tool follows from the
+joints, rest ends a take and is left out, and takes are shown, trimmed and deleted.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s"
 
 @pytest.fixture(scope="module")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    """One that hears, and one that is connected to it and publishes."""
+    """A session that receives, and a connected session that publishes."""
     with (
         open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
         open_session(connect=endpoints(hearing)) as sender,
@@ -57,7 +57,7 @@ def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
 
 
 def heard(taken: Capture, count: int) -> None:
-    """Waits until so many messages came."""
+    """Wait until this number of messages has arrived."""
 
     def is_complete() -> bool:
         taken.collect()
@@ -130,7 +130,7 @@ def test_what_is_not_heard_is_named(
 def put_until(
     told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event
 ) -> None:
-    """Publishes positions by key, ever again."""
+    """Publish positions by key, again and again."""
     publishers = {key: told.declare_publisher(key) for key in poses}
     for i in range(2000):
         for key, position in poses.items():
@@ -170,7 +170,7 @@ def put_until(
 def test_unsuitable_streams_are_reported_before_recording(
     sessions: tuple[zenoh.Session, zenoh.Session], poses: dict[str, Any], wait_s: float, words: str
 ) -> None:
-    """What is published otherwise than needed is said before anything is recorded."""
+    """The streams are published in an unsuitable form."""
     over = threading.Event()
     tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
     tracker.start()
@@ -185,7 +185,9 @@ def test_unsuitable_streams_are_reported_before_recording(
 def test_take_too_far_away_says_where_and_in_which_unit(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
-    """In metres is what is in `base`; by `[hands] unit` hands, and what names the tracker."""
+    """Positions in `base` are in metres; hands, and poses in the tracker's frame, are in `[hands]
+    unit`.
+    """
     taken = Capture(sessions[0], "bench", Settings(hands=HandSettings(unit="mm", frame="tracker")))
     path = tmp_path / "a.mcap"
     taken.close()
@@ -240,7 +242,7 @@ def test_take_too_far_away_says_where_and_in_which_unit(
 def test_pose_in_an_unknown_frame_ends_the_take_early(
     sessions: tuple[zenoh.Session, zenoh.Session], key: str
 ) -> None:
-    """A pose in a frame of which nothing is known ends a take before it begins."""
+    """The take ends before it begins."""
     for hands, refused in ((HandSettings(), True), (HandSettings(frame="camera"), False)):
         taken = Capture(sessions[0], "bench", Settings(hands=hands))
         taken.close()
@@ -258,7 +260,7 @@ def test_pose_in_an_unknown_frame_ends_the_take_early(
 
 
 def samples_of(way: np.ndarray, end_ns: int) -> list[Sample]:
-    """A sample each 10 ms up to now, at places (N,) along one axis [m]."""
+    """Samples each 10 ms up to now, at positions (N,) along one axis [m]."""
     times = end_ns - np.arange(len(way))[::-1] * 10_000_000
     return [
         Sample(int(at_ns), b"", np.array([x, 0.0, 0.0]))
@@ -293,7 +295,7 @@ def test_rest_after_motion_is_the_end_and_is_left_out(
 def test_a_demonstration_is_recorded_shown_trimmed_and_deleted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By the command, of the bench's teacher, eight times as fast."""
+    """The command records the bench's teacher at eight times the speed."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     options = {"connect": [endpoint], "cell": "thirdhand", "speed": 8.0, "wait_s": 20.0}
     teacher = threading.Thread(target=perform, args=(Scene(),), kwargs=options | {"seed": 1})

@@ -1,5 +1,5 @@
-"""The web server of this machine's pages: what is refused is answered, and orders do not wait for
-each other.
+"""The web server of the service's pages: refusals are answered, and orders do not wait for each
+other.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from thirdhand.workbench.trackers.pinch import Pinches
 from thirdhand.workbench.trackers.web_server import FOREIGN, server_certificate
 from trackers.test_browser_hands import opened, reason
 
-REFUSED: dict[
-    str, tuple[bytes, str]
-] = {  # a request, with HOST for the header, and the answer to it
+REFUSED: dict[str, tuple[bytes, str]] = {  # requests, with HOST for the header, and their answers
     "a body without end": (
         b"POST / HTTP/1.1\r\nHOSTContent-Length: 99999999\r\n\r\n" + b"a" * 9000,
         "4096 bytes",
@@ -65,7 +63,7 @@ def test_what_is_refused_is_answered_in_words(name: str) -> None:
 def test_silent_connections_take_no_more_than_their_share(
     scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A page that is open stays so; once the silent ones are closed, others are answered."""
+    """An open page stays connected; once silent connections are closed, others are answered."""
     monkeypatch.setattr(web_server, "REQUEST_WITHIN_S", 0.5)
     certificate = server_certificate("localhost", tmp_path) if scheme == "https" else None
 
@@ -104,7 +102,7 @@ def test_a_cell_of_any_name_is_text_on_its_page(cell: str) -> None:
 
 
 def test_hold_is_carried_out_beside_another_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hold is carried out while a page waits for another answer."""
+    """A page waits for another answer meanwhile."""
     orders: list[str] = []
     slow = threading.Event()
 
@@ -145,7 +143,9 @@ def test_hold_is_carried_out_beside_another_answer(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the two distances, a hand keeps the clutch pressed only if it has pinched itself."""
+    """Between the two distances, a hand keeps the clutch pressed only if the same hand has
+    pinched.
+    """
     monkeypatch.setattr(browser_hands, "MAX_PINCH_GAP_S", 0.5)
     pressed: list[bool] = []
     # [m]
@@ -153,7 +153,7 @@ def test_a_pinch_ends_with_its_page_and_with_a_pause(monkeypatch: pytest.MonkeyP
     between = 0.03
 
     async def says(value: bool, socket: Any = None, apart_m: float = 0.0) -> None:
-        """The first thing that is heard next; a message is sent again if it was dropped."""
+        """Assert that the next received value is this one; a dropped message is sent again."""
         async with asyncio.timeout(10):
             while not pressed:
                 if socket is not None:

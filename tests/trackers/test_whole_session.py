@@ -1,6 +1,6 @@
-"""One session from a headset to a finished task: an emulated headset is calibrated at an arm that
-is led, and its hands play the scene of the demo with the left one's pinch as the clutch. What was
-recorded replays exactly.
+"""A session from a headset to a finished task: an emulated headset is calibrated at a led arm, and
+its hands play the scene of the demo, with the left hand's pinch as the clutch. The recording
+replays exactly.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ def in_tracker(base: headset.Array) -> headset.Array:
 
 
 class LeadingHand:
-    """An arm that is led in real time, and the right hand, which holds its tool; a context."""
+    """An arm that is led in real time, and the right hand, which holds its tool; used as a
+    context.
+    """
 
     def __init__(self, session: zenoh.Session, tab: Tab, arm: LedArm) -> None:
         self._session = session
@@ -79,7 +81,7 @@ class LeadingHand:
         rows = np.hstack(
             [in_tracker(arm.tool + turns.apply(GRIP)), (TRUE_TURN.inv() * turns).as_quat()]
         )
-        step = round(ROW_MS / 10)  # the arm has 100 rows a second
+        step = round(ROW_MS / 10)  # the arm's motion has 100 rows a second
         tab.ask(
             f"rows = {json.dumps(rows[::step].round(6).tolist())}; begunMs = {self._begun_ns / 1e6}"
         )
@@ -104,14 +106,14 @@ class LeadingHand:
 
 
 def begin(tab: Tab, scene: Scene) -> None:
-    """Let the hands begin where the scene does."""
+    """Move the hands to the start of the scene."""
     tab.ask("Object.assign(window, {at: {}, goals: {}, rows: null, begunMs: 0})")
     go(tab, {"left": scene.left_start, "right": scene.right_start})
     tab.ask(f"Object.assign(at, goals); {MOVED.replace('ROW_MS', str(ROW_MS))}")
 
 
 def go(tab: Tab, places: dict[str, tuple[float, float, float]]) -> None:
-    """Let palms go to places [m] in frame `base`."""
+    """Move palms to positions [m] in frame `base`."""
     for side, place in places.items():
         palm, _ = headset.palm_in_hand(
             json.loads(tab.ask(f"JSON.stringify(joints('{side}'))")), side

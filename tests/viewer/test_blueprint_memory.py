@@ -1,4 +1,4 @@
-"""Blueprints that are sent, file after file, by a process that runs for months."""
+"""Memory of a process that runs for months and sends a blueprint with each file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a drawing shows: its arrangement, the arm without meshes, labels, a picture's moment."""
+"""Content of a drawing: the arm without meshes, labels, and the time of a picture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
 def test_picture_is_of_the_last_followed_moment(tmp_path: Path) -> None:
-    """A picture without a time is of the last moment at which the arm followed."""
+    """This is the default time of a picture."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:
         if k >= 400:
@@ -47,14 +47,14 @@ def test_picture_is_of_the_last_followed_moment(tmp_path: Path) -> None:
                     picture.crop((picture.width - 200, 0, picture.width, 28)).convert("L"), int
                 )
             )
-    assert all((corner > 128).sum() > 50 for corner in corners)  # the time stands there
+    assert all((corner > 128).sum() > 50 for corner in corners)  # the corner with the time
     assert (corners[0] != corners[1]).any()
 
 
 def test_arm_without_meshes_is_drawn_by_capsules(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """An arm without its meshes is drawn by its capsules and that is said."""
+    """The log says so."""
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
     (tmp_path / "arm.urdf").write_text(
@@ -96,7 +96,7 @@ def test_arm_without_meshes_is_drawn_by_capsules(
         texts = [text for (text,) in values(rows["/log"], TEXT) if "drawn by its capsules" in text]
         assert len(texts) == is_drawn
         assert re.search(words, "".join(texts))
-        # of a library: once, in the log, is enough
+        # the library's own warning is not printed
         assert "WARN" not in "".join(capfd.readouterr())
 
 

@@ -1,5 +1,5 @@
-"""Viewers that lag: what they do not read is left out, not queued, and who comes later sees what
-is new.
+"""Viewers that lag: data that they do not read is omitted, not queued, and later viewers see new
+data.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from thirdhand.viewer.stream import Viewer, rerun_program
 
 pytestmark = pytest.mark.thorough
 
-# of 500 ticks
+# speed over real time, and duration of the scene [s] at 500 ticks a second
 TIMES_REAL = 4
 SCENE_S = 48
 BOUND_MB = 100.0
@@ -33,7 +33,7 @@ STREAM = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 
 
 def resident_mb() -> float:
-    """What this process holds in memory [MB]."""
+    """The resident memory of this process [MB]."""
     (line,) = (
         row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmRSS")
     )
@@ -41,7 +41,7 @@ def resident_mb() -> float:
 
 
 class Fed:
-    """A live view that is fed on and on."""
+    """A live view that is fed continuously."""
 
     def __init__(self) -> None:
         self.view = LiveView(lambda: Viewer(urdf=WAM, settings=Settings(), live_port=0))
@@ -55,7 +55,7 @@ class Fed:
         self._ticks = ticks(1_000_000)
 
     def feed(self, scene_s: float) -> None:
-        """Adds so much of the scene [s], in a quarter of the time."""
+        """Feed a part of the scene [s], at four times the real speed."""
         began = time.monotonic()
         for k in range(round(scene_s * 500)):
             tick, frame, timing = next(self._ticks)
@@ -66,7 +66,7 @@ class Fed:
 
 @contextlib.contextmanager
 def browser(url: str) -> Iterator[None]:
-    """A page that asked for the stream and reads nothing."""
+    """A connection that requested the stream and reads nothing."""
     connection = http.client.HTTPConnection(
         urlsplit(url.removeprefix("rerun+")).netloc, timeout=TIMEOUT_S
     )
@@ -78,7 +78,7 @@ def browser(url: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def program(url: str, file: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Rerun's program, which saves what it receives."""
+    """Rerun's program, which saves the received stream."""
     quiet = subprocess.DEVNULL
     with subprocess.Popen(
         [str(rerun_program()), "--save", str(file), url], stdout=quiet, stderr=quiet
@@ -101,9 +101,9 @@ def stopped(url: str, file: Path) -> Iterator[None]:
         yield
 
 
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still written
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the file is still being written
 def test_memory_is_bounded_beside_stopped_viewers(tmp_path: Path) -> None:
-    """Memory stays within a bound beside viewers that stopped and later ones see what is new."""
+    """Later viewers see new data."""
     fed = Fed()
     fed.feed(4.0)
     with browser(fed.url), stopped(fed.url, tmp_path / "stopped.rrd"):
@@ -118,7 +118,7 @@ def test_memory_is_bounded_beside_stopped_viewers(tmp_path: Path) -> None:
             assert viewer.poll() is None
             assert time.monotonic() < until
             fed.feed(4.0)
-            # before it has anything, or within a message
+            # the file may be empty, or end within a message
             with contextlib.suppress(OSError, KeyError, RuntimeError):
                 newest_tick = values(drawn(tmp_path / "later.rrd")["/joints/position"], "tick")[-1]
     fed.view.close()

@@ -1,6 +1,4 @@
-"""The viewer's tap: what is drawn is in the file, failures spare the rest, a recording becomes a
-drawing.
-"""
+"""The viewer's tap: content of drawings, failures of single parts, and drawings of recordings."""
 
 from __future__ import annotations
 
@@ -32,14 +30,13 @@ from thirdhand.workbench.cli.view import convert
 
 
 def measured(tick: int, joints: Record) -> tuple[str, bytes]:
-    """The event of joints (7,) [rad] that are measured in a tick."""
+    """The event of measured joints (7,) [rad] in a tick."""
     return "joints/state", cdr.encode_joints(
         JointState(at_ns(tick), JOINT_NAMES, tuple(joints), ())
     )
 
 
 def test_recording_becomes_a_drawing_with_every_tick(tmp_path: Path) -> None:
-    """A recording becomes a drawing with every tick in the curves."""
     entries = write(tmp_path / "a.mcap", 1200)
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 1200
     rows = drawn(tmp_path / "a.rrd")
@@ -58,7 +55,7 @@ def test_recording_becomes_a_drawing_with_every_tick(tmp_path: Path) -> None:
 
 
 def test_hands_and_target_are_drawn_once_they_are_known(tmp_path: Path) -> None:
-    """Hands and target are drawn once there are hands and the arm moves."""
+    """Hands are known once they are seen, the target once the arm moves."""
     entries = list(ticks(600))
 
     def change(one: Viewer, k: int, _: Record) -> None:
@@ -108,10 +105,10 @@ def test_every_curve_names_its_unit(tmp_path: Path) -> None:
 
 
 def test_trail_begins_anew_where_the_hand_reappears(tmp_path: Path) -> None:
-    """A trail begins where the hand was first seen and anew where it is seen again."""
+    """The first trail begins where the hand was first seen."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:
-        if 300 <= k < 600:  # away, and then back elsewhere
+        if 300 <= k < 600:  # the hand disappears, and reappears elsewhere
             frame["hand_ages"][0] = k - 300
         if k >= 600:
             frame["hands"][0] += 0.5
@@ -119,7 +116,7 @@ def test_trail_begins_anew_where_the_hand_reappears(tmp_path: Path) -> None:
     rows = viewed(tmp_path / "a.rrd", 900, change)
     strips = [strips[0] for strips in values(rows["/scene/left_trail"], "LineStrips3D:strips")]
     corners = np.concatenate([np.array(strip).reshape(-1, 3) for strip in strips])
-    assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # none at the origin
+    assert (np.linalg.norm(corners, axis=1) > 0.5).all()  # no corner is at the origin
     steps = [
         np.linalg.norm(np.diff(np.array(strip).reshape(-1, 3), axis=0), axis=1) for strip in strips
     ]
@@ -149,7 +146,7 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
 
 
 def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill) -> None:
-    """The shipped skill is drawn with its demonstrations and what it was taught."""
+    """Its via-points are drawn too."""
     point = ViaPoint(
         "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
     )
@@ -182,7 +179,7 @@ def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill
 
 
 def test_orientation_and_gripper_are_drawn(tmp_path: Path, skill: Skill) -> None:
-    """What turns and grips is drawn where the skill knows of it."""
+    """They are drawn if the skill has them."""
     turned = Rotation.from_euler("x", 3, degrees=True)
 
     def change(_: Viewer, k: int, frame: Record) -> None:
@@ -207,7 +204,7 @@ def test_orientation_and_gripper_are_drawn(tmp_path: Path, skill: Skill) -> None
 
 
 def test_undrawable_skill_spares_the_scene(tmp_path: Path) -> None:
-    """A skill of which nothing can be drawn is named in the log and spares the scene."""
+    """The log names the skill."""
     rows = viewed(tmp_path / "a.rrd", 30, skill=b"nonsense")
     assert len(values(rows["/joints/position"], "tick")) == 30
     assert any(
@@ -216,7 +213,7 @@ def test_undrawable_skill_spares_the_scene(tmp_path: Path) -> None:
 
 
 def test_objects_are_drawn_where_they_are(tmp_path: Path) -> None:
-    """Things are drawn where they are and go where they are no more."""
+    """They disappear from the drawing when they are no longer reported."""
     board = SceneObject(
         "board",
         "box",
@@ -286,7 +283,7 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
 
 
 def test_live_view_listens_on_this_machine_only() -> None:
-    """The live view listens on this machine only and ends when it is closed."""
+    """It ends when it is closed."""
     viewer = Viewer(urdf=WAM, settings=Settings(), live_port=0)
     assert viewer.url is not None
     port = int(viewer.url.rsplit(":", 1)[1].split("/")[0])
@@ -337,7 +334,7 @@ def test_what_cannot_be_shown_is_said_in_words(
 
 
 def test_unmeasured_arm_is_drawn_too_small_to_see(tmp_path: Path) -> None:
-    """Every link of an arm that is not measured yet is somewhere and too small to see."""
+    """Each link needs a pose, though the arm was not measured yet."""
 
     def change(_: Viewer, k: int, frame: Record) -> list[tuple[str, bytes]]:
         return [measured(k, frame["joints"])] if k > 50 else []
@@ -351,11 +348,11 @@ def test_unmeasured_arm_is_drawn_too_small_to_see(tmp_path: Path) -> None:
 
 
 def test_hands_of_a_one_handed_skill_are_drawn(tmp_path: Path) -> None:
-    """What the right hand conducts is drawn before the left is seen."""
+    """The right hand conducts; the left hand is not seen."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:
         frame["hand_ages"][0] = -1
-        frame["covariance"][:] *= k >= 10  # nothing is predicted before
+        frame["covariance"][:] *= k >= 10  # there is no prediction before
         frame["tool"] += [0.02, 0.0, 0.0]
 
     rows = viewed(tmp_path / "a.rrd", 200, change)
@@ -368,4 +365,4 @@ def test_hands_of_a_one_handed_skill_are_drawn(tmp_path: Path) -> None:
         ), path
     ages = np.array(values(rows["/age"], "Scalars:scalars"))
     assert (len(ages), ages[:, 1].min()) == (190, 0.0)
-    assert np.isnan(ages[:, 0]).all()  # a curve that is not there
+    assert np.isnan(ages[:, 0]).all()  # the left hand has no curve

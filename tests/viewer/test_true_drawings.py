@@ -1,5 +1,5 @@
-"""A drawing is as true as its recording: time, log, modes, skills and late ticks are the same, and
-where the recording has a gap, curves and trails have one.
+"""A drawing agrees with its recording: time, log, modes, skills and late ticks are the same, and
+gaps of the recording are gaps of curves and trails.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from thirdhand.skills.skill_file import with_file
 from thirdhand.workbench.cli.view import convert
 
 VISE = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
-# between whole frames
+# ticks between those of whole frames
 MEASURED_AT = 55
 TAUGHT_AT = 155
 LATE_AT = 205
@@ -38,7 +38,7 @@ def log_of(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
 
 
 def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill) -> None:
-    """A drawing shows what a recording holds between its whole frames."""
+    """Events and late ticks between whole frames are shown."""
     taught = with_file(replace(skill, via_points=(VISE,))).file
     with Recorder(
         tmp_path / "a.mcap", settings=Settings(), skill=skill.file, thin=True
@@ -67,7 +67,7 @@ def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill
     assert values(rows["/joints/position"], "tick") == whole
     assert {0, HELD_AT, HELD_AT + 1} < set(whole)
     seconds = [time.total_seconds() for time in values(rows["/joints/position"], "seconds")]
-    assert seconds == pytest.approx(np.array(whole) / 500)  # 0 is the first tick
+    assert seconds == pytest.approx(np.array(whole) / 500)  # time 0 is the first tick
     log = log_of(rows)
     assert log["before the first tick"] == 0.0
     assert log["All via-points were removed."] == pytest.approx(0.9)
@@ -77,7 +77,7 @@ def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill
     late = dict(
         zip(whole, np.ravel(values(rows["/timing/lateness"], "Scalars:scalars")), strict=True)
     )
-    assert max(late, key=lambda tick: late[tick]) == 220  # the next whole frame
+    assert max(late, key=lambda tick: late[tick]) == 220  # tick of the next whole frame
     assert any(
         "vise" in labels for labels in values(rows["/skill/via_points/tool"], "Points3D:labels")
     )
@@ -89,7 +89,7 @@ def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill
 def test_curves_are_interrupted_where_frames_are_missing(
     tmp_path: Path, lost: int, pause_ticks: int, is_broken: bool
 ) -> None:
-    """Ticks that are not recorded, or a loop that was stopped for a second; missed deadlines are no
+    """Gaps are unrecorded ticks, and a loop that was stopped for a second; missed deadlines are no
     gap.
     """
     with Recorder(tmp_path / "a.mcap", settings=Settings(), skill=SKILL, thin=True) as recorder:
@@ -114,7 +114,7 @@ def test_curves_are_interrupted_where_frames_are_missing(
             if "tick" in row
         )
         breaks = [tick for tick, is_break in curve if is_break]
-        assert breaks == [201] * is_broken, path  # after the last frame before the gap
+        assert breaks == [201] * is_broken, path  # behind the last frame before the gap
     trails = {
         row["tick"]: len(row["LineStrips3D:strips"][0])
         for row in rows["/scene/left_trail"]
@@ -128,7 +128,7 @@ def test_curves_are_interrupted_where_frames_are_missing(
 
 
 def test_unreadable_recording_leaves_no_part_of_a_drawing(tmp_path: Path) -> None:
-    """A recording that cannot be read to its end leaves no part of a drawing."""
+    """The recording cannot be read to its end."""
     path = tmp_path / "a.mcap"
     with Recorder(path, settings=Settings(), skill=SKILL) as recorder:
         for tick, frame, timing in ticks(40):
