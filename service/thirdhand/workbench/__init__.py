@@ -1,1 +1,1 @@
-"""What a person does beside a running cell: teach, look, measure, set up."""
+"""Tools for the work beside a running cell: teaching, viewing, measuring, setting up."""

@@ -195,7 +195,7 @@ def _reach(proposal: Proposal) -> Iterator[str]:
 
 
 def _tool(proposal: Proposal) -> Iterator[str]:
-    """What the arm can do with its tool, what the settings allow, and the tool's axes."""
+    """The tool's limits by the joints and by the settings, and the tool's axes."""
     tool = proposal.settings.tool
     where = "in this posture" if proposal.unmet else "where the demo's tool goes"
     for number, (direction, limit) in enumerate(proposal.tool_limits.items()):
@@ -213,7 +213,7 @@ def _tool(proposal: Proposal) -> Iterator[str]:
 
 
 def _base(proposal: Proposal) -> Iterator[str]:
-    """The place of an arm that does not stand at the origin."""
+    """The position of an arm that does not stand at the origin."""
     if proposal.text:
         x, y, z = proposal.stand
         yield (
@@ -223,7 +223,7 @@ def _base(proposal: Proposal) -> Iterator[str]:
 
 
 def _demo(proposal: Proposal) -> Iterator[str]:
-    """The places of the demo's tool that the arm does not reach."""
+    """The tool positions of the demo that the arm does not reach."""
     if proposal.unmet:
         far = ", ".join(
             f"{name} at {math.dist(DEMO_TOOL_M[name], proposal.shell.centre):.2f} m"
@@ -237,7 +237,7 @@ def _demo(proposal: Proposal) -> Iterator[str]:
 
 
 def _bare(names: tuple[str, ...], link: int) -> str:
-    """The place of a link in the chain, by the number of joints that move it."""
+    """The position of a link in the chain, by the number of joints that move it."""
     return f"after {names[link - 1]}" if link else f"before {names[0]}"
 
 

@@ -1,4 +1,4 @@
-"""`thirdhand bundle`: one archive for whoever is asked for help, without secrets."""
+"""`thirdhand bundle`: one archive without secrets, for the person who is asked for help."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Recordings show how hands and arm moved. Read it before you pass it on.\n\n"""
 
 
 def bundle(args: argparse.Namespace) -> int:
-    """Write the archive and print what it holds; exit code 0 also if the daemon does not answer."""
+    """Write the archive and print its content; exit code 0 also if the daemon does not answer."""
     settings = cell_of(str(args.config)) if args.config else None
     now = datetime.now(UTC)
     args.cell = args.cell or (settings or Settings()).cell
@@ -91,7 +91,7 @@ def _newest(recordings: Sequence[Path], minutes: float) -> Sequence[Path]:
 
 
 def _unfound(folder: str, settings: Settings | None) -> str:
-    """Where no recordings were found."""
+    """A message on the folder in which no recordings were found."""
     if folder:
         return f"in {folder}"
     origin = "[files] record" if settings else "--config"
@@ -147,7 +147,7 @@ def _log(args: argparse.Namespace) -> str:
 
 
 def _write(path: Path, texts: dict[str, str], recordings: Sequence[Path]) -> None:
-    """Write the archive whole or not at all; a recording that still grows is cut."""
+    """Write the archive completely or not at all; a recording that still grows is cut."""
     with whole(path) as part:
         private = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with (

@@ -60,7 +60,7 @@ def calibrate(args: argparse.Namespace) -> int:
     only_check = args.check and not (args.held or points)
     if not only_check:
         if file is not None:
-            real_path(file)  # before the arm is led in vain
+            real_path(file)  # before the arm is led, as errors would waste this work
     elif file is None:
         raise UsageError(
             "--check compares with the last calibration of a cell: give its settings by --config "
@@ -326,7 +326,7 @@ def _write(file: Path | None, record: CalibrationRecord, frame: str, settings: S
 
 def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> CalibrationRecord:
     """The last calibration of the tracker in whose frame the hand of a side is; without a side, of
-    the calibrated one among those of the hands. Raises CalibrationError.
+    the calibrated tracker among those of both hands. Raises CalibrationError.
     """
     hands = [track for hand, track in led.hands.items() if side in (None, hand)]
     if not hands:
@@ -352,7 +352,7 @@ def _last(led: LedTracks, file: Path, settings: Settings, side: str | None) -> C
 def _checked(
     led: LedTracks, settings: Settings, record: CalibrationRecord, args: argparse.Namespace
 ) -> int:
-    """Print how far the hand is from where the tool has it; 1 if that is more than accepted."""
+    """Print the hand's distance from its position by the tool's pose; 1 if it is not accepted."""
     if (track := led.hands.get(record.hand)) is None:
         raise CalibrationError(
             f"hands/{record.hand} does not arrive, which was calibrated on {record.date}"

@@ -32,13 +32,13 @@ from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.mouse_page import MousePage, PlayedTask
 from thirdhand.workbench.trackers.web_server import Address
 
-DEMO_CELL = "thirdhand"  # of the demo
+DEMO_CELL = "thirdhand"  # name of the demo's cell
 SCENE_TIMEOUT_S = 60.0
 DEMO_ATTEMPTS = 3  # a task that fails while the machine is too busy is tried again
-TOO_BUSY = "too-busy"  # folder in --output of what such attempts recorded
-# at 500 Hz, a browser without a GPU, or a compiler, leaves two cores too little for the arm
+TOO_BUSY = "too-busy"  # folder in --output for the recordings of such attempts
+# at 500 Hz, a browser without a GPU, or a compiler, leaves too little of two cores for the arm
 SLOW_RATE_HZ = 100
-PLAY_S = 180.0  # a person has this time for the task, from when both hands are seen
+PLAY_S = 180.0  # a person has this time for the task, after both hands are seen
 PAGE_WAIT_S = 600.0  # the page is opened within this time
 PLAY_TIMEOUT_S = PAGE_WAIT_S + PLAY_S + 120.0  # the bench ends within this time
 OUTCOME_S = 1.0  # the page shows the outcome before its server ends
@@ -91,7 +91,7 @@ def _busy_rate_hz(args: argparse.Namespace) -> int | None:
 
 
 def _set_aside(folder: Path, before: Set[Path]) -> None:
-    """Move the recordings that were not there before into a folder of their own."""
+    """Move the new recordings into a folder of their own."""
     aside = folder / TOO_BUSY
     aside.mkdir(exist_ok=True)
     for recording in set(folder.glob("*.mcap")) - before:

@@ -13,7 +13,7 @@ class EnterPressed:
     """
 
     def __init__(self) -> None:
-        self.listens = sys.stdin is not None  # the system may start a program without one
+        self.listens = sys.stdin is not None  # a program may lack standard input
 
     def __call__(self) -> bool:
         try:

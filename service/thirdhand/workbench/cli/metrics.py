@@ -46,7 +46,7 @@ def metrics(args: argparse.Namespace) -> int:
 
 
 def _bound(server: WSGIServer) -> None:
-    """Close connections that are silent, and those beyond MOST_REQUESTS at once, without a word."""
+    """Close silent connections, and those beyond MOST_REQUESTS at once, without an answer."""
     server.RequestHandlerClass.timeout = SCRAPE_TIMEOUT_S  # type: ignore[attr-defined]
     server.verify_request = lambda *_: threading.active_count() < MOST_REQUESTS  # type: ignore[method-assign]
     server.handle_error = lambda *_: None  # type: ignore[method-assign]

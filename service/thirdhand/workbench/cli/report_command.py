@@ -105,7 +105,7 @@ def _write_page(path: Path, reports: Sequence[Report]) -> None:
 
 
 def _report_many(args: argparse.Namespace) -> int:
-    """Report on more recordings than anyone reads one by one: a row for each, and totals."""
+    """Report on many recordings: a row for each, and totals."""
     recordings = [recording for _, recording in of_each(args, "reading", overview)]
     if not recordings:
         return 1

@@ -1,4 +1,4 @@
-"""The address of a page that a command serves, from its option, and the serving until Ctrl-C."""
+"""The address of a page that a command serves, from its option; and a server until Ctrl-C."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ RICH_SCALES = POSITION_SCALES._replace(
     ells=(
         2.0 ** np.arange(-1.0, 6.0)
     ).tolist(),  # [1/m²] inputs with memory or turns are farther from each other
-    ridges=(RIDGE_M, 0.05),  # [m] the second one suppresses inputs that repeat what others tell
+    ridges=(RIDGE_M, 0.05),  # [m] the second one suppresses redundant inputs
     linear_share=1.0,
 )
 

@@ -213,8 +213,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     held: float  # [%] of the time in which the gate would hold
     # [%] of the samples at which the tool is more than 10 cm from its prediction
     wrong: float = 0.0
-    told: float | None = None  # [%] of these at which the skill is unsure; None if there are none
-    falsely_told: float = 0.0  # [%] of the other samples at which it is
+    told: float | None = None  # [%] of these samples: the skill is unsure; None without them
+    falsely_told: float = 0.0  # [%] of the other samples at which the skill is unsure
     other_mm: dict[str, float] = {}  # errors of baselines
 
 
@@ -226,8 +226,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     gate_mm: float
     held_std: float = 0.0  # standard deviation of `held` over the demonstrations
     swapped: float  # share of wrong samples that the gate holds: left and right hand swapped
-    beside: float  # the same with both hands displaced by 30 cm
-    one_beside: float  # the same with one hand displaced by 30 cm
+    beside: float  # share held with both hands displaced by 30 cm
+    one_beside: float  # share held with one hand displaced by 30 cm
     ambiguous: float  # share of the samples that contradict another: same hands, other tool
     beyond_reach: float  # share of the tool's path
     # share of the tool's variance that held-out predictions explain, see `judged`
@@ -243,7 +243,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     unsafe: tuple[str, ...] = ()  # reasons not to use the skill
     tried_mm: dict[str, float] = {}  # held-out error of each kind of inputs
     taken: str = ""  # the kind of inputs that was chosen
-    weight: str = ""  # of a new take against one of the skill that is refined; empty if none is
+    weight: str = ""  # weight of a new take against an earlier one; empty if no skill is refined
     weights_mm: dict[str, float] = {}  # held-out error of the new takes with each weight
     by_person: bool = False  # true if all demonstrations of a person were held out at once
     delay_s: float | None = None  # the teacher's delay; None if it was not learned

@@ -1,7 +1,7 @@
 """Calibration of a model's covariance and of its regions, by takes that the model was not learned
 from.
 
-Judged is the tool at the same moment, including its lag. With e the errors, C the model's
+The tool is judged at the same moment, including its lag. With e the errors, C the model's
 covariances and v the recent velocities of its predictions, the timing's standard deviation is
 
     τ = argmin mean(log det C_τ) + 3 log mean(eᵀ C_τ^-1 e),   C_τ = C + τ² v vᵀ
@@ -42,7 +42,7 @@ from thirdhand.skills.via_points import check_agreement
 from thirdhand.workbench.learning.records import HeldOut, Take, TimedErrors, persons_of
 
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
-# takes that follow each other, often of one person or hour, are held out in so many blocks at most
+# largest number of blocks of successive takes, often of one person or hour, that are held out
 REGION_BLOCKS = 6
 JUDGED_SAMPLES = 150  # samples of a take that are judged, at most
 # Candidates for the timing's standard deviation. A larger one explains few large errors by making
@@ -54,8 +54,8 @@ LEAST_RADIUS = 1e-9  # a squared radius is at least this large
 # shares of the right and of the wrong moments at which the skill is unsure
 FALSE_ALARM_SHARE = 0.12
 ALARM_SHARE = 0.95
-LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm tells
-# what is that improbable is no alarm, and what is more probable than not is one
+LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm detects
+# range of the alarm: a smaller probability is no alarm, and a larger one always is
 ALARMS = (0.005, 0.5)
 # errors that a model of the hands' inputs keeps, which bound the duration of a tick
 LOCAL_ERRORS_RETAINED = 300

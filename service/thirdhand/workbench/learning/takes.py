@@ -27,7 +27,7 @@ from thirdhand.workbench.learning.methods.segmented import Segmented
 from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Take
 from thirdhand.workbench.learning.regions import REGION_BLOCKS
 
-LEAST_COMPARED = 4  # takes: among fewer, none counts as standing out
+LEAST_COMPARED = 4  # among fewer takes, none counts as standing out
 STANDS_OUT_TIMES = 4.0
 COMPARED_TIMES = 100  # shares of the duration at which demonstrations are compared
 REPEATED_M = 0.003  # demonstrations with a smaller root mean square distance are the same one
@@ -139,8 +139,8 @@ def _check(entry: NamedDemonstration) -> None:
 def _without_repeats(
     demonstrations: Sequence[NamedDemonstration], refined: Sequence[NamedDemonstration]
 ) -> tuple[list[NamedDemonstration], list[NamedDemonstration], list[str]]:
-    """The new demonstrations, and the earlier ones, which are by other persons; each once. With
-    remarks on those that repeat another.
+    """The new demonstrations and the earlier ones, which are by other persons, without those that
+    repeat another; and remarks on these.
     """
     named = [*refined, *demonstrations]
     repeats = _repeats([entry.demonstration for entry in named])
@@ -273,7 +273,8 @@ def takes_of(demonstrations: Sequence[Demonstration], names: Sequence[str]) -> l
 
 def standing_out(held_out: Sequence[HeldOut]) -> dict[str, float]:
     """The held-out errors [m] of the takes that stand out, by name: above STANDS_OUT_TIMES the
-    median, and above UNSURE_M; none of fewer than LEAST_COMPARED takes, or of more than a third.
+    median, and above UNSURE_M. None stands out among fewer than LEAST_COMPARED takes, or if more
+    than a third would.
     """
     errors_m = {result.take.name: rms(result.errors) for result in held_out}
     limit_m = max(UNSURE_M, STANDS_OUT_TIMES * float(np.median(list(errors_m.values()))))

@@ -1,9 +1,9 @@
 """Verdicts on a skill: a table of rules with predicates, severities, texts and remedies.
 
-Unsafe is what the service cannot make safe: a tool out of reach, or one that the hands do not
-determine. A residual risk remains after all that the service does, as a gate that cannot tell hands
-in a wrong position from those of the task: somebody may accept it (ISO 12100). A skill that holds
-often is a nuisance and no danger, so this is a warning.
+A skill is unsafe if the service cannot make it safe: its tool is out of reach, or the hands do not
+determine the tool. A residual risk remains after all measures of the service, such as a gate that
+does not distinguish hands in a wrong position from those of the task: a person may accept it (ISO
+12100). A skill that holds often is a nuisance and no danger, so this is a warning.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ LEAST_TOLD = 80.0
 
 
 class Subject(NamedTuple):
-    """A skill's figures with what else is judged, and the part of it that a rule looks at."""
+    """A skill's figures and other data for the rules, and the part that a rule judges."""
 
     figures: Figures
     gate: Gate

@@ -120,7 +120,7 @@ def _opened(file: bytes) -> Image.Image | None:
     """The picture in a file; None if it is damaged."""
     try:
         image: Image.Image = Image.open(io.BytesIO(file))
-        if image.mode.startswith("I"):  # a grey of 16 bits
+        if image.mode.startswith("I"):  # a grey picture of 16 bits
             image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
         return image.convert("RGB")
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):

@@ -1,4 +1,4 @@
-"""Why the arm held or was at fault, as the status reported at that time, and what preceded it."""
+"""Causes of holds and faults of the arm, as the status reported them, and preceding incidents."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from thirdhand.contract.requests import Source
 from thirdhand.core.tuning import TUNING
 from thirdhand.workbench.report.columns import Columns
 
-BEFORE_S = 1.0  # what happened in this time before a fault is listed
+BEFORE_S = 1.0  # incidents within this time before a fault are listed
 LISTED_LATE_US = 1000.0  # a tick that began later than this is listed
 
 
 def why(columns: Columns, begin: int, end: int) -> Explanation:
-    """Reason of frames [begin, end) in words, and what to do: from the first status among them, or,
-    if none was recorded, from the first frame.
+    """The reason of frames [begin, end) in words, and the remedy: from the first status among them,
+    or, if none was recorded, from the first frame.
     """
     frame = columns.frames[begin]
     last = int(columns.frames["tick"][end - 1])

@@ -160,7 +160,7 @@ class _TickReading:
         self._followed_tick = -(1 << 62)  # newest tick in which the arm followed
 
     def add(self, step: Step) -> bool:
-        """Take in a step; False if it is a state alone, which has no time."""
+        """Add a step; False for a step that has only a state, and no time."""
         is_after_gap = bool(step.lost or step.damage)
         if is_after_gap:
             self.gaps.append(Gap(self.newest_tick, step.tick, step.lost, step.damage))
@@ -281,7 +281,7 @@ def _ages_between(ages: Any, until: Any, later_ages: Any, elapsed: Any) -> Any:
 
 
 def _take_events(found: Columns, step: Step, followed: int) -> None:
-    """Count the events of a step; keep its requests, skills and joints that stop."""
+    """Count the events of a step; keep its requests, its skills, and the joints during a stop."""
     settings = found.recording.settings
     is_stopping = 0 < step.tick - followed <= settings.rate_hz  # for 1 s
     if step.skill:

@@ -85,7 +85,9 @@ class Approach(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A limit that was active or that bound: its duration, number of times, and first time [s]."""
+    """A limit that was active, or that bound the motion: its duration, number of times, and first
+    time [s].
+    """
 
     name: str
     lasts_s: float
@@ -219,7 +221,7 @@ class Report:
         )
 
     def overview(self) -> Overview:
-        """The figures of this recording, and where they belong among those of many."""
+        """The figures of this recording, with its cell and week for a comparison of many."""
         cell = self.columns.recording.settings.cell
         return Overview(
             Path(self.path),

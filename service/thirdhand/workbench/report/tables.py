@@ -332,7 +332,7 @@ class _Session(NamedTuple):
         ]
         ended = [span for span in report.spans if span.mode is Mode.HOLD and span.start_s >= end_s]
         if report.spans[-1].mode is Mode.FAULT:
-            ended = []  # a fault is no end of a session
+            ended = []  # a fault does not end a session
         stops = [
             span
             for span in report.spans
@@ -379,7 +379,9 @@ def summary(report: Report) -> list[str]:
 
 
 def comparison(reports: Sequence[Report]) -> Iterator[Table]:
-    """Figures of two reports side by side, and settings that differ; of more, a row for each."""
+    """Figures of two reports side by side, and settings that differ; for more reports, a row for
+    each.
+    """
     if len(reports) != 2:
         yield from overviews([report.overview() for report in reports])
         return

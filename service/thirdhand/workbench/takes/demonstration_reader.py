@@ -259,8 +259,8 @@ class CommonPart(NamedTuple):
 def _leading(
     hands: Sequence[Checked], conducts: Hands
 ) -> tuple[Sequence[Checked], Hands, list[str]]:
-    """The hands that lead the tool, without one that is hardly seen while the other is; with a
-    remark.
+    """The hands that lead the tool, without a hand that is hardly seen while the other one is; with
+    a remark.
     """
     shares = [hand.seen_share for hand in hands]
     if not min(shares) < MIN_SEEN_SHARE <= max(shares):
@@ -313,7 +313,7 @@ def _span_ns(track: Track) -> tuple[int, int]:
 
 
 def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settings) -> Track:
-    """The track with NaN for poses that are too far away; `before` is the track as published.
+    """The track with NaN for poses that are too far away; `before` is the published track.
 
     Raises RecordingError if all poses are too far away.
     """
@@ -337,7 +337,7 @@ def _near(recorded: PoseRecording, track: Track, before: Track, settings: Settin
 
 
 def _invalid_in(tracks: Sequence[Track]) -> list[str]:
-    """A remark on the number of poses of the tracks that are NaN; empty if none is."""
+    """A remark on the number of poses that are NaN; empty if none is."""
     most_m = TUNING.intake.max_hand_distance_m
     none = sum(int(np.isnan(track.poses[:, 0]).sum()) for track in tracks)
     count = sum(len(track.poses) for track in tracks)
@@ -369,7 +369,7 @@ def is_by_tracker(name: str, frame: str, hands: HandSettings) -> bool:
 
 
 def in_metres(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) [m] in the tracker's frame, right-handed, given those in its axes and
+    """Positions (N, 3) [m] in the tracker's frame, right-handed, from positions in its axes and
     unit.
     """
     if hands.axes == "left-handed":
@@ -378,7 +378,7 @@ def in_metres(positions: Vector, hands: HandSettings) -> Vector:
 
 
 def from_tracker(positions: Vector, hands: HandSettings) -> Vector:
-    """Positions (N, 3) in frame `base` [m], given those in the tracker's axes and unit."""
+    """Positions (N, 3) in frame `base` [m], from positions in the tracker's axes and unit."""
     axes = rotation(hands.base_from_tracker[3:])
     origin = np.array(hands.base_from_tracker[:3])
     return np.asarray(in_metres(positions, hands) @ axes.T + origin)
@@ -417,9 +417,9 @@ def in_base(
     """Tracks of left hand, right hand and tool in frame `base`, and a remark on which of them were
     transformed.
 
-    As in the daemon, hands are transformed unless they are in `base` and the tracker has a frame of
-    its own. The tool is transformed only if it names the tracker's frame. Raises RecordingError for
-    other frames.
+    As in the daemon, hands are transformed, except for hands in `base` of a tracker whose own frame
+    has another name. The tool is transformed only if it names the tracker's frame. Raises
+    RecordingError for other frames.
     """
     for track in tracks:
         if problem := unknown_frame(track.name, track.frame, settings.hands_in(track.frame)):

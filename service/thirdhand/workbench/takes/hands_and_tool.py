@@ -31,7 +31,7 @@ TRACK_WORDS = {
 
 class HandsAndTool(NamedTuple):
     """The tracks of left hand, right hand and tool, the hands that lead the tool, and remarks on
-    guesses. A hand that leads alone has both hands' places in `tracks`.
+    guesses. The track of a hand that leads alone stands in `tracks` twice, for both hands.
     """
 
     tracks: list[Track]
@@ -86,7 +86,7 @@ def _hands(
 
 
 def _named(recorded: PoseRecording, name: str, given: Mapping[str, PoseTopic]) -> PoseTopic | None:
-    """The stream that is `given`, or else that with the end of the service's own name."""
+    """The stream that is `given`, or else the one whose name ends like the service's own topic."""
     return _given(recorded, name, given[name]) if name in given else by_ending(recorded, name)
 
 

@@ -252,7 +252,7 @@ class PoseRecording:
             self._raw.setdefault(connection.topic, []).append((logged_ns, bytes(data)))
 
     def _read_sqlite(self, file: Path) -> None:
-        """Read a `.db3`, and what a recorder that was killed has left in its `-wal`."""
+        """Read a `.db3`, and messages that a killed recorder has left in its `-wal`."""
         with contextlib.closing(
             sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)
         ) as database:

@@ -27,9 +27,8 @@ from scipy.ndimage import maximum_filter, median_filter, percentile_filter
 
 from thirdhand.core.frame import Vector
 
-# n, the samples before and after a step. Range 3 to 5: smaller values average noise less, larger
-# ones
-# include more of the motion's curvature.
+# n, the samples before and after a step. Range 3 to 5: smaller values average less noise, larger
+# ones include more of the motion's curvature.
 HALF_WINDOW = 4  # missed 0.5, 6.7, 5.9 %; removed 0.03, 0.59, 0.11 %
 # [m] Smaller steps are ignored. Range 0.008 to 0.02.
 STEP_M = 0.01  # missed 0.5, 0.5, 0.7 %; removed 0.03, 0.37, 0.03 %
@@ -38,10 +37,9 @@ USUAL_PERCENTILE = 80  # missed 0.5, 0.5, 0.6 %; removed 0.03, 1.00, 0.00 %
 # [s] Range 0.7 to 2: smaller values follow the motion sooner, larger ones include less of the jump.
 USUAL_S = 1.5  # missed 0.5, 0.5, 0.5 %; removed 0.03, 0.03, 0.10 %
 # A step is unusual from this multiple of the usual step on. Range 2 to 3.5: larger values miss
-# small
-# jumps.
+# small jumps.
 UNUSUAL_RATIO = 2.5  # missed 0.5, 0.5, 0.8 %; removed 0.03, 3.73, 0.00 %
-GLITCH_WINDOW = 5  # samples in whose median up to two that are off do not count
+GLITCH_WINDOW = 5  # samples of a median, on which up to two wrong ones have no effect
 # A sample is off from this multiple of the usual distance from that median on. Range 2.5 to 5.
 GLITCH_RATIO = 3.0
 # |step + return| / |step - return| of a jump. Range 0.15 to 0.35.
@@ -50,8 +48,7 @@ MAX_REMAINDER = 0.25  # missed 0.5, 0.7, 0.5 %; removed 0.03, 0.03, 0.14 %
 # motion looks like a step.
 MAX_BESIDE = 0.35  # missed 0.5, 6.5, 0.5 %; removed 0.03, 0.00, 0.38 %
 # [s] Time from a step to its return. Range 3 to 6: with larger values, more pairs of steps look
-# like a
-# jump.
+# like a jump.
 MAX_JUMP_S = 5.0  # missed 0.5, 8.1, 0.5 %; removed 0.03, 0.03, 0.03 %
 
 
@@ -80,8 +77,8 @@ def displaced(seconds: Vector, positions: Vector) -> NDArray[np.bool_]:
 
 
 def _without_glitches(positions: Vector, around: int) -> Vector:
-    """The positions (N, 3) [m], with the median of their neighbourhood for one or two that are
-    farther from it than usual among so many neighbours.
+    """The positions (N, 3) [m]; one or two positions that are farther from the median of their
+    neighbourhood than usual among `around` neighbours are replaced by it.
     """
     medians = median_filter(positions, (GLITCH_WINDOW, 1), mode="nearest")
     distances_m = np.linalg.norm(positions - medians, axis=1)
@@ -91,7 +88,9 @@ def _without_glitches(positions: Vector, around: int) -> Vector:
 
 
 def _usual(sizes: Vector, around: int) -> Vector:
-    """The usual one of sizes (N,) among so many neighbours on both sides."""
+    """The usual size near each of the sizes (N,): a percentile over `around` neighbours on both
+    sides.
+    """
     return np.asarray(
         percentile_filter(sizes, USUAL_PERCENTILE, size=2 * around + 1, mode="mirror")
     )

@@ -26,7 +26,7 @@ from thirdhand.workbench.timing.probe import EDGES_US, figures, percentiles
 from thirdhand.workbench.timing.probe_processes import ProbeError, echo, family, probe
 
 PROGRAM = ("-m", "thirdhand")
-# the duration is divided into two parts each for the empty loop, the core and the whole
+# the duration is divided into two parts for each of the empty loop, the core and the whole
 DURATION_PARTS = 6
 MISSED_MORE = 0.0005  # the whole may miss this share of deadlines more than the empty loop
 KERNEL = (

@@ -1,1 +1,1 @@
-"""The hands' side: demonstrations captured from live trackers."""
+"""Hands and their trackers: headset, mouse, camera, calibration, and capture of demonstrations."""

@@ -1,4 +1,4 @@
-"""The websocket by which a page sends hands, and receives what the cell does.
+"""The websocket by which a page sends hands, and receives the cell's status.
 
 A page sends messages of hands and pings as bytes (`hand_message`), and orders as text: `hold`,
 `resume` or `reset` of its buttons, `hold by hands` or `resume by hands` of a sign. A resume by
@@ -35,7 +35,7 @@ MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the
 # a page that sends nothing for this long is disconnected: it pings five times a second
 PAGE_SILENCE_S = 10.0
 OWNER_S = 1.0  # after this time without hands of a page, another page may send hands
-MAX_HELD_UP_S = 0.5  # hands that were held up for longer are dropped: they show where a hand was
+MAX_HELD_UP_S = 0.5  # hands with a longer delay are dropped, as they show a past position
 MAX_PINCH_GAP_S = 0.3  # a pinch that was not seen for longer has ended
 PAGE_STATUS_S = 0.1  # interval of the status
 BY_HANDS = {f"{order} by hands": order for order in ("hold", "resume")}
@@ -71,7 +71,7 @@ class BrowserHands:
         self._frame = frame
         self._has_token = has_token
         self._pinches = pinches
-        self._name = f"hands {secrets.token_hex(4)}"  # of the person who holds by a sign
+        self._name = f"hands {secrets.token_hex(4)}"  # name of the person who holds by a sign
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
         self._owned_s = 0.0
@@ -120,7 +120,7 @@ class BrowserHands:
             elif message.type == WSMsgType.TEXT:
                 refusal = self._take_order(page, message.data, orders)
             else:
-                return None  # it left, or sent what is no message, for which aiohttp has closed it
+                return None  # it left, or aiohttp closed it for invalid data
             if refusal is not None:
                 return await web_server.close(page, *refusal)
 
@@ -185,7 +185,9 @@ class BrowserHands:
         return True
 
     def _release(self) -> None:
-        """End a pinch: one of another page, or from before a pause, presses no clutch."""
+        """End a pinch: a pinch of another page, or from before a pause, does not press the
+        clutch.
+        """
         if self._pinches is not None:
             self._pinches.release()
 

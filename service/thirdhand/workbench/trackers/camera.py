@@ -65,8 +65,7 @@ class HandCamera(AbstractContextManager["HandCamera"]):
 
     def hands(self, picture: Any, at_ms: int) -> dict[str, HandPoints]:
         """The hands by side, in a picture (H, W, 3) in RGB, not mirrored; its time must grow.
-
-        MediaPipe names the sides. If it takes both hands for the same one, the surer is that.
+        MediaPipe names the sides. If both hands have the same side, the more certain one counts.
         """
         quiet = _silenced() if self._last_ms == 0 else contextlib.nullcontext()
         self._last_ms = max(at_ms, self._last_ms + 1)
@@ -106,14 +105,14 @@ class HandCamera(AbstractContextManager["HandCamera"]):
 
 
 def pictures(source: str) -> Iterator[tuple[int, Any]]:
-    """Time of arrival [ns] and picture (H, W, 3) in RGB of a camera, named by its number, or of a
+    """Times of arrival [ns] and pictures (H, W, 3) in RGB of a camera, given by its number, or of a
     video file; ends with the file. Raises CameraError.
     """
     cv2 = _module("cv2")
     device = cv2.VideoCapture()
     try:
         is_open = False
-        # of a number or a name that it cannot pass on
+        # OpenCV raises for numbers or names that it cannot use
         with contextlib.suppress(cv2.error, ValueError):
             is_open = device.open(int(source) if source.isdecimal() else source)
         if not is_open:
@@ -121,7 +120,7 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
                 f"no camera {source} can be opened; the number of a camera that no program uses "
                 "needed, or a video file"
             )
-        device.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not one that waited
+        device.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not a queued one
         any_read = False
         while (read := device.read())[0]:
             any_read = True
@@ -135,8 +134,8 @@ def pictures(source: str) -> Iterator[tuple[int, Any]]:
 def publish(
     tracker: Tracker, camera: HandCamera, source: str, say: Callable[[str], object]
 ) -> None:
-    """Publish the hands of each picture of a source, until it ends; every 2 s, say what is seen.
-    Raises CameraError.
+    """Publish the hands of each picture of a source, until it ends; every 2 s, print which hands
+    are seen. Raises CameraError.
     """
     count = 0
     since = time.monotonic()

@@ -117,8 +117,8 @@ def corrected(client: Client, given: str) -> tuple[bool, str]:
 
 
 def carried_out(client: Client, order: str, by: str = "") -> tuple[bool, str]:
-    """True if the daemon carried out hold, resume or reset, and its answer in words. `by` names who
-    holds, or ends its own hold.
+    """True if the daemon carried out hold, resume or reset, and its answer in words. `by` names the
+    holder of a hold, or whose hold ends.
     """
     try:
         reply: Reply = getattr(client, order)(*([by] if by else []))

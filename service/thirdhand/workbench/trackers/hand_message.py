@@ -1,4 +1,4 @@
-"""The binary message by which a page sends hands, and the one by which it compares clocks.
+"""The binary messages of a page: its hands, and a ping to compare clocks.
 
 All numbers are little endian. A message of hands has 120 bytes:
 
@@ -33,8 +33,8 @@ SERVER_TIME = struct.Struct("<d")
 HAND_FLOATS = 12
 MAX_AHEAD_MS = 200.0  # a headset predicts less than this
 MAX_CLOCK_ERROR_MS = 1000.0  # a page that compares clocks is never ahead by this
-MAX_AGE_MS = 60_000.0  # older than this is not a delay, but a wrong clock
-UNIT_TOLERANCE = 0.01  # of a quaternion's norm, as the daemon accepts it
+MAX_AGE_MS = 60_000.0  # a larger age is caused by a wrong clock, not by a delay
+UNIT_TOLERANCE = 0.01  # tolerance of a quaternion's norm, as in the daemon
 
 
 class PageHand(NamedTuple):
@@ -50,7 +50,7 @@ class PageHand(NamedTuple):
 
 
 class PageHands(NamedTuple):
-    """The hands in a message; `stamp_ns` is the time that they are measured or predicted for."""
+    """The hands in a message; `stamp_ns` is the time for which they are measured or predicted."""
 
     epoch: int
     number: int

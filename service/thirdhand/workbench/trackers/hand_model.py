@@ -1,8 +1,8 @@
-"""MediaPipe's model of hands: where it comes from, and the file that MediaPipe loads.
+"""MediaPipe's model of hands: its origin, and the file that MediaPipe loads.
 
 Later packages of MediaPipe come without a model, and expect it to be fetched from a server. The
-package of version 0.10.21 still has its two networks. They are taken out of it once, without
-installing it: it needs NumPy 1.
+package of version 0.10.21 still has its two networks. They are extracted from the package once. It
+is not installed, because it needs NumPy 1.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.settings.user_folder import user_folder
 
 PACKAGE = "mediapipe==0.10.21"
-# the networks are the same for all
+# the networks are the same in the packages of all platforms
 PLATFORM = ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11")
 NETWORKS = {  # name in the model: path in the package, SHA-256
     "hand_detector.tflite": (

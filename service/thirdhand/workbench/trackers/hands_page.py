@@ -84,7 +84,9 @@ class HandsPage:
         )
 
     def _answer(self, request: web.Request, text: str, kind: str, policy: str) -> web.Response:
-        """A text for who has the token, which may connect to this server alone."""
+        """The answer with a text for clients with the token; the page may connect to this server
+        only.
+        """
         if not self.has_token(request.query.get("token", "")):
             return answer(403, NO_TOKEN)
         socket = f"{'wss' if self.server.scheme == 'https' else 'ws'}://{request.host}"

@@ -25,7 +25,7 @@ PAGE_COLOURS = {
 
 
 class PlayedTask:
-    """A task that a person plays on the page: what was achieved, and its end."""
+    """A task that a person plays on the page: achieved events, and its end."""
 
     def __init__(self, end: Callable[[], None]) -> None:
         """`end` is called when the person ends the task."""

@@ -99,7 +99,7 @@ def palm_pose(
         turned = turn.apply(palm)
         x, y, z = (turned + position_m).T
         if z.min() < hand_length / 2:
-            return None  # a hand as near as this does not fit into a picture
+            return None  # a hand this near would not fit into the picture
         errors = np.stack([x, y], 1) / z[:, None] - u
         none = np.zeros(len(z))
         rows = np.stack([1 / z, none, -x / z**2], 1), np.stack([none, 1 / z, -y / z**2], 1)

@@ -36,11 +36,11 @@ INLINE = (
     "img-src 'self' data: blob:; font-src 'self' data:; style-src 'unsafe-inline'; script-src "
     "'unsafe-inline'"
 )
-MAX_BODY_BYTES = 4096  # of a request
-MAX_CONNECTIONS = 256  # at once: some for each page; a process may often open 1024 files
+MAX_BODY_BYTES = 4096  # limit of a request
+MAX_CONNECTIONS = 256  # open at once, several for each page; often 1024 files are allowed
 REQUEST_WITHIN_S = 5.0  # a handshake, and then the first request, must be complete after this time
 FOREIGN = "This page answers at this machine's own address only, and only to itself."
-MAX_PAGE_MESSAGE_BYTES = 256  # of a websocket
+MAX_PAGE_MESSAGE_BYTES = 256  # limit of a message on a websocket
 CLOSE_CODE = 4000  # a websocket is refused with this close code plus the status of HTTP
 MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, section 5.5
 

@@ -34,7 +34,7 @@ from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
 from thirdhand.workbench.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
 from thirdhand.workbench.learning.regions import local_errors, refitted_errors
 
-# an error up to this multiple of the least one, or this much larger, is as good
+# an error is as good up to this multiple of the least error, or up to this difference from it
 AS_GOOD = 1.02
 AS_GOOD_M = 0.002
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
@@ -65,7 +65,7 @@ class Inputs(NamedTuple):
         return self.clock is not None and self.clock.weight > 0.0
 
     def of(self, demonstration: Demonstration, tempo: Tempo | None = None) -> Vector:
-        """The inputs (T, I) [m] of a demonstration, whose `tempo` is needed for a clock."""
+        """The inputs (T, I) [m] of a demonstration; a clock needs the `tempo`."""
         hands = demonstration.hands
         turns = demonstration.turns if self.turned else None
         if self.alone is not None:
@@ -177,8 +177,8 @@ def _remarks(kind: Inputs) -> Iterator[str]:
 
 
 class _Used(NamedTuple):
-    """The takes that are learned from with their inputs (T, I), the new ones first; the last
-    `earlier` ones are of a skill that is refined.
+    """The takes that are learned from, with their inputs (T, I): first the new ones, then `earlier`
+    ones of a skill that is refined.
     """
 
     kind: Inputs
@@ -298,7 +298,9 @@ def refit(
 
 
 class Chosen(NamedTuple):
-    """A kind of inputs, the error [m] of each kind, and that of this one with each weight."""
+    """A kind of inputs, the error [m] of each kind, and the errors of the chosen kind with each
+    weight.
+    """
 
     kind: Inputs
     tried_m: Mapping[str, float]
@@ -397,5 +399,5 @@ def as_good_m(least_m: float) -> float:
 
 
 def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
-    """The first of the kinds whose error is as good as the least of theirs."""
+    """The first of the kinds whose error is as good as their least error."""
     return preferred(kinds, errors_m, as_good_m(min(errors_m)))

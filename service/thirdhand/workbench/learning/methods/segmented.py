@@ -95,7 +95,7 @@ LEAST_SEEN_S = 0.4  # a corner counts as demonstrated if hands were near it for 
 CORNERS = ((1.0, 0.0), (0.0, 1.0))
 # the tool waits at these shares of the path to a corner that was demonstrated
 SEEN_SHARES = (0.5, 1.0)
-UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # the same for a corner that no demonstration has
+UNSEEN_SHARES = (0.15, 0.3, 0.45, 0.7, 1.0)  # at a corner without demonstrations
 # shares of the longest clock at which the tool's share is known
 KNOWN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 CLOCK_WEIGHTS_PER_S = (0.1, 0.2, 0.4, 0.8)  # candidates for the weight of a clock

@@ -1,6 +1,6 @@
 """Weights of new takes against those of a skill that is refined.
 
-A new take shows how whoever will work with the skill does the task, an earlier one how others do.
+A new take shows how the skill's user does the task, an earlier one how other people do it.
 In a KMP, a sample that has w times the weight has the w-th part of the covariance Sigma of equation
 (8) of Huang et al. 2019. As the noise of the new samples is chosen by held-out errors anyway, they
 keep theirs, and that of the earlier samples is multiplied:

@@ -39,16 +39,16 @@ MAX_GAP_S = 0.25  # in a longer gap between the arm's states, the tool's pose is
 SHOWN_SAMPLES = 120  # the expected accuracy is computed from this number of samples
 SHOW_EVERY_S = 2.0
 LEAST_LED_S = 15.0  # the tool is led at least this long
-LED_S = 40.0  # afterwards it ends once the accuracy is accepted, before only at half of that
-# and at least this far, in each direction
+LED_S = 40.0  # after this time the accepted accuracy ends it, before only half of that error
+# least motion and rotation of the led tool in each direction
 LEAST_LED_M = 0.10
 LEAST_TURNED_RAD = math.radians(40)
 LED_POLL_S = 0.05
 STREAM_ENDS_S = 1.0  # a stream that is silent for longer has ended
 LARGEST_POSITION = 1e9  # in any unit; squares of larger numbers overflow
-# positions are left out if they are this many times as far from the median as half of them
+# positions are left out beyond this multiple of the median distance from their median
 FAR_RATIO = 100.0
-# in the tracker's unit: a hand that rested for most of the time may still move by 5 m
+# least median distance [tracker's unit]: a hand that mostly rested may still move by 5 m
 MIN_MEDIAN_OFF = 0.05
 TOUCH_S = 0.5  # a touch is the median over this time
 MAX_TOUCH_M = 0.015  # during a touch, the hand moves at most this far
@@ -76,8 +76,8 @@ class SolvedHand(NamedTuple):
 
 
 def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Settings]:
-    """Hands and tool in a recording or demonstration with joint states, and the settings: those
-    given, else those in the file. Raises RecordingError, CalibrationError.
+    """Hands and tool in a recording or demonstration with joint states, and the settings: the given
+    ones, or else those in the file. Raises RecordingError, CalibrationError.
     """
     recorded = PoseRecording(path)
     settings = settings or recorded.settings or Settings()
@@ -257,8 +257,8 @@ def held_tool(hand: Track, tool: Track, hands: HandSettings) -> tuple[HeldTool, 
 
 
 def _plausible(positions: Vector) -> NDArray[np.bool_]:
-    """True for each position (N, 3) that is finite and not FAR_RATIO times as far from their median
-    as half of them are: one such position would outweigh all others in the fit.
+    """True for each position (N, 3) that is finite and within FAR_RATIO times the median distance
+    from their median: one position beyond would outweigh all others in the fit.
     """
     sound = np.asarray((np.abs(positions) < LARGEST_POSITION).all(axis=1))
     if sound.any():
@@ -280,7 +280,7 @@ def _clock(track: Track) -> tuple[NDArray[np.int64], bool]:
 
 def the_hand(hands: Collection[str], side: str | None) -> str:
     """The hand that is calibrated: that of a side, or else the only one that arrives. Raises
-    CalibrationError: which hand a tracker calls left is not assumed.
+    CalibrationError if both arrive, as no side is assumed.
     """
     if side is None and len(hands) > 1:
         raise CalibrationError(
@@ -417,7 +417,7 @@ def lead(
 
 
 def distances_m(held: HeldTool, calibration: Calibration) -> Vector:
-    """Distances (N,) [m] between the mapped hand and where it is by the tool's pose."""
+    """Distances (N,) [m] of the mapped hand from its position by the tool's pose."""
     at_s = np.clip(held.hand_s - calibration.delay_s, held.tool_s[0], held.tool_s[-1])
     rows = np.clip(np.searchsorted(held.tool_s, at_s), 0, len(held.tool_s) - 1)
     tool = np.stack([np.interp(at_s, held.tool_s, axis) for axis in held.tool.T], axis=1)

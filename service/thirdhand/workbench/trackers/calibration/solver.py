@@ -39,7 +39,7 @@ MAX_STAMP_DELAY_S = 0.5  # a longer delay shows that clocks differ
 FIRST_DELAYS_S = tuple(np.linspace(-0.2, 0.4, 13).tolist())  # the fit begins with the best of these
 LEVER_M = 0.5  # for the condition number, a rotation by 1 rad is a displacement of 0.5 m
 MAX_CONDITION = 1000.0
-# of a hand that holds the tool
+# numbers of samples of a hand that holds the tool
 MIN_SAMPLES = 100
 MAX_FIT_SAMPLES = 400
 MIN_POINTS = 4
@@ -55,7 +55,7 @@ HELD_MIRRORED_RATIO = 0.75
 # the residual of a hand at the tool is at most this share of the tool's motion
 MAX_UNEXPLAINED = 0.5
 BENCH_HEIGHT_M = 0.4  # the bench extends from the table top to this height
-CONFIDENCE = 0.99  # of the upper limit of the errors' variance: few samples may agree by chance
+CONFIDENCE = 0.99  # of the variance's upper limit, as few samples may agree by chance
 EPSILON = 1e-7  # step of numerical derivatives
 TURN_WRIST = "turn the wrist while you lead the tool, about two axes"
 LEAD_APART = "lead the tool farther apart, in all three directions, and for longer"
@@ -243,9 +243,9 @@ def _degrees(cover: Coverage) -> str:
 
 
 def _check_extent(cover: Coverage, outliers: Sequence[int] | NDArray[np.intp] = ()) -> None:
-    """Raise CalibrationError if the positions are not spread in all three directions: then the
-    pose is uncertain, and mirrored axes would remain unnoticed. `outliers` are the points without
-    which they are not.
+    """Raise CalibrationError if the positions are not spread in all three directions: then the pose
+    is uncertain, and mirrored axes would remain unnoticed. `outliers` are points that were left
+    out, which the message names.
     """
     if cover.extent_m[2] >= MIN_EXTENT_M:
         return
