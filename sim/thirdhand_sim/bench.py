@@ -40,7 +40,7 @@ from thirdhand_sim.world import (
 # shortest and longest time for the arm to settle before the script begins
 SETTLE_RANGE_S = (0.5, 2.5)
 SETTLED_STILL_S = 0.25  # the arm has settled after resting for this time
-# after a silence, a command must be within this of the standing arm
+# after a silence, a command must be this near to position and velocity of the standing arm
 STAND_RAD = 0.02
 STAND_RADPS = 0.05
 HOLDS = 0.5  # fingers that are closed this far hold a thing between them
@@ -91,7 +91,7 @@ class Observation(NamedTuple):
 
 
 class _Watch:
-    """The smallest distance within the window of one event."""
+    """The smallest distance of the tool within the window of one event."""
 
     def __init__(self) -> None:
         self.nearest = math.inf
@@ -299,8 +299,7 @@ class Bench:
             self._since_command = 0
         else:
             # The clocks of bench and daemon differ, so periods without a command are ordinary. The
-            # arm
-            # continues at the commanded velocity until BRAKE_AFTER_S.
+            # arm continues at the commanded velocity until BRAKE_AFTER_S.
             self._since_command += 1
             age_s = self._since_command * self.period_s
             if self._since_command == round(BRAKE_AFTER_S / self.period_s):
@@ -361,7 +360,7 @@ class Bench:
         self._held[thing] = (holder, seen_from(self._holders[holder], self.world.pose(thing)))
 
     def _watch(self, seen: Observation) -> None:
-        """Detect the events, by the distances in the rests after the motions."""
+        """Detect the events by the tool's distances, in the rests after the motions."""
         world = self.world
         scene = self.scene
         reached = itertools.takewhile(

@@ -35,7 +35,7 @@ WANDERING_S = 2.0  # time in which a tracker's wandering error changes
 FINGER_M = 0.004  # a fingertip misses the point that it touches by this, on each axis
 GRIP = (0.03, -0.02, -0.05)  # [m] the hand in the frame of the tool
 SWINGS_HZ = (0.05, 0.25)  # frequencies at which a led joint swings
-# and how far: joints, and the last three
+# amplitudes of the swings: of all joints, and of the last three
 SWING_RAD = (0.5, 0.35, 0.5, 0.35)
 WRIST_SWING_RAD = (0.6, 0.6, 0.8)
 MARGIN_RAD = 0.05

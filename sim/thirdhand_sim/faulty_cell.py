@@ -156,8 +156,8 @@ class FaultyCell:
                 to_arm = self.to_arm.endpoint
             else:
                 to_tracker = to_arm = self.router.endpoint if self.network == "router" else endpoint
-            # The operator connects to the service directly, to observe commands during network
-            # faults.
+            # The operator connects to the service directly, to observe commands during faults of
+            # the network.
             with as_usual_afterwards():
                 self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)

@@ -31,7 +31,7 @@ from thirdhand_sim.tracked_hands import TrackedHands
 THINGS_HZ = 10
 # the bench runs for this time after the last hands, so that the service can stop the arm
 FINAL_STOP_S = 1.0
-QUIET_S = 1.0  # missing commands are reported after this time
+QUIET_S = 1.0  # a silence of commands is reported after this time
 MOST_QUEUED = 256  # commands wait in a queue of this length while the bench is held up
 DRIVE_HEADROOM = 1.25  # drive limits / command limits, so that the arm can catch up after a hold-up
 
@@ -329,7 +329,7 @@ class _Run:
         self._deadlines = Deadlines(rate_hz)
         self._key = channels.key(live.cell, "joints/command")
 
-        self._index = -1  # of the newest period
+        self._index = -1  # number of the newest period
         # time from which commands arrive and the hands wait at their start
         self._ready_s: float | None = None
         self._is_running = False  # the script runs

@@ -77,7 +77,7 @@ class Person(NamedTuple):
     skew: float
     correction: float  # share of a path that a second, slower motion covers
     lead_s: float  # lead of the right hand
-    dwells: tuple[float, float]  # [s] shortest and longest wait of hands at a place
+    dwells: tuple[float, float]  # [s] shortest and longest rest of hands at a place
     haste: float  # duration of the right hand's motion to the iron / that of the left hand's motion
     sway: float  # rms of a waiting hand's sway per axis
     strays: float  # probability that a waiting hand makes another motion

@@ -215,7 +215,7 @@ class HandScript:
         return TaskProgress(next(observed, None), (script_s > first[1]) + (script_s > second[1]))
 
     def places(self) -> tuple[SceneObject, ...]:
-        """No places are drawn: nobody has to find them."""
+        """No places: nobody has to find them in a viewer."""
         return ()
 
     def truth(self, t: float) -> HandMotions:

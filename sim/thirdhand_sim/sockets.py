@@ -9,7 +9,9 @@ from typing import Self
 
 
 class CountingRelay:
-    """A relay between clients of `endpoint` and a target, on a port, 0: a free one; a context."""
+    """A relay between clients of `endpoint` and a target, on a port (0: a free one); used as a
+    context.
+    """
 
     def __init__(self, target: str, port: int = 0) -> None:
         host, _, target_port = target.removeprefix("tcp/").rpartition(":")
@@ -33,7 +35,7 @@ class CountingRelay:
     @staticmethod
     def _close(*sockets: socket.socket) -> None:
         for connection in sockets:
-            with contextlib.suppress(OSError):  # it is closed, or was never connected
+            with contextlib.suppress(OSError):  # the socket is closed, or was never connected
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 

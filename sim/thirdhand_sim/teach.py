@@ -205,9 +205,9 @@ def publish(
     wait_s: float,
     rate_hz: int = 100,
 ) -> bool:
-    """Publish hands and tool in real time, as their tracker would, from when somebody listens to
-    the hands until nobody does: they rest for `before_s` first, and REST_AFTER_S at the end.
-    `poses` are those at a time [s] from the begin, (7,) each.
+    """Publish hands and tool in real time, as a tracker does, while the hands have subscribers: at
+    first they rest for `before_s`, and at the end for REST_AFTER_S. `poses` gives the poses at a
+    time [s] after the begin, (7,) each.
 
     Returns True if both hands had a subscriber until the end. Raises UnreachableError.
     """

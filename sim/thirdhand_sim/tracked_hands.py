@@ -57,7 +57,7 @@ class TrackedHands:
 
     def __init__(self, scene: Scene, settings: Settings, *, timeout_s: float = math.inf) -> None:
         """The settings map the hands to frame `base`. The task ends `timeout_s` [s] after its
-        begin, reached or not.
+        begin, whether its events were reached or not.
         """
         self.scene = scene
         self._settings = settings

@@ -25,7 +25,7 @@ from thirdhand_sim.lab.evidence import RESULTS, commit, origin, result_of, stale
 from thirdhand_sim.lab.results import ExperimentError, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
 
-OF_OTHERS = "-of-others"  # ends the name of a result on recorded hands
+OF_OTHERS = "-of-others"  # suffix of the names of results on recorded hands
 FAILURES = (ExplainedError, ExperimentError, FaultError, PartError, OSError)
 EXAMPLE = """example:
   python -m thirdhand_sim.lab letters --output results
@@ -90,7 +90,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def jobs(name: str, options: Options) -> dict[str, Options]:
-    """The results that a name on the command line stands for, with the options that each uses."""
+    """The results of a name on the command line, with the options that each uses."""
     names = [name] if name in EXPERIMENTS else [*EXPERIMENTS]
     if options.hands is None and name == "all":
         names.remove("motion" + OF_OTHERS)
@@ -104,7 +104,7 @@ def jobs(name: str, options: Options) -> dict[str, Options]:
 
 
 def redraw(results: Results, experiment: ModuleType) -> None:
-    """Draws an experiment's figures of the numbers in its JSON again.
+    """Draw an experiment's figures again from the numbers in its JSON.
 
     Raises ExperimentError if its figures show more than its numbers.
     """
@@ -116,7 +116,7 @@ def redraw(results: Results, experiment: ModuleType) -> None:
 
 
 def make(results: Results, experiment: ModuleType, options: Options) -> None:
-    """Runs an experiment and writes its result. Raises one of FAILURES."""
+    """Run an experiment and write its result. Raises one of FAILURES."""
     earlier_options = (result_of(results.folder, results.name) or {}).get("options", {})
     for option, value in earlier_options.items():
         if isinstance(value, dict) and getattr(options, option) is None:
@@ -129,12 +129,12 @@ def make(results: Results, experiment: ModuleType, options: Options) -> None:
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)
     if (now := commit()) != results.origin["commit"]:
-        results.origin["commit"] += f" to {now}"  # the tree was changed meanwhile
+        results.origin["commit"] += f" to {now}"  # the source tree was changed meanwhile
     print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit code: 0, 1 if an experiment failed, 2 on bad usage."""
+    """Run the command; exit code 0, 1 if an experiment failed, 2 on bad usage."""
     p = parser()
     args = p.parse_args(arguments)
     if not 0 < args.share <= 1:
@@ -150,7 +150,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if args.name == "stale":
             return stale(args.output or RESULTS, selected)
-        pyplot()  # reports now what is missing, not after an hour
+        pyplot()  # reports a missing package now, not after an hour
         return int(sum(made(name, job_options, args) for name, job_options in selected.items()) > 0)
     except FAILURES as error:
         print(f"python -m thirdhand_sim.lab: {in_words(error)}", file=sys.stderr)
@@ -158,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def made(name: str, options: Options, args: argparse.Namespace) -> int:
-    """Makes one result, or draws it again, where that is due; returns the exit code."""
+    """Make one result, or draw it again, unless it is up to date; returns the exit code."""
     try:
         only_stale = args.name == "all" and not args.anew and not args.redraw
         if only_stale and not staleness(name, result_of(args.output, name), tree(), options):
@@ -177,7 +177,9 @@ def made(name: str, options: Options, args: argparse.Namespace) -> int:
 
 
 def stale(folder: Path, wanted: dict[str, Options]) -> int:
-    """Lists the results in a folder that do not belong to this tree; returns the exit code."""
+    """List the results in a folder that do not belong to this source tree; returns the exit
+    code.
+    """
     reasons = {
         name: staleness(name, result_of(folder, name), tree(), options)
         for name, options in wanted.items()

@@ -1,9 +1,8 @@
-"""The experiments: the module of each, what its numbers depend on, and its seeds, tuning and
-evaluation apart.
+"""The experiments: module, dependencies and seeds of each, separately for tuning and evaluation.
 
 An experiment is a module with `run(results, options) -> numbers`, and a row of `EXPERIMENTS`. The
 first sentence of the module is its help. The command writes the seeds into the result. No number of
-the service or of a rival may be chosen on what an experiment is evaluated on.
+the service or of a rival may be chosen by data on which an experiment is evaluated.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ DRAWING = 0  # seed of the scatter of dots in a figure, and of resampling for an
 
 
 class Stream(NamedTuple):
-    """Random things, each drawn from the stream's seed and its own number."""
+    """Random scenes, hands or people, each drawn from the stream's seed and its own number."""
 
     kind: str
-    seed: int  # 0 where each is drawn from its number alone
+    seed: int  # 0 if each is drawn from its number only
     numbers: range
 
     def share(self, share: float, *, least: int = 1) -> range:
@@ -33,7 +32,7 @@ class Stream(NamedTuple):
         return self.numbers[: max(least, round(len(self.numbers) * share))]
 
     def overlaps(self, other: Stream) -> bool:
-        """True if something is drawn in both."""
+        """True if two streams have an item in common."""
         return self[:2] == other[:2] and not set(self.numbers).isdisjoint(other.numbers)
 
     def __str__(self) -> str:
@@ -41,7 +40,7 @@ class Stream(NamedTuple):
 
 
 class Seeds(NamedTuple):
-    """Random streams of an experiment: to learn from, to choose constants on, to evaluate on.
+    """Random streams of an experiment: for learning, for the choice of constants, for evaluation.
 
     `method` is the seed of the methods' own random choices.
     """
@@ -52,7 +51,7 @@ class Seeds(NamedTuple):
     method: int = 0
 
     def named(self) -> dict[str, object]:
-        """The seeds as a result's JSON names them."""
+        """The seeds as in a result's JSON."""
         parts = {"learned": self.learned, "tuning": self.tuning, "evaluation": self.evaluation}
         return {"method": self.method} | {
             part: {name: str(stream) for name, stream in streams.items()}
@@ -73,7 +72,7 @@ class Experiment(NamedTuple):
 
     @property
     def about(self) -> str:
-        """Its purpose: the first sentence of the module, read without importing it."""
+        """The experiment's purpose: the first sentence of its module, read without importing it."""
         path = Path(__file__).parent.joinpath(*self.module.split(".")).with_suffix(".py")
         text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
         return " ".join(text.partition("\n\n")[0].split())
@@ -131,7 +130,7 @@ _FOLLOWED = {
     "small": Stream("small motion", 0, range(200, 202)),
 }
 _OTHERS = Seeds({}, tuning=_TUNED_HANDS, learned=_TEACHERS)  # evaluated on recordings
-_SENSITIVITY = Seeds(  # one of each for each seed of a session
+_SENSITIVITY = Seeds(  # an item of each stream for each seed of a session
     {},
     tuning={
         "people": Stream("moving hands", 0, range(300, 306)),

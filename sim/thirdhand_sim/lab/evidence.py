@@ -1,9 +1,8 @@
-"""The origin of each experiment's result, and whether it still belongs to this tree.
+"""The origin of each experiment's result, and its staleness against this source tree.
 
-A result depends on up to three things, each named by a digest: `core`, the frames of the golden
-session; `learning`, the numbers of the shipped skill, which `learn` makes of the shipped takes;
-`kmp`, what the library computes for two small problems. A result whose digests are not the tree's
-is stale.
+A result depends on up to three digests: `core`, of the frames of the golden session; `learning`, of
+the numbers of the shipped skill, which `learn` makes of the shipped takes; `kmp`, of the library's
+results for two small problems. A result is stale if its digests are not those of the tree.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ CODE = (
     "recordings/golden.mcap",
 )
 MACHINE = ("cpu", "python", "numpy", "scipy", "pin", "ruckig")
-DECIMALS = 6  # kmp's outputs are rounded to these, on which CPUs agree
+DECIMALS = 6  # kmp's outputs are rounded to these decimals, on which CPUs agree
 
 
 USUAL = Options()
@@ -62,8 +61,8 @@ def tree() -> dict[str, str]:
 def core_digest(golden: Path) -> str:
     """The digest of a golden session's frames and messages. Raises RecordingError.
 
-    Where the file has a frame as a whole, its checksum covers the state too, which decides nothing
-    by itself: the frame is taken then.
+    Checksums of frames cover the state too, which decides nothing by itself. So a frame that the
+    file has as a whole counts instead of its checksum.
     """
     recording = Recording.open(golden)
     sums = hashlib.blake2b(digest_size=16)
@@ -86,7 +85,7 @@ def _skill_digest() -> str:
 
 @functools.cache
 def kmp_digest() -> str:
-    """The digest of what kmp computes for two small problems, rounded to DECIMALS."""
+    """The digest of kmp's results for two small problems, rounded to DECIMALS."""
     sums = hashlib.blake2b(digest_size=16)
     for output in kmp_outputs():
         sums.update((np.round(output, DECIMALS) + 0.0).tobytes())  # -0.0 becomes 0.0
@@ -124,7 +123,7 @@ def kmp_outputs() -> Iterable[Array]:
 
 
 def commit() -> str:
-    """The commit of this tree, with a `+` if its code is changed; "unknown" without git."""
+    """The commit of this source tree, with a `+` if its code is changed; "unknown" without git."""
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
         return _git("rev-parse", "--short=12", "HEAD") + "+" * bool(
             _git("status", "--porcelain", "--", *CODE)
@@ -139,7 +138,7 @@ def _git(*arguments: str) -> str:
 
 
 def origin(name: str, options: Options) -> dict[str, Any]:
-    """The origin of a result that is made now, as its JSON names it."""
+    """The origin of a result that is made now, for its JSON."""
     machine_facts = machine()
     digests = tree()
     return {
@@ -167,7 +166,7 @@ def options_of(name: str, options: Options) -> dict[str, Any]:
 
 
 def _folder(folder: Path) -> dict[str, Any]:
-    """The recordings in a folder: how many, and a digest of their names and bytes."""
+    """The number of recordings in a folder, and a digest of their names and bytes."""
     files = sorted(folder.glob("*.npz"))
     sums = hashlib.blake2b(digest_size=16)
     for file in files:
@@ -178,9 +177,9 @@ def _folder(folder: Path) -> dict[str, Any]:
 def staleness(
     name: str, result: Mapping[str, Any] | None, here: Mapping[str, str], options: Options = USUAL
 ) -> str:
-    """The reason why a result is not that of these digests and options; empty if it is.
+    """The reason why a result does not belong to these digests and options; empty if it does.
 
-    A folder that the options do not name may have been any.
+    If the options name no folder, a result with any folder is accepted.
     """
     if result is None:
         return "there is no result"
@@ -198,7 +197,7 @@ def staleness(
 
 
 def result_of(folder: Path, name: str) -> dict[str, Any] | None:
-    """The JSON of an experiment in a folder, if it is there. Raises ExperimentError."""
+    """The JSON of an experiment in a folder, if it exists. Raises ExperimentError."""
     path = folder / f"{name}.json"
     try:
         return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None

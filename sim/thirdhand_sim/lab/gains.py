@@ -28,7 +28,7 @@ def gain(target: Array, path: Array, rate_hz: float) -> float:
 
 
 def _amplitude(path: Array, rate_hz: float) -> Array:
-    """Coefficients (2, 3) [m] of sine and cosine at the end of a path (N, 3), beside its drift."""
+    """Coefficients (2, 3) [m] of sine and cosine at the end of a path (N, 3), without its drift."""
     path = path[-round(SMALL_JUDGED_S / PERIOD_S) :]
     t = np.arange(len(path)) * PERIOD_S
     angle = 2 * np.pi * rate_hz * t

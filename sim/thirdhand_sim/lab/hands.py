@@ -43,7 +43,7 @@ MOVED = Drawn(
     (),
     HANDS_SEED,
 )
-MOVING_M_S = 0.05  # a hand at this speed has started
+MOVING_M_S = 0.05  # a hand that has reached this speed has started
 # rates of the paths in the figure, and of their recordings
 DRAWN_HZ = 20
 SERVICE_HZ = 500
@@ -77,7 +77,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         ("nominal", NOMINAL, True),
         ("adaptation", MOVED, True),
     ):
-        if options.share < 1:  # a quick look, in process
+        if options.share < 1:  # quick look: in process
             runs[name] = (None, _in_process(drawn, taught=taught))
             continue
         ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)
@@ -144,7 +144,9 @@ def _in_process(drawn: Drawn, *, taught: bool) -> Traces:
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
-    """The figure of the paths of hands and tool. That of the stages shows more than the numbers."""
+    """The figure of the paths of hands and tool. The figure of the stages needs more than the
+    numbers.
+    """
     runs = {
         name: Traces(*(np.array(paths[part]).T for part in Traces._fields))
         for name, paths in numbers["shown"].items()

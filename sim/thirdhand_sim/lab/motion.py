@@ -65,7 +65,7 @@ from thirdhand_sim.lab.rivals.followers import (
 from thirdhand_sim.lab.rivals.linear_filters import best_linear, error_at
 from thirdhand_sim.lab.workers import shared_out
 
-TRIED_LAGS_S = (-0.06, 0.2)  # lags that are tried
+TRIED_LAGS_S = (-0.06, 0.2)  # range of the lags that are tried
 MOTION_SEEDS = EXPERIMENTS["motion"].seeds
 PEOPLE, STOPS, SCENE, SMALL = (
     MOTION_SEEDS.evaluation[name] for name in ("people", "stops", "hands", "small")
@@ -73,8 +73,8 @@ PEOPLE, STOPS, SCENE, SMALL = (
 SMALL_HZ = range(1, 13)
 SECONDS = 15.0
 SETTLED_MM = 5.0
-BEGUN_S = 1.0  # not judged: a recording may begin in full motion, with the tool at rest
-DIALS = ("closely", "calmly")  # of `[tool] follow`, besides the default
+BEGUN_S = 1.0  # not judged before: recordings may begin in motion, the tool begins at rest
+DIALS = ("closely", "calmly")  # values of `[tool] follow`, besides the default
 # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))
 SERVOS = (1.5, 20.0)  # coefficients of the Butterworth filter: the plug-in's default, smoother
@@ -87,19 +87,19 @@ MOTION_LABELS = {
 TRUTH = "truth"
 SMOOTH = "minimum jerk"
 FLOOR_GROUPS = {"clean": 100, "recorded": 30}  # Hz
-# a group: recorded hands, where a follower should follow jumps
+# name of the group of recorded hands in which followers should follow jumps
 WITH_JUMPS = "recorded, jumps in the truth"
 HARDER_GROUPS = ("late", "unseen")  # clean hands made harder; only ours is measured
 TICKS_MM = (1, 2, 5, 10, 20)
 AS_PAPER = "experiments/as-paper.npz"
-# the skills, appended to a group's name
+# the skill's part of a group's name
 SHIPPED_SKILL_HANDS = ""
 OF_SUCH_HANDS = ", skill of such hands"
 TEACHERS = MOTION_SEEDS.learned["teachers"].numbers  # people who are not followed
-# ticks from one sample to the next
+# duration of a take for such a skill [s], and ticks from one sample to the next
 TAUGHT_S = 20.0
 TAUGHT_EVERY = 10
-# motion of their tool, per motion of a hand
+# motion of the tool in these takes, per motion of a hand
 LEFT_GAIN = 0.8
 RIGHT_GAIN = 0.5
 
@@ -108,7 +108,8 @@ RIGHT_GAIN = 0.5
 class MotionFigures:
     """One sequence with one follower.
 
-    Overshoot and settling are those of sudden stops, the rest of all others.
+    Overshoot and settling are only those of sudden stops, all other figures only those of other
+    sequences.
     """
 
     follower: str
@@ -118,14 +119,14 @@ class MotionFigures:
     error_rms_mm: float
     error_p95_mm: float
     lag_ms: float
-    acceleration_ratio: float  # root mean square, to the truth's
+    acceleration_ratio: float  # root mean square, relative to the truth's
     jerk_ratio: float
-    limited: float  # share of ticks with a limit met
+    limited: float  # share of ticks in which a limit is reached
     top_speed: float  # [m/s] of the tool
     overshoot_mm: float
     settled_ms: float
-    joint_speeds: list[float]  # [rad/s] by frequency, as of `spectra`
-    tracker: str = ""  # its kind, of recorded hands
+    joint_speeds: list[float]  # [rad/s] by frequency, see `spectra`
+    tracker: str = ""  # kind of tracker of recorded hands
     error_with_jumps_mm: float = math.nan  # rms error against the truth with the tracker's jumps
 
 
@@ -179,7 +180,7 @@ def skill_of_such_hands(shipped: Skill, middle: Array) -> Skill:
 
 
 def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follower]:
-    """All followers; for a quick look one of each kind, and ours."""
+    """All followers; for a quick look, ours and one of each kind."""
     by_name = {"ours": ours(skill, settings)}
     first = None if share == 1 else 1
     for dial in DIALS if share == 1 else ():
@@ -202,7 +203,7 @@ def sequences(options: Options, middle: Array) -> list[Moving]:
     """The modelled hands that are followed."""
     share = options.share
     people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
-    if share < 1:  # a quick look
+    if share < 1:  # quick look
         people = [sequence for sequence in people if sequence.group in FLOOR_GROUPS]
     numbers = STOPS.share(share, least=2)
     return [
@@ -217,9 +218,9 @@ _known: dict[str, Any] = {}
 
 
 def prepare(share: float, arm: str) -> None:
-    """Load the skills and their followers, once in a process."""
+    """Load the skills and their followers, once in each process."""
     settings = cell_of(arm)
-    # A function of the hands' positions alone, so that only the followers differ.
+    # A skill that depends on the hands' positions only, so that only the followers differ.
     skill = decoded((recordings() / AS_PAPER).read_bytes(), origin=AS_PAPER)
     other = skill_of_such_hands(skill, skill.hands.mean(axis=0))
     for skill_key, loaded_skill in ((SHIPPED_SKILL_HANDS, skill), (OF_SUCH_HANDS, other)):
@@ -289,7 +290,7 @@ def figures(name: str, hands: Moving, target: Array, seen: Followed) -> MotionFi
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """Follows all hands with all followers; returns the numbers for its JSON."""
+    """Follow all hands with all followers; returns the numbers for the JSON."""
     prepare(options.share, options.arm)
     skill, _, by_name = _known[SHIPPED_SKILL_HANDS]
     if options.hands is not None:
@@ -341,7 +342,7 @@ def _floors(hands: Sequence[Any], skill: Skill) -> dict[str, list[dict[str, Any]
 
 
 def _summary(rows: list[MotionFigures]) -> dict[str, dict[str, float]]:
-    """Means over the sequences of each group; of stops the worst too."""
+    """Means over the sequences of each group; for stops also the worst."""
     out: dict[str, dict[str, float]] = {}
     for group in dict.fromkeys(row.group for row in rows):
         of = [row for row in rows if row.group == group]
@@ -377,7 +378,7 @@ def _measured(tasks: list[tuple[str, str, Moving]], options: Options) -> list[Mo
 
 
 def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
-    """The tasks of ours and of the chases on these hands."""
+    """The tasks of the service and of the chases on these hands."""
     names = [
         name
         for name in _known[SHIPPED_SKILL_HANDS][2]
@@ -389,11 +390,11 @@ def _beside_chases(hands: list[Moving]) -> list[tuple[str, str, Moving]]:
 def _by_arm(
     results: Results, options: Options, hands: list[Moving]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """The errors with each shipped arm by group, as of `_compared`."""
+    """The errors with each shipped arm by group, see `_compared`."""
     tasks = _beside_chases(hands)
     out = {}
     for arm in ARMS:
-        prepare(options.share, arm)  # of this process, which measures if there is one worker
+        prepare(options.share, arm)  # prepares this process, which measures if there is one worker
         measured = _measured(tasks, replace(options, arm=arm))
         out[arm] = {
             group: _compared([row for row in measured if row.group == group])
@@ -431,7 +432,9 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
 
 
 def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dict[str, Any]:
-    """The numbers of recorded hands: ours beside the chases; and with samples late or missing."""
+    """The numbers of recorded hands: the service beside the chases; and with late or missing
+    samples.
+    """
     harder = [
         ("ours", SHIPPED_SKILL_HANDS, sequence)
         for sequence in hands
@@ -484,7 +487,7 @@ def _of_recorded(results: Results, options: Options, hands: list[Moving]) -> dic
 def _bound(
     results: Results, hands: list[Moving], found: list[MotionFigures]
 ) -> dict[str, dict[str, float]]:
-    """By tracker, the errors [mm] of ours and of the best linear filter that is as jerky, which is
+    """Errors [mm] by tracker: of the service, and of the best linear filter with the same jerk,
     fitted to each recording; medians over recordings.
     """
     skill = _known[SHIPPED_SKILL_HANDS][0]
@@ -510,7 +513,7 @@ def _bound(
 def _by_person(
     results: Results, rows: list[MotionFigures]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """The errors of each group and person, as of `_compared`."""
+    """The errors of each group and person, see `_compared`."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for group in dict.fromkeys(row.group for row in rows):
         of = [row for row in rows if row.group == group]
@@ -523,8 +526,8 @@ def _by_person(
 
 
 def _compared(rows: list[MotionFigures]) -> dict[str, float]:
-    """Errors [mm] over sequences, root mean square and median: ours, and those of the best chase
-    for each person. Our lag is a median too.
+    """Errors [mm] over sequences, root mean square and median, of the service and of the best chase
+    for each person; and the service's median lag.
     """
     errors: dict[str, list[float]] = {"ours": [], "chase": []}
     for name in dict.fromkeys(row.person for row in rows):
@@ -599,7 +602,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             results,
             {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()},
         )
-    if "gain_by_frequency" in numbers:  # results of an older layout have none
+    if "gain_by_frequency" in numbers:  # older results have no gains
         gains.draw(results, numbers["gain_by_frequency"])
 
 

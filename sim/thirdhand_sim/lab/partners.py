@@ -1,11 +1,11 @@
 """Learned skills where a third hand does something other than soldering: recordings of real
 partners, and made tasks of eleven kinds. Ours beside rivals, on takes that were left out.
 
-What is judged is what a user has: the skill of `thirdhand learn` with its defaults. Where the
-command refuses, there is none, and the error that the skill would have had is given apart.
-Recordings are left out take by take, person by person, or in blocks. The made tasks are shown by
-some people and done by others. A rival that is given the via-points knows as much as a skill
-between them.
+The experiment judges the skill that a user gets from `thirdhand learn` with its defaults. If the
+command refuses, there is no skill, and the error that it would have had is listed separately.
+Recordings are left out take by take, person by person, or in blocks. In the made tasks, some people
+demonstrate and others do the task. A rival with given via-points has the same information as a
+skill between via-points.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from thirdhand_sim.made_tasks import TASK_KINDS, takes
 
 SERVICE = "service"
 TOLD = ", told"
-RECORDED = {  # the beginnings of the files' names
+RECORDED = {  # prefixes of the files' names
     "robot holds driver": ("robot_hold_driver",),
     "robot hands over plate": ("robot_hand_over_plate",),
     "robot hands over screw": ("robot_hand_over_screw",),
@@ -62,15 +62,15 @@ RECORDED = {  # the beginnings of the files' names
     "give": ("give",),
     "walk": ("walk",),
 }
-GROUPED_BY_PERSON = ("give",)  # its groups are persons
-NAMES_PLACES = ("give",)  # takes whose begin and end serve as via-points
+GROUPED_BY_PERSON = ("give",)  # tasks whose groups are persons
+NAMES_PLACES = ("give",)  # tasks whose takes begin and end at via-points
 TAKES_OF_BLOCK = 9  # takes of `walk` that are left out together
 PARTNER_SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 OWN = 3  # takes by which a person refines the skill of the others
 PARTNERS_SHOWING = len(PARTNER_SEEDS.learned[TASK_KINDS[0]].numbers)
 WANTED_TOLD = 90.0  # [%] of the samples with an error above UNSURE_M should be held or unsure
-ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the others may be
+ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the other samples may be held or unsure
 # in the figure: label, and colour of refused skills
 GIVEN = ", via-points given"
 REFUSED = "#F6D2BD"
@@ -86,7 +86,9 @@ SHOWN_SETS = {
 
 
 class Part(NamedTuple):
-    """The work of one process: a task and the group left out of it; made kinds leave none out."""
+    """The work of one process: a task and the group that is left out; made tasks leave no group
+    out.
+    """
 
     task: str
     out: str
@@ -99,30 +101,31 @@ class SkillFold(NamedTuple):
 
     refusals: tuple[str, ...]  # reasons why the command writes no skill
     residual: tuple[str, ...]  # risks that somebody must accept before the daemon serves it
-    figures: Figures | None  # none where nothing could be learned
+    figures: Figures | None  # None if nothing could be learned
     model: str
     accepted: list[Judged | None]  # each take with the command's skill; None: refused
-    again: list[list[Judged]]  # the further rounds of each accepted take, by their rests
+    again: list[list[Judged]]  # further rounds of each accepted take, by their rests
     # each take of a refused fold, with the skill used in spite of the refusal
     in_spite: list[Judged]
     take_refusals: list[str]  # via-points that the skill cannot be adapted to
 
 
 class Found(NamedTuple):
-    """The judged takes of each rival, the service's fold without and with via-points, and more that
-    some tasks have.
+    """The judged takes of each rival, the service's fold without and with via-points, and further
+    results of some tasks.
     """
 
     rivals: dict[str, list[Judged]]
     service: dict[str, SkillFold]
-    moved: RigidMap | None = None  # of recorded takes, into the arm's reach
-    # the skill refined by OWN takes of the person who is left out, on the rest
+    moved: RigidMap | None = None  # map of recorded takes into the arm's reach
+    # fold of a skill refined by OWN takes of the left-out person, judged on that person's other
+    # takes
     own: SkillFold | None = None
 
 
 @functools.lru_cache(maxsize=2)
 def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], list[LeftOut]]:
-    """Takes to learn from, and those that are left out wherever they are not learned from."""
+    """Takes to learn from, and takes to judge wherever they are not learned from."""
     if task in TASK_KINDS:
         groups = [
             [
@@ -217,10 +220,10 @@ def served(
     told: bool,
     refined: StoredSkill | None = None,
 ) -> SkillFold:
-    """The service's skill of the shown takes, on those that are left out.
+    """The service's skill of the demonstrated takes, judged on the left-out ones.
 
-    An accepted skill is judged within the reach of the arm. A refused one is judged without it, as
-    otherwise the reach alone would decide.
+    An accepted skill is judged with the arm's reach. A refused skill is judged without it, as
+    otherwise only the reach would decide.
     """
     skill, refusals = as_command(shown, told=told, refined=refined)
     if skill is None:
@@ -293,7 +296,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
     """The numbers of a set: of each rival, and of the service.
 
-    Those of the service are of accepted takes alone, and `beside_mm` has each rival on these takes.
+    The service's numbers are those of accepted takes, and `beside_mm` has each rival on the same
+    takes.
     """
     methods = {
         name: summary([take for part in found for take in part.rivals[name]])
@@ -364,7 +368,7 @@ def _beside(
 
 
 def _said(figures: Sequence[Figures]) -> dict[str, Any]:
-    """What `learn` says of its skills."""
+    """Figures and remarks of `learn` on its skills."""
     if not figures:
         return {"learn_says_mm": None, "ambiguous": None, "unsafe": 0, "says": []}
     return {
@@ -376,7 +380,7 @@ def _said(figures: Sequence[Figures]) -> dict[str, Any]:
 
 
 def summary(takes: Sequence[Judged]) -> dict[str, Any]:
-    """Errors over all samples [mm], and shares of samples; none of no takes."""
+    """Errors over all samples [mm], and shares of samples; only the number 0 without takes."""
     if not takes:
         return {"takes": 0}
     count = sum(take.samples for take in takes)
@@ -392,13 +396,15 @@ def summary(takes: Sequence[Judged]) -> dict[str, Any]:
         "held": _share([take.held for take in takes], count),
         "unsure": _share([take.unsure for take in takes], count),
         "wrong": wrong / count,
-        "told": _share([take.told for take in takes], wrong),  # of the wrong ones, held or unsure
+        "told": _share([take.told for take in takes], wrong),  # held or unsure, of wrong ones
         "falsely_told": _share([take.falsely_told for take in takes], count - wrong),
     }
 
 
 def _share(counts: Sequence[float | None], total: int) -> float | None:
-    """The share that the known counts are of a total; None if none is known, or the total is 0."""
+    """The sum of the known counts as a share of a total; None if none is known, or the total is
+    0.
+    """
     known_counts = [count for count in counts if count is not None]
     return sum(known_counts) / total if known_counts and total > 0 else None
 
@@ -410,7 +416,9 @@ def _line(fold: SkillFold) -> str:
 
 
 class SetVerdict(NamedTuple):
-    """A set as `learn` judges it: summaries of accepted takes, and of refused skills in spite."""
+    """A set by the judgement of `learn`: summaries of accepted takes, and of refused skills used in
+    spite.
+    """
 
     accepted: Mapping[str, Any]
     in_spite: Mapping[str, Any]
@@ -420,7 +428,9 @@ class SetVerdict(NamedTuple):
 
     @property
     def some_refused(self) -> bool:
-        """True if the errors are of some of the takes only, and rivals are known on the same."""
+        """True if the errors are those of some takes only, and rivals were judged on the same
+        takes.
+        """
         return bool(
             self.accepted["takes"] and self.accepted["refuses"] and "beside_mm" in self.accepted
         )
@@ -429,8 +439,8 @@ class SetVerdict(NamedTuple):
 def verdict(task: Mapping[str, Any], method: str) -> SetVerdict:
     """The verdict on the service in a set's numbers.
 
-    In results without `folds_refused`, skills were used although `learn` calls all of a set unsafe,
-    or none.
+    In older results without `folds_refused`, `learn` calls all or none of a set's skills unsafe,
+    and all were used.
     """
     numbers = task["methods"][method]
     none = {"takes": 0}
@@ -451,7 +461,7 @@ def verdict(task: Mapping[str, Any], method: str) -> SetVerdict:
 
 
 def _rows_of(sets: Mapping[str, Any]) -> list[tuple[str, Any, str]]:
-    """The rows of a panel: label, numbers of the set, and the setting's ending."""
+    """The rows of a panel: label, numbers of the set, and suffix of the setting."""
     rows = []
     for name, task in sets.items():
         endings = [ending for ending in ("", TOLD) if SERVICE + ending in task["methods"]]
@@ -535,7 +545,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
 
 
 def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
-    """The figure of what a skill says of its own errors, set by set."""
+    """The figure of the skills' own estimates of their errors, set by set."""
     plt = pyplot()
     figure, (inside, warned) = plt.subplots(1, 2, figsize=(7.5, 3.6))
     inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)

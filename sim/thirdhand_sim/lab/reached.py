@@ -1,5 +1,6 @@
-"""Are via-points reached? One harness for all that asks it: the places of a scene are taught,
-and the three events are judged open loop, in closed loop (`rehearsal`) or live (`load.live`).
+"""Judgement whether via-points are reached, for several experiments: the places of a scene are
+taught, and the three events are judged in open loop, in closed loop (`rehearsal`) or live
+(`load.live`).
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ def taught(skill: StoredSkill, via_points: Sequence[ViaPoint]) -> Skill:
 
 
 def ours(scene: Scene) -> Callable[[Bench], Skill]:
-    """The shipped skill, taught the three places of a scene as the demo teaches them."""
+    """The shipped skill, adapted to the three via-points of a scene as in the demo."""
     skill = taught(shipped_skill(), scene.via_points())
     return lambda bench: skill
 
 
 def places_in(scene: Scene) -> Places:
-    """The places of a scene, known exactly."""
+    """The places of a scene, without errors."""
     s = scene
     points = (s.left_start, s.right_start, s.handover, s.glass, s.soldering, s.iron, s.robot_start)
     return Places._make([*(np.array(point) for point in points), 0.0])
@@ -59,8 +60,8 @@ def shown() -> list[SessionDemonstration]:
 
 
 def at_the_events(scene: Scene, seed: int) -> tuple[Array, Array]:
-    """Both hands (3, 6) at the end of each rest, off by 8 mm an axis, and the tool wanted then
-    (3, 3) [m].
+    """Both hands (3, 6) [m] at the end of each rest, with errors of 8 mm per axis, and the wanted
+    tool positions (3, 3) [m].
     """
     script = HandScript(scene, seed=seed, offset_std=OFFSET_M)
     motions = [script.truth(end) for _, end in scene.dwells]

@@ -34,20 +34,20 @@ SESSION_NOISE_M = 0.0005
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """The events of a run, and, where these are kept, arrays over its T ticks."""
+    """The events of a run, and, if requested, arrays over its T ticks."""
 
     events: TaskEvents
     held_s: float  # time in which the service did not follow while the hands moved
     frames: NDArray[np.void]
     time_s: Array  # of the script; 0 before it begins
     hands: Array  # (T, 2, 3) true positions, without noise [m]
-    joints: Array  # (T, 2, J) as measured [rad, rad/s]
-    tool: Array  # (T, 3) as measured in the simulation [m]
-    axis: Array  # (T, 3) the tool's +z, as measured
+    joints: Array  # (T, 2, J) measured [rad, rad/s]
+    tool: Array  # (T, 3) measured in the simulation [m]
+    axis: Array  # (T, 3) the tool's measured +z
 
     @property
     def errors_mm(self) -> tuple[float, float, float]:
-        """Errors of handover, grasp and carry."""
+        """The errors of handover, grasp and carry [mm]."""
         return tuple(getattr(self.events, name).error_mm for name in TaskEvents.__struct_fields__)
 
 
@@ -65,8 +65,8 @@ def rehearse(
     """One run of a script through core and physics.
 
     `settings` name the arm and the rate (default: the shipped cell's); `rate_hz` overrides the
-    rate; `world` is the physics (default: the first installed). `look` sees the bench after each
-    tick; `keep` keeps the arrays.
+    rate; `world` is the physics (default: the first installed). `look` is called with the bench
+    after each tick; `keep` requests the arrays.
     """
     settings = settings or Settings()
     settings = msgspec.structs.replace(settings, rate_hz=rate_hz or settings.rate_hz)
@@ -98,7 +98,7 @@ def rehearse(
 
 
 def demonstrated(stream: Stream = SHIPPED_TAKES) -> list[Demonstration]:
-    """Demonstrations of the nominal scene, 100 Hz."""
+    """Demonstrations of the nominal scene at 100 Hz."""
     return [
         demonstrate(Scene(), seed=1000 * stream.seed + n, begin_s=60 * n) for n in stream.numbers
     ]

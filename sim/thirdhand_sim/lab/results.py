@@ -39,23 +39,23 @@ DESIRED = "#CC79A7"
 REFERENCE = "#7F7F7F"
 DPI = 110
 COLOURS = 256
-ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in a JSON, which takes one line
+ROW = re.compile(r"\[\s+([-+.\de,\s]+?)\s+\]")  # a list of numbers in JSON, put into one line
 
 
 class ExperimentError(ExplainedError):
-    """An experiment that cannot be made; the message gives the remedy."""
+    """An experiment cannot be made; the message has the remedy."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of the command line."""
 
-    letters: Path | None = None  # a folder of recorded letters, for those about letters
+    letters: Path | None = None  # a folder of recorded letters, for experiments on letters
     # a folder of recorded hands, for `motion`, and for `people` to choose parameters
     hands: Path | None = None
     data: Path | None = None  # a folder of recorded takes of hands and a third hand, for `partners`
     group: Literal["tuning", "test"] = "test"  # the people of `people`
-    workers: str = "1"  # as `thirdhand.process.parallel.spread` takes them
+    workers: str = "1"  # see `thirdhand.process.parallel.spread`
     share: float = 1.0  # share of the full size; less for a quick look
     arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
 
@@ -76,7 +76,7 @@ class Results:
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def say(self, line: str) -> None:
-        """Shows progress."""
+        """Print a line of progress."""
         if self.said:
             print(
                 f"[{self.name} {time.monotonic() - self.began_s:5.1f} s] {line}",
@@ -117,7 +117,7 @@ class Results:
         return path
 
     def measured(self) -> dict[str, Any]:
-        """The numbers in the experiment's JSON, which an earlier run left."""
+        """The numbers in the experiment's JSON of an earlier run."""
         numbers: dict[str, Any] = json.loads(
             (self.folder / f"{self.name}.json").read_text(encoding="utf-8")
         )
@@ -126,7 +126,9 @@ class Results:
     def series(
         self, values: Mapping[str, Sequence[Any]], timeline: str, styles: Mapping[str, Any] = {}
     ) -> None:
-        """Records numbers by path, one a step of a timeline; a path may have a style of its own."""
+        """Record numbers by path, one for each step of a timeline; a path may have a style of its
+        own.
+        """
         stream = self.recording()
         for path, numbers in values.items():
             if path in styles:
@@ -152,7 +154,7 @@ def pyplot() -> Any:
             "'thirdhand[experiments]'"
         ) from None
     mpl.use("Agg")
-    # it warns of limits that equal scales change
+    # Matplotlib warns of limits that equal scales change
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     from matplotlib import pyplot as plt
 
@@ -182,7 +184,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def equal_box(axes: Any, points: Array) -> None:
-    """Gives 3-D axes equal scales around points (N, 3)."""
+    """Set equal scales of 3-D axes around points (N, 3)."""
     low = points.min(axis=0)
     high = points.max(axis=0)
     half = 0.55 * (high - low).clip(min=1e-3)
@@ -194,7 +196,7 @@ def equal_box(axes: Any, points: Array) -> None:
 
 
 def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:
-    """Draws the ellipse of one standard deviation of a 2-D normal (2,), (2, 2)."""
+    """Draw the ellipse of one standard deviation of a 2-D normal (2,), (2, 2)."""
     from matplotlib.patches import Ellipse
 
     values, vectors = np.linalg.eigh(covariance)

@@ -13,12 +13,12 @@ from thirdhand_sim.lab.results import Array
 from thirdhand_sim.scene import MOST_MOVED, Scene
 from thirdhand_sim.script import Clock, HandScript, ScriptPause
 
-LOWEST_M = 0.05  # above the table
-OFFSET_M = 0.008  # deviation of where the hands stop, each axis
+LOWEST_M = 0.05  # least height above the table
+OFFSET_M = 0.008  # deviation of the hands' stops, each axis
 
 
 class Drawn(NamedTuple):
-    """A scene and how its hands go through it."""
+    """A random scene, with the speed and the pauses of its hands."""
 
     scene: Scene
     speed: float
@@ -39,7 +39,7 @@ class Drawn(NamedTuple):
 
     @property
     def turns(self) -> int:
-        """The number of times the hands go back and return."""
+        """The number of times that the hands move back on their path."""
         return sum(pause.depth > 1 for pause in self.pauses)
 
 
@@ -48,7 +48,7 @@ def draw(number: int, *, seed: int) -> Drawn:
 
     Handover, glass and soldering place lie anywhere within 15 cm of the nominal ones, at least 5 cm
     above the table. Hands are 0.5 to 2 times as fast. In two scenes of three they pause once; in
-    every other scene they go back once for a while and return.
+    every other scene they move back on their path once, and forward again.
     """
     random = np.random.default_rng([seed, number])
     nominal = Scene()
@@ -68,7 +68,8 @@ def draw(number: int, *, seed: int) -> Drawn:
         (halves[1], turns, 2.0, 1.5),
     ):
         if has_pause:
-            # Each lies in its own half of the script; the second is delayed by the first.
+            # Pause and reversal lie in different halves of the script; the first one delays the
+            # second.
             at_s = (0.08 + 0.42 * half + random.uniform(0, 0.3)) * lasts_s
             pauses.append(ScriptPause(at_s, float(random.uniform(0.6, longest_s)), depth))
     ordered = sorted(pauses)
@@ -79,7 +80,7 @@ def draw(number: int, *, seed: int) -> Drawn:
 
 
 def _never_before_the_start(pauses: list[ScriptPause], speed: float) -> list[ScriptPause]:
-    """The pauses; those in which the hands go back end where they would be at their start."""
+    """The pauses; reversals are shortened so that the hands do not move back beyond their start."""
     shorter = list(pauses)
     for i in range(len(shorter)):
         while (
@@ -98,7 +99,7 @@ def _script_s_after(pause: ScriptPause, pauses: list[ScriptPause], speed: float)
 def _moved(
     place: tuple[float, float, float], random: np.random.Generator
 ) -> tuple[float, float, float]:
-    """A place anywhere in the ball around a place, and high enough."""
+    """A random place in a ball around a place, and high enough above the table."""
     while True:
         step: Array = random.uniform(-1, 1, 3)
         x, y, z = np.round(np.array(place) + MOST_MOVED * step, 6).tolist()

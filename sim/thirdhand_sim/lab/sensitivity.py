@@ -41,16 +41,16 @@ SensitivityFigures: TypeAlias = dict[str, float]
 
 TUNING_STREAMS = EXPERIMENTS["sensitivity"].seeds.tuning
 SEEDS_AT_USUAL = len(TUNING_STREAMS["people"].numbers)
-CHANGED = 2  # seeds of the sessions at other values
+CHANGED = 2  # seeds of the sessions with changed values
 FACTORS = (0.5, 2.0)
 MOTION_S = 4.0
-STOP_RATES_HZ = {100: 0.0005, 30: 0.002, 15: 0.002}  # noise [m] of the trackers
+STOP_RATES_HZ = {100: 0.0005, 30: 0.002, 15: 0.002}  # noise [m] of the trackers by rate
 WITHOUT_HAND_S = (1.7, 2.3)  # begin and end of the time without a hand
-# bursts of three outliers, and how far away they are
+# number of bursts of three outliers, and distance of the outliers
 BURSTS = 4
 BURST_M = 0.2
 BOX = Box((0.52, -0.2, 0.36), (0.08, 0.04, 0.3))  # on the way to the handover
-# an arm trembles ever less until then
+# initial amplitude of an arm's tremor, and time until it ends
 TREMBLE_RAD = 0.05
 TREMBLE_S = 1.0
 # length of the session, and share of implausible samples
@@ -101,12 +101,12 @@ def numbers() -> dict[str, Number]:
 
 @functools.cache
 def _skill() -> Skill:
-    """A skill that depends on the hands alone."""
+    """A skill that depends on the hands' positions only."""
     return decoded((recordings() / motion.AS_PAPER).read_bytes(), origin=motion.AS_PAPER)
 
 
 def _followed(hands: list[Moving], tuning: Tuning) -> list[motion.MotionFigures]:
-    """Figures of sequences of hands that the core alone follows."""
+    """Figures of sequences of hands that the core follows without the bench."""
     follow = ours(_skill(), Settings(), tuning)
     return [
         motion.figures("ours", sequence, targets(_skill(), sequence.truth), follow(sequence))
@@ -123,7 +123,7 @@ def _person(seed: int) -> list[Moving]:
 
 
 def moving(tuning: Tuning, seed: int) -> SensitivityFigures:
-    """Hands as in `motion`, seen by a precise and by a poor tracker."""
+    """Hands as in `motion`, with a precise and with a poor tracker."""
     rows = _followed(_person(seed), tuning)
     return {
         name: float(np.mean([getattr(row, name) for row in rows]))
@@ -186,7 +186,7 @@ def beside_a_box(tuning: Tuning, seed: int) -> SensitivityFigures:
 
 
 def implausible(tuning: Tuning, seed: int) -> SensitivityFigures:
-    """An arm that trembles ever less, joint states and hands that cannot be, and a fast clock."""
+    """An arm with a decreasing tremor, implausible joint states and hands, and a fast clock."""
     skill = reached.taught(shipped_skill(), Scene().via_points())
     settings = msgspec.structs.replace(
         Settings(), arm=msgspec.structs.replace(Settings().arm, source="state")
@@ -233,8 +233,8 @@ SESSIONS = (moving, stops, disturbed, beside_a_box, implausible)
 
 
 def measured(task: tuple[str, float, int]) -> SensitivityFigures | str:
-    """Figures of all sessions with a seed and a number, by its key (an empty one: none), times a
-    factor; or the error with which they fail.
+    """Figures of all sessions with a seed, with the number of this key times a factor (empty key:
+    no change); or the error with which they fail.
     """
     key, factor, seed = task
     tuning = numbers()[key].tuning(factor) if key else TUNING
@@ -278,7 +278,7 @@ def effect(rows: list[SensitivityFigures | str], tuned: list[SensitivityFigures]
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """Effect of each number, by its key and the factor; with fewer seeds for a quick look."""
+    """The effect of each number, by its key and the factor; with fewer seeds for a quick look."""
     all_numbers = numbers().values()
     seeds = range(math.ceil(options.share * CHANGED))
     noise_seeds = range(max(3, round(options.share * SEEDS_AT_USUAL)))

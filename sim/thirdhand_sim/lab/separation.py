@@ -1,7 +1,7 @@
 """Distance and speed of the arm toward hands: random scenes in closed loop, and scenes in which a
 hand is thrust in its way.
 
-Both are judged from outside: joints as the simulation measures them, hands as they are.
+Both are judged by the joints measured in the simulation and by the true hands.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from thirdhand_sim.script import (
     Teacher,
 )
 
-# half the rate, to save time
+# separate from the tuning scenes; the rate is halved to save time
 RANDOM_SCENES = EXPERIMENTS["separation"].seeds.evaluation["scenes"]
 SEPARATION_HZ = 250
 SCENE_KINDS = ("random", "thrust", "unheeded")
 EXCESS = ("excess_at_once", "excess_after_reaction", "excess_hurried", "excess_lasts_s")
-GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # the largest over all scenes
+GREATEST = ("pushed_mm", *EXCESS, "fastest_hand")  # results are maxima over all scenes
 # durations of a thrust
 THRUST_S = (0.35, 0.7)
 STAY_S = 2 * PAUSE_RAMP_S
-# a hand is thrust this far ahead of the tool on its path, and at most this time
+# a hand is thrust at a point of the tool's path this distance ahead, and at most this time ahead
 AHEAD_M = 0.22
 AHEAD_S = 1.5
 THRUST_STEP_S = 0.02  # times at which the path is sampled
@@ -61,14 +61,14 @@ SPEED_STEP_S = 1e-6
 # the figure shows the first scenes, and every tenth tick
 SHOWN_SCENES = 5
 SHOWN_TICKS = 10
-HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more is hurried
-UNHEEDED_EVERY = 4  # scenes run without separation too, to measure its cost
+HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more than this is hurried
+UNHEEDED_EVERY = 4  # every 4th scene is run without separation too, to measure its cost
 
 
 class ThrustScript(HandScript):
-    """Hands of a random scene; one is thrust into the tool's path once, stays, and returns.
+    """Hands of a random scene; one hand thrusts into the tool's path once, stays, and returns.
 
-    Meanwhile the task returns to where it was, so that nothing of it is lost.
+    Meanwhile the script moves back, so that no part of the task is lost.
     """
 
     def __init__(self, drawn: Drawn) -> None:
@@ -95,7 +95,7 @@ class ThrustScript(HandScript):
         )
 
     def truth(self, t: float) -> HandMotions:
-        """Both hands' motion, the thrust included."""
+        """The motion of both hands, including the thrust."""
         hands = list(super().truth(t))
         begin = (t - self.at_s) / self.lasts_s
         back = (t - self.at_s - self.lasts_s - STAY_S) / self.lasts_s
@@ -113,10 +113,10 @@ class ThrustScript(HandScript):
 def _thrust(
     random: np.random.Generator, teacher: Teacher, drawn: Drawn, duration_s: float, lasts_s: float
 ) -> tuple[float, Array]:
-    """Time [s], outside of pauses, and place (3,) [m] on the tool's path of a thrust.
+    """Time [s] of a thrust, outside of pauses, and its place (3,) [m] on the tool's path.
 
-    The tool is AHEAD_M from the place and gets there within AHEAD_S. If the tool is never that
-    fast, the time and the place are those where it gets farthest.
+    At that time the tool is AHEAD_M from the place, and arrives there within AHEAD_S. If the tool
+    is never that fast, the place is the farthest that it reaches in AHEAD_S.
     """
     times = np.arange(0.5, duration_s - 1.0, THRUST_STEP_S)
     count = round(AHEAD_S / THRUST_STEP_S)
@@ -151,16 +151,16 @@ class SeparationOutcome(NamedTuple):
     success: bool
     errors_mm: tuple[float, float, float]
     times_s: tuple[float, float, float]  # of the events
-    away_s: float  # time in which a hand was thrust in
+    away_s: float  # time in which a hand was in the tool's path
     # least distance of the arm's and the hands' shapes in the simulation; below 0 they overlap
     shapes_mm: float
-    capsules_mm: float  # the same for the capsules of the rule, which are wider
+    capsules_mm: float  # least distance of the capsules of the rule, which are wider
     pushed_mm: float  # path of a part of the arm toward a hand that it touches
     excess_at_once: float  # [m/s] largest excess over the rule
     excess_after_reaction: float  # [m/s] over the largest allowed speed within the reaction time
-    excess_hurried: float  # the same for hands that were faster than the rule had assumed
+    excess_hurried: float  # as above, for hands that were faster than the rule assumes
     excess_lasts_s: float  # longest time of an excess above slip_speed_mps
-    fastest_hand: float  # [m/s] toward the arm, within the reach of the rule
+    fastest_hand: float  # [m/s] toward the arm, near enough for the rule
     limited_s: float  # time in which separation limited the arm
     self_mm: float  # least distance of links that are kept apart
     table_mm: float
@@ -249,7 +249,7 @@ def _judged(
 
 
 def _longest(found: NDArray[np.bool_]) -> int:
-    """The largest number of consecutive ticks in which something is found, (T, ...)."""
+    """The largest number of consecutive true ticks in (T, ...)."""
     run = np.zeros(found.shape[1:], np.int64)
     most = 0
     for now in found:
@@ -395,7 +395,7 @@ def _failed(rows: list[SeparationOutcome]) -> list[int]:
 
 
 def _shown(rows: list[SeparationOutcome]) -> dict[str, Any]:
-    """Content of the figure, of its scenes: points at distances [mm] and speeds [mm/s]."""
+    """The points of the figure, from its scenes: distances [mm] and speeds [mm/s]."""
     rows = [row for row in rows if row.number < SHOWN_SCENES]
     near = np.concatenate([row.near for row in rows])
     return {
@@ -433,8 +433,8 @@ def _later(ours: list[SeparationOutcome], free: list[SeparationOutcome]) -> dict
 def _later_for(
     thrust: list[SeparationOutcome], undisturbed: list[SeparationOutcome]
 ) -> dict[str, Any]:
-    """Delay of the end of the task [s] by a thrust, less the time in which the hand was away, where
-    both runs succeed.
+    """Delay of the end of the task [s] by a thrust, less the time of the thrust, if both runs
+    succeed.
     """
     pairs = [
         (row, other)

@@ -1,5 +1,5 @@
-"""Joint speeds by frequency while the tool moves, for `motion`. Between 4 and 13 Hz a person's
-motion has nothing.
+"""Joint speeds by frequency while the tool moves, for `motion`. A person's motion has no components
+between 4 and 13 Hz.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def speeds(tool: Array, joints: Array) -> list[float]:
 
 
 def ripple(bands: list[float]) -> float:
-    """The share of such speeds that lies in RIPPLE_HZ."""
+    """The share of the speeds that lies in RIPPLE_HZ."""
     begin = int(np.argmin(abs(EDGES_HZ - RIPPLE_HZ[0]))) + 1
     return float(np.linalg.norm(bands[begin : begin + RIPPLE_BANDS]) / np.linalg.norm(bands))
 
 
 def draw(results: Results, by_follower: dict[str, list[float]]) -> None:
-    """The figure of such speeds, by frequency."""
+    """The figure of the joints' speeds by frequency."""
     plt = pyplot()
     figure, panel = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
     panel.axvspan(*RIPPLE_HZ, color="0.93", lw=0)

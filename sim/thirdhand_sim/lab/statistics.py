@@ -29,8 +29,8 @@ from thirdhand_sim.scene import GRASP_DISTANCE
 
 TASK_SEEDS = EXPERIMENTS["statistics"].seeds
 TASK_SCENES = TASK_SEEDS.evaluation["scenes"]
-SHIPPED_ELL = 5.0  # [1/m²] as the shipped skill
-# to save time: the lower rate changes errors by 2 mm at most
+SHIPPED_ELL = 5.0  # [1/m²] ell of the shipped skill
+# rivals have a lower rate to save time, which changes errors by 2 mm at most
 OURS_HZ = 500
 RIVALS_HZ = 125
 TASK_METHODS: dict[str, tuple[str, Learn]] = {
@@ -47,7 +47,7 @@ TASK_METHODS: dict[str, tuple[str, Learn]] = {
     "gaussian_process": ("Gaussian process,\nsame places", SampleProcess().learn),
     "gmr": ("GMR alone", MixtureRegression(GMR_COMPONENTS).learn),
 }
-SHOWN_LEAST_MM = 1e-3  # errors are rounded to it; a logarithmic axis shows nothing smaller
+SHOWN_LEAST_MM = 1e-3  # smaller errors are drawn at this value, as the axis is logarithmic
 
 
 def colour_of(method: str) -> str:
@@ -158,7 +158,7 @@ def wilson(successes: int, of: int) -> tuple[float, float]:
 
 
 def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
-    """The figure of the experiment's numbers: a row a method."""
+    """The figure of the experiment's numbers, with a row for each method."""
     plt = pyplot()
     methods = numbers["methods"]
     figure, (rates, *events) = plt.subplots(

@@ -11,7 +11,7 @@ from thirdhand.process.parallel import spread
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
-_prepared: list[bytes] = []  # the preparation of this process, by its pickle
+_prepared: list[bytes] = []  # pickle of the preparation that this process has run
 
 
 def shared_out(
@@ -21,8 +21,8 @@ def shared_out(
     *,
     prepare: Callable[[], None] | None = None,
 ) -> Iterator[Outcome]:
-    """The outcome of each task, in order: in this process if there is one worker, which is prepared
-    then; else by the workers that `spread` takes, which run `prepare` before their first task.
+    """The outcome of each task, in order. With one worker, tasks run in this process, after
+    `prepare`; otherwise in the workers of `spread`, which run `prepare` before their first task.
     """
     if workers == "1":
         yield from map(work, tasks)

@@ -1,1 +1,1 @@
-"""The service as processes of its own: in real time, and when parts of it fail."""
+"""Experiments on the service as processes: in real time, and with failing parts."""

@@ -1,10 +1,10 @@
 """Faults, each caused for real while the tool is fast: time to rest, path until then, and lost
 ticks.
 
-Service, scribe, skill worker, tracker and network are processes; PyBullet is the arm. Measured are
-the decision to stop (from the recording), the time at which the tool came to rest and its path
-until then (from the arm), the commanded path (from the commands that left the service), and the
-ticks that the recording lacks.
+Service, scribe, skill worker, tracker and network are processes; PyBullet is the arm. The
+experiment measures the decision to stop (from the recording), the time at which the tool came to
+rest and its path until then (from the arm), the commanded path (from the commands that left the
+service), and the ticks that the recording lacks.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _begin_anew(part: str) -> Act:
 
 
 def _and_reset(mend: Act) -> Act:
-    """An act that mends, then resets a service in fault, as an operator would."""
+    """An act that repairs, and then resets a service in fault, as an operator would."""
 
     def mend_and_reset(cell: FaultyCell) -> None:
         mend(cell)
@@ -78,7 +78,7 @@ def _end_the_service(cell: FaultyCell) -> None:
 
 def _kill_the_workshop_at_work(cell: FaultyCell) -> None:
     skill_worker = cell.child("skill worker")
-    os.kill(skill_worker, signal.SIGSTOP)  # so it is at work when it is killed
+    os.kill(skill_worker, signal.SIGSTOP)  # its work cannot end before it is killed
     threading.Timer(0.2, os.kill, [skill_worker, signal.SIGKILL]).start()
     place = {
         "name": "p",
@@ -138,9 +138,9 @@ FAULTS = {
         _stop_or_kill("scribe", STOP), _until_recorded, stops=False, lasts_s=SCRIBE_SILENT_S
     ),
     "disk full": Fault(_fill_the_disk, _empty_the_disk, stops=False, lasts_s=3.0),
-    # The last of its cell, as it ends the service.
+    # This fault must be the last one in its cell, as it ends the service.
     "service killed": Fault(_kill_the_service, FaultyCell.begin_service),
-    # The first of its cell, as it removes the recordings.
+    # This fault must be the first one in its cell, as it removes the recordings.
     "recording folder removed": Fault(
         _remove_the_folder, _until_recorded, stops=False, network="router", lasts_s=3.0
     ),
@@ -177,22 +177,22 @@ class Recorded:
         )
 
     def first_stop(self, after: int) -> tuple[int, str] | None:
-        """The first tick after a given one that did not follow, and its reason."""
+        """The first tick after a given one in which the arm did not follow, and its reason."""
         indices = np.flatnonzero((self.ticks > after) & (self.modes != Mode.FOLLOW))
         if not len(indices):
             return None
         return int(self.ticks[indices[0]]), Reason(int(self.reasons[indices[0]])).name.lower()
 
     def stopped(self, after: int, until: int) -> int:
-        """The number of ticks that did not follow."""
+        """The number of ticks in which the arm did not follow."""
         return int(
             ((self.ticks > after) & (self.ticks <= until) & (self.modes != Mode.FOLLOW)).sum()
         )
 
 
 def way_to_rest(times: Array, places: Array) -> tuple[float, float]:
-    """Time at which a point came to rest [s], and its path until then [m]: times (T,) and places
-    (T, 3) from an event until the point surely rests.
+    """Time at which a point came to rest [s], and its path until then [m], from times (T,) and
+    positions (T, 3) between an event and the end of observation.
     """
     far = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) > STANDS_M)
     rest_index = min(int(far[-1]) + 1, len(times) - 1) if len(far) else 0
@@ -212,7 +212,7 @@ def figures(
     stop = recorded.first_stop(event.tick)
     hold_ms = None if stop is None else (stop[0] - event.tick) * period_ms
     if hold_ms is not None and hold_ms > 1e3 * (until - event.struck_s):
-        hold_ms = None  # it belongs to a later event
+        hold_ms = None  # the hold belongs to a later event
     numbers: dict[str, Any] = {
         "hold_ms": hold_ms,
         "reason": None if stop is None or hold_ms is None else stop[1],
@@ -279,8 +279,8 @@ def disk() -> Iterator[tuple[Path, bool]]:
 @dataclass
 class Suffered:
     """Figures of faults by name, the tool's speed around each (T, 2) [s, m/s], the number of
-    commands that are neither recorded nor counted as lost, and the number of faults that nobody
-    caused.
+    commands that are neither recorded nor counted as lost, and the number of faults that were not
+    injected.
     """
 
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -345,7 +345,7 @@ def _suffer(
 
 
 def table(found: dict[str, dict[str, Any]]) -> str:
-    """The figures for people to read."""
+    """The figures as a table of text."""
     rows = [
         f"{'':<32}{'holds':>8}{'at rest':>9}{'travelled':>11}{'commanded':>11}"
         f"{'lost':>7}{'moves again':>13}"

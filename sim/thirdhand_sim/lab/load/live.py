@@ -44,12 +44,11 @@ def steady_run(
 def live_run(drawn: Drawn, folder: Path, *, taught: bool = True, record: bool = False) -> RunReport:
     """The bench's report of one scene through a service of its own. Raises LaunchError.
 
-    With `record` its recording goes into `folder`. If not `taught`, the skill is as it
-    was learned.
+    With `record` its recording goes into `folder`. If not `taught`, the skill has no via-points.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (
-        tempfile.TemporaryDirectory() as scratch,  # nothing taught from before
+        tempfile.TemporaryDirectory() as scratch,  # without earlier via-points
         launched(Path(scratch), "--joints", "state", record=folder if record else None) as service,
         open_session(connect=[service.endpoint]) as session,
     ):

@@ -1,1 +1,1 @@
-"""Modelled and recorded people: their movements, and what is judged of a skill on them."""
+"""Modelled and recorded people: their movements, and the judgement of skills on them."""

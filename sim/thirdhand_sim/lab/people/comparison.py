@@ -1,8 +1,8 @@
 """Learned skills on modelled people who did not demonstrate, ours beside rivals.
 
-All methods learn from the same demonstrations, are given the same places with the same errors, and
-are followed by the same core. Parameters are chosen on the people of the tuning set, from the same
-number of candidates for each method. The figures are those of the test set.
+All methods learn from the same demonstrations, get the same places with the same errors, and their
+targets are followed by the same core. Parameters are chosen on the people of the tuning set, from
+the same number of candidates for each method. The figures are those of the test set.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PEOPLE_SHOWING = len(PEOPLE_SEEDS.learned["people"].numbers)
 PEOPLE_OF_GROUP: dict[Group, int] = {
     group: len(part["people"].numbers) for group, part in STREAMS_OF_GROUP.items()
 }
-# scenes of a person, half with each sigma
+# scenes of each person, half with each of SIGMAS_M
 SCENES_OF_GROUP: dict[Group, int] = {
     "tuning": 2,
     "test": 4,
@@ -65,7 +65,7 @@ TEACHER = "teacher"
 
 
 class Entry(NamedTuple):
-    """A method: its label, and the parameters that were tried, the chosen ones first."""
+    """A method: its label, and the candidates of its parameters, the chosen ones first."""
 
     label: str
     candidates: tuple[RivalMethod, ...]
@@ -108,7 +108,9 @@ PEOPLE_METHODS = {
 
 
 class MethodTask(NamedTuple):
-    """One method with one candidate's parameters, in the people's scenes or in those that break."""
+    """One method with the parameters of one candidate, in the people's scenes or in the breaking
+    ones.
+    """
 
     method: str
     candidate: int
@@ -133,8 +135,8 @@ def _learned(method: str, candidate: int) -> RivalModel[Places]:
 def _sessions(
     group: Group, kind: str, people: int, scenes: int, hands: Path | None
 ) -> list[SeenSession]:
-    """The sessions of a group: scene by scene with alternating sigma; exact places where one kind
-    of difference is tried.
+    """The sessions of a group, with alternating sigma from scene to scene; in breaking scenes the
+    places are exact.
     """
     if kind:
         return [seen(breaking(kind, number, group=group)) for number in range(scenes)]
@@ -158,7 +160,7 @@ def outcomes(task: MethodTask) -> list[TrialOutcome]:
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
-    """The numbers: of all candidates on the tuning set, of the chosen ones on the test set."""
+    """The numbers: all candidates on the tuning set, or the chosen ones on the test set."""
     group = options.group
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
     tasks = _tasks(options, breaking_scenes)
@@ -204,7 +206,9 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 
 
 def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
-    """What is measured: the teacher, each method with its candidates, and with broken hands."""
+    """The tasks: the teacher, each method with its candidates, and each method in breaking
+    scenes.
+    """
     group = options.group
     people = max(2, round(PEOPLE_OF_GROUP[group] * options.share))
     has_candidates = group == "tuning" and options.share == 1
@@ -232,7 +236,7 @@ def _say_better_candidates(results: Results, by_task: dict[MethodTask, list[Tria
 
 
 def _breaking(by_task: dict[MethodTask, list[TrialOutcome]]) -> dict[str, dict[str, Any]]:
-    """The figures of broken hands, by method and kind."""
+    """The figures of breaking scenes, by method and kind."""
     broken: dict[str, dict[str, Any]] = {method: {} for method in PEOPLE_METHODS}
     for task, rows in by_task.items():
         if task.kind:
@@ -305,7 +309,7 @@ def _resampled(rows: Sequence[TrialOutcome], values: Array) -> tuple[float, floa
 
 
 def _broken(rows: Sequence[TrialOutcome]) -> dict[str, int]:
-    """Successes, and failures in which the tool held through each event that it missed."""
+    """Successes, and failures in which the tool held during each missed event."""
     held = [
         not o.success and all(e.held for e in o.events if not e.reached) and not o.too_near
         for o in rows

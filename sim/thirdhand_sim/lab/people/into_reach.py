@@ -6,8 +6,8 @@ The map turns by a quarter turn about the vertical and shifts, and nothing is sc
 
 with the mean m of the tool in the takes that are learned from. The quarter turns k and the centre c
 are those with which the tool is best inside the reach: of all on a grid, they have the largest 2 %
-quantile of the tool's depth, its distance from the nearest boundary (negative beyond it). Takes
-that are left out do not enter, but are moved likewise.
+quantile of the tool's depth, its distance from the nearest boundary (negative beyond it). Left-out
+takes do not determine the map, but are moved by it too.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand_sim.lab.people.left_out import LeftOut
 from thirdhand_sim.lab.results import Array
 
-SHALLOW_SHARE = 0.02  # of the tool's samples that may be less deep
-GRID_M = 0.05  # distance of the centres that are tried
-PLACED_SAMPLES = 20  # of a take
+SHALLOW_SHARE = 0.02  # this share of the tool's samples may be less deep
+GRID_M = 0.05  # grid spacing of the candidates for the centre
+PLACED_SAMPLES = 20  # samples of a take
 
 
 def depth_m(points: Array, reach: Reach) -> Array:
@@ -59,7 +59,7 @@ class RigidMap(NamedTuple):
 
     @staticmethod
     def of(shown: Sequence[LeftOut], reach: Reach) -> RigidMap:
-        """The map that brings the tool of these takes best into the reach."""
+        """The map with which the tools of these takes are deepest in the reach."""
         tool = np.concatenate(
             [take.tool[:: max(1, len(take.tool) // PLACED_SAMPLES)] for take in shown]
         )

@@ -1,10 +1,10 @@
-"""Takes that were left out, as the service's core sees them and predicts their tool, and their
-judgement.
+"""Left-out takes: the hands as the service's core estimates them, its predictions of the tool, and
+their judgement.
 
 Hands pass sample by sample through the core's stages `intake` and `skill`, each take from a fresh
-state, alone or in a session: the same take again and again, with the way back of the hands and a
-rest before each further round. Targets are clamped only where a reach is given: most recordings lie
-outside the arm's.
+state, alone or in a session: the same take again and again, with the hands' return and a rest
+before each further round. Targets are clamped only if a reach is given, as most recordings lie
+outside the arm's reach.
 """
 
 from __future__ import annotations
@@ -40,26 +40,28 @@ CORE_HZ = 125
 JUDGED_HZ = 25
 LONGEST_SHIFT_S = 1.0
 SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
-BACK_S = 2.0  # the hands' way back to where the take begins
-UNBOUNDED_M = 1e3  # the corner of a workspace that clamps nothing
+BACK_S = 2.0  # duration of the hands' return to the begin of the take
+UNBOUNDED_M = 1e3  # corners of a workspace that does not clamp
 UNBOUNDED_REACH = Reach(inner=1e-6, outer=UNBOUNDED_M, min_x=-UNBOUNDED_M, min_z=-UNBOUNDED_M)
 VIA_POINT_STD_M = 0.003  # deviation of a via-point at the begin or end of a take
 
 
 class LeftOut(NamedTuple):
-    """A take: its name, whom or what it is left out with, and what intake makes of it."""
+    """A take: its name, the group with which it is left out, and the hands as estimated by
+    intake.
+    """
 
     name: str
     group: str
     demonstration: Demonstration
     times: Array  # (T,) [s], JUDGED_HZ
-    hands: Array  # (T, 6) [m]; of one that conducts alone, twice
+    hands: Array  # (T, 6) [m]; twice the hand that conducts alone
     velocities: Array  # (T, 6) [m/s]
-    tool: Array  # (T, 3) [m] the teacher's
+    tool: Array  # (T, 3) [m] the teacher's tool
 
     @property
     def seen(self) -> Observed:
-        """The hands alone; nothing is estimated of their stillness."""
+        """The hands, without an estimate of their stillness."""
         return Observed(self.times, self.hands, self.velocities, np.zeros((len(self.times), 2)))
 
 
@@ -70,15 +72,15 @@ class Judged(NamedTuple):
 
     samples: int
     squares: float
-    shifted: float  # with the time shift that makes this least
-    shift_s: float  # more than 0: the prediction is ahead of the teacher
+    shifted: float  # squared errors with the time shift that minimises them
+    shift_s: float  # this shift; above 0, the prediction is ahead of the teacher
     worst_m: float
     inside: tuple[int, ...] | None
     held: int | None
     unsure: int | None
-    wrong: int  # the tool is farther off than UNSURE_M
-    told: int | None  # of these, those where it held or reported to be uncertain
-    falsely_told: int | None  # the same of all others
+    wrong: int  # samples with a larger error than UNSURE_M
+    told: int | None  # wrong samples with a hold or a report of uncertainty
+    falsely_told: int | None  # other samples with a hold or a report of uncertainty
 
 
 @cache
@@ -87,7 +89,7 @@ def _settings(reach: Reach) -> Settings:
 
 
 def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
-    """A take, once through intake."""
+    """A take, passed through intake once."""
     times, moving, _ = _through_core(demonstration)
     stamps = (demonstration.stamps_ns - demonstration.stamps_ns[0]) * 1e-9
     tool = np.stack(
@@ -97,8 +99,8 @@ def left_out(name: str, group: str, demonstration: Demonstration) -> LeftOut:
 
 
 def predicted(skill: Skill, take: LeftOut, *, reach: Reach | None = None) -> Predicted:
-    """The core's prediction of a take with a skill; targets are held within `reach`, if any, and
-    within the skill's workspace then.
+    """The core's prediction of a take with a skill; if `reach` is given, targets are clamped to it
+    and to the skill's workspace.
     """
     return _through_core(take.demonstration, skill, reach)[2]
 
@@ -106,8 +108,8 @@ def predicted(skill: Skill, take: LeftOut, *, reach: Reach | None = None) -> Pre
 def predicted_rounds(
     skill: Skill, take: LeftOut, *, reach: Reach | None = None, broken_share: float = 0.0
 ) -> list[Predicted]:
-    """The core's predictions in each round of a session; the first one is that of `predicted`. See
-    `session_of`.
+    """The core's predictions in each round of a session, see `session_of`; the first one equals
+    `predicted`.
     """
     hands, begins = session_of(take.demonstration, broken_share)
     prediction = _through_core(hands, skill, reach)[2]
@@ -129,11 +131,12 @@ def predicted_rounds(
 
 
 def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstration, list[int]]:
-    """The hands of a session, and the sample at JUDGED_HZ with which each round begins. Before each
-    further round, `broken_share` of the take is done and broken off, if it is not 0.
+    """The hands of a session, and the sample at JUDGED_HZ with which each round begins. If
+    `broken_share` is not 0, this share of the take is done and broken off before each further
+    round.
 
-    On the way back, position is a polynomial of minimum jerk over BACK_S, and orientation is the
-    normalized mean of the ends. The tool is where the take has it, and is not used.
+    During the return, the position is a minimum-jerk polynomial over BACK_S, and the orientation is
+    the normalized mean of the ends. The tool is that of the take, and is not used.
     """
     seconds = [take.seconds]
     poses = [np.hstack([take.left, take.right])]
@@ -170,7 +173,7 @@ def session_of(take: Demonstration, broken_share: float = 0.0) -> tuple[Demonstr
 
 
 def _way(first: Array, last: Array, shares: Array) -> Array:
-    """Poses (T, 14) of both hands at these shares (T,) of the time from `first` to `last` (14,)."""
+    """Poses (T, 14) of both hands between `first` and `last` (14,), at shares (T,) of the time."""
     moved = (shares**3 * (10.0 - 15.0 * shares + 6.0 * shares**2))[:, None]
     out = first + moved * (last - first)
     for part in (slice(3, 7), slice(10, 14)):
@@ -183,9 +186,9 @@ def _way(first: Array, last: Array, shares: Array) -> Array:
 def _through_core(
     demonstration: Demonstration, skill: Skill | None = None, reach: Reach | None = None
 ) -> tuple[Array, Array, Predicted]:
-    """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and what a skill predicts.
+    """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and a skill's predictions.
 
-    While no hands are known, it holds what it predicted last.
+    While no hands are known, the last prediction is kept.
     """
     settings = _settings(reach or UNBOUNDED_REACH)
     used = skill or shipped_skill()
@@ -280,9 +283,9 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
 
 
 def read(path: Path, *, named: bool = False) -> Demonstration:
-    """A recorded take: `.npz` with t (T,) [s], and left, right and tool (T, 3) [m]; a hand that was
-    not seen is NaN throughout, the other conducts alone then. `named`: where it begins and ends are
-    its places.
+    """A recorded take: `.npz` with t (T,) [s], and left, right and tool (T, 3) [m]; a hand with NaN
+    only was not seen, and the other one conducts alone. `named`: begin and end of the take are its
+    places.
 
     Raises ExperimentError.
     """

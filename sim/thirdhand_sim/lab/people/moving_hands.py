@@ -3,7 +3,7 @@
 Recordings are `.npz` files with `time_s` or `t` (T,) [s], `left` and `right` (T, 3) [m], NaN where
 a hand was not seen; a hand that was never seen rests. Files whose names differ only after the last
 underscore are of one person. Recorded hands are moved into the skill's region; their truth is the
-recording without the tracker's jumps, and without what is too fast for a wrist.
+recording without the tracker's jumps, low-pass filtered to frequencies of a wrist.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ NOISY_HZ = 60.0
 CUT_HZ = 6.0
 NOISY_CUT_HZ = 2.5
 PRECISE_M = 0.0004  # [m] noise (standard deviation) of motion capture is below this
-# base from a camera's x right, y down
+# frame base from a camera's axes: x right, y down
 CAMERA_AXES = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 MOST_SPEED = 1.0  # [m/s] faster motion (99th percentile of a hand's speed) is scaled down
-# [m/s], [s] of sudden stops
+# speed [m/s] before a sudden stop, and duration of the stop [s]
 STOP_SPEED = 0.31
 STOP_S = 0.08
 MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
 # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
 UNSEEN_AT = (0.3, 0.7)
 UNSEEN_S = (0.1, 0.5)
-SMALL_KINDS = {  # amplitude [m], speed of the hand besides [m/s]
+SMALL_KINDS = {  # amplitude [m], speed of the drift [m/s]
     "3 mm in a drift of 0.1 m/s": (0.003, 0.1),
     "2 mm at rest": (0.002, 0.0),
 }
-# duration, its judged end, the rise at the begin
+# duration, duration of the judged end, duration of the rise at the begin
 SMALL_S = 3.5
 SMALL_JUDGED_S = 2.0
 SMALL_RISE_S = 0.5
@@ -60,10 +60,10 @@ class Moving:
     truth: Array
     stamps: Array
     samples: Array
-    stop_s: float = math.nan  # when a sudden stop begins
+    stop_s: float = math.nan  # begin of a sudden stop [s]
     late: Array | None = None  # (M, 2) [s] delay of each hand's samples; inf: they never arrive
-    jumping: Array | None = None  # (N, 6) [m] the truth with the tracker's jumps, if it had some
-    tracker: str = ""  # its kind, of a recording
+    jumping: Array | None = None  # (N, 6) [m] the truth with the tracker's jumps, if there are any
+    tracker: str = ""  # kind of tracker of a recording
 
     @property
     def person(self) -> str:
@@ -72,8 +72,8 @@ class Moving:
 
 
 def recorded(folder: Path, middle: Array) -> list[Moving]:
-    """Each recording of a folder: clean, as it is, seen at 30 Hz; and clean, but late, or with one
-    hand out of sight twice. Raises ExperimentError.
+    """Each recording of a folder in the groups: clean, as recorded, at 30 Hz, clean but late, and
+    clean with one hand out of sight twice. Raises ExperimentError.
     """
     files = sorted(folder.glob("*.npz"))
     if not files:
@@ -151,7 +151,7 @@ def tracker_kind(rate_hz: float, hands: Array) -> str:
 
 
 def _unseen(stamps: Array, random: np.random.Generator) -> Array:
-    """Delays (M, 2) of samples of which one hand's are missing, twice."""
+    """Delays (M, 2) of samples; those of one hand are missing twice."""
     late = np.zeros((len(stamps), 2))
     for share in UNSEEN_AT:
         begin = stamps[-1] * (share + random.uniform(-0.1, 0.1))
@@ -161,7 +161,7 @@ def _unseen(stamps: Array, random: np.random.Generator) -> Array:
 
 
 def _seen(t: Array, hand: Array) -> Array:
-    """A hand's path (T, 3), straight where it was not seen; at rest where it never was."""
+    """A hand's path (T, 3), straight where it was not seen; at rest if it was never seen."""
     is_seen = np.isfinite(hand).all(axis=1)
     if not is_seen.any():
         return np.zeros_like(hand)
@@ -299,7 +299,7 @@ def reaches(*, seeds: Sequence[int]) -> list[Moving]:
 
 
 def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Moving:
-    """A hand that moves to and fro by millimetres at a frequency, at rest or in a steady drift."""
+    """A hand that oscillates by millimetres at a frequency, at rest or in a steady drift."""
     amplitude_m, drift_mps = SMALL_KINDS[kind]
     random = np.random.default_rng([number, 8])
     directions = random.standard_normal((2, 3)) * (1.0, 1.0, 0.5)

@@ -20,7 +20,7 @@ from thirdhand_sim.sessions import SHAPE_STEPS
 RECORDED_SLOW_MPS = 0.05
 LEAST_REACH_M = 0.06
 MOST_UNEVEN = 5.0  # largest ratio of a reach's highest speed to its mean speed
-FIRST_NUMBER = 100  # seeds of their other habits, which no modelled person has
+FIRST_NUMBER = 100  # first seed of their other habits; no modelled person has these seeds
 
 
 def recorded_people(folder: Path) -> list[Person]:
@@ -53,8 +53,8 @@ def _of_file(path: Path, number: int) -> Person | None:
 
 
 def _reaches(x: Array, rate_hz: float) -> list[tuple[Array, Array]]:
-    """Reaches in a hand's path (T, 3) [m]: shares of the way (M,), and deviations from it (M, 3)
-    per metre, with the way along x.
+    """Reaches in a hand's path (T, 3) [m]: covered shares (M,) of the straight line along x, and
+    deviations from it (M, 3) per metre.
     """
     speed = np.linalg.norm(np.gradient(x, 1 / rate_hz, axis=0), axis=1)
     moving = np.flatnonzero(

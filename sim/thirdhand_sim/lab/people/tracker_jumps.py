@@ -3,8 +3,8 @@ in which left and right are exchanged.
 
 A run of samples is wrong if the samples before and after it predict that no hand can have been
 there. The prediction is a Gaussian process with the covariance of a very quick hand, conditioned on
-both sides: a smoother that looks both ways. Its squared Mahalanobis distance decides. A path that
-this covariance allows has no part that it excludes, so quick motion is left as it is.
+the samples of both sides, as in a smoother. Its squared Mahalanobis distance decides. Paths that
+this covariance allows are not changed, so quick motion is kept.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from thirdhand_sim.lab.results import Array
 # standard deviation of 27 m/s^2 an axis: a reach of 0.2 m at 2 m/s has 33 m/s^2 at most.
 SPREAD_M = 0.1
 SCALE_S = 0.08
-# the spread is in proportion to a recording's speed above this
+# above this speed of a recording, the spread is proportional to the speed
 USUAL_MPS = 2.0
 SPEED_SPAN_S = 0.1
 SCALES_S = (SCALE_S, 0.12, 0.18, 0.27, 0.4)  # from quick to calm hands
-# standard deviations of the place and of the speed over a window
+# standard deviations of position and speed over a window
 PLACE_M = 1.0
 DRIFT_MPS = 1.0
 TRACKED_NOISE_FLOOR_M = 0.002  # includes a hand's tremor
 SAMPLES_BESIDE = 8  # samples on each side that predict
-LONGEST_S = 0.5  # longest run
+LONGEST_S = 0.5  # duration of the longest run
 RUN_GROWTH = 1.25  # ratio of the lengths of runs, above the first few
-# squared distance of a wrong run, and more for each of its samples
+# least squared distance of a wrong run, and its increase for each sample
 THRESHOLD = 30.0
 THRESHOLD_EACH = 6.0
 LEAST_JUMP_M = 0.01  # rms distance of a wrong run from its prediction
 # the candidates are runs with at least this share of the largest excess over the threshold
 ALIKE = 0.5
 CANDIDATES = 40  # the shortest of these are compared
-# share of the box around the neighbours by which a predicted sample may be outside of it
+# a predicted sample may exceed the box of its neighbours by this share of the box
 BRIDGE_MARGIN = 0.25
-STAMP_S = 1e-3  # stamps are rounded to this, so that windows are alike
-EXCHANGE_MPS = 3.0  # two hands do not exchange their places faster than this
+STAMP_S = 1e-3  # stamps are rounded to this, so that windows of samples are equal
+EXCHANGE_MPS = 3.0  # two hands do not exchange their positions faster than this
 NOISE_ORDER = 5  # differences of this order contain a tracker's noise and hardly a hand's motion
 
 
 class Repaired(NamedTuple):
-    """Hands (T, 6) [m] without a tracker's mistakes; which samples of each hand were replaced
-    (T, 2), and in which left and right had been exchanged (T,).
+    """Hands (T, 6) [m] without a tracker's mistakes; True for replaced samples of each hand (T, 2),
+    and for samples with exchanged hands (T,).
     """
 
     hands: Array
@@ -112,8 +112,8 @@ def noise_std_m(x: Array) -> float:
 
 
 def quick_process(t: Array, x: Array) -> Process:
-    """The quickest motion to be expected of a hand with a path (T, 3) [m]: a walking person's hand
-    is quicker than that of a seated one.
+    """The process of the quickest motion expected in a hand's path (T, 3) [m]: the hand of a
+    walking person is quicker than that of a seated one.
     """
     span = max(1, round(SPEED_SPAN_S / float(np.median(np.diff(t)))))
     speed = np.linalg.norm(x[span:] - x[:-span], axis=1) / (t[span:] - t[:-span])
@@ -124,8 +124,8 @@ def quick_process(t: Array, x: Array) -> Process:
 
 
 def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
-    """Samples (T,) in which a tracker has exchanged left and right: it does so where both hands
-    jump to where the other one was, faster than hands move. Most samples are named rightly.
+    """True (T,) for samples with exchanged hands: an exchange is a jump of both hands to the
+    position of the other one, faster than hands move. Most samples are assumed right.
     """
     left = hands[:, :3]
     right = hands[:, 3:]
@@ -141,8 +141,8 @@ def exchanged_samples(t: Array, hands: Array) -> NDArray[np.bool_]:
 
 
 def jumped_samples(t: Array, x: Array, quick: Process) -> NDArray[np.bool_]:
-    """Samples (T,) of a path (T, 3) [m] that jump off it. The most improbable runs are taken out
-    first, until those that are left are probable.
+    """True (T,) for samples of a path (T, 3) [m] that jump off it. The most improbable runs are
+    removed first, until the remaining ones are probable.
     """
     wrong = np.zeros(len(t), bool)
     while True:
@@ -155,7 +155,7 @@ def jumped_samples(t: Array, x: Array, quick: Process) -> NDArray[np.bool_]:
 
 
 def _improbable_runs(t: Array, x: Array, quick: Process) -> list[tuple[int, int]]:
-    """Improbable runs [begin, end), each more so than all runs near it."""
+    """Improbable runs [begin, end), each more improbable than all runs near it."""
     if len(t) <= 2 * SAMPLES_BESIDE:
         return []
     longest = max(1, round(LONGEST_S / float(np.median(np.diff(t)))))
@@ -225,7 +225,7 @@ def _off_prediction(t: Array, x: Array, length: int, quick: Process) -> tuple[Ar
 
 def _bridged(t: Array, x: Array, wrong: NDArray[np.bool_], quick: Process) -> Array:
     """A path (T, 3) [m] with its wrong samples predicted from the right ones around them, by the
-    process that makes these most probable; hardly beyond where these are.
+    process under which these are most probable; limited to a box around them.
     """
     out = x.copy()
     valid = np.flatnonzero(~wrong)

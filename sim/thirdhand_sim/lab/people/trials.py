@@ -1,7 +1,7 @@
 """Sessions of a person with a skill, and their judgement: hands as a tracker sees them pass through
 the service's core, whose arm moves exactly as commanded.
 
-All run in process at one rate, the same for every skill.
+All sessions run in process at the same rate.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ TRIAL_HZ = 125
 WITHIN_M = 0.010
 FOR_S = 0.3
 SLOW_MPS = 0.05
-# nearer than 5 cm to a hand, a tool above 0.25 m/s is a failure
+# a tool faster than 0.25 m/s within 5 cm of a hand is a failure
 NEAR_HAND_M = 0.05
 FAST_MPS = 0.25
-WRONG_M = 0.10  # a target farther from the teacher's tool is followed falsely
-SMOOTHED = 5  # ticks; velocity of a target of a rival with a memory is taken over them
+WRONG_M = 0.10  # a target that is farther from the teacher's tool is followed falsely
+SMOOTHED = 5  # ticks over which the velocity of a rival's target is computed, if it has a memory
 LONGEST_DELAY_S = 0.6
-MAX_ASTRAY_SHARE = 0.05  # largest share of the time falsely followed on the teacher's path
+MAX_ASTRAY_SHARE = 0.05  # on the teacher's path, at most this share of the time is falsely followed
 # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
 SWAP_NOTICED_S = 0.3
 SWAP_OVER_S = 0.2
@@ -49,17 +49,17 @@ SWAP_OVER_S = 0.2
 
 @dataclass(frozen=True, eq=False)
 class SeenSession:
-    """A session as the service sees it, tick by tick, and as it is."""
+    """A session tick by tick: as estimated by the service, and the truth."""
 
     session: Session
     ticks: tuple[Tick, ...]
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
     rest: Array  # (T, 2) stillness of each hand, 0 to 1
-    fresh: Mask  # (T,) whether both hands are seen, by one source
-    swapped: Mask  # (T,) whether left is reported as right
-    hands: Array  # (T, 6) as they are
-    tool: Array  # (T, 3) the teacher's
+    fresh: Mask  # (T,) true if both hands are seen, each by one source
+    swapped: Mask  # (T,) true if the tracker exchanges the hands
+    hands: Array  # (T, 6) true positions
+    tool: Array  # (T, 3) the teacher's tool
 
     @property
     def due(self) -> Mask:
@@ -68,7 +68,7 @@ class SeenSession:
 
 
 def settings() -> Settings:
-    """The service's own, at the rate of the trials."""
+    """The service's settings, at the rate of the trials."""
     return msgspec.structs.replace(Settings(), rate_hz=TRIAL_HZ)
 
 
@@ -83,7 +83,9 @@ def ticks(session: Session) -> Iterator[Tick]:
 
 
 def seen(session: Session) -> SeenSession:
-    """The session through tracker and service, which holds only because of the hands."""
+    """The session, passed through tracker and service, which holds only for reasons of the
+    hands.
+    """
     all_ticks = tuple(ticks(session))
     core = controller(replace(shipped_skill(), threshold=np.inf), settings())
     times = np.arange(len(all_ticks)) / TRIAL_HZ
@@ -111,8 +113,8 @@ def seen(session: Session) -> SeenSession:
 
 
 class EventOutcome(NamedTuple):
-    """One event: whether it succeeded, least distances [mm] from the perceived and from the true
-    place, and whether the tool held throughout its window.
+    """One event: success, least distances [mm] from the perceived and from the true place, and True
+    if the tool held during the whole window.
     """
 
     reached: bool
@@ -129,14 +131,14 @@ class TrialOutcome(NamedTuple):
     success: bool
     events: tuple[EventOutcome, EventOutcome, EventOutcome]
     too_near: bool
-    path_mm: float  # rms of the target from the teacher's tool, its delay taken out
-    delay_s: float  # of the target; and of the tool
+    path_mm: float  # rms distance of the target from the teacher's tool, without its delay
+    delay_s: float  # delay of the target; next, that of the tool
     tool_delay_s: float
     held: float
     falsely_held: float
     falsely_followed: float
-    swapped: float  # from 0.3 s after the swap of hands
-    swapped_held: float  # of the session, as all shares
+    swapped: float  # share after 0.3 s of exchanged hands
+    swapped_held: float  # held share of the session with exchanged hands
     negative_log_likelihood: float
     inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
     predicted_mm: float  # rms that the covariance predicts
@@ -144,12 +146,14 @@ class TrialOutcome(NamedTuple):
 
     @property
     def kept(self) -> bool:
-        """True for a success on the teacher's path, not only at its places."""
+        """True for a success in which the tool also stays on the teacher's path."""
         return self.success and self.falsely_followed <= MAX_ASTRAY_SHARE
 
 
 def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
-    """The outcome of a session; None is the teacher, who perceives the places as the methods do."""
+    """The outcome of a session with a skill; None: with the teacher, who perceives the places as
+    the methods do.
+    """
     served_frames = served(placed, one)
     target = served_frames["target"]
     tool = served_frames["tool"]
@@ -202,7 +206,7 @@ def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
 
 
 def served(placed: PlacedModel | Skill | None, one: SeenSession) -> NDArray[np.void]:
-    """The service's frames (T,) of a session: with its skill, or with a rival in its place."""
+    """The service's frames (T,) of a session, with its skill or a rival."""
     if isinstance(placed, Skill):
         return frames(placed, one.ticks, settings())
     predicted, motion = _moving(placed, one)
@@ -230,8 +234,8 @@ def served(placed: PlacedModel | Skill | None, one: SeenSession) -> NDArray[np.v
 def _moving(placed: PlacedModel | None, one: SeenSession) -> tuple[Predicted, Array]:
     """A rival's predictions at all ticks, and the motion of its target (T, 3, 3).
 
-    The target of a function of the hands moves along with them, as that of the service's skill; the
-    velocity of others is taken from consecutive predictions.
+    If a rival is a function of the hands, its target moves with them, as with the service's skill;
+    otherwise velocities follow from consecutive predictions.
     """
     s, v, a = one.estimates.transpose(1, 0, 2)
     if placed is None:
@@ -255,7 +259,7 @@ def _moving(placed: PlacedModel | None, one: SeenSession) -> tuple[Predicted, Ar
 def _event(one: SeenSession, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
-    if i == 0:  # the board belongs where the hand is seen
+    if i == 0:  # the board belongs to the tracked hand
         perceived = one.estimates[window, 0, :3] + TOOL_FROM_HAND
         true = one.hands[window, :3] + TOOL_FROM_HAND
     else:

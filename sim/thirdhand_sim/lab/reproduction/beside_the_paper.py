@@ -2,8 +2,9 @@
 each difference: the same five demonstrations, learned and taught with one number at a time as in
 the paper.
 
-Open loop, in random scenes: the distance of the target from the places at the three events, with
-hands 8 mm an axis beside their announced positions, and the gain from hand to tool.
+The figures are measured in open loop, in random scenes: the distance of the target from the places
+at the three events, with hands 8 mm per axis off their taught positions, and the gain from hand to
+tool.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ REAL_SCENES = EXPERIMENTS["hands"].seeds.evaluation["scenes"]
 
 
 class Variant(NamedTuple):
-    """A skill as learned, and whether a place is one point (the paper) or a neighbourhood."""
+    """A skill without via-points, and whether a place is one point (the paper) or a
+    neighbourhood.
+    """
 
     skill: StoredSkill
     bare: bool
@@ -47,7 +50,7 @@ class Reached(NamedTuple):
     refused: int
 
     def numbers(self) -> dict[str, Any]:
-        """By name."""
+        """The figures by name."""
         return {
             "within_3_cm_at_all_events_percent": 100
             * float((self.errors_mm <= 1000 * GRASP_DISTANCE).all(axis=1).mean()),

@@ -24,7 +24,7 @@ from thirdhand_sim.lab.results import (
     rgb,
 )
 
-# the paper's; time in seconds
+# the paper's numbers; time in seconds
 LETTER_ELL = 8.0
 LAMBDA = 0.1
 LETTER_SEEDS = EXPERIMENTS["letters"].seeds
@@ -37,7 +37,7 @@ VIA_VARIANCE = 1e-6  # [cm²]
 TOLERANCE_S = 0.004
 HALF_CM = 12.5  # half of the width and height of a drawn letter
 SETS = {"model": "modelled", "recorded": "recorded"}
-# farther in time from every desired point is elsewhere: the kernel has fallen to exp(-2)
+# times farther from every desired point are "elsewhere": the kernel has fallen to exp(-2)
 NEAR_S = 0.5
 
 
@@ -64,8 +64,8 @@ class Letter(NamedTuple):
 
 
 def learned(name: str, demonstrations: Array) -> Letter:
-    """The letter of some demonstrations: mixture by EM, reference by GMR at 200 times, KMP with the
-    paper's numbers.
+    """The letter learned from some demonstrations: mixture by EM, reference by GMR at 200 times,
+    KMP with the paper's numbers.
     """
     samples = np.concatenate(
         [np.column_stack([TIMES, demonstration]) for demonstration in demonstrations]
@@ -146,7 +146,7 @@ def by_kmp(letter: Letter, case: Case) -> Array:
 
 
 def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
-    """The letters of each set: the model's, and the recorded ones where a folder is given."""
+    """The letters of each set: the model's, and recorded ones if a folder is given."""
     names = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
     sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in names}}
     if options.letters is not None:
@@ -187,7 +187,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
 def _summary(
     measured: Iterable[list[dict[str, Any]]], letters: Sequence[Letter]
 ) -> dict[str, float]:
-    """What holds for all letters of a set."""
+    """The figures over all letters of a set."""
     entries = list(itertools.chain.from_iterable(measured))
     rms_cm = np.array([entry["rms_elsewhere_cm"] for entry in entries])
     scatter_cm = [letter.demonstrations.std(axis=0).mean() for letter in letters]
@@ -200,7 +200,7 @@ def _summary(
 
 
 def _record_letter(stream: rr.RecordingStream, path: str, letter: Letter) -> None:
-    """Draw a letter's demonstrations and what is made of it in each case."""
+    """Record a letter's demonstrations and its adaptation in each case."""
     strips = list(letter.demonstrations * (1, -1))
     lines = rr.LineStrips2D(strips, colors=[rgb(REFERENCE)], radii=[0.03])
     stream.log(f"{path}/demonstrations", lines, static=True)
@@ -230,7 +230,7 @@ def record(
     lines: Mapping[str, tuple[Array, str]],
     case: Case,
 ) -> None:
-    """Logs the trajectories of a case, by name with their colours, and its desired points."""
+    """Record the trajectories of a case, by name with their colours, and its desired points."""
     stream.set_time("case", sequence=number)
     for name, (line, colour) in lines.items():  # Rerun's y axis points down
         stream.log(
@@ -244,7 +244,7 @@ def record(
 def draw_lines(
     axes: Any, letter: Letter, case: Case, lines: Mapping[str, tuple[Array, str]], mark: str
 ) -> None:
-    """Draws the mean of the demonstrations, trajectories by label with their colours, and desired
+    """Draw the mean of the demonstrations, trajectories by label with their colours, and desired
     points in the colour `mark`.
     """
     mean = letter.demonstrations.mean(axis=0)
@@ -258,7 +258,9 @@ def draw_lines(
 
 
 def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
-    """A row a letter and a block of four a set: demonstrations and mixture, and three cases."""
+    """Draw a row for each letter, and four columns for each set: demonstrations with mixture, and
+    three cases.
+    """
     plt = pyplot()
     names = sorted({row.name for rows in sets.values() for row in rows})
     figure, grid = plt.subplots(

@@ -90,7 +90,7 @@ def conditioned(letter: Letter, case: Case) -> Array:
 
 
 def configured(letter: Letter, case: Case) -> Array:
-    """The letter's DMP (of movement_primitives), with the start and the end that the case wants."""
+    """The letter's DMP (of movement_primitives), with the start and the end of the case."""
     try:
         from movement_primitives.dmp import DMP
     except ImportError:

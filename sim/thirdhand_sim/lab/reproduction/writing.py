@@ -3,8 +3,8 @@ and letters recorded by others.
 
 The model: a pen passes through the targets of a letter on a smooth curve, at a speed that falls
 with the curvature's cube root (the two-thirds power law: Lacquaniti, Terzuolo, Viviani 1983) and
-rises from and falls to rest at the ends. What varies between repetitions: each target, the whole
-letter's size, slant and place, and the tempo along it.
+rises from and falls to rest at the ends. Repetitions vary in each target, in the whole letter's
+size, slant and position, and in the tempo along it.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ PLACE_STD_CM = 0.3
 SIZE_STD = 0.04
 SLANT_STD = 0.04
 TEMPO_STD = 0.05
-SMALLEST_CURVATURE = 0.05  # [1/cm] below it the pen gains no more speed
+SMALLEST_CURVATURE = 0.05  # [1/cm] below this curvature the pen's speed is constant
 STARTING_SHARE = 0.12  # share of the path on which the pen accelerates
 
 

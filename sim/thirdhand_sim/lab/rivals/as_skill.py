@@ -1,6 +1,6 @@
 """Predictions of a rival as a skill that the service's core can run.
 
-The core estimates, holds, clamps, follows and limits all that is compared; only the predictions
+For all rivals the same core estimates, holds, clamps, follows and limits; only the predictions
 differ.
 """
 
@@ -49,7 +49,7 @@ def differences(behind: Array, now: Array, ahead: Array) -> Array:
 
 
 class RivalSaid(NamedTuple):
-    """A rival's prediction: motion (3, 3), covariance (3, 3) [m²], and whether the hands are far
+    """A rival's prediction: motion (3, 3), covariance (3, 3) [m²], and True if the hands are far
     from its data.
     """
 
@@ -80,7 +80,7 @@ class Rival(Skill):
 def rival(skill: Skill, says: Callable[[Array, Array, Array], RivalSaid], **changed: Any) -> Skill:
     """The skill with another law, and with other changed fields."""
     values = {attribute.name: getattr(skill, attribute.name) for attribute in fields(Skill)}
-    # The digest is of the name alone: nothing is recorded that would need the rest.
+    # The digest is that of the name only: no recording needs more.
     return Rival(
         **{**values, "name": "rival", "threshold": 0.5, "digest": b"rival".ljust(16), **changed},
         says=says,

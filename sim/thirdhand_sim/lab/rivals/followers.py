@@ -1,6 +1,7 @@
 """Followers of moving hands in `motion`: the service's own core, and rivals at the same limits.
 
-All use the same skill, inverse kinematics and joint limiter; only what lies between differs.
+All use the same skill, inverse kinematics and joint limiter; they differ only in the smoothing
+between these.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ from thirdhand_sim.lab.people.moving_hands import PERIOD_S, Moving
 from thirdhand_sim.lab.results import Array
 
 SETTLE_TICKS = 1500  # before a sequence the tool moves to its first target
-RESTING_EVERY = 5  # ticks from one sample to the next meanwhile
+RESTING_EVERY = 5  # ticks from one sample to the next during that motion
 
 
 class Followed(NamedTuple):
-    """The tool's path (N, 3) [m], the joints' velocities (N, J) [rad/s], the tool's greatest speed
-    [m/s], and the share of ticks with a limit met.
+    """The tool's path (N, 3) [m], the joints' velocities (N, J) [rad/s], the tool's largest speed
+    [m/s], and the share of ticks in which a limit is reached.
     """
 
     tool: Array
     joints: Array
     top_speed: float
     limited: float
-    estimate: Array | None = None  # (N, 2, 3) of the hands
+    estimate: Array | None = None  # (N, 2, 3) estimated hands
     target: Array | None = None
     setpoint: Array | None = None
 
@@ -49,8 +50,8 @@ Follower: TypeAlias = Callable[[Moving], Followed]
 
 
 def ours(skill: Skill, settings: Settings, tuning: Tuning = TUNING) -> Follower:
-    """The service's core, tick by tick. Like the rivals, it never holds because hands are far from
-    the demonstrations, and keeps no distance from people and things.
+    """The service's core, tick by tick. As the rivals, it does not hold for hands far from the
+    demonstrations, and keeps no distance from people and obstacles.
     """
     skill = replace(skill, threshold=math.inf)
     settings = msgspec.structs.replace(
@@ -130,7 +131,8 @@ class _Chain:
         joints = np.empty((len(setpoints), len(q)))
         limited = 0
         for k, (position, velocity) in enumerate(setpoints):
-            # Without the acceleration that ours passes on: a time-optimal one jumps.
+            # Ours also passes on the acceleration. A time-optimal acceleration jumps, so rivals do
+            # not.
             solution = self.arm.step(q, position, velocity, self.orientation, moving=dq)
             q, dq, ddq = self.limiter.step(q, dq, ddq, solution.velocity)[:3]
             tool[k] = self.arm.at(q).position
@@ -153,7 +155,7 @@ def _newest(hands: Moving) -> Array:
 
 
 def one_euro(hands: Moving, least_hz: float, beta: float) -> Array:
-    """Samples behind a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
+    """Samples after a One-Euro filter (Casiez, Roussel and Vogel, CHI 2012), each hand by its
     speed.
     """
     out = np.empty_like(hands.samples)
@@ -191,8 +193,8 @@ def chase(skill: Skill, settings: Settings, *, least_hz: float, beta: float) -> 
 
 
 def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
-    """As MoveIt Servo: inverse kinematics of the newest target, then a Butterworth filter and
-    Ruckig on the joints.
+    """The pipeline of MoveIt Servo: inverse kinematics of the newest target, then a Butterworth
+    filter and Ruckig on the joints.
 
     The filter is the first-order one of its plug-in, with its coefficient.
     """
@@ -223,7 +225,7 @@ def servo(skill: Skill, settings: Settings, *, coefficient: float) -> Follower:
 
 
 def unsmoothed(skill: Skill, settings: Settings) -> Follower:
-    """The newest sample's target straight to the inverse kinematics."""
+    """The newest sample's target, passed to the inverse kinematics without smoothing."""
 
     def follow(hands: Moving) -> Followed:
         chain = _Chain(skill, settings)
@@ -234,7 +236,7 @@ def unsmoothed(skill: Skill, settings: Settings) -> Follower:
 
 
 def truth(skill: Skill, settings: Settings) -> Follower:
-    """The target of the true hands straight to inverse kinematics: the arm alone."""
+    """The target of the true hands, passed to the inverse kinematics: errors of the arm only."""
 
     def follow(hands: Moving) -> Followed:
         chain = _Chain(skill, settings)
@@ -245,7 +247,9 @@ def truth(skill: Skill, settings: Settings) -> Follower:
 
 
 def _by_ruckig(wanted: Array, limits: tuple[list[float], list[float], list[float]]) -> Array:
-    """States (N, 3, D) of a time-optimal chase of positions (N, D), each assumed at rest."""
+    """States (N, 3, D) of a time-optimal motion to each of the positions (N, D), assumed at
+    rest.
+    """
     size = wanted.shape[1]
     solver = Ruckig(size, PERIOD_S)
     question = InputParameter(size)

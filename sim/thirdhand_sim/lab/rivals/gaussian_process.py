@@ -1,7 +1,7 @@
 """Gaussian processes from hands to tool: one posterior, and three ways to choose the kernel.
 
-`GaussianProcess` takes demonstrations for independent, and not their samples. `SampleProcess` takes
-all samples for independent. `by_folds` chooses lengths that predict some demonstrations best from
+`GaussianProcess` assumes independent demonstrations, but not independent samples. `SampleProcess`
+assumes independent samples. `by_folds` chooses lengths that predict some demonstrations best from
 the others, for inputs beside the hands too.
 """
 
@@ -27,18 +27,21 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import via_points_of
 
-COVARIANCE_EVERY = 4  # ticks from one covariance to the next: as often as a slow tracker sends
+COVARIANCE_EVERY = 4  # ticks from one covariance to the next, about the rate of a slow tracker
 VIA_STD_M = 0.001
 PROCESS_SAMPLES = 400
 FOLDS = 4
-# Tried lengths of the hands, and of other inputs relative to them, in the inputs' median distance.
+# Candidates for the hands' lengths, in the inputs' median distance, and ratios of other inputs'
+# lengths.
 LENGTHS = (0.15, 0.3, 0.6, 1.2)
 LENGTH_RATIOS = (1.0, 0.3, 3.0)
 PROCESS_NOISES = (0.01, 0.1, 1.0)
 
 
 class Posterior(NamedTuple):
-    """A process given N outputs: (K + Sigma)^-1 as a Cholesky factor, and times the outputs."""
+    """A process conditioned on N outputs: a Cholesky factor of K + Sigma, and the weights (K +
+    Sigma)^-1 y.
+    """
 
     root: tuple[Array, bool]
     weights: Array  # (N, 3)
@@ -46,7 +49,9 @@ class Posterior(NamedTuple):
 
     @staticmethod
     def of(covariance: Array, outputs: Array, centre: Array, *, lower: bool = True) -> Posterior:
-        """From K + Sigma (N, N) and outputs (N, 3) [m]; `lower` is the triangle of the factor."""
+        """The posterior from K + Sigma (N, N) and outputs (N, 3) [m]; `lower` is the triangle of
+        the factor.
+        """
         root = cho_factor(covariance, lower=lower)
         return Posterior(root, cho_solve(root, outputs - centre), centre)
 
@@ -76,8 +81,8 @@ class ProcessKernel:
 
 @dataclass(frozen=True, eq=False)
 class PlacedProcess:
-    """A process in a scene. The last group of its data is the scene itself, with which a query
-    shares all kernels; with the other groups it shares the first one only.
+    """A process in a scene. The last group of its data is the scene itself: a query shares all
+    kernels with it, and only the first kernel with other groups.
     """
 
     kernels: Sequence[ProcessKernel]
@@ -132,17 +137,17 @@ class PlacedProcess:
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """A Gaussian process over demonstrations that differ: one function of the hands that all share,
-    and one of each demonstration's own, both with kernels found by maximum likelihood.
+    """A Gaussian process over demonstrations that differ: a common function of the hands, plus a
+    function of each demonstration, both with kernels of maximum likelihood.
 
-    Samples of a demonstration are therefore not independent; demonstrations are. A scene is one
-    more demonstration, whose places are known. (Hierarchical model of Behseta et al. 2005, and
+    Samples of a demonstration are therefore not independent; demonstrations are. A scene is a
+    further demonstration, whose places are known. (Hierarchical model of Behseta et al. 2005, and
     Hensman et al. 2013.)
     """
 
     each: int = 30  # samples of a demonstration
     own_m: float = 0.0  # least deviation of a demonstration's own function
-    gate: float = 1.5  # hands are far beyond this multiple of the largest held-out deviation
+    gate: float = 1.5  # hands are far above this multiple of the largest held-out deviation
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedProcess:
         """The process with its kernels."""
@@ -213,7 +218,7 @@ class LearnedProcess:
     threshold: float  # deviation [m] above which hands are far
 
     def without(self, number: int) -> LearnedProcess:
-        """With one demonstration left out."""
+        """The process without one demonstration."""
         mask = self.owner != number
         return replace(
             self, inputs=self.inputs[mask], outputs=self.outputs[mask], owner=self.owner[mask]
@@ -249,8 +254,8 @@ class SampleProcess:
     """A Gaussian process of the demonstrations' samples, with lengths and noise by maximum
     likelihood, or with one length for all inputs by `ell` [1/m²].
 
-    The same neighbourhoods of places as in our skill are data with 1 mm of noise, and replace the
-    samples near them.
+    The neighbourhoods of places, as in the service's skill, are data with 1 mm of noise, and
+    replace the samples near them.
     """
 
     every: int = 20
@@ -302,15 +307,16 @@ class LearnedSamples:
         noise = np.concatenate(
             [np.full(int(is_far.sum()), self.noise), np.full(len(via_hands), VIA_STD_M**2)]
         )
-        # Closed loops amplify rounding: another triangle moves the events of a scene by 0.8 mm.
+        # Closed loops amplify rounding: the factor's other triangle moves the events of a scene by
+        # 0.8 mm.
         covariance = self.kernel(inputs, inputs) + np.diag(noise)
         posterior = Posterior.of(covariance, outputs, self.centre, lower=False)
         return PlacedProcess([self.kernel], inputs, slice(None), posterior, np.inf)
 
 
 def by_folds(inputs: Callable[[Observed | LeftOut], list[Array]]) -> Learn:
-    """A process whose length for each group of inputs, and noise, predict demonstrations best from
-    the others; its variance is scaled to the errors there.
+    """A process whose noise and length for each group of inputs predict held-out demonstrations
+    best; its variance is scaled to these errors.
     """
 
     def learn(shown: Sequence[LeftOut]) -> Law:

@@ -1,5 +1,5 @@
-"""The best causal linear filters for given hands, fitted to these very hands, without limits and
-arm: a bound for all linear filters.
+"""The best causal linear filters for given hands, fitted to the same hands, without limits and arm:
+a bound for all linear filters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
     """The filters of the target's samples with the least squared error plus weight times squared
     jerk, one a weight.
 
-    Sequences with gaps in their samples are taken as they are: the samples in order.
+    Gaps in the samples of sequences are ignored: only the order of the samples counts.
     """
     up = max(1, -(-LEAST_OUTPUT_HZ // rate_hz))
     taps = round(FILTER_S * rate_hz)
@@ -66,7 +66,7 @@ def best_linear(sequences: list[Moving], skill: Skill, *, rate_hz: int) -> list[
             energy = energy + float(x @ x)
             count = count + len(x)
     scale = float(np.trace(square)) / size
-    whole = np.kron(np.eye(up), np.ones(taps))  # what rests is met
+    whole = np.kron(np.eye(up), np.ones(taps))  # inputs at rest are met exactly
     floors = []
     for weight in JERK_WEIGHTS:
         left = square + weight * jerk + 1e3 * scale * whole.T @ whole + 1e-9 * scale * np.eye(size)
@@ -88,7 +88,9 @@ def error_at(floors: list[Floor], jerk_ratio: float) -> float:
 
 
 def _rows(samples: Array, outputs: Array, up: int, taps: int) -> Array:
-    """Inputs of each output: the newest samples, in the columns of its phase between two."""
+    """The inputs of each output: the newest samples, in the columns of the output's phase between
+    two samples.
+    """
     rows = np.zeros((len(outputs), taps * up))
     for row, output in enumerate(outputs):
         newest, phase = divmod(int(output), up)

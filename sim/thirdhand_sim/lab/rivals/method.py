@@ -1,7 +1,8 @@
-"""The interface of all that predicts the tool: a function learns from demonstrations, its model is
-placed in a scene, and what is placed predicts from the hands.
+"""The interface of methods that predict the tool: a method learns a model from demonstrations, the
+model is placed in a scene, and the placed model predicts from the hands.
 
-To add a rival, write a class or a function here or beside, and name it where it is compared.
+To add a rival, write a class or function in this package, and add it to the methods of an
+experiment.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ Mask = NDArray[np.bool_]
 
 
 class DependsOn(Enum):
-    """The input of a prediction; it decides how the predicted tool moves."""
+    """The input of a prediction, which determines the motion of the predicted tool."""
 
     HANDS = "the hands now"
     PAST = "the hands until now"
 
 
 class Observed(NamedTuple):
-    """Both hands as the service estimates them, one row a sample, in the order of time."""
+    """Both hands as the service estimates them, one row for each sample, in the order of time."""
 
     times: Array  # (T,) [s]
     hands: Array  # (T, 6) [m]
@@ -47,9 +48,9 @@ class Observed(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """The predicted tool: means (T, 3) [m], covariances (T, 3, 3) [m²] if there are any, where the
-    method holds and where it reports to be uncertain (T,), and the squared Mahalanobis distances of
-    the regions of LEVELS.
+    """The predicted tool: means (T, 3) [m], covariances (T, 3, 3) [m²] or None, True (T,) where the
+    method holds and where it reports uncertainty, and the squared Mahalanobis distances of the
+    regions of LEVELS.
     """
 
     mean: Array
@@ -70,7 +71,7 @@ class PlacedModel(Protocol):
         """The tool for observed hands."""
 
     def mean(self, seen: Observed) -> Array:
-        """The means alone (T, 3) [m]."""
+        """The means only (T, 3) [m]."""
 
 
 class RivalModel(Protocol[Scene_contra]):
@@ -93,13 +94,13 @@ class RivalMethod(Protocol):
 
 @dataclass(frozen=True)
 class Law:
-    """A model that is the same in each scene, and predicts by a function."""
+    """A model that ignores the scene, and predicts by a function."""
 
     predict: Callable[[Observed], Predicted]
     depends_on: DependsOn = DependsOn.PAST
 
     def place(self, scene: object) -> Law:
-        """The same."""
+        """The model itself, which ignores the places."""
         return self
 
     def mean(self, seen: Observed) -> Array:

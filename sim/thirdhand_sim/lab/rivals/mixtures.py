@@ -16,7 +16,8 @@ from thirdhand_sim.scene import TOOL_FROM_HAND
 from thirdhand_sim.sessions import SessionDemonstration
 
 MIXTURE_SEED = EXPERIMENTS["people"].seeds.method
-# Hands are far below this quantile of the demonstrations' log densities, less a slack [nat].
+# Hands are far if their log density is below this quantile of the demonstrations', less a slack
+# [nat].
 UNUSUAL = 0.001
 THRESHOLD_SLACK = 10.0
 
@@ -47,13 +48,13 @@ def path_share(shown: SessionDemonstration) -> Array:
         axis=1,
     )
     speed = np.linalg.norm(np.gradient(x, axis=0).reshape(-1, 3, 3), axis=2).sum(axis=1)
-    travel_m = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] below 2 cm/s they rest
+    travel_m = np.cumsum(np.maximum(speed - 0.0008, 0.00005))  # [m] slower than 2 cm/s is rest
     return np.asarray((travel_m - travel_m[0]) / (travel_m[-1] - travel_m[0]))
 
 
 @dataclass(frozen=True)
 class MixtureRegression:
-    """A Gaussian mixture of hands and tool, conditioned on the hands (GMR). Knows no places."""
+    """A Gaussian mixture of hands and tool, conditioned on the hands (GMR), without places."""
 
     components: int = 10
 
@@ -78,7 +79,7 @@ class LearnedMixture:
     depends_on = DependsOn.HANDS
 
     def place(self, places: Places) -> LearnedMixture:
-        """The same: it takes no places."""
+        """The model itself, which ignores the places."""
         return self
 
     def mean(self, seen: Observed) -> Array:
@@ -86,7 +87,7 @@ class LearnedMixture:
         return self.mixture.regress(seen.hands).mean
 
     def predict(self, seen: Observed) -> Predicted:
-        """As `Placed.predict`; it holds where such hands were not demonstrated."""
+        """As `Placed.predict`; it holds for hands that were not demonstrated."""
         regression = self.mixture.regress(seen.hands)
         return Predicted(
             regression.mean,

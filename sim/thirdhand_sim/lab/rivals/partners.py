@@ -1,8 +1,8 @@
-"""Rivals on takes that were left out: the simplest predictions, Gaussian processes with and without
-a memory, and an HMM that finds in which demonstration, and where along it, the hands are.
+"""Rivals on left-out takes: the simplest predictions, Gaussian processes with and without a memory,
+and an HMM over the samples of all demonstrations.
 
-A rival that is given the via-points of a scene predicts in the mean scene: hands are carried there,
-and the tool back, by the displacements of the via-points.
+A rival with given via-points predicts in the mean scene: hands are mapped to it, and the tool back,
+by the displacements of the via-points.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from thirdhand_sim.lab.rivals.gaussian_process import by_folds
 from thirdhand_sim.lab.rivals.method import Law, Learn, Observed, Predicted
 
 MOVES_MPS = 0.08  # a hand that moves faster begins the task
-MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # before now
+MEMORY_S = (0.25, 0.5, 1.0, 2.0)  # times before the present at which past hands are inputs
 HMM_STATES = 6000
-CORRELATED = 0.2  # weight of an observation in the HMM: consecutive ones are correlated
+CORRELATED = 0.2  # weight of an observation in the HMM, as consecutive ones are correlated
 RESTARTS = 1e-4  # probability, at each sample, that the hands are anywhere in any demonstration
 DERIVATIVE_STEP_S = 0.01  # step of the numerical derivative by which velocities are carried
-OFF_PLACE_M = 0.02  # nearer to a via-point, its own displacement dominates
+OFF_PLACE_M = 0.02  # within this distance of a via-point, its own displacement dominates
 
 
 def carried(points: Array, here: Array, there: Array) -> Array:
-    """Points (T, 3) moved by the displacements of places (K, 3) from here to there, weighted by
+    """Points (T, 3) moved by the displacements of places (K, 3) from `here` to `there`, weighted by
     distance (Shepard's interpolation).
     """
     weights = 1.0 / (cdist(points, here, "sqeuclidean") + OFF_PLACE_M**2) ** 2
@@ -100,7 +100,7 @@ def left_out_by(
 
 
 def mean_of_all(shown: Sequence[LeftOut]) -> Law:
-    """The tool's mean."""
+    """The mean position of the tool."""
     mean = np.concatenate([take.tool for take in shown]).mean(axis=0)
     return Law(lambda seen: Predicted(np.tile(mean, (len(seen.hands), 1))))
 
@@ -143,7 +143,8 @@ def neighbours(shown: Sequence[LeftOut]) -> Law:
 
 def hmm(shown: Sequence[LeftOut]) -> Law:
     """The mean of the tools, weighted by the probability that the hands are at each sample of each
-    demonstration. They proceed along one at about its pace, or are anywhere.
+    demonstration. The state proceeds along one demonstration at about its pace, or restarts
+    anywhere.
     """
     total = sum(len(take.tool) for take in shown)
     step = max(1, -(-total // HMM_STATES))

@@ -1,4 +1,4 @@
-"""Rivals that know the via-points of a scene and no demonstration."""
+"""Rivals that use the via-points of a scene and no demonstrations."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 from thirdhand_sim.teach import via_points_of
 
-# d tool / d hands where the tool follows the left hand
+# d tool / d hands at a place at which the tool follows the left hand
 FOLLOW_LEFT = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 
 @dataclass(frozen=True)
 class NoDemonstrations:
-    """Kernel regression through via-points and start alone; it never holds, as no data are near."""
+    """Kernel regression through via-points and start only; it never holds, as it has no
+    demonstrations.
+    """
 
     ell: float = 5.0  # [1/m²] of exp(-ell |s - s'|²)
     deviation_m: float = 0.2  # deviation of the tool far from all via-points

@@ -15,8 +15,8 @@ from thirdhand_sim.people import Places
 from thirdhand_sim.sessions import SessionDemonstration
 
 BASES = 20  # basis functions of each axis over time
-# Multiple of the mean variance of the weights: of 0 to 100, about where ProMP changes the rest of a
-# letter as little as KMP does.
+# Multiple of the mean variance of the weights. Of 0 to 100, ProMP with this one changes a letter
+# away from via-points about as little as KMP.
 RIDGE = 10.0
 PROMP_LEAST_STD_M = 0.001
 
@@ -26,9 +26,9 @@ def learned_promp(
 ) -> Any:
     """The ProMP (of movement_primitives) of trajectories (T, O) at times (T,) [s], from 0.
 
-    H demonstrations leave the weights' covariance with a rank of H - 1, which can meet that many
-    numbers and no more: three places in space are nine. Therefore `ridge` times the mean variance
-    is added to the diagonal; with it, ProMP meets via-points as it does in the paper.
+    With H demonstrations, the weights' covariance has the rank H - 1, so at most H - 1 numbers can
+    be met, but three places in space have nine. Therefore `ridge` times the mean variance is added
+    to the diagonal; with it, ProMP meets via-points as it does in the paper.
 
     Raises ExperimentError.
     """
@@ -40,7 +40,7 @@ def learned_promp(
             "'thirdhand[experiments]'"
         ) from None
     primitive = ProMP(n_dims=trajectories[0].shape[1], n_weights_per_dim=bases)
-    # divides the given times in place
+    # `imitate` divides the given times in place
     primitive.imitate([t.copy() for t in times], list(trajectories))
     variance = ridge * np.trace(primitive.weight_cov) / len(primitive.weight_cov)
     return primitive.from_weight_distribution(
@@ -53,17 +53,17 @@ class InteractionProMP:
     """Interaction ProMP (Amor et al. 2014; Ewerton et al. 2015): hands and tool share a
     distribution of weights over the phase, which is conditioned on the places.
 
-    The phase is estimated from the hands so far by a hidden Markov model over a grid; the tool is
-    the expectation over it, conditioned on where the hands are now. Not conditioned: weights on
+    A hidden Markov model over a grid estimates the phase from the hands so far; the tool is the
+    expectation over the phase, conditioned on the present hands. The weights are not conditioned on
     earlier hands.
     """
 
     bases: int = 15
-    ridge: float = 0.1  # times the mean variance of the weights, added to each
+    ridge: float = 0.1  # this multiple of the mean variance of the weights is added to each
     by_length: bool = True  # the phase of a demonstration: share of the path, else of the time
     hands_m: float = 0.02  # deviation of the hands from the model
     cells: int = 100
-    sharpness: float = 0.1  # weight of an observation: consecutive ones are correlated
+    sharpness: float = 0.1  # weight of an observation, as consecutive ones are correlated
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedInteraction:
         """The distribution of the weights."""
@@ -120,7 +120,7 @@ class LearnedInteraction:
     threshold: float
 
     def place(self, places: Places) -> PlacedInteraction:
-        """Conditioned on hands and tool at each place."""
+        """The model conditioned on hands and tool at each place."""
         method = self.method
         mean = self.mean
         covariance = self.covariance
@@ -149,11 +149,11 @@ class PlacedInteraction:
     means: Array
     covariances: Array
     threshold: float
-    every: int = 5  # ticks from one look at the phase to the next
+    every: int = 5  # ticks from one estimate of the phase to the next
     depends_on = DependsOn.PAST
 
     def evidence(self, hands: Array) -> Array:
-        """Log density (T,) of hands (T, 6) at the likeliest phase."""
+        """Log density (T,) of hands (T, 6) at the most likely phase."""
         return np.asarray(self._likelihoods(hands).max(axis=1))
 
     def mean(self, seen: Observed) -> Array:

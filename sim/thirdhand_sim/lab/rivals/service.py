@@ -1,4 +1,4 @@
-"""The service's own skill as a method, as it learns by default and in the paper's way."""
+"""The service's own skill as a method: learned by default, and in the paper's way."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Service:
     """The skill that the service learns by default, with the start among its via-points."""
 
     def learn(self, demonstrations: Sequence[SessionDemonstration]) -> LearnedByService:
-        """By `thirdhand.workbench.learning`."""
+        """The skill that `thirdhand.workbench.learning` learns."""
         return LearnedByService(
             learn([recorded(demonstration) for demonstration in demonstrations]), start=True
         )
@@ -58,7 +58,7 @@ class ServiceAsPaper:
 
 @dataclass(frozen=True, eq=False)
 class LearnedByService:
-    """A skill of the service, and whether the start is among its via-points."""
+    """A skill of the service, and True if the start is among its via-points."""
 
     skill: StoredSkill
     start: bool = False
