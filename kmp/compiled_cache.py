@@ -33,9 +33,9 @@ def _number_anew() -> None:
     """Give this process a range of its own for the numbers of compiled functions.
 
     A symbol of compiled code consists of the function's name, this number, and the numbers of
-    types. Each process counts them, and a forked one goes on where the other one is. Without a
-    range of its own, two processes could give one symbol to different codes, and a third one, which
-    loads both, would call the wrong one.
+    types. Each process counts them, and a forked process continues from its parent's counts.
+    Without a range of its own, two processes could give one symbol to different codes, and a third
+    process, which loads both, would call the wrong code.
     """
     FunctionIdentity._unique_ids = itertools.count(int.from_bytes(os.urandom(6), "big") << 20)  # noqa: SLF001
 

@@ -234,7 +234,7 @@ class Dense(Expansion):
 
     @cached_property
     def covariance_factor(self) -> Array:
-        """The same with the lambda of the covariance."""
+        """The lower Cholesky factor of K (x) I + lambda_c Sigma: N C distinct rows and columns."""
         solver = self._covariance_solver
         if solver is self._mean_solver:
             return self.mean_factor

@@ -1,7 +1,8 @@
 """Values of this package as named arrays, exact to the bit: what their files hold.
 
-A primitive has the names of `_NAMES`. Any other value has its kind, and its fields by name; a value
-in a value, also a primitive, has the field's name before its own names.
+The arrays of a primitive have the names of `_NAMES`. Any other value has an array with its kind,
+and its fields by name. The names of a value within a value, or of a primitive there, begin with the
+field's name.
 """
 
 from __future__ import annotations

@@ -55,7 +55,9 @@ class Inner(Immutable):
 
     @cached_property
     def compiled_query(self) -> CompiledQuery | None:
-        """The same for compiled loops; None without Numba, or for a kernel that they lack."""
+        """The arrays of a query for compiled loops; None without Numba, or for a kernel that they
+        lack.
+        """
         return CompiledQuery.of(self.query)
 
 
@@ -265,7 +267,7 @@ class Predictor(Immutable):
 
     @property
     def prior_offset(self) -> Array:
-        """(O,) [unit of the outputs] the prior mean at inputs of 0."""
+        """The prior mean (O,) [unit of the outputs] at inputs of 0."""
         return self.inner.solution.hyperparameters.prior_offset
 
     @property

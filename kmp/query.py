@@ -58,7 +58,7 @@ class Query(Immutable):
     scale: float
     stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
     centres: Array  # (R, I), there
-    derivatives: Derivatives | None  # which of the R are derivatives
+    derivatives: Derivatives | None  # the derivatives among the R centres
     weights: Array  # (R C, D)
     weight_rows: Array  # (D, R C), the same
     prior_mean: Array  # (O, 1) its offset, or (O, 1 + I) and its matrix
@@ -170,7 +170,9 @@ class Query(Immutable):
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
     ) -> MotionPrediction:
-        """All of these for a query (I,), its velocity (I,) and acceleration (I,)."""
+        """The output at a query (I,), and its motion by the query's velocity and acceleration
+        (I,).
+        """
         row = self.row(query)
         jacobian = self.jacobian(row)
         curvature = self.curvature(row, velocity)

@@ -1,6 +1,5 @@
-"""From demonstrations to a primitive, with the hyper-parameters chosen where none are given.
-
-Chosen by leaving one demonstration out: what is learned from the others must predict it. Or by the
+"""From demonstrations to a primitive, with a choice of the hyper-parameters that are not given. The
+criterion is the error on left-out demonstrations, of primitives learned from the others, or the
 marginal likelihood of the reference.
 """
 
@@ -27,24 +26,24 @@ from kmp.problem.database import Database
 from kmp.problem.hyperparameters import checked_kernel
 from kmp.time_kernels import VelocityKernel
 
-_ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # over twice the variance of the inputs
-_LAMBDAS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # over the mean variance of the reference
+_ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # ell times twice the inputs' variance
+_LAMBDAS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # lambda / mean variance of the reference
 _OF_MEAN = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3, 1e4, 1e5)  # lambda_c over lambda
-_STEP = 4.0  # of the search around the best
+_STEP = 4.0  # factor of the first steps around the best parameters
 _SWEEPS = 2
-_AS_GOOD = 1.03  # times the least RMSE: among these the shortest lengths are taken
-_AROUND = 10.0 ** np.arange(-1, 4)  # times the best lambda, that are tried with each of these
-# times the best ell, that are tried for it, up to the last of _ELLS
+_AS_GOOD = 1.03  # the shortest lengths up to this multiple of the least RMSE are taken
+_AROUND = 10.0 ** np.arange(-1, 4)  # multiples of the best lambda that are tried with each length
+# multiples of the best ell that are tried, up to the last of _ELLS
 _SHORTER = 2.0 ** np.arange(1, 9)
 _ROUNDED = 1 + 1e-9
 _PLACES = 9  # reference points at which the reach of a via-point is measured
 _COARSEST = 1e-3  # largest step between two numbers of the inputs' size / deviation of the inputs
-_HELD_OUT = 200  # points of a demonstration that are predicted
+_HELD_OUT = 200  # points of a held-out demonstration that are predicted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Score(Immutable):
-    """How well some hyper-parameters predict a demonstration that was left out."""
+    """The errors of some hyper-parameters on a left-out demonstration."""
 
     ell: float | Array
     lambda_mean: float
@@ -72,7 +71,7 @@ class Learned(Immutable):
 
     @cached_property
     def reach(self) -> Array:
-        """(I,) [unit of the inputs] how far a via-point matters, along each input.
+        """Distances (I,) [unit of the inputs] up to which a via-point matters, along each input.
 
         The median of `KMP.via_point_reach` over some of the reference points: up to there, the mean
         moves by at least a tenth of what it moves at the via-point. For another reach, give `learn`
@@ -113,7 +112,7 @@ class Learned(Immutable):
 
 @dataclass(frozen=True)
 class _Recipe:
-    """How a reference is made of demonstrations."""
+    """The parameters by which a reference is made of demonstrations."""
 
     components: int
     seed: int
@@ -124,7 +123,9 @@ class _Recipe:
     def mixture(
         self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None
     ) -> GaussianMixture:
-        """The mixture of all samples, from that of a few more if it is known."""
+        """The mixture of all samples; EM begins at `start`, the mixture of a few more samples, if
+        given.
+        """
         try:
             return mixture_of(
                 np.concatenate([np.hstack(pair) for pair in data]),
@@ -141,7 +142,7 @@ class _Recipe:
     def reference(
         self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool
     ) -> Fold:
-        """The reference of all demonstrations, nothing held out."""
+        """The reference of these demonstrations."""
         samples = np.concatenate([s for s, _ in data])
         if shown:
             inputs = samples[
@@ -160,7 +161,7 @@ class _Recipe:
     def folds(
         self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool
     ) -> _Folds:
-        """Those that hold out one demonstration each, with the mixtures of the others."""
+        """The folds, each without one demonstration, from the mixtures of the others."""
         return _Folds(
             tuple(self._fold(data, h, mixture, shown) for h, mixture in enumerate(mixtures)),
             shown,
@@ -181,7 +182,9 @@ class _Recipe:
 
 
 class _Folds(NamedTuple):
-    """The folds of all demonstrations, whose references are at inputs shown, or not."""
+    """The folds of all demonstrations, with references at demonstrated inputs (`shown`) or drawn
+    ones.
+    """
 
     each: tuple[Fold, ...]
     shown: bool
@@ -189,11 +192,11 @@ class _Folds(NamedTuple):
 
     @property
     def outputs(self) -> int:
-        """Of values: rates do not count."""
+        """The number of outputs that are values, not rates."""
         return self.each[0].reference.outputs // self.channels
 
     def rmses(self, kernel: Kernel, penalties: Sequence[float]) -> list[float]:
-        """Of all folds, for each penalty."""
+        """The RMSE over all folds, for each penalty."""
         fold_rmses = [fold.rmses(kernel, penalties, self.outputs) for fold in self.each]
         return [float(rmse) for rmse in np.sqrt(np.mean(np.square(fold_rmses), axis=0))]
 
@@ -238,7 +241,8 @@ def learn(
     "likelihood": those of the greatest marginal likelihood of the reference (Rasmussen and Williams
     2006, section 5.4.1), for normals of the covariance s^2 (K + lambda Sigma), s^2 the likeliest;
     then a lambda of the covariance that is not given is N / s^2. One demonstration is enough, and
-    no scores are made. Give components enough: it takes the kinks of too few for what was shown.
+    no scores are made. Give enough components: with too few, the primitive imitates the kinks of
+    the mixture.
 
     `scales`: a length for "each" input, or "one" for all, over their deviations. `velocity`: the
     outputs are values and then their rates over time, the kernel a VelocityKernel. What is tried
@@ -349,7 +353,7 @@ def _best_first(score: Score) -> tuple[float, float]:
 
 
 def _likeliest(folds: _Folds, kernel: Kernel, lambda_mean: float, scores: list[Score]) -> float:
-    """The lambda of the covariance of the least negative log likelihood. Notes the scores."""
+    """The covariance's lambda of the least negative log likelihood; appends the scores."""
     others = [factor * lambda_mean for factor in _OF_MEAN]
     [rmse] = folds.rmses(kernel, [lambda_mean])
     likelihoods = folds.likelihoods(kernel, lambda_mean, others)
@@ -371,14 +375,15 @@ class _Tried(NamedTuple):
 
 @dataclass(frozen=True)
 class _Search:
-    """For the kernel and lambda of the least RMSE, of which some may be given."""
+    """The search for the kernel and lambda of the least RMSE; one of them may be given."""
 
     kernel: Kernel | None
     lambda_mean: float | None
     one_length: bool
 
     def best(self, choices: Sequence[_Folds]) -> tuple[_Folds, Kernel, float, list[Score]]:
-        """A grid for each choice of folds; for the best of them, steps along each parameter.
+        """Search a grid for each choice of folds, then take steps along each parameter for the
+        best.
 
         Of the lengths that predict as well as the best, the shortest are taken: a via-point then
         changes no more of the skill than the demonstrations ask for.

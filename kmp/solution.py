@@ -96,7 +96,7 @@ class Solution(Protocol):
         """
 
     def posterior_covariance(self, rows: Array) -> Array:
-        """The same (M, O, O) of the kernel rows (M C, R C) of M queries, each by itself."""
+        """The covariances (M, O, O) for the kernel rows (M C, R C) of M queries, each by itself."""
 
     def adapted(self, changes: Changes) -> Solution:
         """The solution of the base database, before any adaptation, with these changes."""

@@ -34,8 +34,8 @@ def held_out_residuals(
     """The residuals (J, N, D) of kernel ridge regression without each point's group.
 
     `ratios` (J,) are the variances of the noise over the kernel's, `group` (N,) the numbers of the
-    groups, and `targets` gives those (N, D) to predict when a group is held out, as the mean that
-    was subtracted from them may depend on it.
+    groups. `targets` gives the values (N, D) to predict when a group is held out, because the mean
+    that was subtracted from them may depend on the group.
     """
     values, vectors = np.linalg.eigh(kernel)
     numbers = np.unique(group).tolist()

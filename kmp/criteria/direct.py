@@ -62,7 +62,7 @@ class Scales(NamedTuple):
     )
     max_gain: float  # limit of the affine mean's singular values
     local: float  # l [unit of the inputs]
-    noise: float  # sigma, the noise of the outputs, which made demonstrations lack
+    noise: float  # sigma, the noise of the outputs, which synthetic demonstrations lack
 
 
 class Parameters(NamedTuple):
@@ -220,7 +220,7 @@ class DirectSelection:
     def primitive(
         self, parameters: Parameters, residuals: Array, *, without: int | None = None
     ) -> KMP:
-        """The primitive of all groups but one.
+        """The primitive of all groups, or of those `without` one.
 
         With the covariance of IJRR 2019, N / lambda_c = d^2 and lambda_c Sigma_n = q S_n; for the
         mean, lambda Sigma_n = r S_n.

@@ -224,7 +224,7 @@ class LowRank(Expansion):
 
     @cached_property
     def covariance_factor(self) -> Array:
-        """The same with the lambda of the covariance."""
+        """The lower Cholesky factor of information + lambda_c I."""
         parameters = self.hyperparameters
         check_resolved(parameters, self.database, both=True)
         if parameters.lambda_covariance == parameters.lambda_mean:

@@ -37,7 +37,7 @@ class Changes(NamedTuple):
 
     @property
     def inputs(self) -> Array:
-        """(V, I) where the via-points are."""
+        """The inputs (V, I) of the via-points."""
         return self.functionals.inputs
 
 
@@ -55,7 +55,7 @@ class Database(Immutable):
 
     @property
     def inputs(self) -> Array:
-        """(N, I) where the points are."""
+        """The inputs (N, I) of the points."""
         return self.functionals.inputs
 
     def least_shares(self, kernel: Kernel) -> Array:

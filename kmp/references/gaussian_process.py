@@ -31,7 +31,7 @@ _LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
 _NOISE = 1e-6, 1e1  # bounds of the noise's variance over the variance of the output
 # factors on the likeliest lengths, evaluated on held-out demonstrations
 _LONGER = (1.0, 1.5, 2.5, 4.0)
-_NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # noises, evaluated on the same
+_NOISES = 1e-6, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0  # noises, evaluated in the same way
 
 
 def gaussian_process_reference(
@@ -139,7 +139,7 @@ def _left_out(gram: Array, y: Array, of: NDArray[np.intp]) -> tuple[Array, Array
     pull = precision @ y
     errors = np.empty_like(y)
     deviations = np.empty_like(y)
-    # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, given the rest
+    # covariance P_hh^-1 and error P_hh^-1 (P y)_h of a normal, conditioned on all other samples
     for h in np.unique(of):
         rows = of == h
         covariance = np.linalg.inv(precision[np.ix_(rows, rows)])
