@@ -62,7 +62,7 @@ def test_what_is_copied_into_the_image_suffices_for_the_wheel(tmp_path: Path) ->
 
 
 def test_services_reach_each_other() -> None:
-    """Their commands are those of this version."""
+    """The services' commands are those of this version."""
     services = COMPOSE["services"]
     configs = COMPOSE["configs"]
     cell, metrics = (parser().parse_args(services[name]["command"]) for name in ("cell", "metrics"))

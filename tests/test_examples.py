@@ -33,7 +33,7 @@ def example(name: str) -> ModuleType:
 def test_tracker_follower_teacher_and_watcher_work_together(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """They get a second attempt with twice the time, as the machine may be busy."""
+    """The programs get a second attempt with twice the time, as the machine may be busy."""
     output = ""
     ended = dict[str, Any]()
     with serving(tmp_path) as daemon:

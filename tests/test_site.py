@@ -141,7 +141,7 @@ def test_page_on_the_command_line_is_complete() -> None:
 
 
 def test_pages_on_python_are_those_of_the_docstrings() -> None:
-    """They have every name."""
+    """The pages have every public name."""
     for page, written in program("library_page").pages().items():
         assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
         module = {"library": kmp, "client": client}[page.stem]
@@ -281,7 +281,7 @@ def test_programs_for_users_of_other_libraries_run() -> None:
 
 
 def test_each_setting_has_words_or_a_unit() -> None:
-    """They stand beside it in the source."""
+    """Words or unit stand beside the setting in the source."""
     rows = [line for line in written_by("settings_page").splitlines() if line.startswith("| `")]
     assert len(rows) > 40
     assert [row for row in rows if row.endswith("|  |")] == []

@@ -204,7 +204,8 @@ def test_it_waits_for_a_daemon_that_starts_later_and_says_so(tmp_path: Path) -> 
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with following("simulated", "--connect", endpoint) as running:
         running.until("waiting, up to 60 s: ")
-        time.sleep(3.0)  # longer than the time-outs of a connection and a request
+        # longer than the time-outs of a connection and a request
+        time.sleep(3.0)
         with (
             serving(tmp_path, network=f'[network]\nlisten = ["{endpoint}"]\n') as daemon,
             Tracker(daemon.session),

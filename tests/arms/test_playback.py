@@ -167,7 +167,8 @@ def test_limits_hold_whatever_network_and_clocks_do(
     wishes_radps = np.array([value for value, count in wishes for _ in range(count)])
     commands = motion(wishes_radps)
     arriving = [*sent(commands, late), *(Sent(*pair) for pair in hostile)]
-    if restart is not None:  # the new daemon counts ticks anew, and starts near the arm
+    # the new daemon counts ticks anew, and starts near the arm
+    if restart is not None:
         after, tick, offset_rad, silent_s = restart
         end = commands[min(after, len(commands) - 1)]
         commands = commands[:after]

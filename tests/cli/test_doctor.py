@@ -112,7 +112,8 @@ def test_a_cell_with_ones_own_arm_and_tracker(
 
         with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
-            for _ in range(5):  # the rate is known some time after the driver's first state
+            # the rate is known some time after the driver's first state
+            for _ in range(5):
                 _, report = findings(daemon, capsys)
                 if all(finding["level"] == "ok" for finding in report):
                     break

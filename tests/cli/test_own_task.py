@@ -91,7 +91,8 @@ def test_the_tutorial_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for kind in ("STATE", "CONFIG"):  # another HOME would have an empty cache of compiled code
+    # another HOME would have an empty cache of compiled code
+    for kind in ("STATE", "CONFIG"):
         monkeypatch.setenv(f"XDG_{kind}_HOME", str(tmp_path))
     shell = Shell()
     try:

@@ -49,7 +49,7 @@ def part(names: str, stamp_ns: int, value: float = 0.5) -> JointState:
 
 
 def test_messages_without_joints_of_the_arm_are_ignored() -> None:
-    """They are named once no state arrives."""
+    """The ignored messages are named once no state arrives."""
     states = JointStates(NAMES, 0.1)
     fingers = part("xy", 1)
     for k in range(300):

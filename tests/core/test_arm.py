@@ -190,7 +190,6 @@ def test_arm_leaves_the_stretched_posture() -> None:
 
 
 def test_outside_limits_joints_move_inwards() -> None:
-    """From outside their limits, joints only move inwards."""
     home = np.array([0.0, -2.0, 0.0, 3.13, 0.0, 0.0, 0.0])
     run = wait(home, START, AHEAD_AND_DOWN, seconds=12.0)
     outside = np.maximum(np.maximum(run.position - UPPER, LOWER - run.position), 0.0)

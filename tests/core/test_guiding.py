@@ -37,7 +37,6 @@ def lead(loop: Loop, ticks: int, by: float = LED_RAD, *, is_reported: bool = Tru
 
 @pytest.mark.parametrize("first", ["a hold", "nothing"])
 def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, first: str) -> None:
-    """An arm that is led holds and starts again where it was left."""
     loop = Loop(CELL, taught)
     assert loop.run(1500)["mode"][-1] == Mode.FOLLOW
     if first == "a hold":
@@ -68,7 +67,6 @@ def test_led_arm_holds_and_starts_where_left(taught: Skill, tmp_path: Path, firs
 
 
 def test_led_arm_without_report_is_a_fault(taught: Skill) -> None:
-    """An arm that is led by hand without reporting it is a fault."""
     loop = Loop(CELL, taught)
     loop.run(700, {500: order("hold")})
     assert lead(loop, 800, is_reported=False)["reason"][-1] == Reason.ARM_ERROR

@@ -143,7 +143,6 @@ def test_slow_tremor_at_rest_is_removed(hz: float) -> None:
 @pytest.mark.parametrize(("size_m", "speed"), [(0.003, 0.1), (0.002, 0.25)])
 @pytest.mark.parametrize("hz", [4.0, 4.4, 5.0, 6.0, 9.1, 13.0])
 def test_tremor_hardly_ripples_velocity(hz: float, size_m: float, speed: float) -> None:
-    """A tremor hardly ripples the velocity of a hand on its way."""
     _, velocity = shaking(hz, size_m, speed)
     assert part_at(hz, velocity) < 0.15 * 2 * np.pi * hz * size_m
 
@@ -232,7 +231,7 @@ def test_a_hand_that_trembles_rests(tremor_m: float) -> None:
 
 @pytest.mark.parametrize("hz", [25, 125, 500])
 def test_rest_ends_at_once_and_begins_slowly(hz: int) -> None:
-    """This holds at any rate."""
+    """The tracker's rate does not matter."""
     speed = np.concatenate([np.zeros(hz), np.full(hz, 0.3), np.zeros(hz)])
     stillness = rest_of(speed, hz)
     assert stillness[hz - 1] == 1.0

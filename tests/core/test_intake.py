@@ -195,7 +195,7 @@ def test_clock_set_back_locks_a_hand_out_until_stale_only() -> None:
 
 @pytest.mark.parametrize("ahead_ns", [110_000_000, 10**9, 3600 * 10**9, 2**62, 2**63 - 1])
 def test_stamp_from_the_future_locks_no_source_out(ahead_ns: int) -> None:
-    """Such a sample is refused."""
+    """The sample with a stamp from the future is refused."""
     hands = Hands()
     hands.hand(0, side=RIGHT)  # stamp 0 stands for no sample: repeated
     for tick in range(1, 60):

@@ -204,7 +204,8 @@ def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]
     """Hands that reappear with exchanged labels are rejected."""
     hands = BothHands(rate_hz)
     hands.tell(1.0)
-    hands.tell(0.2, hidden=hidden)  # a hand is covered, then the other one gets its label
+    # a hand is covered, then the other one gets its label
+    hands.tell(0.2, hidden=hidden)
     hands.tell(0.1, swapped=True, hidden=hidden)
     errors_m, fresh = hands.tell(0.8, swapped=True)
     assert errors_m.max() < 0.02

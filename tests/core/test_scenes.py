@@ -243,7 +243,6 @@ def settled(
 @pytest.mark.parametrize("number", sorted({*range(MANY or 2), 10}))  # 10 once oscillated for ever
 @pytest.mark.one_case
 def test_any_cell_comes_to_rest(taught: Skill, number: int) -> None:
-    """The arm comes to rest in every cell."""
     random = np.random.default_rng(number)
     cell = cell_of(("wam", "panda", "ur5")[number % 3])
     rate_hz = int(random.choice([250, 500, 1000]))
@@ -350,7 +349,6 @@ def along(speed: float, parts: slice) -> Vector:
 
 @pytest.mark.parametrize("speed", [0.002, 0.005, 0.02])
 def test_slow_hand_moves_tool_evenly(speed: float) -> None:
-    """A tool moves evenly with a slow hand."""
     assert along(speed, slice(0, 3)).std() < 0.001
 
 

@@ -113,7 +113,6 @@ def coal_capsule(segment: Vector) -> tuple[Any, Any]:
 
 
 def test_capsule_distances_are_those_of_coal() -> None:
-    """Distances of capsules are those of Coal."""
     random = np.random.default_rng(2)
     near = np.empty(9)
     for _ in range(300):

@@ -159,7 +159,7 @@ def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Ve
 def test_way_from_elsewhere_is_ignored(
     taught: Skill, stuck: tuple[Settings, Vector, Vector]
 ) -> None:
-    """Such a path does not begin at the arm's posture."""
+    """The path does not begin at the arm's posture."""
     cell, start, hands = stuck
     state = start_state(cell, taught)
     state["joints"][0] = start

@@ -100,7 +100,7 @@ def test_rate_and_change_are_derivatives(clock: TaskClock) -> None:
 
 @pytest.mark.parametrize("rate_hz", [24, 100, 500])
 def test_learned_clock_is_the_live_one(rate_hz: int) -> None:
-    """This holds at any rate."""
+    """The clock counts the same at any rate."""
     times = np.arange(0.0, 4.0, 1.0 / rate_hz)
     speeds = np.where(times > 1.0, 0.3, 0.0)
     stillness = np.where(times > 1.0, 0.0, 1.0)
@@ -209,7 +209,7 @@ def test_every_round_is_predicted_as_the_first(kind: str) -> None:
 
 
 def test_each_segment_restarts_the_clock() -> None:
-    """It restarts with the first motion in the segment."""
+    """A clock restarts with the first motion in the segment."""
     rows = np.tile(RUNS.numbers, (2, 1))
     state = np.zeros(CLOCK_SIZE)
     seconds = []

@@ -26,7 +26,7 @@ def numbers(size: int) -> st.SearchStrategy[Vector]:
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(numbers(3), numbers(3), numbers(3))
 def test_clamped_target_is_reachable(p: Vector, v: Vector, a: Vector) -> None:
-    """Its motion leads no further out."""
+    """The motion of a clamped target leads no further out."""
     v = v.clip(-1e6, 1e6)
     a = a.clip(-1e6, 1e6)
     position, velocity, acceleration, clamped = clamp(p, v, a, box=EVERYWHERE, reach=REACH)

@@ -134,7 +134,8 @@ def test_stamps_follow_a_drifting_clock_without_a_jump() -> None:
     deadlines = clock.deadlines()
     stamps(clock, deadlines, 5)
     for _ in range(3000):
-        clock.set_by_ns += 1_000  # 500 parts in a million, the largest slew of a clock
+        # 500 parts in a million, the largest slew of a clock
+        clock.set_by_ns += 1_000
         before = deadlines.stamp_ns
         deadlines.wait()
         assert abs(deadlines.stamp_ns - before - PERIOD_NS) <= 1_000
@@ -174,7 +175,7 @@ def test_a_system_clock_that_is_set_is_reported_once(set_by_s: float, words: str
 
 
 def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
-    """It is prepared only if there is time."""
+    """A tick is prepared only if there is time."""
     clock = FakeClock()
     prepared = []
     start = clock.now

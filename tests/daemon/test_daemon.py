@@ -132,9 +132,7 @@ def test_at_most_four_samples_a_tick_are_taken(tmp_path: Path) -> None:
 
 
 def test_via_points_survive_a_restart(tmp_path: Path) -> None:
-    """They survive an end and a kill of the daemon; the lock of a killed daemon keeps no other one
-    out.
-    """
+    """The daemon ends or is killed; the lock of a killed daemon does not keep others out."""
     with serving(tmp_path, "--joints", "assumed") as daemon:
         daemon.client.add([HANDOVER, msgspec.structs.replace(HANDOVER, name="second")])
         daemon.client.ask("via_points", {"op": "remove", "names": ["second"]})

@@ -58,7 +58,7 @@ def test_each_sign_is_told_with_its_figure(tmp_path: Path) -> None:
 
 
 def test_busy_machine_is_the_cause_of_timing_incidents_only() -> None:
-    """It is not named with other incidents."""
+    """A busy machine is not named with other incidents."""
     evidence = Evidence(busy="the loop was up to 45 ms late")
     for reason in Reason:
         blamed = explained(reason, evidence).why.startswith(

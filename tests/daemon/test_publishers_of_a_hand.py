@@ -86,7 +86,7 @@ def test_second_publisher_is_refused(
     first: Callable[[zenoh.Session], Put],
     second: Callable[[zenoh.Session], Put],
 ) -> None:
-    """Its samples are refused even if they are near, and with any stamps."""
+    """The second publisher's samples are refused even if they are near, and with any stamps."""
     streams, arrivals, session = cell
     put = first(session)
     put_other = second(session)

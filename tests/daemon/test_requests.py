@@ -470,7 +470,7 @@ def test_a_plain_request_is_answered_with_the_tick_that_took_it(cell: Cell, suff
 
 
 def test_named_hold_is_ended_by_its_name_only(cell: Cell) -> None:
-    """Other holds remain."""
+    """Holds by other names remain."""
     mine = {"by": "me"}
     for name in ("me", "you"):
         cell.client.hold(name)

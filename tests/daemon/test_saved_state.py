@@ -238,7 +238,7 @@ REASONS: dict[str | bytes, tuple[str, ...]] = {
 def test_wrong_thing_in_place_of_a_saved_file_is_set_aside(
     how: str | bytes, settings: Settings, skill: Skill, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is reported too."""
+    """The wrong file is reported too."""
     folder = state_folder(settings)
     saved_points = SavedViaPoints(settings)
     segment = folder / "segment.json"
@@ -260,7 +260,7 @@ def test_wrong_thing_in_place_of_a_saved_file_is_set_aside(
 
 
 def test_daemon_starts_with_a_damaged_state(tmp_path: Path, skill: Skill) -> None:
-    """It saves its state again."""
+    """The daemon saves its state again."""
     settings = Settings(files=Files(state=str(tmp_path / "state")))
     folder = state_folder(settings)
     points = SavedViaPoints(settings).path(skill)

@@ -141,7 +141,7 @@ def test_a_workshop_that_hangs_is_replaced_and_a_slow_one_is_not(
 
 
 def test_time_of_a_request_counts_from_its_arrival(skill_worker: SkillWorker) -> None:
-    """It does not count from the start of its processing."""
+    """The time does not count from the start of the processing."""
     with ThreadPoolExecutor(1) as pool, skill_worker._busy:  # noqa: SLF001  # an earlier request
 
         def late(left_s: float) -> None:

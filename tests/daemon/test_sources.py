@@ -283,7 +283,7 @@ def test_a_clock_that_was_set_back_is_told_from_a_second_source(
 
 
 def test_first_rejection_is_logged_and_others_are_counted(skill: Skill) -> None:
-    """This holds for each kind of rejection."""
+    """Each kind of rejection has a log entry of its own."""
     cell = Cell(skill)
     for k in range(30):
         cell.tell(("left", pose(k + 1, frame="camera")))
@@ -320,7 +320,7 @@ def test_what_was_rejected_long_ago_is_blamed_for_nothing(skill: Skill) -> None:
 
 
 def test_hold_names_the_missing_sample_and_the_remedy(skill: Skill) -> None:
-    """It names the source, the cause and the remedy."""
+    """The reason of the hold names the source, the cause and the remedy."""
     settings = Settings(hands=HandSettings(frame="optitrack"))
     cell = Cell(skill, settings)
     for k in range(200):

@@ -73,7 +73,8 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
             daemon.client.ask("reset")
             daemon.client.ask("resume")
         daemon.until(lambda status: status["mode"] == "follow")
-        assert daemon.end() == 1  # the recording is incomplete, and its last line says so
+        # the recording is incomplete, and its last line says so
+        assert daemon.end() == 1
         assert daemon.log.read_text().endswith("ticks are not recorded\n")
     (recording,) = records.glob("*.mcap")
     result = replay(recording)
@@ -150,13 +151,14 @@ def test_the_arm_is_stopped_and_files_are_closed_on(tmp_path: Path, signals: lis
     assert last.endswith(
         f" ended: the daemon of cell thirdhand; its newest recording is {recording}"
     )
-    assert "operator" not in log  # its own stop is no operator's hold, which `resume` would end
+    # its own stop is no operator's hold, which `resume` would end
+    assert "operator" not in log
     result = replay(recording)
     assert result.exact, result.text()
 
 
 def test_paused_daemon_counts_what_it_missed(tmp_path: Path) -> None:
-    """The daemon continues."""
+    """The daemon continues after the pause."""
     with serving(tmp_path, "--joints", "assumed") as daemon, Tracker(daemon.session):
         before = daemon.until(lambda now: now["mode"] == "follow")
         daemon.process.send_signal(signal.SIGSTOP)
@@ -170,8 +172,9 @@ def test_paused_daemon_counts_what_it_missed(tmp_path: Path) -> None:
 
 
 def test_a_second_daemon_of_a_cell_does_not_start(tmp_path: Path) -> None:
-    """This holds even if Zenoh does not show it the first daemon. A daemon of another cell starts.
-    That a cell is free after the end of its daemon is tested in test_via_points_survive_a_restart.
+    """The second daemon does not start even if Zenoh does not show it the first one. A daemon of
+    another cell starts. That a cell is free after the end of its daemon is tested in
+    test_via_points_survive_a_restart.
     """
     with serving(tmp_path, "--joints", "assumed") as daemon:
         arguments = (

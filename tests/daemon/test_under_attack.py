@@ -237,7 +237,7 @@ def test_hold_is_in_force_at_once_behind_a_flood_of_requests(daemon: Daemon, kin
 
 
 def test_hold_does_not_wait_for_a_slow_client(daemon: Daemon) -> None:
-    """That client sends requests and reads no answers."""
+    """The slow client sends requests and reads no answers."""
     with attack(NOTHING_READ, daemon) as report:
         assert report == "begun"
         took = holds_s(daemon, 4.0)

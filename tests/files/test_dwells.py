@@ -50,7 +50,7 @@ def test_missed_via_point_is_named_with_its_distance(taken: Demonstration, tmp_p
 
 
 def test_rest_far_from_all_via_points_is_noted(taken: Demonstration) -> None:
-    """Such a rest may be a via-point that was not named."""
+    """A rest far from all via-points may be a via-point that was not named."""
     # on the way to the glass, at the highest speed
     middle = int(np.argmax(np.abs(np.gradient(taken.tool[:, 1]))))
     period_ns = round(1e9 * taken.period_s)

@@ -48,7 +48,7 @@ def test_what_was_written_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_step_after_a_gap_brings_state_and_skill(tmp_path: Path) -> None:
-    """That step has the number of missing ticks too."""
+    """The step after a gap has the number of missing ticks too."""
     with Recorder(tmp_path / "a.mcap", settings=CELL, skill=SKILL) as recorder:
         for tick, frame, _ in ticks(10):
             recorder.write(tick, frame, time_ns=at_ns(tick.index))

@@ -187,7 +187,7 @@ def odometry(stamp_ns: int, frame: str, *at: float) -> Any:
 def test_unread_type_is_refused_with_accepted_types(
     kind: str, encoding: str, read: Callable[[Path], object], tmp_path: Path
 ) -> None:
-    """The refusal names both."""
+    """The refusal names the type and the accepted types."""
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = McapWriter(stream)
         writer.start()

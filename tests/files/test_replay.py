@@ -177,7 +177,7 @@ def test_damage_is_told_and_what_follows_is_compared(recorded: Path, tmp_path: P
 
 
 def test_cut_is_forbidden_only_where_exactness_is_asked_for(recorded: Path, tmp_path: Path) -> None:
-    """Otherwise the cut is reported."""
+    """Without the demand for exactness, the cut is only reported."""
     data = recorded.read_bytes()
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[: len(data) * 2 // 3])

@@ -73,7 +73,6 @@ def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
 @properties
 @given(seeds, st.sampled_from([None, 7.0]), st.sampled_from([0.0, 1.0, 100.0]))
 def test_adapting_is_fitting_changed_database(seed, lambda_covariance, tolerance):
-    """Adapting is fitting the changed database."""
     adapted = skill(seed, lambda_covariance=lambda_covariance).adapt(
         *via(seed, 4, std=0.01), tolerance=tolerance
     )

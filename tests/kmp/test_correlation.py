@@ -33,7 +33,6 @@ def roughness(path):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_neutral_correlation_changes_nothing(representation):
-    """The neutral correlation changes nothing."""
     primitive = letter(representation)
     unchanged = basis().applied(primitive)
     assert unchanged.representation == representation

@@ -37,7 +37,6 @@ def taught(one, deviation=1e-4):
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernel_of_derivatives(name):
-    """The kernel of derivatives is the derivative of the kernel."""
     kernel = KERNELS[name]
     h = 1e-5
     i = 4 if name in {"one length", "a length an input"} else 1
@@ -85,7 +84,7 @@ def test_taught_jacobian_is_met(representation, kernel):
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_mean_and_covariance_are_naive_ones(representation):
-    """They equal those of `support.primitives.naive`."""
+    """Predictions equal those of `support.primitives.naive`."""
     primitive = taught(base(representation), deviation=0.1)
     queries = np.concatenate([PLACE, PLACE + 0.05, S[5:8] + 0.1])
     mean, joint = naive(primitive, queries)

@@ -31,7 +31,6 @@ def demonstrations():
 
 
 def test_em_finds_two_clusters():
-    """EM finds two clusters."""
     random = np.random.default_rng(0)
     samples = np.concatenate(
         [random.normal([0, 0], 0.1, (300, 2)), random.normal([5, 1], [0.3, 0.1], (100, 2))]
@@ -86,7 +85,6 @@ def test_regression_far_away_is_finite():
 
 
 def test_sampled_inputs_have_marginal_moments():
-    """Sampled inputs have the moments of the marginal."""
     mix = mixture(5)
     drawn = mix.sample_inputs(40_000, dimensions=2, seed=0)
     mean = mix.weights @ mix.means[:, :2]

@@ -39,7 +39,6 @@ def skill(request):
 
 
 def test_joint_covariance_is_the_naive_one(skill):
-    """The joint covariance is that of the naive solution."""
     _, covariance = naive(skill, QUERIES)
     within = 1e-9 if skill.representation == "dense" else 1e-6
     np.testing.assert_allclose(
@@ -48,7 +47,7 @@ def test_joint_covariance_is_the_naive_one(skill):
 
 
 def test_trajectories_have_mean_and_covariance():
-    """They follow from the seed."""
+    """The trajectories follow from the seed."""
     skill = fitted()
     drawn = skill.sample(QUERIES, 20_000, seed=3)
     joint = skill.predict_joint(QUERIES)

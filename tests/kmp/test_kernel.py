@@ -40,7 +40,7 @@ def test_ell_for_each_input(seed):
 @properties
 @given(seeds, ells)
 def test_velocity_kernel_has_derivatives(seed, ell):
-    """They equal finite differences of the kernel."""
+    """The derivatives equal finite differences of the kernel."""
     random = np.random.default_rng(seed)
     h = 1e-4
     k = VelocityKernel(ell)

@@ -24,7 +24,7 @@ from support.primitives import (
 @properties
 @given(seeds, st.sampled_from([1, 2, 3]), st.sampled_from([None, 5.0]), st.booleans())
 def test_mean_and_covariance_are_naive_ones(seed, outputs, lambda_covariance, adapted):
-    """They equal those of `support.primitives.naive`."""
+    """Predictions equal those of `support.primitives.naive`."""
     prior = np.arange(outputs) + 0.5
     primitive = skill(seed, lambda_covariance=lambda_covariance, prior_mean=prior, outputs=outputs)
     if adapted:
@@ -54,7 +54,7 @@ def test_batches_equal_single_queries():
 @properties
 @given(seeds, st.sampled_from([0.001, 0.1, 1.0]), representations)
 def test_covariance_is_positive_definite(seed, spread, representation):
-    """It is symmetric too, and holds at the data."""
+    """The covariance is symmetric too, also at the data."""
     random = np.random.default_rng(seed)
     inputs = spread * random.normal(size=(20, 2))
     exact = Gaussians(random.normal(size=(20, 2)), np.tile(1e-11 * np.eye(2), (20, 1, 1)))
@@ -71,7 +71,7 @@ def test_covariance_is_positive_definite(seed, spread, representation):
 
 @pytest.mark.parametrize("lambda_covariance", [1e-2, 1.0])
 def test_hidden_covariance_is_refused_with_remedy(lambda_covariance):
-    """The remedy works."""
+    """The remedy in the message works."""
     inputs, reference = database()
     sure = Gaussians(reference.mean, np.tile(1e-9 * np.eye(3), (30, 1, 1)))
     primitive = KMP.fit(
@@ -296,7 +296,7 @@ def hands():
 @pytest.mark.parametrize("ell", [0.5, 20.0, np.array([0.5, 1, 2, 0.5, 1, 2])])
 @pytest.mark.parametrize("adapted", [False, True])
 def test_nine_digits_in_extended_precision(lambda_covariance, ell, adapted):
-    """This holds for mean and covariance."""
+    """Mean and covariance have nine right digits."""
     inputs, reference = hands()
     primitive = KMP.fit(
         inputs,

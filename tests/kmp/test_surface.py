@@ -133,7 +133,7 @@ def test_other_lambda_keeps_the_mean(representation, changed):
 
 
 def test_estimator_is_loaded_when_needed():
-    """It is not imported before."""
+    """The estimator's module is not imported before."""
     code = (
         "import sys, kmp; assert 'sklearn' not in sys.modules; kmp.KMPRegressor(); assert "
         "'sklearn' in sys.modules"

@@ -14,7 +14,7 @@ BLOCKS = [
 
 
 def test_tutorial_runs_as_it_stands():
-    """Its output is the printed one."""
+    """The output is the one on the page."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:
         # a failure then names the page's line

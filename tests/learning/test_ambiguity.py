@@ -38,7 +38,7 @@ def test_fine_motion_is_legal_if_tracked_well() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0005])
 def test_opposite_ways_are_refused(noise_m: float) -> None:
-    """This holds for any tracker."""
+    """The tracker may be of any quality."""
     figures = judged(
         [fine(seed, noise_m, sign) for seed, sign in enumerate((1.0, -1.0, 1.0, -1.0))]
     )

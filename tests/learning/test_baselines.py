@@ -26,7 +26,7 @@ def take(person: int, hands: np.ndarray, tool: np.ndarray) -> Take:
 
 
 def test_linear_function_is_found() -> None:
-    """The other demonstrations determine it."""
+    """The other demonstrations determine the function."""
     takes = [take(person, hands, hands @ SLOPE + OFFSET) for person, hands in enumerate(HANDS)]
     for errors in held_out_errors(takes, linear):
         assert errors == pytest.approx(np.zeros((50, 3)), abs=1e-9)

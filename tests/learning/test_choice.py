@@ -32,7 +32,9 @@ def choice() -> DirectSelection:
 def test_residuals_are_those_of_left_out_fits(
     choice: DirectSelection, ridge_m: float | None
 ) -> None:
-    """They equal those of primitives and prior means that are fitted without the demonstration."""
+    """Residuals equal those of primitives and prior means that are fitted without the
+    demonstration.
+    """
     ell = 4.0
     noise = 0.1
     for group in range(4):

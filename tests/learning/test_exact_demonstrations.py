@@ -36,7 +36,7 @@ def along_a_line(number: int) -> Demonstration:
 
 
 def test_gate_is_above_noise() -> None:
-    """This holds for a task between via-points."""
+    """The skill is one of a task between via-points."""
     skill = learn([along_a_line(number) for number in range(3)])
     assert skill.threshold >= FLOOR_M
     random = np.random.default_rng(1)

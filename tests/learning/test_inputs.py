@@ -78,7 +78,7 @@ def test_both_hands_where_both_tell() -> None:
 
 
 def test_one_hand_where_it_tells_as_much() -> None:
-    """The other hand then has no effect, and that is reported."""
+    """The other hand has no effect, and a remark says so."""
     skill = learn([shown(seed, "left") for seed in range(5)], points=120)
     figures = figures_of(skill)
     assert skill.conductor == 0
@@ -114,7 +114,7 @@ def test_turned_hand_predicts_fixed_tool(carried: StoredSkill) -> None:
 
 
 def test_persons_are_left_out_together() -> None:
-    """This happens if two persons are named."""
+    """Takes of a person are left out together if two persons are named."""
     takes = [shown(seed, "both", person) for seed, person in enumerate(("Ada", "Ada", "Bo", "Bo"))]
     assert persons(takes) == [0, 0, 1, 1]
     assert persons([take._replace(person="Ada") for take in takes]) == [0, 1, 2, 3]

@@ -32,7 +32,7 @@ def with_tool(one: Demonstration, tool: np.ndarray) -> Demonstration:
 
 
 def test_good_demonstrations_are_safe(good: list[Demonstration]) -> None:
-    """Their errors are listed one by one."""
+    """The errors of the demonstrations are listed one by one."""
     figures = judged(good, names=["a", "b", "c", "d"])
     assert figures.unsafe == ()
     assert [row.name for row in figures.demonstrations] == ["a", "b", "c", "d"]

@@ -108,7 +108,7 @@ def test_correction_at_an_end_teaches_via_point(
 
 
 def test_repeated_corrections_are_offered(segmented: StoredSkill) -> None:
-    """They replace each other and are counted."""
+    """Repeated corrections replace each other and are counted."""
     hands = hands_in(segmented, 0, 0.5)
     skill = segmented
     for count in range(1, OFFERED_AFTER + 1):

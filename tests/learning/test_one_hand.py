@@ -96,7 +96,7 @@ def test_other_hand_makes_no_difference(skill: StoredSkill) -> None:
 
 
 def test_takes_with_via_points_of_one_hand() -> None:
-    """They are learned as a task between via-points."""
+    """Takes that name their via-points are learned as a task between via-points."""
     takes = []
     for seed in range(4):
         take = made("one_hand", [seed], each=1)[0]
@@ -112,7 +112,6 @@ def test_takes_with_via_points_of_one_hand() -> None:
 
 
 def test_different_hands_are_not_mixed() -> None:
-    """Takes of different hands are not mixed."""
     words = r"conducted by different hands: both, left; .*\(both: b; left: a\)"
     with pytest.raises(SkillError, match=words):
         learn([led(0), circling(1)], names=["a", "b"])
@@ -156,7 +155,7 @@ def test_absent_hand_is_not_needed(side: str, tmp_path: Path) -> None:
 
 
 def test_one_stream_for_both_hands_is_refused(tmp_path: Path) -> None:
-    """Its name does not say which hand it is."""
+    """The stream's name does not say which hand it is."""
     streams = streams_of(circling(0))
     path = write_streams(tmp_path / "a.mcap", {"left": streams["left"], "tool": streams["tool"]})
     topics = dict.fromkeys(("left", "right"), PoseTopic("cell/tool/pose"))

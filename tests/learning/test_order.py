@@ -31,7 +31,6 @@ def test_order_of_files_makes_no_difference(named: bool) -> None:
 
 
 def test_sitting_is_held_out_together() -> None:
-    """Takes of a sitting are held out together."""
     base = shown()[0]
     hour_ns = 3600 * 10**9
     later = [

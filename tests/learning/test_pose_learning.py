@@ -128,7 +128,6 @@ def test_contradicting_via_points_are_refused(skill: Skill) -> None:
 
 
 def test_gripper_in_millimetres_is_refused(shown: list[Demonstration]) -> None:
-    """A gripper that reports millimetres is refused."""
     spoilt = [take._replace(gripper=80.0 * np.asarray(take.gripper)) for take in shown]
     with pytest.raises(SkillError, match=r"from 0 to 80: 0 \(open\) to 1 \(closed\) needed"):
         learn(spoilt, components=5, points=60)
@@ -143,7 +142,7 @@ def test_more_than_half_a_turn_is_learned(turn_deg: int) -> None:
 
 
 def test_wrongly_learned_turns_are_unsafe() -> None:
-    """Such a skill is unsafe."""
+    """A skill whose tool turns wrongly is unsafe."""
     figures = figures_of(learn([spinning(seed, 1500) for seed in range(4)], points=60))
     assert any("up to 60° accepted: it turns by up to" in line for line in figures.unsafe)
 

@@ -26,7 +26,7 @@ def cell_with(arm: str, reach: Reach, folder: Path) -> Settings:
 
 @pytest.mark.parametrize("arm", [*ARMS, "sliding"])
 def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
-    """This holds at the joints' limits too."""
+    """Postures at the joints' limits are included."""
     cell = cell_with(arm, WIDE, tmp_path)
     lower = np.array(cell.joints.lower)
     upper = np.array(cell.joints.upper)

@@ -42,7 +42,7 @@ def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
 
 @pytest.mark.parametrize("count", [6, 12, 40])
 def test_regions_hold_on_other_people(count: int) -> None:
-    """This holds for the share of every level."""
+    """Regions of every level contain the stated share."""
     held = []
     for seed in range(20):
         rng = np.random.default_rng([seed, count])
@@ -70,7 +70,7 @@ def places(rng: np.random.Generator) -> TimedErrors:
 
 
 def test_unsure_where_wrong() -> None:
-    """It is rarely unsure elsewhere."""
+    """The skill is rarely unsure elsewhere."""
     rng = np.random.default_rng(4)
     regions = calibrated([places(rng) for _ in range(12)], np.arange(12))
     asked = [places(rng) for _ in range(40)]
@@ -152,7 +152,7 @@ def learned() -> StoredSkill:
 
 
 def test_learned_regions_hold(learned: StoredSkill) -> None:
-    """They include the teacher's lag."""
+    """The learned regions include the teacher's lag."""
     figures = figures_of(learned)
     assert learned.regions.std_s > 0.0
     assert figures.all.within_50 == pytest.approx(50, abs=10)

@@ -84,7 +84,7 @@ def test_tool_goes_to_its_via_points(between: Skill, shown: list[Demonstration])
 
 
 def test_unusable_via_points_are_explained(shown: list[Demonstration]) -> None:
-    """Such takes are refused with a reason."""
+    """Takes with unusable via-points are refused with a reason."""
     assert task_of([take._replace(via_points=()) for take in shown]) == (None, "")
     fewer = [shown[0], shown[1]._replace(via_points=shown[1].via_points[:2])]
     assert "not all demonstrations name the same via-points" in task_of(fewer)[1]

@@ -138,7 +138,6 @@ def test_wrong_arrays_are_refused(skill: Skill, arrays: dict[str, Any], message:
 
 @pytest.mark.parametrize("begin", [b"", b"PK\x01\x02"], ids=["anywhere", "in the directory"])
 def test_flipped_bit_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -> None:
-    """A bit that flips in a file changes nothing or is refused."""
     random = np.random.default_rng(8)
     whole = aimed.file
     unchanged = 0
@@ -155,7 +154,7 @@ def test_flipped_bit_changes_nothing_or_is_refused(aimed: Skill, begin: bytes) -
 
 
 def test_large_archive_is_not_unpacked() -> None:
-    """It would unpack to too many bytes."""
+    """The archive would unpack to too many bytes."""
     out = io.BytesIO()
     with (
         zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,

@@ -33,7 +33,7 @@ def test_neighbourhood_follows_a_hand_or_is_flat(aimed: Skill, step: tuple[float
 
 
 def test_via_points_are_taught_to_the_base(learned: Skill, aimed: Skill) -> None:
-    """They are not added to an adapted primitive."""
+    """Via-points are not added to an adapted primitive."""
     anew = adapted(aimed, VIA_POINTS[1:], tolerance=0.05)
     assert anew.file == adapted(learned, VIA_POINTS[1:], tolerance=0.05).file
     assert adapted(aimed, (), tolerance=learned.tolerance).file == learned.file

@@ -219,7 +219,7 @@ def test_a_second_interrupt_does_not_wait_for_what_is_put_away() -> None:
 
 
 def test_early_interrupt_is_not_lost() -> None:
-    """It arrives just before the code that cleans up is entered."""
+    """The interrupt arrives just before the code that cleans up is entered."""
     done = python(INTERRUPTED_JUST_BEFORE)
     assert (done.returncode, done.stderr) == (130, f"{SAID}\n")
 

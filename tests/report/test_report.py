@@ -142,7 +142,7 @@ def session(golden: Path) -> Report:
 
 
 def test_stop_distance_is_compared_with_people(golden: Path) -> None:
-    """It is measured at the tool, and compared with people's stops."""
+    """The stop distance is measured at the tool, and compared with the assumed one of people."""
     columns = read(Recording.open(golden))
     report = Report(columns)
     assert report.stop_mm is not None
@@ -220,7 +220,7 @@ def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
 
 
 def test_via_points_are_met_while_the_hands_are_there(session: Report) -> None:
-    """They are distinguished by the time at which they were taught."""
+    """Via-points of one name are distinguished by the time at which they were taught."""
     by_name = [(point.name, point.start_s) for point in session.via_points]
     assert {name for name, _ in by_name} == {"handover", "glass", "soldering"}
     first, second = [point for point in session.via_points if point.name == "handover"]

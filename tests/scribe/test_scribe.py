@@ -119,7 +119,7 @@ def test_images_of_a_camera_are_recorded_beside_the_ticks(tmp_path: Path) -> Non
 
 
 def test_stopped_process_costs_ticks_but_no_time(tmp_path: Path) -> None:
-    """The recording shows the gap."""
+    """The recording shows the gap of a stopped process."""
     with scribe(recording=tmp_path / "a.mcap") as writer:
         pid = writer.status()["pid"]
         os.kill(pid, signal.SIGSTOP)

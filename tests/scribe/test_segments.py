@@ -288,7 +288,7 @@ def test_after_a_full_disk_the_recording_goes_on_by_itself(tmp_path: Path) -> No
 
 
 def test_removed_folder_is_made_again(tmp_path: Path) -> None:
-    """Its content counts as lost."""
+    """The ticks in the removed folder count as lost."""
     folder = tmp_path / "records"
     with session(folder=folder) as sender:
         sender.until(lambda status: status["sent"] > 200)

@@ -173,7 +173,7 @@ def test_an_error_names_the_path_and_what_is_accepted(text: str, path: str, acce
 
 
 def test_contradictions_are_reported_at_once() -> None:
-    """The values are valid by themselves."""
+    """Each contradicting value is valid by itself."""
     text = """
     [reach]
     inner = 3
@@ -252,7 +252,7 @@ def test_endpoint_of_the_command_line_goes_first(monkeypatch: pytest.MonkeyPatch
 
 
 def test_daemon_listens_on_this_machine_only() -> None:
-    """This is the default."""
+    """Listening on this machine only is the default."""
     network = Settings().network
     assert [is_local(endpoint) for endpoint in network.listen] == [True]
     assert (network.connect, network.certificate, network.allow_insecure) == ((), "", False)

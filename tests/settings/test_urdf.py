@@ -25,7 +25,6 @@ from thirdhand_sim.scene import Scene
 
 
 def test_chain_has_its_joints_in_order_with_limits() -> None:
-    """The chain to the tool has the joints in order with their limits."""
     joints = Urdf(URDF).movable("tool_plate")
     assert tuple(joint.name for joint in joints) == JOINT_NAMES
     assert (joints[3].lower, joints[3].upper, joints[3].velocity) == (-0.9, 3.1, 2.0)

@@ -32,7 +32,7 @@ SCENE = Scene()
 
 @pytest.mark.parametrize("arm", ["franka", "ur5"])
 def test_shipped_arm_does_the_task(arm: str) -> None:
-    """It keeps its limits, and its distance from the hands."""
+    """The arm keeps its limits, and its distance from the hands."""
     cell = cell_of(arm)
     near = []
     taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
@@ -147,7 +147,7 @@ def tips(
 def test_shipped_arm_moves_as_published(
     arm: str, file: str, theirs: tuple[str, ...], tip: str, stand: tuple[float, float, float]
 ) -> None:
-    """Its kinematics equals that of a published description."""
+    """The arm's kinematics equals that of a published description."""
     cell = cell_of(arm)
     names = cell.joints.names
     postures = np.random.default_rng(0).uniform(
@@ -200,7 +200,7 @@ def test_capsules_cover_published_meshes(arm: str, meshes: dict[str, str]) -> No
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_described_cell_is_read_back(arm: str) -> None:
-    """It comes back as published in the status."""
+    """The cell's description comes back as published in the status."""
     boxes = (Box(centre=(0.5, 0.6, 0.1), half_size=(0.1, 0.1, 0.1)),)
     cell = msgspec.structs.replace(cell_of(arm), obstacles=Obstacles(boxes=boxes))
     assert parse(described(cell), origin="cell.toml") == cell

@@ -151,7 +151,7 @@ def test_same_commands_give_same_run() -> None:
 
 
 def test_arm_brakes_without_commands(bench: Bench) -> None:
-    """It brakes 20 ms after the last command."""
+    """The arm brakes 20 ms after the last command."""
     joints = np.array(bench.observe().joints)
     speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     for _ in range(100):
@@ -195,7 +195,8 @@ def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
         observation = bench.step(tuple(position), tuple(velocity))
         assert np.abs(np.array(observation.joints) - stood).max() < 2e-3
     assert bench.refused == 21
-    for k in range(100):  # a service that takes over begins at the arm's position
+    # a service that takes over begins at the arm's position
+    for k in range(100):
         observation = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
     assert observation.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
     assert bench.refused == 21
@@ -362,7 +363,7 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
 def test_process_ends_on_signal_with_report(
     network: tuple[zenoh.Session, str], tmp_path: Path
 ) -> None:
-    """It plays until then."""
+    """The process plays until the signal."""
     service = Service(network[0], "thirdhand")
     target = tmp_path / "report.json"
     arguments = (
@@ -414,7 +415,7 @@ def test_exit_codes(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_command_is_never_followed(payload: bytes) -> None:
-    """Such bytes are counted."""
+    """Bytes that are no command are counted."""
     commands = Commands(JOINT_NAMES)
     commands.receive(Sample(Bytes(payload)))  # type: ignore[arg-type]
     assert (commands.count, commands.rejected, commands.take()) == (0, 1, (None, None))

@@ -62,7 +62,7 @@ def test_engines_give_same_scores() -> None:
 
 @pytest.mark.quick
 def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
-    """This holds for moving commands."""
+    """The arm follows moving commands."""
     start = np.array(bench.observe().joints)
     wrong = []
     for tick in range(1000):
@@ -79,7 +79,8 @@ def test_arm_follows_within_a_millimetre(bench: Bench) -> None:
 def test_motors_are_no_stronger_than_described(bench: Bench) -> None:
     """The motors' efforts are those of the description."""
     start = np.array(bench.observe().joints)
-    for _ in range(20):  # a motor of 60 N m cannot reach this speed of the stretched arm in 40 ms
+    # a motor of 60 N m cannot reach this speed of the stretched arm in 40 ms
+    for _ in range(20):
         bench.world.follow(
             tuple(start + np.array([0, -2.0, 0, 0, 0, 0, 0])), (0.0, -100.0, *(0.0,) * 5)
         )
@@ -133,7 +134,6 @@ def test_pictures_show_what_is_there(bench: Bench) -> None:
 
 
 def test_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An engine that is not installed is named."""
     monkeypatch.setattr(
         "thirdhand.daemon.launch.ENGINES", {"none_such": "NoneSuch", "msgspec": "Msgspec"}
     )

@@ -123,7 +123,7 @@ def test_result_names_its_origin(tmp_path: Path) -> None:
 
 
 def test_result_is_stale_where_dependency_changed() -> None:
-    """Other changes do not make it stale."""
+    """Other changes do not make a result stale."""
     digests = {"core": "1", "learning": "2", "kmp": "3"}
     result = {
         "commit": "12ab",

@@ -139,7 +139,7 @@ ELSEWHERE = {"motion-of-others", "sensitivity", "people", "partners", "faults"} 
 def test_experiment_bears_out_its_claim(
     name: str, tmp_path: Path, letters: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its files exist too."""
+    """The files of the experiment exist too."""
     monkeypatch.setattr(
         "thirdhand_sim.lab.statistics.TASK_SCENES", TASK_SCENES._replace(numbers=range(10))
     )

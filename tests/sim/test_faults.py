@@ -70,7 +70,7 @@ def test_cut_network_leaves_no_arm_in_motion(suffered: dict[str, Any], name: str
 
 
 def test_killed_service_leaves_no_arm_in_motion(suffered: dict[str, Any]) -> None:
-    """Its recording can be read."""
+    """The recording of the killed service can be read."""
     fault = suffered["faults"]["service killed"]
     assert fault["travelled_mm"] < BRAKE_MM
     assert fault["speed_at_the_end_m_per_s"] < 1e-3

@@ -60,7 +60,6 @@ def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engi
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_bench_and_core_agree_on_the_tool(tmp_path: Path, engine: str) -> None:
-    """The bench has the tool where the core has it."""
     cell = sliding_cell(tmp_path)
     posture = (0.2, *cell.arm.posture[1:])
     with (

@@ -46,7 +46,7 @@ def rms_mm(said: list[Predicted], asked: list[LeftOut]) -> float:
 
 
 def test_core_predicts_as_the_skill(shown: list[LeftOut]) -> None:
-    """This holds for resting hands, and the core starts anew with each take."""
+    """The hands rest, and the core starts anew with each take."""
     skill = learn([take.demonstration for take in shown])
     first, second = (predicted(skill, shown[0]) for _ in range(2))
     assert first.mean.tobytes() == second.mean.tobytes()
@@ -89,7 +89,7 @@ def test_rivals_that_see_more_err_less(shown: list[LeftOut], asked: list[LeftOut
 
 @pytest.mark.timeout(120)
 def test_reduced_run_has_all_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It reports refusals."""
+    """The run reports refusals."""
     pytest.importorskip("matplotlib")
     from thirdhand_sim.lab.partners import run
 
@@ -162,7 +162,7 @@ def test_judged_and_refused_as_the_command_does(
 
 
 def test_refused_fold_enters_no_mean(shown: list[LeftOut], asked: list[LeftOut]) -> None:
-    """Its error is listed separately."""
+    """The error of a refused fold is listed separately."""
 
     def found(takes_: list[LeftOut], tested: list[LeftOut]) -> Found:
         predictions = left_out_by(RIVALS["mean"], takes_, tested, told=True)

@@ -45,7 +45,6 @@ def test_the_groups_share_nobody() -> None:
 
 @pytest.mark.parametrize("mistake", ["", *MISTAKES])
 def test_hands_come_to_their_places(mistake: str) -> None:
-    """The hands reach their places."""
     for number in range(4):
         subject = person("tuning", number)
         scene = session(subject, 0, group="tuning")
@@ -98,7 +97,7 @@ class TestJudging:
         assert judgement.path_mm < 15  # the errors with which people perceive places
 
     def test_still_tool_follows_falsely(self, as_seen: SeenSession) -> None:
-        """It reaches only the place at which it stays."""
+        """The tool reaches only the place at which it stays."""
         judgement = judge(Still(as_seen.session.told.glass, far=False), as_seen)
         assert [event.reached for event in judgement.events] == [False, True, False]
         assert judgement.falsely_followed > 0.3

@@ -59,7 +59,7 @@ def test_bench_follows_rate_of_service(rate_hz: int, bench_hz: int) -> None:
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 @pytest.mark.thorough
 def test_demo_succeeds_with_every_arm(rate_hz: int, engine: str, arm: str) -> None:
-    """This holds at every rate and in every engine."""
+    """The demo succeeds at every rate and in every engine too."""
     assert_succeeded(done(rate_hz, arm, engine), rate_hz)
 
 

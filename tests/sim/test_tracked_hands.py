@@ -90,7 +90,6 @@ base_from_tracker = [1.45, 0.0, -0.75, 0.5, 0.5, 0.5, 0.5]
     [(BASE, (0.9, 0.1, 0.05)), ("webxr", (0.1, 0.8, -0.55)), ("unity", (10.0, 80.0, 55.0))],
 )
 def test_hands_are_mapped_as_by_the_daemon(frame: str, position: Point) -> None:
-    """Hands are mapped as the daemon maps them."""
     hands = TrackedHands(SCENE, parse(HEADSET, origin="a test"))
     for side in ("left", "right"):
         hands.receive(side, PoseStamped(1, frame, position, HAND_ORIENTATION))

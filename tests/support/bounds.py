@@ -26,8 +26,8 @@ SPEED_ROUNDING_MPS = 1e-6
 STOP_RISE = 1.01
 STOP_RISE_MPS = 0.01
 SLOW_RISE_MPS = 0.1  # the tool's speed in a stop, beyond its speed at the start
-BEHIND_M = 0.25  # the tool may be this far from its setpoint, or:
-# beyond this distance the setpoint stops and waits for the tool
+BEHIND_M = 0.25  # the tool may be this far from its setpoint, or farther:
+# this plus the stopping distance, as the setpoint stops and waits for a tool beyond this distance
 WAITING_M = 0.12
 OUTSIDE_M = 0.03  # the tool may leave the workspace by this distance
 SLIP_MPS = 0.01  # speed of approach of joints that start one after the other

@@ -219,7 +219,8 @@ def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Pa
         for side in ("left", "right")
         for arrived, pose in zip(heard.arrived_ns[side], heard.poses[side], strict=True)
     ]
-    assert max(ages_s) < 2.0  # the server drops after 0.5 s; the rest is for busy machines
+    # the server drops after 0.5 s; the rest is for busy machines
+    assert max(ages_s) < 2.0
 
 
 @pytest.mark.thorough

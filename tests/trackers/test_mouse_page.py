@@ -78,7 +78,7 @@ def until_arrived(
 
 @pytest.mark.thorough
 def test_hands_begin_at_the_first_via_point(daemon: Daemon, url: str, tmp_path: Path) -> None:
-    """They are published at the positions at which they are drawn."""
+    """The hands are published at the positions at which they are drawn."""
     received = Heard(daemon.session)
     with person_at(url, tmp_path) as person:
         status = daemon.until(lambda status: status["mode"] == "follow")

@@ -28,7 +28,7 @@ from thirdhand.workbench.cli.view import RRD_MAGIC, last_followed, screenshot
 @pytest.mark.usefixtures("drawing")
 @pytest.mark.thorough
 def test_picture_is_of_the_last_followed_moment(tmp_path: Path) -> None:
-    """This is the default time of a picture."""
+    """The last moment in `follow` is the default time of a picture."""
 
     def change(_: Viewer, k: int, frame: Record) -> None:
         if k >= 400:

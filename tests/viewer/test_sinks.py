@@ -146,7 +146,7 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
 
 
 def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill) -> None:
-    """Its via-points are drawn too."""
+    """The skill's via-points are drawn too."""
     point = ViaPoint(
         "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
     )
@@ -179,7 +179,7 @@ def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill
 
 
 def test_orientation_and_gripper_are_drawn(tmp_path: Path, skill: Skill) -> None:
-    """They are drawn if the skill has them."""
+    """Orientation and gripper are drawn if the skill has them."""
     turned = Rotation.from_euler("x", 3, degrees=True)
 
     def change(_: Viewer, k: int, frame: Record) -> None:
@@ -213,7 +213,7 @@ def test_undrawable_skill_spares_the_scene(tmp_path: Path) -> None:
 
 
 def test_objects_are_drawn_where_they_are(tmp_path: Path) -> None:
-    """They disappear from the drawing when they are no longer reported."""
+    """Objects disappear from the drawing when they are no longer reported."""
     board = SceneObject(
         "board",
         "box",
@@ -283,7 +283,7 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
 
 
 def test_live_view_listens_on_this_machine_only() -> None:
-    """It ends when it is closed."""
+    """The live view ends when it is closed."""
     viewer = Viewer(urdf=WAM, settings=Settings(), live_port=0)
     assert viewer.url is not None
     port = int(viewer.url.rsplit(":", 1)[1].split("/")[0])
