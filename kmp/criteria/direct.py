@@ -62,7 +62,8 @@ class Scales(NamedTuple):
     )
     max_gain: float  # limit of the affine mean's singular values
     local: float  # l [unit of the inputs]
-    noise: float  # sigma, the noise of the outputs, which synthetic demonstrations lack
+    # sigma, the noise of the outputs, which synthetic demonstrations lack
+    noise: float
 
 
 class Parameters(NamedTuple):

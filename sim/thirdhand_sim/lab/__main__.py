@@ -129,7 +129,8 @@ def make(results: Results, experiment: ModuleType, options: Options) -> None:
     results.say(EXPERIMENTS[results.name].about)
     numbers = experiment.run(results, options)
     if (now := commit()) != results.origin["commit"]:
-        results.origin["commit"] += f" to {now}"  # the source tree was changed meanwhile
+        # the source tree was changed meanwhile
+        results.origin["commit"] += f" to {now}"
     print(f"{results.numbers(numbers)}  {time.monotonic() - began:.0f} s", flush=True)
 
 
@@ -150,7 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if args.name == "stale":
             return stale(args.output or RESULTS, selected)
-        pyplot()  # reports a missing package now, not after an hour
+        # reports a missing package now, not after an hour
+        pyplot()
         return int(sum(made(name, job_options, args) for name, job_options in selected.items()) > 0)
     except FAILURES as error:
         print(f"python -m thirdhand_sim.lab: {in_words(error)}", file=sys.stderr)

@@ -77,7 +77,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         ("nominal", NOMINAL, True),
         ("adaptation", MOVED, True),
     ):
-        if options.share < 1:  # quick look: in process
+        # quick look: in process
+        if options.share < 1:
             runs[name] = (None, _in_process(drawn, taught=taught))
             continue
         ran, attempts = steady_run(drawn, scratch, taught=taught, record=True)

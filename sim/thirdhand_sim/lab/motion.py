@@ -73,7 +73,8 @@ PEOPLE, STOPS, SCENE, SMALL = (
 SMALL_HZ = range(1, 13)
 SECONDS = 15.0
 SETTLED_MM = 5.0
-BEGUN_S = 1.0  # not judged before: recordings may begin in motion, the tool begins at rest
+# [s] Not judged before this time: recordings may begin in motion, the tool begins at rest.
+BEGUN_S = 1.0
 DIALS = ("closely", "calmly")  # values of `[tool] follow`, besides the default
 # cut-off [Hz] and beta of the One-Euro filter: untuned, tuned
 CHASES = ((1.5, 8.0), (2.0, 40.0), (4.0, 40.0))
@@ -203,7 +204,8 @@ def sequences(options: Options, middle: Array) -> list[Moving]:
     """The modelled hands that are followed."""
     share = options.share
     people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
-    if share < 1:  # quick look
+    # quick look
+    if share < 1:
         people = [sequence for sequence in people if sequence.group in FLOOR_GROUPS]
     numbers = STOPS.share(share, least=2)
     return [
@@ -394,7 +396,8 @@ def _by_arm(
     tasks = _beside_chases(hands)
     out = {}
     for arm in ARMS:
-        prepare(options.share, arm)  # prepares this process, which measures if there is one worker
+        # prepares this process, which measures if there is one worker
+        prepare(options.share, arm)
         measured = _measured(tasks, replace(options, arm=arm))
         out[arm] = {
             group: _compared([row for row in measured if row.group == group])
@@ -602,7 +605,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             results,
             {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()},
         )
-    if "gain_by_frequency" in numbers:  # older results have no gains
+    # older results have no gains
+    if "gain_by_frequency" in numbers:
         gains.draw(results, numbers["gain_by_frequency"])
 
 

@@ -61,7 +61,8 @@ SPEED_STEP_S = 1e-6
 # the figure shows the first scenes, and every tenth tick
 SHOWN_SCENES = 5
 SHOWN_TICKS = 10
-HURRY = 0.05  # [m/s] a hand that exceeds the assumed speed by more than this is hurried
+# [m/s] a hand that exceeds the assumed speed by more than this is hurried
+HURRY = 0.05
 UNHEEDED_EVERY = 4  # every 4th scene is run without separation too, to measure its cost
 
 

@@ -305,7 +305,7 @@ def _show(
 
 
 def _write(file: Path | None, record: CalibrationRecord, frame: str, settings: Settings) -> None:
-    """Write the calibration into the tracker's table in the cell's settings, or print what to
+    """Write the calibration into the tracker's table in the cell's settings, or print the lines to
     write.
     """
     tracker = frame if frame in settings.trackers else ""

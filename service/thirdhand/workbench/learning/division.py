@@ -192,8 +192,9 @@ class Divided:
         return self.demonstration.period_s
 
     def in_task(self, task: Task) -> Divided:
-        """The same segments of a task in which other hands lead, or the tool follows
-        others, or turns with them."""
+        """The demonstration in a task with the same segments, but other leading, followed or
+        turning hands.
+        """
         return replace(self, segments=_segments(task, self.at))
 
     def turns(self, late_s: float) -> Vector:

@@ -1,4 +1,4 @@
-"""Storage of what was learned: the skill, with the bytes of its file."""
+"""Storage of the learned skill, with the bytes of its file."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def _row(row: Row, width: int, *, has_moments: bool) -> str:
 
 
 def _explanation(found: Figures, *, has_moments: bool) -> Iterator[str]:
-    """What rows and columns are."""
+    """The meaning of rows and columns."""
     yield (
         "Each row is a demonstration that was left out and predicted from the others. The columns:"
         if len(found.demonstrations) > 1

@@ -66,7 +66,7 @@ def _by_frame(columns: Columns, row: int) -> Explanation:
 
 
 def before(columns: Columns, begin: int) -> Iterator[str]:
-    """Sentences on what preceded frame `begin`."""
+    """Sentences on the incidents before frame `begin`."""
     if begin == 0:
         yield "the fault is older than the recording"
         return

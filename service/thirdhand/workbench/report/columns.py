@@ -111,7 +111,7 @@ class Columns:
     # measured joints by the last tick before
     stops: dict[int, list[Any]] = field(default_factory=dict)
     samples: Counter[str] = field(default_factory=Counter)  # events by kind
-    remarks: list[str] = field(default_factory=list)  # sentences on what could not be read
+    remarks: list[str] = field(default_factory=list)  # sentences on unreadable parts
 
     @property
     def start_ns(self) -> int:

@@ -207,7 +207,7 @@ def _indices(i: int, ends: Sequence[int], fps: int) -> Episode:
 def _videos(
     camera_rows: Sequence[CameraRows], folder: Path, fps: int
 ) -> dict[str, tuple[dict[str, Any], list[Any]]]:
-    """Write the videos; what `write_videos` returns, by the names of the features."""
+    """Write the videos; the results of `write_videos`, by the names of the features."""
 
     def video_of(key: str) -> Path:
         return folder / VIDEO.format(video_key=_named(key), chunk_index=0, file_index=0)

@@ -34,7 +34,7 @@ POINTS = 1500  # most points of a curve
 # smaller values are not shown
 LEAST_US = 10.0
 LEAST_MM = 0.1
-SHOWN_PERCENT = 99.5  # an axis holds this share of the values; a note tells of the rest
+SHOWN_PERCENT = 99.5  # an axis shows this share of the values; a note names the others
 TINT = 0.08  # opacity of the background where the arm does not follow; gives palette.PAPER
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fff; max-width: 62rem;
@@ -264,7 +264,7 @@ def _path(axes: Any, points: Vector, colour: str, label: str) -> None:
 
 
 def _bounded(axes: Any, values: Vector) -> None:
-    """Limit the axis, so that a few outliers do not flatten the rest."""
+    """Limit the axis, so that a few outliers do not flatten the other values."""
     usual = np.percentile(values, SHOWN_PERCENT)
     largest = values.max(initial=0.0)
     if largest > 2 * usual > 0:

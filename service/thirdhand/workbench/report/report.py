@@ -432,7 +432,7 @@ def differing_settings(one: Report, other: Report) -> list[tuple[str, Any, Any]]
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Names and both values of what differs."""
+    """Names and both values of differing entries."""
     values = ((name, a.get(name, "unknown"), b.get(name, "unknown")) for name in sorted({*a, *b}))
     return [entry for entry in values if entry[1] != entry[2]]
 
@@ -446,8 +446,8 @@ def flat(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def why_missed(found: Report, name: str, *, begun_s: float, start_s: float, end_s: float) -> str:
-    """A sentence on what kept the tool from a via-point between two times [s], which count from
-    `begun_s` of the recording.
+    """A sentence on the cause that kept the tool from a via-point between two times [s], which
+    count from `begun_s` of the recording.
     """
     begin_s = begun_s + start_s
     until_s = begun_s + end_s

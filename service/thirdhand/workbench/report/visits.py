@@ -114,7 +114,7 @@ def _visits(
 
 
 def _closed(there: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """The same values with gaps up to a length filled."""
+    """The mask with gaps up to a length filled."""
     filled = there.copy()
     for begin, end in runs(there):
         if not there[begin] and end - begin <= longest and begin > 0 and end < len(there):

@@ -99,7 +99,8 @@ def palm_pose(
         turned = turn.apply(palm)
         x, y, z = (turned + position_m).T
         if z.min() < hand_length / 2:
-            return None  # a hand this near would not fit into the picture
+            # a hand this near would not fit into the picture
+            return None
         errors = np.stack([x, y], 1) / z[:, None] - u
         none = np.zeros(len(z))
         rows = np.stack([1 / z, none, -x / z**2], 1), np.stack([none, 1 / z, -y / z**2], 1)

@@ -78,7 +78,8 @@ def _end_the_service(cell: FaultyCell) -> None:
 
 def _kill_the_workshop_at_work(cell: FaultyCell) -> None:
     skill_worker = cell.child("skill worker")
-    os.kill(skill_worker, signal.SIGSTOP)  # its work cannot end before it is killed
+    # its work cannot end before it is killed
+    os.kill(skill_worker, signal.SIGSTOP)
     threading.Timer(0.2, os.kill, [skill_worker, signal.SIGKILL]).start()
     place = {
         "name": "p",

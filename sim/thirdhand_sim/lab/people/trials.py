@@ -41,7 +41,8 @@ FAST_MPS = 0.25
 WRONG_M = 0.10  # a target that is farther from the teacher's tool is followed falsely
 SMOOTHED = 5  # ticks over which the velocity of a rival's target is computed, if it has a memory
 LONGEST_DELAY_S = 0.6
-MAX_ASTRAY_SHARE = 0.05  # on the teacher's path, at most this share of the time is falsely followed
+# on the teacher's path, at most this share of the time is falsely followed
+MAX_ASTRAY_SHARE = 0.05
 # a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
 SWAP_NOTICED_S = 0.3
 SWAP_OVER_S = 0.2
@@ -259,7 +260,8 @@ def _moving(placed: PlacedModel | None, one: SeenSession) -> tuple[Predicted, Ar
 def _event(one: SeenSession, tool: Array, speed: Array, held: Mask, i: int) -> EventOutcome:
     begin, end = one.session.windows[i]
     window = (one.times >= begin) & (one.times < end)
-    if i == 0:  # the board belongs to the tracked hand
+    # the board belongs to the tracked hand
+    if i == 0:
         perceived = one.estimates[window, 0, :3] + TOOL_FROM_HAND
         true = one.hands[window, :3] + TOOL_FROM_HAND
     else:

@@ -120,11 +120,11 @@ class PlacedProcess:
         return rows
 
     def mean(self, seen: Observed) -> Array:
-        """As `Placed.mean`."""
+        """As `PlacedModel.mean`."""
         return self.posterior.mean(self._rows(seen.hands))
 
     def predict(self, seen: Observed) -> Predicted:
-        """As `Placed.predict`."""
+        """As `PlacedModel.predict`."""
         rows = self._rows(seen.hands)
         prior = sum(kernel.variance for kernel in self.kernels)
         sparse_variance = np.maximum(

@@ -104,5 +104,5 @@ class Law:
         return self
 
     def mean(self, seen: Observed) -> Array:
-        """As `Placed.mean`."""
+        """As `PlacedModel.mean`."""
         return self.predict(seen).mean

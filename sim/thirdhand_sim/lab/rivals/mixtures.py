@@ -83,11 +83,11 @@ class LearnedMixture:
         return self
 
     def mean(self, seen: Observed) -> Array:
-        """As `Placed.mean`."""
+        """As `PlacedModel.mean`."""
         return self.mixture.regress(seen.hands).mean
 
     def predict(self, seen: Observed) -> Predicted:
-        """As `Placed.predict`; it holds for hands that were not demonstrated."""
+        """As `PlacedModel.predict`; it holds for hands that were not demonstrated."""
         regression = self.mixture.regress(seen.hands)
         return Predicted(
             regression.mean,

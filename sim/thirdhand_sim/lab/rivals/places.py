@@ -67,11 +67,13 @@ class PlacedLookUp:
     depends_on = DependsOn.HANDS
 
     def mean(self, seen: Observed) -> Array:
-        """As `Placed.mean`."""
+        """As `PlacedModel.mean`."""
         return self._weighed(seen.hands)[0]
 
     def predict(self, seen: Observed) -> Predicted:
-        """As `Placed.predict`; the covariance is that of the weighted tools, and a constant."""
+        """As `PlacedModel.predict`; the covariance is that of the weighted tools, and a
+        constant.
+        """
         mean, weights, tools = self._weighed(seen.hands)
         offsets = tools - mean[:, None]
         covariance = np.einsum(

@@ -157,11 +157,11 @@ class PlacedInteraction:
         return np.asarray(self._likelihoods(hands).max(axis=1))
 
     def mean(self, seen: Observed) -> Array:
-        """As `Placed.mean`."""
+        """As `PlacedModel.mean`."""
         return self.predict(seen).mean
 
     def predict(self, seen: Observed) -> Predicted:
-        """As `Placed.predict`."""
+        """As `PlacedModel.predict`."""
         logs = self._likelihoods(seen.hands)
         beliefs = self._phases(logs)  # (T, Z)
         over = self.covariances[:, :6, :6]

@@ -57,7 +57,7 @@ LEAST_TOUCH_SAMPLES = 5
 
 class LedTracks(NamedTuple):
     """The tracks of the hands that arrived, by side, in the tracker's unit, and of the tool; and
-    remarks on what was left out.
+    remarks on omitted samples.
     """
 
     hands: Mapping[str, Track]
@@ -66,7 +66,7 @@ class LedTracks(NamedTuple):
 
 
 class SolvedHand(NamedTuple):
-    """A calibration, the hand and frame that it is of, what it was computed from, and remarks."""
+    """A calibration, its hand and frame, the samples that it was computed from, and remarks."""
 
     calibration: Calibration
     side: str
