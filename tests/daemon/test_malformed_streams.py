@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
 
 from support.cell import LISTENING, serving, until
 from thirdhand.cli.diagnosis import findings
-from thirdhand.contract import channels
+from thirdhand.contract import cdr, channels
 from thirdhand.contract.requests import Status
 
 EVERY_INPUT = (
@@ -24,16 +25,22 @@ SOURCES = {"hands/left": "left hand", "hands/right": "right hand", "joints/state
 @pytest.mark.thorough
 def test_malformed_messages_are_counted_by_stream(tmp_path: Path) -> None:
     keys = {key: channels.key("thirdhand", key) for key in HEARD} | {"camera": "camera"}
+    unstamped_pose = cdr.CDR_HEADER + struct.pack("<7d", *[0.5] * 7)
+    payloads = {keys["hands/left"]: unstamped_pose, keys["hands/right"]: bytes(100_000)}
     with serving(tmp_path, "--joints", "state", network=EVERY_INPUT) as daemon:
         before = daemon.client.status()
 
         def complete_status() -> Status | None:
             for key in keys.values():
-                daemon.session.put(key, bytes(100_000) if key.endswith("right") else b"\0\1\0\0")
+                daemon.session.put(key, payloads.get(key, b"\0\1\0\0"))
             status = daemon.client.status()
             return status if all(f"malformed {key}" in status.rejected for key in keys) else None
 
         status = until(complete_status)
+        assert (
+            "60 bytes that fit geometry_msgs/msg/Pose or Transform; geometry_msgs/msg/PoseStamped "
+            "needed"
+        ) in status.sources["left"].refused
         named = {SOURCES.get(key, key) for key in keys}
         for key, stream in status.streams.items():
             assert f"what arrives on {key} is malformed: {stream.refused}" in status.because

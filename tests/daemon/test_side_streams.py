@@ -11,7 +11,7 @@ from support.cell import until
 from support.pictures import grey
 from thirdhand.contract.images import decode_image, image_in
 from thirdhand.daemon.cell_streams import Arrivals
-from thirdhand.daemon.side_streams import WAITING_IMAGES, SideStream
+from thirdhand.daemon.side_streams import SideStream
 
 
 def test_images_are_passed_on_in_order_and_the_rest_is_counted(
@@ -25,7 +25,7 @@ def test_images_are_passed_on_in_order_and_the_rest_is_counted(
         came.append((key, image_in(payload, now_ns)))
 
     streams = [
-        SideStream(near, key, functools.partial(pass_on, key), counted, waiting=WAITING_IMAGES)
+        SideStream(near, key, functools.partial(pass_on, key), counted, needed="JPEG", waiting=32)
         for key, counted in arrivals.items()
     ]
     sent = [
@@ -53,6 +53,8 @@ def test_images_are_passed_on_in_order_and_the_rest_is_counted(
         (key, payload) for key, payload in sent[:-1] if payload != b"nonsense"
     ]
     front, side = arrivals.values()
-    assert front.why == "an image that begins with 6e 6f 6e 73 65 6e 73 65; JPEG or PNG needed"
+    assert str(front.refusal) == (
+        "an image that begins with 6e 6f 6e 73 65 6e 73 65, neither JPEG nor PNG; JPEG needed"
+    )
     assert front.count >= front.malformed + 2
     assert (front.malformed >= 2, side.malformed) == (True, 0)

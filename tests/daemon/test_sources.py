@@ -11,9 +11,11 @@ import pytest
 
 from support.in_process import LEFT, RIGHT
 from support.wam import JOINT_NAMES, URDF
+from thirdhand.contract.channels import POSE
 from thirdhand.contract.evidence import explained
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.records import Cause
 from thirdhand.contract.requests import Percentiles, Status
 from thirdhand.core.controller import Controller
@@ -293,7 +295,9 @@ def test_first_rejection_is_logged_and_others_are_counted(skill: Skill) -> None:
         "rejected as wrong_frame: frame 'camera'; 'base' or none accepted. What to do: find [hands]"
         in cell.log[0]
     )
-    cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse("a header of another kind")
+    cell.sources.arrivals[KEY_OF_SOURCE["right"]].refuse(
+        Refusal("a header of another kind", POSE.type)
+    )
     cell.status(103.0)
     assert "right hand: rejected as malformed: a header of another kind" in cell.log[1]
     cell.status(109.0)

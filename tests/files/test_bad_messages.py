@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from support.circling import circling
 from support.paths import RECORDINGS
 from support.recorded import write
-from thirdhand.contract.channels import TAKE_KEYS
+from thirdhand.contract.channels import JOINTS, POSE, TAKE_KEYS
 from thirdhand.recordings.mcap_file import McapFile, RecordingError
 from thirdhand.recordings.mcap_reader import Messages, full_name
 from thirdhand.recordings.recording import Recording
@@ -28,13 +29,18 @@ TAKE = circling(0)._replace(gripper=np.full(600, 0.5))
 BAD: dict[str, Callable[[bytes], bytes]] = {
     "nanoseconds of a whole second": lambda data: data[:8] + struct.pack("<I", 10**9) + data[12:],
     "empty": lambda data: b"",
+    "a Pose": lambda data: data[:4] + struct.pack("<7d", *[0.5] * 7),
     "cut": lambda data: data[:40],
     "not decompressed": lambda data: b"\x28\xb5\x2f\xfd" + data[4:],
 }
 
 
-def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = range(10, 11)) -> Path:
-    """A copy of a recording in which the messages of a topic with these indices are bad."""
+def spoiled(
+    source: Path, topic: str, kind: str = "empty", indices: range = range(10, 11), retyped: str = ""
+) -> Path:
+    """A copy of a recording in which the messages of a topic with these indices are bad, and the
+    topic has the named type.
+    """
     path = source.with_name("spoiled.mcap")
     messages = Messages(source)
     count = 0
@@ -48,7 +54,8 @@ def spoiled(source: Path, topic: str, kind: str = "empty", indices: range = rang
             is_bad = channel.topic == topic and count in indices
             count += channel.topic == topic
             data = BAD[kind](message.data) if is_bad else message.data
-            file.put(channel.topic, full_name(schema), data, message.log_time, 0)
+            named = retyped if retyped and channel.topic == topic else full_name(schema)
+            file.put(channel.topic, named, data, message.log_time, 0)
     return path
 
 
@@ -72,6 +79,35 @@ def test_a_bad_message_is_lost_and_counted(kind: str, key: str, tmp_path: Path) 
             RecordingError, match="hands/left: 600 of 600 messages are not readable: "
         ):
             read_demonstration(spoiled(tmp_path / "take.mcap", topic, kind, range(600)))
+
+
+@pytest.mark.parametrize("key", ["hands/left", "tool/pose", "gripper/state"])
+def test_a_topic_of_another_type_is_named_with_the_accepted_types(key: str, tmp_path: Path) -> None:
+    """A stream of another type is refused, or left out with a remark; never left out silently."""
+    topic = f"/thirdhand/{key}"
+    write_demonstration(tmp_path / "take.mcap", TAKE)
+    path = spoiled(tmp_path / "take.mcap", topic, retyped="geometry_msgs/msg/Pose")
+    remarks = list[str]()
+    accepted = JOINTS.type if key == "gripper/state" else POSE.type
+    words = rf"{topic} \(geometry_msgs/msg/Pose\).*{accepted}"
+    if key == "gripper/state":
+        assert read_demonstration(path, say=remarks.append).gripper is None
+        assert re.search(words, "\n".join(remarks))
+        return
+    with pytest.raises(RecordingError, match=words):
+        read_demonstration(path)
+    if key == "hands/left":
+        assert {side for _, side, _ in hand_samples(path, say=remarks.append)} == {"right"}
+        assert re.search(words, remarks[0])
+
+
+def test_bytes_of_another_type_than_the_schema_are_named(tmp_path: Path) -> None:
+    """Bytes of a Pose under the schema of a PoseStamped are named as such."""
+    write_demonstration(tmp_path / "take.mcap", TAKE)
+    path = spoiled(tmp_path / "take.mcap", "/thirdhand/hands/left", "a Pose", range(600))
+    words = "60 bytes that fit geometry_msgs/msg/Pose or Transform; geometry_msgs/msg/PoseStamped"
+    with pytest.raises(RecordingError, match=words):
+        read_demonstration(path)
 
 
 @pytest.mark.parametrize("key", ["hands/left", "tick", "frame"])

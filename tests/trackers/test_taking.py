@@ -5,6 +5,7 @@ joints, rest ends a take and is left out, and takes are shown, trimmed and delet
 from __future__ import annotations
 
 import re
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -87,13 +88,19 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
         state = JointState(stamp, SETTINGS.joints.names, tuple((joints + 0.01 * i).tolist()), ())
         publishers[JOINT_STATES].put(cdr.encode_joints(state))
         heard(taken, 3 * (i + 1))
-    publishers["hands/left"].put(b"no pose")
+    unstamped = (0.5, -0.3, 0.2, 0.0, 0.0, 0.0, 1.0)
+    publishers["hands/left"].put(cdr.CDR_HEADER + struct.pack("<7d", *unstamped))
     publishers["hands/left"].put(
         cdr.encode_pose(PoseStamped(0, "", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
     )
     heard(taken, 92)
     taken.close()
     assert taken.malformed == {"hands/left": 2}
+    assert taken.unreadable == [
+        "2 messages on hands/left are not readable: 60 bytes that fit geometry_msgs/msg/Pose or "
+        "Transform; geometry_msgs/msg/PoseStamped needed: a stamp of 1071644672 ns beside its "
+        "seconds, less than 1000000000 needed"
+    ]
     path = tmp_path / "a.mcap"
     taken.write(path)
     assert list(tmp_path.iterdir()) == [path]

@@ -262,24 +262,24 @@ class Reader:
         self._is_big_endian = not number & 1
         self._max_align = 8 if encoding == "CDR" else 4
         self._data = data
-        self._at = 4
+        self.at = 4
 
     def unpack(self, layout: struct.Struct, align: int) -> tuple[Any, ...]:
         if self._is_big_endian:
             layout = _big_endian(layout)
-        offset = self._at + (-(self._at - 4) % min(align, self._max_align))
-        self._at = offset + layout.size
+        offset = self.at + (-(self.at - 4) % min(align, self._max_align))
+        self.at = offset + layout.size
         try:
             return layout.unpack_from(self._data, offset)
         except struct.error:
             raise WireError(
-                f"{len(self._data)} bytes end before byte {self._at} of the message"
+                f"{len(self._data)} bytes end before byte {self.at} of the message"
             ) from None
 
     def length(self) -> int:
         count: int = self.unpack(_LENGTH, 4)[0]
-        if count > len(self._data) - self._at:
-            raise WireError(f"a length of {count} with {len(self._data) - self._at} bytes left")
+        if count > len(self._data) - self.at:
+            raise WireError(f"a length of {count} with {len(self._data) - self.at} bytes left")
         return count
 
     def items(self) -> int:
@@ -293,8 +293,8 @@ class Reader:
 
     def _raw_string(self) -> bytes:
         count = self.length()
-        raw = self._data[self._at : self._at + count]
-        self._at += count
+        raw = self._data[self.at : self.at + count]
+        self.at += count
         return raw
 
     def doubles(self) -> tuple[float, ...]:
@@ -317,7 +317,7 @@ class Reader:
             stamp: Any = self.unpack(_STAMP, 4)
             return stamp, self._raw_string(), self._raw_string(), self.unpack(_POSE, 8)
         data = self._data
-        parent_at = self._at + -self._at % 4 + _TRANSFORM.size
+        parent_at = self.at + -self.at % 4 + _TRANSFORM.size
         try:
             seconds, nanoseconds, parent_size = _TRANSFORM.unpack_from(
                 data, parent_at - _TRANSFORM.size
@@ -325,7 +325,7 @@ class Reader:
             child_at = parent_at + parent_size + -(parent_at + parent_size) % 4 + _LENGTH.size
             (child_size,) = _LENGTH.unpack_from(data, child_at - _LENGTH.size)
             pose_at = child_at + child_size + (4 - child_at - child_size) % 8
-            self._at = pose_at + _POSE.size
+            self.at = pose_at + _POSE.size
             pose = _POSE.unpack_from(data, pose_at)
         except struct.error:
             raise WireError(f"{len(data)} bytes end within a transform") from None
@@ -334,8 +334,8 @@ class Reader:
         return (seconds, nanoseconds), parent, child, pose
 
     def end(self) -> None:
-        if len(self._data) - self._at > 3:  # some writers pad to four bytes
-            raise WireError(f"{len(self._data) - self._at} bytes follow the message")
+        if len(self._data) - self.at > 3:  # some writers pad to four bytes
+            raise WireError(f"{len(self._data) - self.at} bytes follow the message")
 
 
 def _read_pose(data: bytes, *layouts: struct.Struct) -> tuple[Any, ...]:

@@ -65,5 +65,5 @@ def _format_of(file: bytes) -> str:
         if file.startswith(magic):
             return name
     raise WireError(
-        f"an image that begins with {file[:8].hex(' ') or 'nothing'}; JPEG or PNG needed"
+        f"an image that begins with {file[:8].hex(' ') or 'nothing'}, neither JPEG nor PNG"
     )

@@ -22,6 +22,7 @@ from thirdhand.client import Publisher
 from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Event, Frame, Record
 from thirdhand.daemon.ros2_domain import Ros2Domain
@@ -59,7 +60,7 @@ MAX_TRANSFORM_MESSAGES = 64
 class Arrivals:
     """Statistics of the messages received on one channel. The loop writes, other threads read."""
 
-    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "others", "why")
+    __slots__ = ("_delays", "at_ns", "count", "frozen", "malformed", "newest", "others", "refusal")
 
     def __init__(self) -> None:
         # stamp, arrival - stamp [ns]
@@ -67,7 +68,7 @@ class Arrivals:
         # messages: all; not decoded; of a lost hand; of another publisher. Arrival of `newest` [ns]
         self.count = self.malformed = self.frozen = self.others = self.at_ns = 0
         self.newest: PoseStamped | JointState | None = None
-        self.why = ""  # the reason why the newest malformed message was not decoded
+        self.refusal = Refusal("", "")  # the newest malformed message
 
     def take(self, message: PoseStamped | JointState | bool | float, at_ns: int) -> None:
         """Note a message and its arrival by the system clock [ns]. Messages of a clutch, a wish or
@@ -116,9 +117,9 @@ class Arrivals:
         later = stamps[stamps.index(accepted_ns) + 1 :] if accepted_ns in stamps else []
         return len(later) > 1 and max(later) < accepted_ns
 
-    def refuse(self, why: str) -> None:
-        """Note bytes that cannot be decoded, and the reason."""
-        self.why = why
+    def refuse(self, refusal: Refusal) -> None:
+        """Note a message that cannot be decoded."""
+        self.refusal = refusal
         self.count += 1
         self.malformed += 1
 
@@ -250,7 +251,10 @@ class CellStreams:
             arrived: list[Event] = []
             for sample in _waiting(source, _most(suffix)):
                 publisher = identity(sample) if suffix in self._sole else ""
-                if (event := self._decoded(suffix, sample.payload, publisher)) is not None:
+                encoding = sample.encoding
+                if (
+                    event := self._decoded(suffix, sample.payload, publisher, encoding)
+                ) is not None:
                     arrived.append(event)
             events += arrived[-1:] if suffix == ARM_STATE else arrived
         for by_frame, source in self._transforms:
@@ -277,13 +281,17 @@ class CellStreams:
                     newest.append((by_frame[frame], cdr.encode_pose(pose), publisher))
             except WireError as error:
                 for frame in frames:
-                    self._arrivals[by_frame[frame]].refuse(str(error))
+                    refusal = Refusal(str(error), channels.TRANSFORMS.type, payload)
+                    self._arrivals[by_frame[frame]].refuse(refusal)
         return [pose for newest in poses.values() for pose in newest]
 
-    def _decoded(self, suffix: str, raw: Any, publisher: str) -> Event | None:
+    def _decoded(
+        self, suffix: str, raw: Any, publisher: str, encoding: object = ""
+    ) -> Event | None:
         """The event of a message; None if it is refused, or completes no state of the arm."""
         channel = channels.BY_KEY[suffix]
         arrivals = self._arrivals[suffix]
+        payload = b""
         try:
             if len(raw) > cdr.MAX_BYTES:
                 raise WireError(f"{len(raw)} bytes, at most {cdr.MAX_BYTES} accepted")
@@ -298,7 +306,7 @@ class CellStreams:
                     message = state
                     payload = cdr.encode_joints(state)
         except WireError as error:
-            arrivals.refuse(str(error))
+            arrivals.refuse(Refusal(str(error), channel.codec.type, payload, str(encoding)))
             return None
 
         # Of two publishers of a hand, only one is heard; the pose of a lost hand is not used.

@@ -149,7 +149,7 @@ class InputMonitor:
         if cause in (FROZEN, OTHER_PUBLISHER):
             return explained(Condition[cause.upper()])
         if cause == MALFORMED or intake is None:
-            return explained(Condition.MALFORMED, Evidence(mistake=arrivals.why))
+            return explained(Condition.MALFORMED, Evidence(mistake=str(arrivals.refusal)))
         refused = intake.refused[name, Cause[cause.upper()]]
         return explained(refused.cause, evidence(refused, self._settings, arrivals))
 

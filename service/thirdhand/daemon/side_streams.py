@@ -11,21 +11,23 @@ import zenoh
 from zenoh.handlers import RingChannel
 
 from thirdhand.contract import channels
-from thirdhand.contract.images import image_in
+from thirdhand.contract.images import COMPRESSED_IMAGE, image_in
 from thirdhand.contract.messages import WireError
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.requests import encode_json
 from thirdhand.daemon.cell_streams import Arrivals
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings
 
 OBJECTS_KEY = "objects"
+IMAGE_TYPES = f"JPEG, PNG or {COMPRESSED_IMAGE}"
 WAITING_IMAGES = 32  # images of a key between two polls; beyond it, the oldest are left out
 
 
 class SideStream:
     """A subscriber that passes the newest messages on one key, and their times [ns], to `take`, and
-    counts them in `arrivals`; those for which `take` raises WireError count as malformed. Between
-    two polls, `waiting` messages are kept.
+    counts them in `arrivals`; those for which `take` raises WireError, because they are not of the
+    type `needed`, count as malformed. Between two polls, `waiting` messages are kept.
     """
 
     def __init__(
@@ -35,11 +37,13 @@ class SideStream:
         take: Callable[[bytes, int], object],
         arrivals: Arrivals,
         *,
+        needed: str,
         waiting: int = 1,
     ) -> None:
         self._subscriber = session.declare_subscriber(key, RingChannel(waiting))
         self._take = take
         self._arrivals = arrivals
+        self._needed = needed
         self._waiting = waiting
 
     def poll(self, now_ns: int) -> None:
@@ -47,11 +51,13 @@ class SideStream:
         for _ in range(self._waiting):
             if (sample := self._subscriber.try_recv()) is None:
                 return
+            payload = sample.payload.to_bytes()
             try:
-                self._take(sample.payload.to_bytes(), now_ns)
+                self._take(payload, now_ns)
                 self._arrivals.count += 1
             except WireError as error:
-                self._arrivals.refuse(str(error))
+                refusal = Refusal(str(error), self._needed, payload, str(sample.encoding))
+                self._arrivals.refuse(refusal)
 
 
 def side_keys(settings: Settings) -> list[str]:
@@ -72,7 +78,11 @@ def side_streams(
         scribe.image(key, image_in(payload, now_ns), now_ns)
 
     objects = SideStream(
-        session, channels.key(settings.cell, OBJECTS_KEY), note_objects, arrivals[OBJECTS_KEY]
+        session,
+        channels.key(settings.cell, OBJECTS_KEY),
+        note_objects,
+        arrivals[OBJECTS_KEY],
+        needed=channels.OBJECTS.type,
     )
     return [
         objects,
@@ -82,6 +92,7 @@ def side_streams(
                 key,
                 functools.partial(record_image, key),
                 arrivals[key],
+                needed=IMAGE_TYPES,
                 waiting=WAITING_IMAGES,
             )
             for key in settings.recording.also

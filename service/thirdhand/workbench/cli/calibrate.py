@@ -160,9 +160,7 @@ def _live(
             calibration = solution.calibration
             frame = solution.frame
             remarks = list(solution.remarks)
-        remarks += [
-            f"{count} messages on {key} were not readable" for key, count in live.malformed.items()
-        ]
+        remarks += live.unreadable
         record = _record(
             calibration, side, frame or settings.hands.frame, "points" if given else "held"
         )

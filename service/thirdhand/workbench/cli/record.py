@@ -155,8 +155,8 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
 
 def _report_omitted(captured: Capture) -> None:
     """Print the numbers of messages that a take does not hold."""
-    for key, count in captured.malformed.items():
-        print(f"{count} messages on {key} were not readable and are left out", file=sys.stderr)
+    for remark in captured.unreadable:
+        print(f"{remark}. They are left out", file=sys.stderr)
     for key, count in captured.of_others.items():
         print(
             f"{count} messages on {key} are left out: a second tracker publishes this hand; stop "

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import JOINTS, POSE, STRING, TAKE_KEYS, topic
 from thirdhand.contract.messages import BASE, GRIPPER, JointState, PoseStamped, WireError
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.requests import Hands, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import rotation
@@ -29,6 +30,7 @@ from thirdhand.workbench.takes.pose_streams import (
     VIA_POINTS_TOPIC,
     PoseRecording,
     PoseTopic,
+    other_type,
     type_of,
     with_types,
 )
@@ -479,6 +481,12 @@ def _hand_key(topic: str) -> str:
     return next((key for key in _STREAMS[:2] if f"/{topic}".endswith(f"/{key}")), "")
 
 
+def _other_hand_types(types: Mapping[str, str]) -> str:
+    """A remark on the topics of hands that have another type, given the type of each topic."""
+    remarks = (other_type(types, key, (POSE.type,)) for key in _STREAMS[:2])
+    return "; ".join(filter(None, remarks))
+
+
 def hand_samples(
     path: str | Path, *, say: Callable[[str], None] = lambda line: None
 ) -> list[tuple[int, str, PoseStamped]]:
@@ -508,12 +516,14 @@ def hand_samples(
                 (message.log_time, name.removeprefix("hands/"), cdr.decode_pose(message.data))
             )
         except WireError as error:
-            causes.append(f"{topic}: {error}")
+            causes.append(f"{topic}: {Refusal(str(error), POSE.type, message.data)}")
     if messages.faults and not ends_early(path):
         raise RecordingError(f"{path} is damaged: {messages.faults[0]}")
     if not topics:
         lacks = f"no topic ending in hands/left or hands/right with {POSE.type}"
         raise RecordingError(f"{path} has {lacks}; its topics: {with_types(types)}")
+    if remark := _other_hand_types(types):
+        say(f"{path}: {remark}")
     if causes:
         remark = (
             f"{path}: {len(causes)} of {len(causes) + len(samples)} poses are not readable: "

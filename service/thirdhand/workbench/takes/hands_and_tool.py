@@ -17,6 +17,7 @@ from thirdhand.workbench.takes.pose_streams import (
     TRACK_NAMES,
     PoseRecording,
     PoseTopic,
+    other_type,
     with_types,
 )
 from thirdhand.workbench.takes.track import Track
@@ -53,6 +54,8 @@ def chosen(
     if len(sources) == 1:
         (conducts,) = (name for name in get_args(Hands) if name in sources)
         other = TRACK_NAMES[1 - TRACK_NAMES.index(conducts)]
+        if remark := other_type(recorded.topics, TAKE_KEYS[other], POSE_TYPES):
+            raise RecordingError(f"{recorded.path}: the {other} hand is {remark}")
         hint = (
             ""
             if conducts == recorded.conducts

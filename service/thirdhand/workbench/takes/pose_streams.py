@@ -30,6 +30,7 @@ from thirdhand.contract.channels import (
 from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.joint_states import JointStates, measured
 from thirdhand.contract.messages import BASE, JointState, PoseStamped, WireError
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.printable import printable
 from thirdhand.contract.requests import Add, Hands, ViaPoint, decode_request
 from thirdhand.core.frame import Vector
@@ -80,6 +81,13 @@ TRANSFORM = "geometry_msgs/msg/TransformStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_TYPES = (POSE.type, POSE_WITH_COVARIANCE.type, TRANSFORM, POSE_ARRAY, TF_MESSAGE, ODOMETRY)
 # covariances, and a velocity
+# accepted types of topics by the ends of their names
+ACCEPTED_TYPES = {
+    **dict.fromkeys(TAKE_KEYS.values(), POSE_TYPES),
+    JOINT_STATES: (JOINTS.type,),
+    GRIPPER_STATE: (JOINTS.type,),
+    VIA_POINTS_TOPIC: (STRING.type,),
+}
 NUMBERS_AFTER = {
     POSE_WITH_COVARIANCE.type: 36,
     ODOMETRY: 36 + 6 + 36,
@@ -149,6 +157,8 @@ class PoseRecording:
             raise RecordingError(f"{self._existing()} has a format that is not read: {instead}")
         else:
             self._read_mcap()
+        other_types = (other_type(self.topics, key, kinds) for key, kinds in ACCEPTED_TYPES.items())
+        self.unused += filter(None, other_types)
 
     def _existing(self) -> Path:
         if not self.path.is_file():
@@ -282,7 +292,7 @@ class PoseRecording:
                     _of_ros_1(whole, self.topics[topic]) if topic in self._ros_1_topics else whole
                 )
             except WireError as error:
-                causes.append(str(error))
+                causes.append(str(Refusal(str(error), self.topics[topic], data)))
             else:
                 yield logged_ns, value
         if not causes:
@@ -446,6 +456,18 @@ def type_of(schema: Schema | None, channel: Channel, read: Sequence[str] = ("cdr
     """The type of a channel's messages, with their encoding unless that is `read`."""
     kind = full_name(schema)
     return kind if channel.message_encoding in read else f"{kind} in {channel.message_encoding}"
+
+
+def other_type(topics: Mapping[str, str], key: str, accepted: Sequence[str]) -> str:
+    """A remark on the topics that end in a key and have none of the accepted types, given the type
+    of each topic; empty if there are none.
+    """
+    others = {
+        topic: kind
+        for topic, kind in topics.items()
+        if f"/{topic}".endswith(f"/{key}") and kind not in accepted
+    }
+    return f"not used: {with_types(others)}; {', '.join(accepted)} accepted" if others else ""
 
 
 def with_types(topics: Mapping[str, str]) -> str:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -20,6 +21,7 @@ from thirdhand.contract.channels import TAKE_KEYS
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.joint_states import JointStates, measured
 from thirdhand.contract.messages import BASE, PoseStamped, WireError, finite
+from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.requests import Hands, ViaPoint, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.intake.arm_samples import in_turn
@@ -69,6 +71,15 @@ class Sample(NamedTuple):
     at: Vector
 
 
+class Received(NamedTuple):
+    """A message as received: its arrival [ns], bytes, publisher and Zenoh encoding."""
+
+    arrived_ns: int
+    payload: bytes
+    publisher: str
+    encoding: str
+
+
 class Capture:
     """The samples of one demonstration: the hands that lead the tool, the tool, the joints and the
     gripper. The subscriptions last until `close`.
@@ -91,12 +102,13 @@ class Capture:
         self.samples: dict[str, list[Sample]] = {
             key: [] for key in CAPTURED_KEYS if key not in HAND_KEYS or key in self.hands
         }
-        self.malformed: dict[str, int] = {}
+        self.malformed = Counter[str]()
+        self._first_refusals: dict[str, Refusal] = {}
         self.of_others: dict[
             str, int
         ] = {}  # messages of a hand's second publisher, which are left out
         self._sole = {key: SolePublisher() for key in self.hands}
-        self._waiting: dict[str, list[tuple[int, bytes, str]]] = {key: [] for key in self.samples}
+        self._waiting: dict[str, list[Received]] = {key: [] for key in self.samples}
         self._heard_s = time.monotonic()
         self._moved = False
         self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
@@ -119,19 +131,32 @@ class Capture:
         def take(sample: zenoh.Sample) -> None:
             arrived_ns = time.time_ns()
             payload = sample.payload.to_bytes()
-            publisher = identity(sample)
+            received = Received(arrived_ns, payload, identity(sample), str(sample.encoding))
             if not frame:
-                waiting.append((arrived_ns, payload, publisher))
+                waiting.append(received)
             elif name in payload:
                 try:
                     poses = cdr.decode_transforms(payload, (frame,))
                     waiting.extend(
-                        (arrived_ns, cdr.encode_pose(pose), publisher) for _, pose in poses
+                        received._replace(payload=cdr.encode_pose(pose)) for _, pose in poses
                     )
-                except WireError:
-                    self.malformed[key] = self.malformed.get(key, 0) + 1
+                except WireError as error:
+                    self._refuse(key, received, error, channels.TRANSFORMS.type)
 
         return take
+
+    def _refuse(self, key: str, received: Received, error: WireError, needed: str) -> None:
+        refusal = Refusal(str(error), needed, received.payload, received.encoding)
+        self._first_refusals.setdefault(key, refusal)
+        self.malformed[key] += 1
+
+    @property
+    def unreadable(self) -> list[str]:
+        """The messages of each key that are not readable, in words: their number, and the first."""
+        return [
+            f"{count} messages on {key} are not readable: {self._first_refusals[key]}"
+            for key, count in self.malformed.items()
+        ]
 
     def close(self) -> None:
         """End the subscriptions and decode the last messages."""
@@ -143,17 +168,18 @@ class Capture:
         """Decode the messages since the last call; unreadable ones are counted."""
         for key, waiting in self._waiting.items():
             while waiting:
-                arrived_ns, payload, publisher = waiting.pop(0)
+                received = waiting.pop(0)
+                arrived_ns = received.arrived_ns
                 self._heard_s = time.monotonic()
                 try:
                     sample = (self._state if key == JOINT_STATES else self._sample)(
-                        key, arrived_ns, payload
+                        key, arrived_ns, received.payload
                     )
-                except WireError:
-                    self.malformed[key] = self.malformed.get(key, 0) + 1
+                except WireError as error:
+                    self._refuse(key, received, error, channels.BY_KEY[key].codec.type)
                     continue
                 sole = self._sole.get(key)
-                if sole is not None and sole.is_other(publisher, arrived_ns / 1e9):
+                if sole is not None and sole.is_other(received.publisher, arrived_ns / 1e9):
                     self.of_others[key] = self.of_others.get(key, 0) + 1
                 elif sample is not None:
                     self.samples[key].append(sample)
@@ -324,9 +350,7 @@ class Capture:
 
     def not_received(self, missing: Sequence[str], more: str = "") -> str:
         """A message on streams that do not arrive, and what to check."""
-        unreadable = "".join(
-            f"; {n} messages on {key} are not readable" for key, n in self.malformed.items()
-        )
+        unreadable = "".join(f"; {remark}" for remark in self.unreadable)
         return (
             f"not received: {', '.join(missing)}{unreadable}{more}. Are tracker and arm running, "
             f"connected to the same endpoint, and in cell {self.cell}?"

@@ -97,7 +97,7 @@ def from_recording(path: Path, settings: Settings | None) -> tuple[LedTracks, Se
             f"{channels.POSE.type} needed; its topics: {with_types(recorded.topics)}"
         )
     tool = recorded.tool_by_joints(joints, settings, recorded.urdf or robot_description(settings))
-    return LedTracks(hands, tool), settings
+    return LedTracks(hands, tool, recorded.unused), settings
 
 
 class LiveLed(Capture):
