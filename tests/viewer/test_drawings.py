@@ -57,9 +57,7 @@ def test_arm_without_meshes_is_drawn_by_capsules(
     """The log says so."""
     shape = re.compile("(<visual>.*?<geometry>).*?(</geometry>)", re.DOTALL)
     mesh = r'\1<mesh filename="package://wam_description/meshes/link.stl"/>\2'
-    (tmp_path / "arm.urdf").write_text(
-        shape.sub(mesh, WAM.read_text(encoding="utf-8")), encoding="utf-8"
-    )
+    urdf = shape.sub(mesh, WAM.read_text(encoding="utf-8"))
     package = tmp_path / "packages" / "wam_description"
     (package / "meshes").mkdir(parents=True)
     (package / "package.xml").write_text(
@@ -71,7 +69,13 @@ def test_arm_without_meshes_is_drawn_by_capsules(
     shutil.copytree(tmp_path / "packages", tmp_path / "unfetched")
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0a1b\nsize 284184\n"
     (tmp_path / "unfetched" / "wam_description" / "meshes" / "link.stl").write_bytes(pointer)
+    shutil.copytree(tmp_path / "packages", tmp_path / "untextured")
+    meshes = tmp_path / "untextured" / "wam_description" / "meshes"
+    (meshes / "link.stl").unlink()
+    (meshes / "link.obj").write_text("mtllib link.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (meshes / "link.mtl").write_bytes(pointer)
     cases = {
+        "untextured": r"link\.mtl: it is a pointer of Git LFS",
         "nowhere": "ROS_PACKAGE_PATH names more",
         "unfetched": r"link\.stl: it is a pointer of Git LFS",
         "packages": "",
@@ -79,6 +83,8 @@ def test_arm_without_meshes_is_drawn_by_capsules(
     for name, words in cases.items():
         folder = tmp_path / name
         is_drawn = bool(words)
+        mesh_name = "link.obj" if name == "untextured" else "link.stl"
+        (tmp_path / "arm.urdf").write_text(urdf.replace("link.stl", mesh_name), encoding="utf-8")
         monkeypatch.setenv("ROS_PACKAGE_PATH", str(folder))
         view = Viewer(urdf=tmp_path / "arm.urdf", settings=Settings(), rrd=tmp_path / "a.rrd")
         for tick, frame, timing in ticks(30):

@@ -39,6 +39,7 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 BANNER_AT = (0.55, 0.66, -0.44)
 BANNER_WIDTH = 0.74  # times the camera's distance, as BANNER_AT is
 _SHAPES = (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D)
+NAMING_OTHERS = (".dae", ".gltf", ".obj")  # meshes that may name other files
 VISUAL = "/visual_geometries/"
 _DRAWN = ("Asset3D:", "Mesh3D:", *(f"{shape.__name__}:" for shape in _SHAPES))
 
@@ -106,7 +107,8 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     files: dict[ElementTree.Element, Path] = {}
     for mesh, file in found_meshes(robot, origin, packages):
         try:
-            begin_of(file)
+            for part in (file, *_named_in(file)):
+                begin_of(part)
             files[mesh] = file
         except (OSError, UnusableError) as error:
             cause = cause or f"a visual mesh is not readable: {in_words(error)}"
@@ -114,6 +116,14 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
         _set_mesh_files(link, files)
     ElementTree.ElementTree(robot).write(path, encoding="utf-8")
     return f"the arm is drawn by its capsules: {cause}" if cause else ""
+
+
+def _named_in(mesh: Path) -> list[Path]:
+    """The files beside a mesh that it names: materials, textures and buffers."""
+    if mesh.suffix.lower() not in NAMING_OTHERS:
+        return []
+    text = mesh.read_bytes()
+    return [file for file in mesh.parent.iterdir() if file.is_file() and file.name.encode() in text]
 
 
 def _packages(settings: Settings) -> tuple[str, ...]:
