@@ -9,8 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from support.in_process import LEFT, RIGHT, arm, hand
 from support.recorded import thin
@@ -32,6 +35,12 @@ from thirdhand.skills.skill_file import decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.report.columns import read, runs
 from thirdhand.workbench.report.report import Report, Span, reported, why_missed
+from thirdhand.workbench.report.stops import (
+    LEAST_SPEED_MPS,
+    TOLERATED_M,
+    excess_m,
+    measured_setting,
+)
 from thirdhand.workbench.report.tables import tables, verdict
 from thirdhand_sim.golden import AWAY_S, BAD_S, DROPOUT_S, HOLD_S, RETEACH_S, SESSION_S, TEACH_S
 
@@ -163,6 +172,25 @@ def test_stop_distance_is_compared_with_people(golden: Path) -> None:
     (prompt,) = (table for table in tables(Report(columns)) if table.name == "times")
     shown_mm = {row[0]: row[3] for row in prompt.rows if row[0].startswith("distance of a stop")}
     assert list(shown_mm.values()) == [f"{distance_mm:.1f}", f"{distance_mm - assumed_mm:.1f}"]
+
+
+@given(
+    stops=st.lists(
+        st.tuples(st.floats(LEAST_SPEED_MPS, 1.5), st.floats(0.0, 1.0)), min_size=1, max_size=5
+    )
+)
+def test_setting_of_measured_stops_covers_all_of_them(stops: list[tuple[float, float]]) -> None:
+    """A proposed setting covers every stop; none is proposed where those in force do."""
+    measured = np.array(stops)
+    text = measured_setting(measured, SETTINGS)
+    is_covered = excess_m(measured, SETTINGS).max() <= TOLERATED_M
+    assert is_covered == text.endswith("within what [people] assumes.")
+    if not is_covered:
+        name, number = re.findall(r"`(\w+) = ([\d.]+)`", text)[0]
+        people = msgspec.structs.replace(SETTINGS.people, **{name: float(number)})
+        changed = msgspec.structs.replace(SETTINGS, people=people)
+        assert excess_m(measured, changed).max() <= TOLERATED_M + 1e-9
+    assert measured_setting(measured[:0], SETTINGS) == ""
 
 
 def test_spans_of_a_session_name_what_happened(session: Report) -> None:

@@ -23,6 +23,7 @@ from thirdhand.skills.corrections import offer_of
 from thirdhand.workbench.report.causes import before, why
 from thirdhand.workbench.report.columns import Columns, read, runs
 from thirdhand.workbench.report.segments import segments
+from thirdhand.workbench.report.stops import excess_m, measured_setting, measured_stops
 from thirdhand.workbench.report.visits import via_point_visits
 
 SHARES = (50, 99, 100)
@@ -187,9 +188,10 @@ class Report:
         # tool to target afterwards, once it has engaged
         self.lag_mm = Percentiles.of(lag_mm[reached:][~engaging])
         self.approach = _approach(columns, self.spans)
-        self.stop_mm, self.stop_excess_mm = map(
-            Percentiles.of, np.array([*_stops_mm(columns)]).reshape(-1, 2).T
-        )
+        stops = measured_stops(columns)
+        self.stop_mm = Percentiles.of(1000 * stops[:, 1])
+        self.stop_excess_mm = Percentiles.of(1000 * excess_m(stops, columns.recording.settings))
+        self.stop_setting = measured_setting(stops, columns.recording.settings)
         self.via_points = tuple(via_point_visits(columns))
         self.segments = tuple(segments(columns))
         self.limits = tuple(_limits(columns))
@@ -329,26 +331,6 @@ def _approach(columns: Columns, spans: tuple[Span, ...]) -> Approach | None:
     return Approach(
         float(frames["hand_distance"][row]), at_s, doing, float(frames["hand_limit"][row])
     )
-
-
-def _stops_mm(columns: Columns) -> Iterator[tuple[float, float]]:
-    """Distance d [mm] of each stop, and d - v r - v²/2b at the speed v before it, with reaction_ms
-    r and brake b of [people].
-    """
-    from thirdhand.core.arm.stage import Arm
-
-    if not columns.recording.urdf:
-        return
-    people = columns.recording.settings.people
-    arm = Arm(columns.recording.settings, columns.recording.urdf)
-    for tick, joints in columns.stops.items():
-        tool_m = np.array([arm.at(np.array(q)).position for q in joints])
-        distance_m = np.linalg.norm(tool_m - tool_m[0], axis=1).max()
-        speed_mps = np.linalg.norm(
-            columns.frames["setpoint_velocity"][columns.frames["tick"] == tick]
-        )
-        assumed_m = speed_mps * (people.reaction_ms / 1000 + speed_mps / people.brake / 2)
-        yield 1000 * distance_m, 1000 * (distance_m - assumed_m)
 
 
 def _limits(columns: Columns) -> Iterator[Limit]:

@@ -374,6 +374,7 @@ def summary(report: Report) -> list[str]:
         if lacks
         else NOTHING_MISSING,
         f"Loop {report.rate_hz:.2f} Hz, {report.missed} deadlines missed. Hands: {hands}.",
+        *([report.stop_setting] if report.stop_setting else []),
         *([f"{report.offer[0].upper()}{report.offer[1:]}."] if report.offer else []),
     ]
 
