@@ -107,8 +107,8 @@ def _write_drawn(urdf: bytes, settings: Settings, path: Path) -> str:
     files: dict[ElementTree.Element, Path] = {}
     for mesh, file in found_meshes(robot, origin, packages):
         try:
-            for part in (file, *_named_in(file)):
-                begin_of(part)
+            for needed_file in (file, *_named_in(file)):
+                begin_of(needed_file)
             files[mesh] = file
         except (OSError, UnusableError) as error:
             cause = cause or f"a visual mesh is not readable: {in_words(error)}"
