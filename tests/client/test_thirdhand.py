@@ -7,6 +7,9 @@ from __future__ import annotations
 import ast
 import itertools
 import math
+import re
+import subprocess
+import sys
 import threading
 import tomllib
 from collections.abc import Callable, Iterator
@@ -62,6 +65,22 @@ def test_the_bare_distribution_is_the_client(editable: bool, tmp_path: Path) -> 
     assert [line.split()[1].partition(">")[0] for line in needs] == ["eclipse-zenoh", "msgspec"]
 
 
+BESIDE_A_CELL = [
+    "serve",
+    "follow simulated",
+    "status",
+    "doctor",
+    "via-points list",
+    "correct",
+    "metrics",
+    "bundle",
+    "bench",
+    "report a.mcap",
+    "replay a.mcap",
+    "view a.mcap",
+]
+
+
 @pytest.mark.parametrize(
     ("command", "extra"),
     [("serve", "cell"), ("learn take.mcap --output skill.npz", "cell"), ("sim", "sim")],
@@ -83,6 +102,28 @@ def test_a_command_whose_extra_is_missing_says_what_to_install(
 def test_extras_in_messages_are_those_of_the_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert EXTRAS.keys() <= project["optional-dependencies"].keys()
+
+
+def test_a_control_machine_has_all_that_its_commands_import() -> None:
+    """The extras that docs/operate.md installs are enough for the commands beside a cell."""
+    (installed,) = re.findall(
+        r"'\.\[([\w,]+)\]'", (ROOT / "docs" / "operate.md").read_text(encoding="utf-8")
+    )
+    missing = [
+        module
+        for extra, modules in EXTRAS.items()
+        for module in modules
+        if extra not in (*installed.split(","), "lerobot")  # Rerun brings pyarrow
+    ]
+    code = (
+        "import importlib, sys\n"
+        f"sys.modules |= dict.fromkeys({missing})\n"
+        "from thirdhand.command_line import parser\n"
+        f"for words in {BESIDE_A_CELL}:\n"
+        "    importlib.import_module(parser().parse_args(words.split()).run.rpartition('.')[0])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 # --- a connection --------------------------------------------------------------------------------

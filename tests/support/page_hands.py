@@ -15,10 +15,10 @@ import zenoh
 from thirdhand.client import Client, Tracker, endpoints, open_session
 from thirdhand.contract.cdr import decode_pose
 from thirdhand.contract.messages import PoseStamped
+from thirdhand.workbench.trackers.address import Address
 from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.hand_message import HANDS_LAYOUT, HANDS_MAGIC
 from thirdhand.workbench.trackers.hands_page import HeadsetPage
-from thirdhand.workbench.trackers.web_server import Address
 
 PALM = (0.1, 1.0, -0.4, 0.0, 0.0, 0.6, 0.8, 0.12, 1.02, -0.5, 0.03, 0.0)
 

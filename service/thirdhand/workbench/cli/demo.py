@@ -27,10 +27,10 @@ from thirdhand.process.child import python
 from thirdhand.process.progress import progress, say
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.workbench.cli.hands import invite
-from thirdhand.workbench.cli.web_address import page_served, web_address
+from thirdhand.workbench.cli.web_address import live_url, page_served, web_address
+from thirdhand.workbench.trackers.address import Address
 from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.mouse_page import MousePage, PlayedTask
-from thirdhand.workbench.trackers.web_server import Address
 
 DEMO_CELL = "thirdhand"  # name of the demo's cell
 SCENE_TIMEOUT_S = 60.0
@@ -200,7 +200,7 @@ def _live_view(session: zenoh.Session, client: Client) -> Iterator[None]:
     """Show the live view in this machine's browser while the context lasts. Raises UsageError,
     ViewerError.
     """
-    from thirdhand.workbench.cli.live_page import live_page, live_url  # their import is slow
+    from thirdhand.workbench.cli.live_page import live_page  # its import is slow
 
     stream = live_url(lambda: client.status().scribe)
     with (

@@ -19,11 +19,12 @@ from thirdhand.settings.file_content import begin_of
 from thirdhand.settings.network import is_local
 from thirdhand.settings.user_folder import user_folder
 from thirdhand.workbench.cli.web_address import serve_page, web_address
+from thirdhand.workbench.trackers.address import Address
 from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.hands_page import HandsPage, HeadsetPage
 from thirdhand.workbench.trackers.mouse_page import MousePage
 from thirdhand.workbench.trackers.pinch import Pinches
-from thirdhand.workbench.trackers.web_server import Address, server_certificate
+from thirdhand.workbench.trackers.web_server import server_certificate
 
 ORDER_TIMEOUT_S = 5.0  # a page waits for the answer to its order for this long
 TOKEN_FILE = "page-token"  # in the user's folder: open pages connect again after a restart

@@ -15,23 +15,19 @@ import secrets
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import zenoh
 from aiohttp import web
 
-from thirdhand.cli.usage import UsageError
 from thirdhand.client import Client
 from thirdhand.contract.incidents import ORDERS
 from thirdhand.daemon.launch import free_port
-from thirdhand.process.progress import progress
 from thirdhand.viewer.stream import ViewerError, rerun_program
 from thirdhand.workbench.trackers.cell_view import Latest, carried_out
 from thirdhand.workbench.trackers.web_server import HTML, INLINE, JSON, WebServer, answer, filled
 
-STARTING_POLL_S = 0.2
 START_S = 15.0  # the viewer's server starts within this time
 PAGE = Path(__file__).with_name("live.html")
 NO_SUCH_PAGE = "There is no such page. The page of this cell is at /."
@@ -71,21 +67,6 @@ class LivePage:
         order = asyncio.to_thread(carried_out, self._client, request.match_info["order"])
         is_done, text = await asyncio.shield(order)
         return answer(200 if is_done else 502, text)
-
-
-def live_url(scribe: Callable[[], Mapping[str, Any]]) -> str:
-    """The address of a live view, which is waited for while it starts; `scribe` is the part of the
-    status. Raises UsageError for a daemon without one.
-    """
-    scribe_status = scribe()
-    with progress("the live view is starting"):
-        while scribe_status.get("live") == "":
-            time.sleep(STARTING_POLL_S)
-            scribe_status = scribe()
-    if url := scribe_status.get("live"):
-        return str(url)
-    errors = "; ".join(error for error in scribe_status["errors"] if "live view" in error)
-    raise UsageError(errors or "this daemon serves no live view; start it with --live PORT")
 
 
 @contextlib.contextmanager

@@ -39,9 +39,8 @@ from thirdhand.settings.whole_file import whole
 from thirdhand.viewer import vulkan
 from thirdhand.viewer.blueprint import TABS, TIMELINE
 from thirdhand.viewer.stream import Viewer, ViewerError, rerun_program
-from thirdhand.workbench.cli.live_page import live_page, live_url
-from thirdhand.workbench.cli.web_address import serve_page, web_address
-from thirdhand.workbench.trackers.web_server import Address
+from thirdhand.workbench.cli.web_address import live_url, serve_page, web_address
+from thirdhand.workbench.trackers.address import Address
 
 RRD_MAGIC = b"RRF2"
 TITLE_BAR = 30  # [pixels] minimum height of a window's title bar
@@ -150,6 +149,8 @@ def _check_web(args: argparse.Namespace) -> None:
 
 def _serve(args: argparse.Namespace, url: str) -> int:
     """Serve the page until Ctrl-C."""
+    from thirdhand.workbench.cli.live_page import live_page  # needs the extra `hands`
+
     listen = web_address("--web", args.web)
     with (
         reached(args) as session,

@@ -1,4 +1,6 @@
-"""The address of a page that a command serves, from its option; and a server until Ctrl-C."""
+"""The address of a page that a command serves, from its option; a server until Ctrl-C; and the
+address of a live view.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,18 @@ import contextlib
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 from thirdhand.cli.usage import UsageError
-from thirdhand.workbench.trackers.web_server import Address, WebServer
+from thirdhand.process.progress import progress
+from thirdhand.workbench.trackers.address import Address
 
+if TYPE_CHECKING:
+    from thirdhand.workbench.trackers.web_server import WebServer  # not all commands have aiohttp
+
+STARTING_POLL_S = 0.2
 END_TIMEOUT_S = 5.0  # a page's server ends within this time
 
 
@@ -60,3 +69,18 @@ def serve_page(
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else error
         raise UsageError(f"{option} {listen}: {why}; another port, or 0 for any, needed") from None
+
+
+def live_url(scribe: Callable[[], Mapping[str, Any]]) -> str:
+    """The address of a live view, which is waited for while it starts; `scribe` is the part of the
+    status. Raises UsageError for a daemon without one.
+    """
+    scribe_status = scribe()
+    with progress("the live view is starting"):
+        while scribe_status.get("live") == "":
+            time.sleep(STARTING_POLL_S)
+            scribe_status = scribe()
+    if url := scribe_status.get("live"):
+        return str(url)
+    errors = "; ".join(error for error in scribe_status["errors"] if "live view" in error)
+    raise UsageError(errors or "this daemon serves no live view; start it with --live PORT")

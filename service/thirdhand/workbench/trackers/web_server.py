@@ -28,6 +28,7 @@ from aiohttp import web
 
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.settings.whole_file import whole
+from thirdhand.workbench.trackers.address import Address
 
 HTML = "text/html; charset=utf-8"
 JSON = "application/json"
@@ -43,16 +44,6 @@ FOREIGN = "This page answers at this machine's own address only, and only to its
 MAX_PAGE_MESSAGE_BYTES = 256  # limit of a message on a websocket
 CLOSE_CODE = 4000  # a websocket is refused with this close code plus the status of HTTP
 MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, section 5.5
-
-
-class Address(NamedTuple):
-    """Host and port of a server."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 class ServerCertificate(NamedTuple):
