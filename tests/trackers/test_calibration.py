@@ -62,6 +62,7 @@ from thirdhand_sim.calibration import (
 
 SEEDS = range(8)
 CORNERS = bench_corners(Settings())
+ACCEPT_M = 0.01  # default of --accept
 
 
 @functools.cache
@@ -110,6 +111,44 @@ def test_a_held_tool_shows_where_the_tracker_is(
     assert np.median(errors) < median_mm, errors
     assert max(errors) < worst_mm, errors
     assert 0.5 < np.sqrt(np.mean(shares)) < 1.7, shares
+
+
+@pytest.mark.parametrize(("seconds", "seed"), [(15.0, 4), (6.0, 3), (40.0, 1)])
+@pytest.mark.one_case
+def test_a_held_tool_is_never_off_by_more_than_twice_what_is_stated(
+    seconds: float, seed: int
+) -> None:
+    """Led for long or short, far or near, with a turned wrist or without, with each kind of
+    tracker: what `--accept` lets through is accurate, and wrong axes, units and hands are refused.
+    """
+    random = np.random.default_rng([seed, int(seconds)])
+    arm = led(cell_of("wam"), seconds, random)
+    mean_m = arm.tool.mean(axis=0)
+    tools = [held(arm, kind, random) for kind in TRACKER_KINDS.values()]
+    others = [
+        arm._replace(turn=np.broadcast_to(arm.turn[0], arm.turn.shape)),
+        arm._replace(tool=arm.tool * (1, 1, 0) + mean_m * (0, 0, 1)),
+        arm._replace(tool=mean_m + 0.2 * (arm.tool - mean_m)),
+    ]
+    tools += [held(other, TRACKER_KINDS["headset"], random) for other in others]
+    accepted = 0
+    for tool in tools:
+        exchanged = tool.hand.mean(axis=0) + 0.1 * (tool.hand - tool.hand.mean(axis=0))[::-1]
+        for wrong in (tool.hand * (1, 1, -1), 1000.0 * tool.hand, exchanged):
+            with pytest.raises(CalibrationError):
+                solve_held(tool._replace(hand=wrong), CORNERS)
+        try:
+            calibration = solve_held(tool, CORNERS)
+        except CalibrationError:
+            continue
+        if calibration.std_m > ACCEPT_M:
+            continue
+        accepted += 1
+        off_m = np.linalg.norm(
+            calibration.mapped(TRUE_TURN.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1
+        )
+        assert np.sqrt(np.square(off_m).mean()) < 2.0 * calibration.std_m
+    assert accepted >= 1
 
 
 def spoilt(held: HeldTool, how: str) -> HeldTool:
@@ -274,8 +313,9 @@ def test_pose_by_points_is_within_twice_its_accuracy(noise_m: float, missed_m: f
         turn = Rotation.random(rng=random)
         hand = turn.inv().apply(base - ORIGIN) + random.normal(0.0, noise_m, base.shape)
         hand[random.integers(len(hand))] += random.normal(0.0, missed_m, 3)
-        with pytest.raises(CalibrationError):
-            solve_points(hand * (1, 1, -1), base, CORNERS)
+        for wrong in (hand * (1, 1, -1), 1000.0 * hand, hand[::-1]):
+            with pytest.raises(CalibrationError):
+                solve_points(wrong, base, CORNERS)
         try:
             calibration = solve_points(hand, base, CORNERS)
         except CalibrationError:
