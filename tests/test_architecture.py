@@ -219,7 +219,7 @@ def test_lines_that_break_a_contract_are_found_and_named(
     [
         (
             "thirdhand.daemon.daemon",
-            195,
+            196,
             ("thirdhand.workbench", "thirdhand_sim", "rerun", "mcap", "sklearn", "rich"),
         ),
         (

@@ -11,14 +11,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from thirdhand.contract.channels import BOOL, CHANNELS, Channel
 from thirdhand.contract.messages import WireError
-from thirdhand.contract.other_types import _LAYOUTS, Refusal, likely_type
+from thirdhand.contract.other_types import _TYPE_LAYOUTS, Refusal, likely_type
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 INPUTS = [channel for channel in CHANNELS if channel.direction == "in"]
 FOUR_BYTES = ("std_msgs/msg/Float32", "std_msgs/msg/Int32")
 KINDS = {
     f"{named.rpartition('/')[0]}/{name.rpartition('/')[2]}": named
-    for named in _LAYOUTS
+    for named in _TYPE_LAYOUTS
     for name in re.split(", | or ", named)
 }
 

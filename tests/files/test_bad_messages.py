@@ -82,7 +82,7 @@ def test_a_bad_message_is_lost_and_counted(kind: str, key: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("key", ["hands/left", "tool/pose", "gripper/state"])
-def test_a_topic_of_another_type_is_named_with_the_accepted_types(key: str, tmp_path: Path) -> None:
+def test_a_topic_of_another_type_is_named_with_accepted_ones(key: str, tmp_path: Path) -> None:
     """A stream of another type is refused, or left out with a remark; never left out silently."""
     topic = f"/thirdhand/{key}"
     write_demonstration(tmp_path / "take.mcap", TAKE)

@@ -36,7 +36,7 @@ from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.report.columns import read, runs
 from thirdhand.workbench.report.report import Report, Span, reported, why_missed
 from thirdhand.workbench.report.stops import (
-    LEAST_SPEED_MPS,
+    LEAST_STOP_SPEED_MPS,
     TOLERATED_M,
     excess_m,
     measured_setting,
@@ -176,7 +176,7 @@ def test_stop_distance_is_compared_with_people(golden: Path) -> None:
 
 @given(
     stops=st.lists(
-        st.tuples(st.floats(LEAST_SPEED_MPS, 1.5), st.floats(0.0, 1.0)), min_size=1, max_size=5
+        st.tuples(st.floats(LEAST_STOP_SPEED_MPS, 1.5), st.floats(0.0, 1.0)), min_size=1, max_size=5
     )
 )
 def test_setting_of_measured_stops_covers_all_of_them(stops: list[tuple[float, float]]) -> None:

@@ -14,7 +14,7 @@ from thirdhand.contract.messages import WireError
 
 # A layout is a sequence of fields, [in brackets] of an array: `h` header, `t` string, and as in
 # `struct` a count of numbers d, f, i or B.
-_LAYOUTS = {
+_TYPE_LAYOUTS = {
     "geometry_msgs/msg/PointStamped or Vector3Stamped": "h3d",
     "geometry_msgs/msg/QuaternionStamped": "h4d",
     "geometry_msgs/msg/TwistStamped or WrenchStamped": "h6d",
@@ -76,7 +76,7 @@ def likely_type(data: bytes) -> str:
     """The type whose layout the bytes of a message have; empty if it is none of those known."""
     if data[:1] in (b"{", b"["):
         return "JSON"
-    return next((kind for kind, layout in _LAYOUTS.items() if _fits(data, layout)), "")
+    return next((kind for kind, layout in _TYPE_LAYOUTS.items() if _fits(data, layout)), "")
 
 
 def _fits(data: bytes, layout: str) -> bool:

@@ -12,7 +12,7 @@ from thirdhand.workbench.report.columns import Columns
 
 TOLERATED_M = 0.001  # a stop may be this much longer than assumed
 # the length of a slower stop depends on the arm's lag and not on its brakes
-LEAST_SPEED_MPS = 0.05
+LEAST_STOP_SPEED_MPS = 0.05
 
 
 def measured_stops(columns: Columns) -> Vector:
@@ -47,7 +47,7 @@ def measured_setting(stops: Vector, settings: Settings) -> str:
 
     Either brake or reaction_ms covers them: the one that adds less to a stop at full speed.
     """
-    judged = stops[stops[:, 0] >= LEAST_SPEED_MPS]
+    judged = stops[stops[:, 0] >= LEAST_STOP_SPEED_MPS]
     if not len(judged):
         return ""
     people = settings.people

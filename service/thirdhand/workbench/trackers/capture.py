@@ -71,7 +71,7 @@ class Sample(NamedTuple):
     at: Vector
 
 
-class Received(NamedTuple):
+class CapturedMessage(NamedTuple):
     """A message as received: its arrival [ns], bytes, publisher and Zenoh encoding."""
 
     arrived_ns: int
@@ -108,7 +108,7 @@ class Capture:
             str, int
         ] = {}  # messages of a hand's second publisher, which are left out
         self._sole = {key: SolePublisher() for key in self.hands}
-        self._waiting: dict[str, list[Received]] = {key: [] for key in self.samples}
+        self._waiting: dict[str, list[CapturedMessage]] = {key: [] for key in self.samples}
         self._heard_s = time.monotonic()
         self._moved = False
         self._states = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
@@ -131,7 +131,7 @@ class Capture:
         def take(sample: zenoh.Sample) -> None:
             arrived_ns = time.time_ns()
             payload = sample.payload.to_bytes()
-            received = Received(arrived_ns, payload, identity(sample), str(sample.encoding))
+            received = CapturedMessage(arrived_ns, payload, identity(sample), str(sample.encoding))
             if not frame:
                 waiting.append(received)
             elif name in payload:
@@ -145,7 +145,7 @@ class Capture:
 
         return take
 
-    def _refuse(self, key: str, received: Received, error: WireError, needed: str) -> None:
+    def _refuse(self, key: str, received: CapturedMessage, error: WireError, needed: str) -> None:
         refusal = Refusal(str(error), needed, received.payload, received.encoding)
         self._first_refusals.setdefault(key, refusal)
         self.malformed[key] += 1
