@@ -251,10 +251,7 @@ class CellStreams:
             arrived: list[Event] = []
             for sample in _waiting(source, _most(suffix)):
                 publisher = identity(sample) if suffix in self._sole else ""
-                encoding = sample.encoding
-                if (
-                    event := self._decoded(suffix, sample.payload, publisher, encoding)
-                ) is not None:
+                if (event := self._decoded(suffix, sample.payload, publisher, sample)) is not None:
                     arrived.append(event)
             events += arrived[-1:] if suffix == ARM_STATE else arrived
         for by_frame, source in self._transforms:
@@ -286,9 +283,11 @@ class CellStreams:
         return [pose for newest in poses.values() for pose in newest]
 
     def _decoded(
-        self, suffix: str, raw: Any, publisher: str, encoding: object = ""
+        self, suffix: str, raw: Any, publisher: str, sample: zenoh.Sample | None = None
     ) -> Event | None:
-        """The event of a message; None if it is refused, or completes no state of the arm."""
+        """The event of a message; None if it is refused, or completes no state of the arm. `sample`
+        has the name of its encoding, for a refusal.
+        """
         channel = channels.BY_KEY[suffix]
         arrivals = self._arrivals[suffix]
         payload = b""
@@ -306,7 +305,8 @@ class CellStreams:
                     message = state
                     payload = cdr.encode_joints(state)
         except WireError as error:
-            arrivals.refuse(Refusal(str(error), channel.codec.type, payload, str(encoding)))
+            encoding = "" if sample is None else str(sample.encoding)
+            arrivals.refuse(Refusal(str(error), channel.codec.type, payload, encoding))
             return None
 
         # Of two publishers of a hand, only one is heard; the pose of a lost hand is not used.
