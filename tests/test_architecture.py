@@ -300,12 +300,8 @@ def defined(path: Path) -> set[str]:
             identifiers.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = (
-                name
-                for target in targets
-                for name in ast.walk(target)
-                if isinstance(name, ast.Name)
-            )
+            nodes = [node for target in targets for node in ast.walk(target)]
+            names = [node for node in nodes if isinstance(node, ast.Name)]
             identifiers |= {
                 name.id
                 for name in names

@@ -55,9 +55,9 @@ def test_the_page_on_the_status_lists_its_fields_and_no_others() -> None:
 def test_what_to_do_names_fields_settings_and_causes_that_exist() -> None:
     settings = msgspec.to_builtins(Settings())
     terms = {*requests.Status.__struct_fields__, *incidents.BY_WORD, *settings, BASE}
-    terms |= {
-        name for section in settings.values() if isinstance(section, dict) for name in section
-    }
+    for section in settings.values():
+        if isinstance(section, dict):
+            terms |= section.keys()
     named = {
         name
         for row in incidents.BY_WORD.values()
@@ -197,11 +197,9 @@ def test_foxglove_layout_shows_existing_topics() -> None:
 
 
 # All pages except the log of changes.
+FOLDERS = (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
 PAGES = sorted(
-    path
-    for folder in (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
-    for path in folder.glob("*.md")
-    if path.name != "CHANGELOG.md"
+    {path for folder in FOLDERS for path in folder.glob("*.md")} - {ROOT / "CHANGELOG.md"}
 )
 
 

@@ -109,12 +109,9 @@ def test_a_control_machine_has_all_that_its_commands_import() -> None:
     (installed,) = re.findall(
         r"'\.\[([\w,]+)\]'", (ROOT / "docs" / "operate.md").read_text(encoding="utf-8")
     )
-    missing = [
-        module
-        for extra, modules in EXTRAS.items()
-        for module in modules
-        if extra not in (*installed.split(","), "lerobot")  # Rerun brings pyarrow
-    ]
+    present = {*installed.split(","), "lerobot"}  # Rerun brings pyarrow
+    lacking = [modules for extra, modules in EXTRAS.items() if extra not in present]
+    missing = [module for modules in lacking for module in modules]
     code = (
         "import importlib, sys\n"
         f"sys.modules |= dict.fromkeys({missing})\n"

@@ -32,7 +32,8 @@ def _value(node: Any, details: Any, random: np.random.Generator) -> Any:
     if node.name == "NAME":
         return _message(details, random)
     if node.name == "BASE":
-        return "abc" if details[0] == "string" else random.normal() if "f" in details[0] else 1
+        number = random.normal() if "f" in details[0] else 1
+        return "abc" if details[0] == "string" else number
     (inner, named), count = details
     count = count if node.name == "ARRAY" else 3
     if inner.name == "NAME" or named[0] == "string":

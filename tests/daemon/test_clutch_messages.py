@@ -84,12 +84,8 @@ def test_arm_holds_in_the_tick_of_a_release(tmp_path: Path) -> None:
     whole = tmp_path / "whole.mcap"
     assert replay(path, output=whole).exact
     steps = [step for step in Recording.open(whole).steps() if step.frame is not None]
-    heard = [
-        cdr.decode_bool(payload)
-        for step in steps
-        for kind, payload in step.events
-        if kind == "clutch"
-    ]
+    events = [event for step in steps for event in step.events]
+    heard = [cdr.decode_bool(payload) for kind, payload in events if kind == "clutch"]
     assert heard.count(False) == 1
     # from the recording: the last message, and the time at which it becomes stale
     newest = False

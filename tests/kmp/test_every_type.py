@@ -155,13 +155,9 @@ def arrays(value):
     """All arrays in a value, however deep."""
     if isinstance(value, np.ndarray):
         return [value]
-    parts = (
-        value
-        if isinstance(value, tuple)
-        else list(vars(value).values())
-        if isinstance(value, Immutable)
-        else []
-    )
+    parts = value if isinstance(value, tuple) else ()
+    if isinstance(value, Immutable):
+        parts = vars(value).values()
     return [array for part in parts for array in arrays(part)]
 
 

@@ -67,12 +67,9 @@ def test_both_hands_where_both_tell() -> None:
     figures = figures_of(skill)
     assert skill.conductor is None
     assert figures.taken == "positions"
-    assert set(figures.tried_mm) == {
-        f"{kind.name}{of}"
-        for kind in KINDS
-        if not kind.turned
-        for of in ("", " of the left hand", " of the right hand")
-    }
+    names = [kind.name for kind in KINDS if not kind.turned]
+    of_hands = ("", " of the left hand", " of the right hand")
+    assert set(figures.tried_mm) == {f"{name}{of}" for name in names for of in of_hands}
     assert figures.tried_mm["positions"] < 0.5 * figures.tried_mm["positions of the left hand"]
     assert "positions is taken:" in table(figures)
 

@@ -1,5 +1,8 @@
 """Readability of the code by folder: `python -m tests.support.air` prints shares of parallel
 assignments, of local names without meaning, and of functions with many branches.
+
+Conditional expressions in each other, and comprehensions with a condition over several loops, are
+found too.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ class Air(NamedTuple):
     functions.
     """
 
+    nested: list[str]
     parallel: list[str]
     assignments: int
     vague: list[str]
@@ -54,6 +58,13 @@ def _is_parallel(node: ast.Assign) -> bool:
     return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
 
 
+def _is_nested(node: ast.AST) -> bool:
+    if isinstance(node, ast.IfExp):
+        return any(isinstance(part, ast.IfExp) for part in (node.body, node.orelse))
+    loops = getattr(node, "generators", [])
+    return len(loops) > 1 and any(loop.ifs for loop in loops)
+
+
 def _stored(node: ast.AST) -> Iterator[str]:
     """The names that a statement or comprehension binds."""
     targets: list[ast.expr] = []
@@ -69,11 +80,13 @@ def _stored(node: ast.AST) -> Iterator[str]:
 
 def air_of(folder: str) -> Air:
     """The dense code below a folder of the project."""
-    air = Air([], 0, [], 0, [], 0)
+    air = Air([], [], 0, [], 0, [], 0)
     vague_names = set(VAGUE.split())
     for path in sorted((ROOT / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             place = f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
+            if _is_nested(node):
+                air.nested.append(place)
             names = list(_stored(node))
             air.vague.extend(f"{place} {name}" for name in names if name in vague_names)
             air = air._replace(names=air.names + len(names))

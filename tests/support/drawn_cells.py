@@ -113,13 +113,12 @@ def changes(cell: Settings, arm: str) -> str:
     """The drawn settings of a cell, as text for failures."""
     default = msgspec.to_builtins(cell_with(arm))
     drawn = msgspec.to_builtins(cell)
-    return ", ".join(
-        f"{section}.{name} = {value}"
-        for section, values in drawn.items()
-        if isinstance(values, dict)
-        for name, value in values.items()
-        if value != default[section][name]
-    )
+    texts = []
+    for section, values in drawn.items():
+        if isinstance(values, dict):
+            changed = {name for name, value in values.items() if value != default[section][name]}
+            texts += [f"{section}.{name} = {values[name]}" for name in sorted(changed)]
+    return ", ".join(texts)
 
 
 def engaging_cell(random: np.random.Generator, cell: Settings) -> Settings:

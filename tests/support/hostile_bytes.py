@@ -228,13 +228,9 @@ def _spoilt(value: Any, random: Random) -> Any:
     if isinstance(value, list):
         index = random.randrange(len(value))
         chance = random.random()
-        inner = (
-            []
-            if chance < 0.1
-            else [value[index]] * 2
-            if chance < 0.2
-            else [_spoilt(value[index], random)]
-        )
+        inner = [] if chance < 0.1 else [value[index]] * 2
+        if chance >= 0.2:
+            inner = [_spoilt(value[index], random)]
         return value[:index] + inner + value[index + 1 :]
     key = random.choice(list(value))
     chance = random.random()

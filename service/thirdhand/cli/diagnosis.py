@@ -185,7 +185,9 @@ def _own_clock(now: Status, own_ns: int) -> Iterator[Finding]:
 def _mode(now: Status) -> Finding:
     actual = in_brief(now.mode, now.reason) + (f", {', '.join(now.flags)}" if now.flags else "")
     actual += f": {now.because}" if now.because else ""
-    level = "ok" if now.mode == "follow" else "note" if now.reason == "operator" else "wrong"
+    level = "ok" if now.mode == "follow" else "wrong"
+    if now.reason == "operator":
+        level = "note"
     return Finding(level, "mode", actual, "follow", now.remedy)
 
 

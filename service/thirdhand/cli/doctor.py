@@ -49,8 +49,9 @@ def doctor(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.format(msgspec.json.encode(results)).decode())
     else:
+        few = ("nothing is wrong", "1 thing is wrong")
         many = f"{count} things are wrong; the first may cause the others"
-        print("nothing is wrong" if not count else "1 thing is wrong" if count == 1 else many)
+        print(few[count] if count < len(few) else many)
     return 1 if count else 0
 
 

@@ -131,7 +131,9 @@ def _settings(
     config: zenoh.Config, connect: Sequence[str], listen: Sequence[str], timeout_s: float | None
 ) -> dict[str, Any]:
     """Zenoh's settings for a session between these endpoints, by name."""
-    role = ("router" if connect else "peer") if listen or not connect else "client"
+    role = "client" if connect else "peer"
+    if connect and listen:
+        role = "router"
     return {
         **FIXED_SETTINGS,
         "mode": json.loads(config.get_json("mode")) or role,

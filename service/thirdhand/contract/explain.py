@@ -273,18 +273,8 @@ def _short(value: Any) -> str:
 
 def _range(node: inspect.IntType | inspect.FloatType) -> str:
     whole = "a whole number" if isinstance(node, inspect.IntType) else "a number"
-    low = (
-        f"above {node.gt}"
-        if node.gt is not None
-        else f"from {node.ge}"
-        if node.ge is not None
-        else ""
-    )
-    high = (
-        f"below {node.lt}"
-        if node.lt is not None
-        else f"to {node.le}"
-        if node.le is not None
-        else ""
-    )
+    limits = (("above", node.gt), ("from", node.ge))
+    low = next((f"{word} {limit}" for word, limit in limits if limit is not None), "")
+    limits = (("below", node.lt), ("to", node.le))
+    high = next((f"{word} {limit}" for word, limit in limits if limit is not None), "")
     return " ".join(part for part in (whole, low, high) if part)

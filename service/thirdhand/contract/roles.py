@@ -178,12 +178,8 @@ class _Rules:
 
     def _hear_latched(self) -> list[str]:
         """The right to receive topics for viewers that were published earlier."""
-        latched = [
-            key_expr
-            for key, topic in self._viewer_topics().items()
-            if topic.latched
-            for key_expr in (key, ros2.kept(key))
-        ]
+        keys = [key for key, topic in self._viewer_topics().items() if topic.latched]
+        latched = [key_expr for key in keys for key_expr in (key, ros2.kept(key))]
         if not latched:
             return []
         asking = [*LIVELINESS_QUERIES, "query", "declare_subscriber"]

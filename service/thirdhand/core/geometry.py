@@ -326,7 +326,9 @@ def between_segments(one: Vector, other: Vector, near: Vector) -> float:  # noqa
         square += near[6 + i] * near[6 + i]
     length = math.sqrt(square)
     for i in range(3):
-        near[6 + i] = near[6 + i] / length if length > LEAST else (-1.0 if i == 2 else 0.0)
+        near[6 + i] = near[6 + i] / length if length > LEAST else 0.0
+    if length <= LEAST:
+        near[8] = -1.0
     return distance
 
 

@@ -121,12 +121,13 @@ class Startup:
             gc.enable()  # compilations leave garbage
             self.note(name, False)
 
+        modules = sys.modules.copy().items()
+        looped = [module for module_name, module in modules if module_name.startswith(LOOPED)]
+        values = [value for module in looped for value in vars(module).values()]
         self._functions = {
-            f"{function.py_func.__module__}.{function.py_func.__name__}": function
-            for module_name, module in sys.modules.copy().items()
-            if module_name.startswith(LOOPED)
-            for function in vars(module).values()
-            if isinstance(function, dispatcher.Dispatcher)
+            f"{value.py_func.__module__}.{value.py_func.__name__}": value
+            for value in values
+            if isinstance(value, dispatcher.Dispatcher)
         }
         with event.install_listener(
             "numba:compile", Compilations(begun, lambda name: self.note(name, True))

@@ -270,20 +270,20 @@ class Scribe:
         """
         alive = self._listens and self._child is not None and self._child.poll() is None
         report = self._report
+        without_report = "off" if self._child is None else "starting"
+        live = None
+        if self._live_port is not None:
+            live = report.live if alive else ""  # empty: it is starting
         return {
             "alive": alive,
-            "state": report.state if alive else "starting" if self._child is not None else "off",
+            "state": report.state if alive else without_report,
             "pid": None if self._child is None else self._child.pid,
             "sent": self._sent,
             "lost": self._lost + self._lost_before + report.lost,
             "restarts": self._restarts,
             "errors": list(self._errors),
             **{name: getattr(report, name) for name in REPORTED},
-            "live": None
-            if self._live_port is None
-            else report.live
-            if alive
-            else "",  # empty: it is starting
+            "live": live,
         }
 
     def close(self, timeout_s: float = CLOSE_TIMEOUT_S) -> str:

@@ -138,12 +138,11 @@ def check(joints: Limits, urdf: Urdf, plate: str) -> None:
         raise SettingsError(
             f"[joints] kinds: {list(joints.every_kind)} given; the URDF's {list(kinds)} needed"
         )
-    wide = [
-        f"[joints] {name}, entry {i + 1}: {problem}"
-        for i, joint in enumerate(moving)
-        for name in LIMITS
-        if (problem := _excess(joint, name, getattr(joints, name)[i]))
-    ]
+    wide = []
+    for i, joint in enumerate(moving):
+        for name in LIMITS:
+            if problem := _excess(joint, name, getattr(joints, name)[i]):
+                wide.append(f"[joints] {name}, entry {i + 1}: {problem}")
     if wide:
         raise SettingsError("\n".join(wide))
 

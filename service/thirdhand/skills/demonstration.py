@@ -98,13 +98,12 @@ class NamedDemonstration(NamedTuple):
 
 def fingerprint(demonstrations: Iterable[Demonstration]) -> str:
     """The hash with which a skill names the demonstrations that it was learned from."""
-    parts = (
-        part.tobytes()
-        for demonstration in demonstrations
-        for part in (demonstration.hands, demonstration.tool, demonstration.gripper)
-        if part is not None
-    )
-    return hashlib.blake2b(b"".join(parts), digest_size=16).hexdigest()
+    sums = hashlib.blake2b(digest_size=16)
+    for demonstration in demonstrations:
+        for part in (demonstration.hands, demonstration.tool, demonstration.gripper):
+            if part is not None:
+                sums.update(part.tobytes())
+    return sums.hexdigest()
 
 
 def exchanged(demonstration: Demonstration) -> list[Demonstration]:

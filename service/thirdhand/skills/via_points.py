@@ -109,12 +109,13 @@ def _are_distinct(skill: Skill, owners: Sequence[ViaPoint]) -> NDArray[np.bool_]
     segments, or of one of each.
     """
     task_names = skill.model.names
-    names = np.array(
-        [
-            p.name if p.name in task_names else f"{p.segment} ->" if p.segment in task_names else ""
-            for p in owners
-        ]
-    )
+
+    def own_name(point: ViaPoint) -> str:
+        if point.name in task_names:
+            return point.name
+        return f"{point.segment} ->" if point.segment in task_names else ""
+
+    names = np.array([own_name(point) for point in owners])
     return np.asarray((names[:, None] != names) & (names[:, None] != "") & (names != ""))
 
 

@@ -288,7 +288,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             for result in by_task[task]
             for fold in result.service.values()
         ]
-        numbers[f"all_{kind}"] = summary([row for fold in folds for row in fold.accepted if row])
+        numbers[f"all_{kind}"] = summary(_accepted(folds))
     draw_numbers(results, numbers)
     return numbers
 
@@ -320,7 +320,8 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
 
 def _accepted(folds: Sequence[SkillFold]) -> list[Judged]:
     """The accepted takes of some folds."""
-    return [take for fold in folds for take in fold.accepted if take]
+    takes = [take for fold in folds for take in fold.accepted]
+    return [take for take in takes if take]
 
 
 def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:

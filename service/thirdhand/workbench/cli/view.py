@@ -417,12 +417,9 @@ def _fresh(client: Any, png: Path) -> float:
 
 def _extent(client: Any, timeline: str = TIMELINE) -> tuple[int, int] | None:
     """Start and end [ns] of the loaded data; None without data."""
-    lines = [
-        line
-        for recording in client.get_state().recordings
-        for line in recording.timelines
-        if line.name == timeline
-    ]
+    recordings = client.get_state().recordings
+    timelines = [line for recording in recordings for line in recording.timelines]
+    lines = [line for line in timelines if line.name == timeline]
     return next(
         (
             (line.start, line.end)

@@ -106,12 +106,11 @@ def _refused(columns: Columns, first: int, last: int) -> list[tuple[str, str, st
     newest of each source and cause.
     """
     statuses = [status for status in columns.statuses if first <= status.tick <= last]
-    newest = {
-        (name, source.cause): source.refused
-        for status in statuses
-        for name, source in (status.sources | status.streams).items()
-        if source.refused
-    }
+    newest: dict[tuple[str, str], str] = {}
+    for status in statuses:
+        for name, source in (status.sources | status.streams).items():
+            if source.refused:
+                newest[name, source.cause] = source.refused
     return [(*of, refused) for of, refused in newest.items()]
 
 

@@ -275,14 +275,10 @@ def _leading(
 def _stretches_in(rows: Sequence[Checked], start_ns: int, end_ns: int, origin_ns: int) -> str:
     """The bad stretches of tracks between two times, in words, by their begin after an origin."""
     stretches = sorted(
-        (
-            stretch
-            for row in rows
-            for stretch in row.stretches
-            if stretch.begin_ns < end_ns and stretch.end_ns > start_ns
-        ),
+        (stretch for row in rows for stretch in row.stretches),
         key=lambda stretch: stretch.begin_ns,
     )
+    stretches = [part for part in stretches if part.begin_ns < end_ns and part.end_ns > start_ns]
     more = len(stretches) - MAX_NAMED_STRETCHES
     named = "; ".join(stretch.text(origin_ns) for stretch in stretches[:MAX_NAMED_STRETCHES])
     return named + f"; and {more} more" * (more > 0)

@@ -191,8 +191,8 @@ def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:
 def _has_words(source: PoseTopic, name: str) -> bool:
     """True if a stream has a word of this track in its name, and none of another hand."""
     words = _words(str(source))
-    others = {word for hand in TRACK_NAMES[:2] if hand != name for word in TRACK_WORDS[hand]}
-    return bool(words & TRACK_WORDS[name]) and not words & others
+    others = [TRACK_WORDS[hand] for hand in TRACK_NAMES[:2] if hand != name]
+    return bool(words & TRACK_WORDS[name]) and words.isdisjoint(*others)
 
 
 def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic]) -> RecordingError:

@@ -423,7 +423,8 @@ class PoseRecording:
                     next(self._joint_states(topic, settings.joints.names))
                     topics.append(topic)
         exact = [topic for topic in topics if f"/{topic}".endswith(f"/{JOINT_STATES}")]
-        return exact[0] if len(exact) == 1 else topics[0] if len(topics) == 1 else ""
+        chosen = exact if len(exact) == 1 else topics
+        return chosen[0] if len(chosen) == 1 else ""
 
     def streams(self) -> Iterator[tuple[PoseTopic, int]]:
         """Every readable stream of poses, and its number of poses."""

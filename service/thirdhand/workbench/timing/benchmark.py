@@ -124,15 +124,8 @@ def _whole(
             if service.stop() != 0:
                 raise ProbeError(f"the service failed: {service.log.read_text()[-500:]}")
         recorded = sorted(set(folder.glob("*.mcap")) - before)
-        timing = np.array(
-            [
-                step.timing
-                for path in recorded
-                for step in Recording.open(path).steps()
-                if step.timing
-            ],
-            TIMING,
-        )
+        steps = [step for path in recorded for step in Recording.open(path).steps()]
+        timing = np.array([step.timing for step in steps if step.timing], TIMING)
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
         began = service.log.read_text().partition("started in ")[2].partition("\n")[0]
     return heard | {

@@ -240,12 +240,12 @@ class Samples(NamedTuple):
         moves = (segments["square"] > STAYS) | (segments["leads"] != NONE)[:, None]
         ends = (at[:, :2] == 1.0).all(axis=1)
         begins = ((at[:, :2] == 0.0) | ~moves).all(axis=1) & moves.any(axis=1)
-        timed_rows = [
-            (row, share, time)
-            for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True)
-            for time in KNOWN_TIMES
-            if clock.waits or not (is_end or is_begin) or time == float(is_end)
-        ]
+        timed_rows = []
+        for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True):
+            is_between = not (is_end or is_begin)
+            for time in KNOWN_TIMES:
+                if clock.waits or is_between or time == float(is_end):
+                    timed_rows.append((row, share, time))
         rows, known_shares, times = (np.array(column) for column in zip(*timed_rows, strict=True))
         return np.column_stack([rows, clock.weight * clock.longest_s * times]), known_shares
 
@@ -268,13 +268,9 @@ class Samples(NamedTuple):
             is_unseen = _seen(shown, corner, moving_segments)[0] < LEAST_SEEN_S
             for k in moving_segments:
                 lasts_s, shares = _seen(shown, corner, [k])
-                usual = (
-                    0.0
-                    if is_unseen
-                    else float(np.median(shares))
-                    if lasts_s >= LEAST_SEEN_S
-                    else 0.5
-                )
+                usual = float(np.median(shares)) if lasts_s >= LEAST_SEEN_S else 0.5
+                if is_unseen:
+                    usual = 0.0
                 if usual < NEAR:
                     waits = UNSEEN_SHARES if is_unseen else SEEN_SHARES
                     rows += [(share * corner[0], share * corner[1], k, 0.0) for share in waits]
