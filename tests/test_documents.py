@@ -198,9 +198,8 @@ def test_foxglove_layout_shows_existing_topics() -> None:
 
 # All pages except the log of changes.
 FOLDERS = (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
-PAGES = sorted(
-    {path for folder in FOLDERS for path in folder.glob("*.md")} - {ROOT / "CHANGELOG.md"}
-)
+ALL_PAGES = [path for folder in FOLDERS for path in folder.glob("*.md")]
+PAGES = sorted(path for path in ALL_PAGES if path.name != "CHANGELOG.md")
 
 
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

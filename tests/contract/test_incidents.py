@@ -18,8 +18,8 @@ STUCK_S = TUNING.decision.stuck_s
 TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s
 
 
-MEMBERS = [member for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind]
-MEMBERS.remove(Reason.NONE)
+ALL_MEMBERS = [member for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind]
+MEMBERS = [member for member in ALL_MEMBERS if member is not Reason.NONE]
 
 
 def test_each_member_has_one_row_with_words_of_its_own() -> None:

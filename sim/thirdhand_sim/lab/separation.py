@@ -346,13 +346,16 @@ def _allow(
                 )
 
 
+def _kinds_of(n: int) -> list[str]:
+    """The kinds of scene number `n`."""
+    return [kind for kind in SCENE_KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
+
+
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
     scenes = RANDOM_SCENES.share(options.share)
     by_kind: dict[str, list[SeparationOutcome]] = {kind: [] for kind in SCENE_KINDS}
-    every = {kind: UNHEEDED_EVERY if kind == "unheeded" else 1 for kind in SCENE_KINDS}
-    all_tasks = [(kind, n) for n in scenes for kind in SCENE_KINDS]
-    tasks = [(kind, n) for kind, n in all_tasks if n % every[kind] == 0]
+    tasks = [(kind, n) for n in scenes for kind in _kinds_of(n)]
     for row in shared_out(run_one, tasks, options.workers):
         by_kind[row.kind].append(row)
         if len(by_kind[row.kind]) % max(1, len(scenes) // 5) == 0:

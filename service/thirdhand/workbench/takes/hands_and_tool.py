@@ -191,8 +191,9 @@ def _by_words(recorded: PoseRecording, name: str) -> PoseTopic | None:
 def _has_words(source: PoseTopic, name: str) -> bool:
     """True if a stream has a word of this track in its name, and none of another hand."""
     words = _words(str(source))
-    others = [TRACK_WORDS[hand] for hand in TRACK_NAMES[:2] if hand != name]
-    return bool(words & TRACK_WORDS[name]) and words.isdisjoint(*others)
+    others = [hand for hand in TRACK_NAMES[:2] if hand != name]
+    has_other = any(words & TRACK_WORDS[hand] for hand in others)
+    return bool(words & TRACK_WORDS[name]) and not has_other
 
 
 def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic]) -> RecordingError:
