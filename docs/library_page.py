@@ -164,8 +164,8 @@ def _described(name: str, value: Any) -> Iterator[str]:
         ):
             continue
         yield _signature(f"{name}.{part}", member) if callable(member) else f"`{name}.{part}`:"
-        same = SAME.get(f"{name}.{part}")
-        yield f"As `{same}`." if same else _text(member)
+        original = SAME.get(f"{name}.{part}")
+        yield f"As `{original}`." if original else _text(member)
 
 
 def _text(value: Any) -> str:

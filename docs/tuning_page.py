@@ -113,7 +113,7 @@ def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> 
 def _both(effects: Mapping[str, Any], text: Any) -> str:
     """The texts of the effects of half and twice a number, without those that are empty."""
     texts = {factor: effect.get("fails") or text(effect) for factor, effect in effects.items()}
-    return "; ".join(f"×{factor}: {said}" for factor, said in texts.items() if said)
+    return "; ".join(f"×{factor}: {words}" for factor, words in texts.items() if words)
 
 
 def _changes(changes: Sequence[float]) -> str:

@@ -173,27 +173,29 @@ class Controller:
 
         conditions |= self._alone(frame)
         unseen = UNSEEN.index(flag) if (flag := conditions & EITHER_UNSEEN) else None
-        wanted = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
-        if wanted is not None:
+        request = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
+        if request is not None:
             conditions |= (
-                SEGMENT_AMBIGUOUS * wanted.is_ambiguous
-                | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
+                SEGMENT_AMBIGUOUS * request.is_ambiguous
+                | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
             )
         lap("skill")
 
-        kinematics = self._decide(frame, conditions, math.nan if wanted is None else wanted.gate_m)
+        kinematics = self._decide(
+            frame, conditions, math.nan if request is None else request.gate_m
+        )
         lap("decision")
 
         self._separation.step(state, frame, kinematics.record)
         lap("separation")
 
-        if wanted is None:
+        if request is None:
             self._hold(frame, lap)
             self._skill.nothing(state, frame)
         elif self._memory["mode"][0] != FOLLOW:
             self._hold(frame, lap)
         else:
-            self._follow(frame, wanted, kinematics, lap)
+            self._follow(frame, request, kinematics, lap)
 
         # An array of bytes is read-only.
         unchanging: Frame = np.frombuffer(as_array(frame).tobytes(), self._layout)[0]

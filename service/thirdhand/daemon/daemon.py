@@ -329,11 +329,10 @@ def serve(
     announce: Announce,
     hold: bool = False,
 ) -> str:
-    """Run a daemon, from its begin in an operator's hold if `hold`, and return a message on ticks
-    that were not recorded (empty: none).
+    """Run a daemon, and return a message on ticks that were not recorded (empty: none).
 
-    Once it is ready, SIGINT, SIGTERM and SIGHUP stop it. Raises SkillError before it starts, and
-    LoopError if the control loop cannot continue.
+    With `hold`, it begins in an operator's hold. Once it is ready, SIGINT, SIGTERM and SIGHUP stop
+    it. Raises SkillError before it starts, and LoopError if the control loop cannot continue.
     """
     with contextlib.closing(SkillWorker()) as skill_worker:
         skill_worker.start()  # before the loop, which the start of a process would delay

@@ -381,7 +381,7 @@ def _said(figures: Sequence[Figures]) -> dict[str, Any]:
 
 
 def summary(takes: Sequence[Judged]) -> dict[str, Any]:
-    """Errors over all samples [mm], and shares of samples; only the number 0 without takes."""
+    """Errors over all samples [mm], and shares of samples; without takes, only their number."""
     if not takes:
         return {"takes": 0}
     count = sum(take.samples for take in takes)
@@ -397,7 +397,8 @@ def summary(takes: Sequence[Judged]) -> dict[str, Any]:
         "held": _share([take.held for take in takes], count),
         "unsure": _share([take.unsure for take in takes], count),
         "wrong": wrong / count,
-        "told": _share([take.told for take in takes], wrong),  # held or unsure, of wrong ones
+        # the shares of wrong samples, and of the others, at which the skill held or was unsure
+        "told": _share([take.told for take in takes], wrong),
         "falsely_told": _share([take.falsely_told for take in takes], count - wrong),
     }
 
@@ -417,8 +418,8 @@ def _line(fold: SkillFold) -> str:
 
 
 class SetVerdict(NamedTuple):
-    """A set by the judgement of `learn`: summaries of accepted takes, and of refused skills used in
-    spite.
+    """A set as `learn` judges it: summaries of accepted takes, and of refused skills that were used
+    all the same.
     """
 
     accepted: Mapping[str, Any]

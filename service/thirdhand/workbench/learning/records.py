@@ -213,7 +213,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     held: float  # [%] of the time in which the gate would hold
     # [%] of the samples at which the tool is more than 10 cm from its prediction
     wrong: float = 0.0
-    told: float | None = None  # [%] of these samples: the skill is unsure; None without them
+    # [%] of these samples at which the skill is unsure; None if there are no such samples
+    told: float | None = None
     falsely_told: float = 0.0  # [%] of the other samples at which the skill is unsure
     other_mm: dict[str, float] = {}  # errors of baselines
 

@@ -5,6 +5,7 @@ which shows the limits of the machine, and with the core alone.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import tempfile
@@ -124,7 +125,7 @@ def _whole(
             if service.stop() != 0:
                 raise ProbeError(f"the service failed: {service.log.read_text()[-500:]}")
         recorded = sorted(set(folder.glob("*.mcap")) - before)
-        steps = [step for path in recorded for step in Recording.open(path).steps()]
+        steps = itertools.chain.from_iterable(Recording.open(path).steps() for path in recorded)
         timing = np.array([step.timing for step in steps if step.timing], TIMING)
         timing = timing[timing["tick"] > timing["tick"][-1] - round(seconds * rate_hz)]
         began = service.log.read_text().partition("started in ")[2].partition("\n")[0]

@@ -79,8 +79,9 @@ class Judged(NamedTuple):
     held: int | None
     unsure: int | None
     wrong: int  # samples with a larger error than UNSURE_M
-    told: int | None  # wrong samples with a hold or a report of uncertainty
-    falsely_told: int | None  # other samples with a hold or a report of uncertainty
+    # number of wrong samples, and of the others, at which the skill held or was unsure
+    told: int | None
+    falsely_told: int | None
 
 
 @cache
