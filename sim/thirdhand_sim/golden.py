@@ -48,7 +48,7 @@ MOVED_SCENE = Scene(handover=(0.66, -0.22, 0.33))
 # Times of the session's events, or their begins and ends.
 TEACH_S = 0.5  # the via-points of the scene are taught
 BEGIN_S = 2.0  # the script begins
-DROPOUT_S = (6.5, 7.0)  # the left hand is out of sight
+DROPOUT_S = (6.5, 7.2)  # the left hand is out of sight
 HOLD_S = (9.0, 9.6)  # the operator holds and resumes
 BAD_S = (10.0, 10.5)  # each sample of the left hand follows an invalid one
 AWAY_S = (13.2, 13.8)  # the left hand is far away from the demonstrations

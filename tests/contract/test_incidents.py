@@ -15,7 +15,7 @@ from thirdhand.core.tuning import TUNING
 from thirdhand.settings.config import ArmSettings, HandSettings, Settings, ToolSettings
 
 STUCK_S = TUNING.decision.stuck_s
-TOO_FAST_S = 1.5 * TUNING.intake.confirmed_s
+TOO_FAST_S = 0.6 * TUNING.intake.confirmed_s
 
 
 ALL_MEMBERS = [member for kind in (Mode, Reason, Flag, Cause, Condition) for member in kind]
@@ -57,7 +57,6 @@ def test_numbers_in_the_table_are_those_that_decide() -> None:
         (Flag.STUCK, f"for {STUCK_S:g} s"),
         (Cause.OLDER, f"more than {TUNING.intake.max_late_s:g} s"),
         (Cause.JUMPED, f"three samples over {1e3 * TUNING.intake.confirmed_s:g} ms"),
-        (Cause.SWAPPED, f"after {TUNING.intake.swapped_s:g} s"),
         (Condition.ARM_UNSETTLED, f"for {TUNING.intake.max_late_s:g} s"),
     ):
         assert words in BY_WORD[word(member)].what_happened + BY_WORD[word(member)].what_to_do

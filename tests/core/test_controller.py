@@ -133,7 +133,6 @@ def test_waits_for_an_unseen_hand_that_matters(taught: Skill, moving: Session) -
         - np.sum(trace["reason"] == Reason.STALE_HAND)
     )
     assert 1650 + 50 < needed < 1650 + 490
-    assert (trace["flags"][needed - 1] & Flag.UNSURE) > 0
 
 
 def test_unseen_hand_keeps_arm_farther_away(taught: Skill, moving: Session) -> None:
@@ -261,17 +260,17 @@ def test_new_skill_is_approached_within_limits(skill: Skill, taught: Skill) -> N
     assert_limits_hold(trace)
 
 
-@pytest.mark.parametrize("wrong_s", [0.05, 0.08])
+@pytest.mark.parametrize(("wrong_s", "holds"), [(0.04, 0), (0.08, 1), (0.12, 1), (0.16, 1)])
 @pytest.mark.parametrize("jump_m", [0.25, 0.3, 0.5])
-def test_repeated_jumps_hold_once(taught: Skill, jump_m: float, wrong_s: float) -> None:
-    """Hands that jump again and again cause one hold."""
+def test_repeated_jumps_hold_once(taught: Skill, jump_m: float, wrong_s: float, holds: int) -> None:
+    """Hands that jump again and again cause one hold; shorter jumps are ignored."""
     hands = np.tile((LEFT, RIGHT), (4000, 1, 1))
     time_s = np.arange(len(hands)) * PERIOD_S
     is_jumped = (time_s > 2.0) & (time_s < 4.0) & (time_s % 0.2 < wrong_s)
     hands[is_jumped, 0, 0] += jump_m
     hands += np.random.default_rng(4).normal(0, 3e-4, hands.shape)
     trace = followed(taught, led(hands, every=5))
-    assert modes(trace).count(("hold", "far_from_demonstrations")) == 1
+    assert modes(trace).count(("hold", "far_from_demonstrations")) == holds
     assert (trace["reason"] != Reason.FAR_FROM_DEMONSTRATIONS)[2200:].all()
 
 

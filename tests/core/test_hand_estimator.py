@@ -35,17 +35,19 @@ def test_reach_is_known_between_samples(rate_hz: int) -> None:
     assert np.abs(states[100:, 1] - velocity[100:]).max() < (0.25 if rate_hz < 100 else 0.1)
 
 
-def test_even_motion_survives_a_late_sample() -> None:
-    """In the 60 ms after the newest sample the speed is kept; predicted as a reach that ends, it
-    would fall by a third.
+@pytest.mark.parametrize(("speed_mps", "kept"), [(0.01, 0.99), (0.05, 0.95), (0.3, 0.7)])
+def test_slow_motion_is_expected_to_go_on(speed_mps: float, kept: float) -> None:
+    """The speed of a slow hand is estimated without a bias, and kept for 60 ms without a sample; a
+    faster hand is expected to stop.
     """
+    noise = np.random.default_rng(2).normal(0.0, 5e-4, (300, 3))
     hands = Hands()
-    follow(hands, lambda t: np.array([0.3 * t, 0.0, 0.2]), until_s=1.0)
-    speeds = []
-    for _ in range(30):
-        hands.intake.advance(hands.state, 1)
-        speeds.append(float(hands.state["hands"][LEFT, 1, 0]))
-    assert min(speeds) > 0.8 * speeds[0] > 0.2
+    states = follow(hands, lambda t: np.array([speed_mps * t, 0.0, 0.2]), until_s=3.0, noise=noise)
+    speeds = states[1000:, 1, 0]
+    assert np.mean(speeds) == pytest.approx(speed_mps, rel=0.1 if kept < 0.9 else 0.05)
+    assert np.std(speeds) < 0.2 * speed_mps
+    hands.intake.advance(hands.state, 30)
+    assert hands.state["hands"][LEFT, 1, 0] > kept * states[-1, 1, 0]
 
 
 @pytest.mark.parametrize("noise_m", [0.0005, 0.002, 0.005])

@@ -112,12 +112,12 @@ def test_late_sample_does_not_undo_a_jump() -> None:
     hands = Hands()
     for k in range(400):
         hands.advance(5)
-        hands.hand(ZERO_NS + 10_000_000 * k, (0.5, 0.1 if k < 390 else 0.3, 0.2))
+        hands.hand(ZERO_NS + 10_000_000 * k, (0.5, 0.1 if k < 380 else 0.3, 0.2))
     assert abs(hands.state["hands"][LEFT, 0, 1] - 0.3) < 0.001
     for k in range(391, 399):
         hands.hand(ZERO_NS + 10_000_000 * k - 5_000_000, (0.5, 0.1, 0.2))
     assert abs(hands.state["hands"][LEFT, 0, 1] - 0.3) < 0.001
-    assert hands.rejected() == {Cause.JUMPED: 2 + 6}  # two of the samples are from before the jump
+    assert hands.rejected() == {Cause.JUMPED: 5 + 8}  # five of the samples confirm the jump
 
 
 def test_restarted_tracker_is_believed_again() -> None:

@@ -21,7 +21,6 @@ from support.tracked import LEFT as LEFT_SIDE
 from support.tracked import PERIOD_S, STRAIGHT, Hands
 from thirdhand.contract.messages import PoseStamped
 from thirdhand.contract.records import Cause, Reason
-from thirdhand.core.frame import Vector
 from thirdhand.core.skill.skill import Skill
 
 PLACE = (0.5, 0.1, 0.2)
@@ -41,14 +40,14 @@ def tell(hands: Hands, places: Sequence[tuple[float, ...] | None], rate_hz: int)
 
 
 @pytest.mark.parametrize("rate_hz", [30, 100, 250, 500])
-def test_jump_is_believed_after_three_samples(rate_hz: int) -> None:
-    """A jump is accepted once three samples over 20 ms agree, and not before."""
+def test_jump_is_believed_after_50_ms(rate_hz: int) -> None:
+    """A jump is accepted once three samples over 50 ms agree, and not before."""
     hands = Hands()
     tell(hands, [PLACE] * rate_hz, rate_hz)
-    y = np.array(tell(hands, [ELSEWHERE] * 30, rate_hz))
+    y = np.array(tell(hands, [ELSEWHERE] * 70, rate_hz))
     believed = int(np.argmax(y > 0.2))
     every = 500 // rate_hz
-    assert believed == max(2, math.ceil(0.02 * 500 / every - 0.5))
+    assert believed == max(2, math.ceil((0.05 * 500 - 0.5) / every))
     assert np.abs(y[:believed] - 0.1).max() < 0.001
     assert np.abs(y[believed:] - 0.3).max() < 0.001
     assert hands.rejected() == {Cause.JUMPED: believed}
@@ -141,103 +140,6 @@ def test_flood_of_samples_is_taken() -> None:
         hands.hand(10**9 + 200_000 * k, tuple((np.array(PLACE) + row).tolist()))
     assert hands.rejected() == {}
     np.testing.assert_allclose(hands.state["hands"][LEFT_SIDE, 0], PLACE, atol=0.002)
-
-
-class BothHands(Hands):
-    """Hands that move up and down, sampled at a rate by a tracker that may exchange them."""
-
-    def __init__(self, rate_hz: int) -> None:
-        super().__init__()
-        self.every = 500 // rate_hz
-        self.noise = np.random.default_rng(8)
-
-    def at(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        up = 0.2 + 0.15 * math.sin(0.006 * float(self.state["tick"]))  # up to 0.45 m/s
-        return (0.5, 0.1, up), (0.6, 0.5, up)
-
-    def tell(
-        self, seconds: float, *, swapped: bool = False, hidden: tuple[int, ...] = ()
-    ) -> tuple[Vector, Vector]:
-        """The lateral error (T, 2) [m] of each estimate, and its freshness, tick by tick, while
-        some labels are hidden.
-        """
-        errors_m = []
-        fresh = []
-        for _ in range(round(500 * seconds)):
-            self.advance()
-            if int(self.state["tick"]) % self.every == 0:
-                places = self.at()[::-1] if swapped else self.at()
-                for side, place in enumerate(places):
-                    if side in hidden:
-                        continue
-                    sample_m = np.array(place) + 0.002 * self.noise.standard_normal(3)
-                    self.hand(10**9 + int(self.state["tick"]), tuple(sample_m.tolist()), side=side)
-            errors_m.append(
-                [
-                    abs(self.state["hands"][side, 0, 1] - place[1])
-                    for side, place in enumerate(self.at())
-                ]
-            )
-            fresh.append([self.fresh(side) for side in (0, 1)])
-        return np.array(errors_m), np.array(fresh)
-
-
-@pytest.mark.parametrize("rate_hz", [30, 100, 500])
-@pytest.mark.parametrize("lasts_s", [0.3, 1.5])
-def test_swapped_hands_are_held_for(rate_hz: int, lasts_s: float) -> None:
-    """Exchanged hands are rejected, and the arm holds."""
-    hands = BothHands(rate_hz)
-    assert hands.tell(1.0)[1][-1].all()
-    errors_m, fresh = hands.tell(lasts_s, swapped=True)
-    assert errors_m.max() < 0.02
-    assert not fresh[75:].any()  # 0.15 s
-    assert hands.rejected()[Cause.SWAPPED] >= 2 * rate_hz * lasts_s - 4
-    assert hands.rejected()[Cause.JUMPED] <= 3
-    errors_m, fresh = hands.tell(1.0)
-    assert fresh[2 * hands.every :].all()
-    assert errors_m.max() < 0.02
-
-
-@pytest.mark.parametrize("rate_hz", [30, 100, 500])
-@pytest.mark.parametrize("hidden", [(0,), (1,), (0, 1)])
-def test_swap_after_hiding_is_not_believed(rate_hz: int, hidden: tuple[int, ...]) -> None:
-    """Hands that reappear with exchanged labels are rejected."""
-    hands = BothHands(rate_hz)
-    hands.tell(1.0)
-    # a hand is covered, then the other one gets its label
-    hands.tell(0.2, hidden=hidden)
-    hands.tell(0.1, swapped=True, hidden=hidden)
-    errors_m, fresh = hands.tell(0.8, swapped=True)
-    assert errors_m.max() < 0.02
-    assert not fresh[25:].any()
-    errors_m, fresh = hands.tell(0.5)
-    assert fresh[2 * hands.every :].all()
-    assert errors_m[2 * hands.every :].max() < 0.02
-
-
-@pytest.mark.parametrize("rate_hz", [30, 100, 500])
-def test_lasting_swap_is_believed_after_2_s(rate_hz: int) -> None:
-    """Labels that stay exchanged are accepted after two seconds."""
-    hands = BothHands(rate_hz)
-    hands.tell(1.0)
-    errors_m, fresh = hands.tell(3.0, swapped=True)
-    held = np.flatnonzero(~fresh.all(axis=1))
-    assert held[-1] / 500 == pytest.approx(2.0, abs=0.07)
-    assert errors_m[held[-1] + 1 :].min() > 0.35
-
-
-def test_one_hand_may_go_where_the_other_is() -> None:
-    hands = BothHands(100)
-    hands.tell(1.0)
-    for _ in range(20):
-        hands.advance(5)
-        stamp_ns = 10**9 + int(hands.state["tick"])
-        right = hands.at()[1]
-        hands.hand(stamp_ns, (right[0], right[1] - 0.04, right[2]), side=0)
-        hands.hand(stamp_ns, right, side=1)
-    assert hands.fresh(0)
-    assert hands.state["hands"][0, 0, 1] == pytest.approx(0.46, abs=0.01)
-    assert Cause.SWAPPED not in hands.rejected()
 
 
 NUMBERS = st.one_of(

@@ -24,6 +24,7 @@ from thirdhand.core.arm.stage import Arm
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import Record, Tick, Vector, blank, frame_layout
 from thirdhand.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
+from thirdhand.core.intake import MODES
 from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.limiter.stage import LimiterStage
 from thirdhand.core.separation import TABLE_DEPTH_M
@@ -415,7 +416,7 @@ def test_a_hand_just_seen_counts_as_fast() -> None:
     separation = Separation(ASSUMED, URDF)
     pose = ARM.at(POSTURE)
     state = with_hands(np.add(pose.position, (0.25, 0.0, 0.0)))
-    state["mode_probabilities"] = 1 / 3
+    state["mode_probabilities"] = 1 / MODES
     separation.step(state, FRAME, pose.record)
     limit_mps = separation.speed_limit
     state["mode_covariances"][0, :, 1, 1] = 0.3**2

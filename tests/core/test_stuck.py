@@ -156,6 +156,29 @@ def test_without_a_way_it_holds(taught: Skill, stuck: tuple[Settings, Vector, Ve
     assert not last["joint_velocities"].any()
 
 
+def test_after_a_way_that_leads_nowhere_it_waits(
+    taught: Skill, stuck: tuple[Settings, Vector, Vector]
+) -> None:
+    """The arm does not swing again until a hand has moved."""
+    cell, start, hands = stuck
+    state = start_state(cell, taught)
+    state["joints"][0] = start
+    controller = Controller(cell, taught, state, urdf=URDF)
+    ticks = round(14.0 / cell.period_s)
+    moves = round(12.0 / cell.period_s)
+    reasons = []
+    for k in range(1, ticks):
+        now = controller.state
+        inbox = seen(hands + 0.05 * (k > moves), k) if k % 5 == 1 else ()
+        if k % 100 == 0 and now["stuck"] and not now["way_count"]:
+            nowhere = json.dumps([now["joints"][0].tolist()])
+            inbox = (*inbox, order("way", nowhere))
+        reasons.append(controller.step(Tick(k, inbox))["reason"])
+    blocked = np.array(reasons) == Reason.BLOCKED
+    assert blocked[moves // 2 : moves].all()
+    assert not blocked[moves:].all()
+
+
 def test_way_from_elsewhere_is_ignored(
     taught: Skill, stuck: tuple[Settings, Vector, Vector]
 ) -> None:

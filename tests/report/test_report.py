@@ -201,15 +201,15 @@ def test_spans_of_a_session_name_what_happened(session: Report) -> None:
     held = {span.reason: span for span in session.spans if span.mode is Mode.HOLD}
     far_end_s = AWAY_S[1] + TUNING.intake.hand_still_s  # the hand returns by a jump
     for reason, (begin_s, end_s) in {
-        # within the first 0.45 s the tool does not depend on that hand
-        Reason.STALE_HAND: (DROPOUT_S[0] + 0.45, DROPOUT_S[1]),
+        # within the first 0.5 s the tool does not depend on that hand
+        Reason.STALE_HAND: (DROPOUT_S[0] + 0.5, DROPOUT_S[1]),
         Reason.OPERATOR: HOLD_S,
         Reason.FAR_FROM_DEMONSTRATIONS: (AWAY_S[0], far_end_s),
     }.items():
         assert held[reason].start_s == pytest.approx(begin_s, abs=0.15)
         assert held[reason].start_s + held[reason].lasts_s == pytest.approx(end_s, abs=0.1)
     # The session has no status, so the words follow from the first frame of each hold.
-    assert re.fullmatch(r"the left hand was last seen [34]\d\d ms ago", held[Reason.STALE_HAND].why)
+    assert re.fullmatch(r"the left hand was last seen [45]\d\d ms ago", held[Reason.STALE_HAND].why)
     asked = held[Reason.OPERATOR]
     assert (asked.why, asked.remedy) == (
         "an operator requested a hold, or the daemon was stopped",
@@ -478,6 +478,6 @@ def test_ages_of_hands_advance_between_recorded_frames(golden: Path, tmp_path: P
     assert np.array_equal(ages < 0, true_ages < 0)
     errors = ages - true_ages
     assert errors.min() >= 0
-    assert errors.max() < 20  # a frame is recorded every 20 ticks
+    assert errors.max() < 20 + 25  # a frame is recorded every 20 ticks; a jump is accepted after 25
     stale = whole.frames["stale_ticks"]
     assert np.array_equal(ages < stale, true_ages < stale)

@@ -261,8 +261,6 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
             )
         case Cause.JUMPED:
             finding = f"{position_text}, from one sample to the next"
-        case Cause.SWAPPED:
-            finding = f"{position_text}, where the other hand was; left and right look exchanged"
         case Cause.WRONG_FRAME:
             accepted = ", ".join(repr(frame) for frame in seen.frames if frame)
             finding = f"frame {sample.frame_id[:LONGEST_NAME]!r}; {accepted} or none accepted"

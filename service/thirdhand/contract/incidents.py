@@ -470,15 +470,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
             None,
             "jumped",
             "a hand or a joint that is suddenly elsewhere; a hand is accepted there after three "
-            "samples over 20 ms that agree",
+            "samples over 50 ms that agree",
             "look for reflections, and for a second tracker that does not name itself",
-        ),
-        Incident(
-            Cause.SWAPPED,
-            None,
-            "hands swapped",
-            "a hand where the other hand was, and the other where it was; accepted after 2 s",
-            "let the tracker see both hands apart for a moment: it takes left for right",
         ),
         Incident(
             Cause.WRONG_FRAME,

@@ -69,7 +69,6 @@ class Cause(enum.IntEnum):
     AHEAD = 6
     JUMPED = 7
     WRONG_FRAME = 8
-    SWAPPED = 9
 
 
 PER_JOINT = 0  # in a shape, stands for the number of joints

@@ -20,6 +20,7 @@ STATE = (
     Field("held_hands", "float64", (2, 3)),  # positions of the hands [m]
     Field("stuck_gap", "float64"),  # distance between tool and target at `stuck_tick` [m]
     Field("stuck_target", "float64", (3,)),  # target at `stuck_tick` [m]
+    Field("stuck_hands", "float64", (2, 3)),  # hands at `stuck_tick` [m]
     # postures of the way out [rad]; the last one has the tool at its target
     Field("way", "float64", (WAY, PER_JOINT)),
     Field("mode", "uint8"),  # `contract.records.Mode`
@@ -28,6 +29,7 @@ STATE = (
     Field("held", "uint8"),  # `codes.Held`; 0: the operator does not hold the arm
     Field("arm_ready", "uint8"),  # `codes.ArmReady`; 0: the arm is not ready
     Field("stuck", "uint8"),  # `codes.Stuck`; 0: the tool comes nearer to its target
+    Field("way_tried", "uint8"),  # 1: a way out has been taken since the tool was at a target
     # 1: the operator has confirmed that the arm may leave the thing that it is inside of
     Field("leaves", "uint8"),
 )

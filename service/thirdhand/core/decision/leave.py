@@ -38,15 +38,16 @@ class WayOut:
 
     def take(self, state: Record, event: Event) -> None:
         """Start on a planned way out, if the tool is still stuck and the way begins within
-        start_rad of the commanded joints.
+        start_rad of the commanded joints. If a way out has been tried already, the arm waits.
         """
         path = np.reshape(
             json.loads(cdr.decode_string(event.payload)), (-1, state["joints"].shape[1])
         )
         far = (np.abs(path[:1] - state["joints"][0]) / self._per_rad).max(initial=0.0)
         if state["stuck"] and far < self._start_rad:
-            count = state["way_count"] = len(path)
-            state["way"][:count] = path
+            count = state["way_count"] = 0 if state["way_tried"] else len(path)
+            state["way"][:count] = path[:count]
+            state["way_tried"] = 1
             state["stuck_tick"] = state["tick"]
             state["stuck"] = HELD
             state["way_next"] = 0

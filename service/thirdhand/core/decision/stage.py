@@ -52,7 +52,7 @@ class Decision:
             end_share=tuning.intake.end_share,
             # a hand that comes to rest after a jump does so within this time
             jumpy_s=tuning.intake.hand_still_s,
-            too_fast_s=1.5 * tuning.intake.confirmed_s,  # one late command is shorter
+            too_fast_s=0.6 * tuning.intake.confirmed_s,  # one late command is shorter
             **tuning.decision._asdict(),
             freed_share=3.0 * tuning.decision.progress_share,  # more than chance
             another_target_m=2.0 * tuning.decision.stuck_gap_m,

@@ -103,18 +103,19 @@ def _why_hold(
       itself holds for a later reason.
     * OPERATOR: the operator holds it.
     * CLUTCH: the clutch is released.
+    * FAR: the arm does not follow, and a hand has jumped within the last jumpy_s.
     * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
       been seen or is not seen now.
     * STALE_HAND: a hand was seen a moment ago, and the target depends on it or the arm does not
       follow yet.
-    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share
-      threshold, or a hand has jumped within the last jumpy_s.
+    * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share threshold.
     * AMBIGUOUS: the segment of the task is not known.
     """
     state = states[0]
+    config = parameters[0]
     if conditions & CONTESTED:
         return TWO_SOURCES
-    if conditions & ARM_GUIDED and not parameters[0].is_assumed:
+    if conditions & ARM_GUIDED and not config.is_assumed:
         return GUIDED
     returns_later = state.arm_ready == RETURNING and conditions & CLUTCH_RELEASED
     if state.arm_ready != READY and not returns_later:
@@ -123,8 +124,13 @@ def _why_hold(
         return OPERATOR
     if conditions & CLUTCH_RELEASED:
         return CLUTCH
+    jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
+    jumped_s = (state.tick - jump_tick) * config.period_s
+    if state.mode != FOLLOW and jump_tick > 0 and jumped_s < config.jumpy_s:
+        return FAR
     reason = _unseen_reason(states, conditions, gate_m)
-    if reason == NONE and _is_far(states, parameters, gate_m, threshold):
+    ease = config.end_share if state.reason == FAR else 1.0
+    if reason == NONE and gate_m > ease * threshold:
         return FAR
     if reason == NONE and conditions & SEGMENT_AMBIGUOUS:
         return AMBIGUOUS
@@ -140,18 +146,6 @@ def _unseen_reason(states: Records, conditions: int, gate_m: float) -> int:
         return NO_HANDS if is_never_seen and not conditions & ONE_HAND else STALE_HAND
     is_needed = conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW
     return STALE_HAND if conditions & sum(UNSEEN) and is_needed else NONE
-
-
-@compiled
-def _is_far(states: Records, parameters: Records, gate_m: float, threshold: float) -> bool:
-    """True if the hands are too far from the demonstrations, see FAR in `_why_hold`."""
-    state = states[0]
-    config = parameters[0]
-    if state.reason != FAR:
-        return bool(gate_m > threshold)
-    jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
-    is_jumpy = jump_tick > 0 and (state.tick - jump_tick) * config.period_s < config.jumpy_s
-    return bool(is_jumpy or gate_m > config.end_share * threshold)
 
 
 @compiled
@@ -287,8 +281,8 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     place of max_speed.
 
     HELD, which starts with a way out (`leave.WayOut.take`), lasts until that way ends or
-    `way_timeout_s` has passed. If no way out was found, it lasts until the target has moved by
-    another_target_m.
+    `way_timeout_s` has passed. If none was found, or one has been tried since the tool was at a
+    target, it lasts until the target or a hand has moved by another_target_m.
     """
     state = states[0]
     frame = frames[0]
@@ -299,7 +293,15 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     passed_s = (state.tick - state.stuck_tick) * config.period_s
     if state.way_next < state.way_count and passed_s < config.way_timeout_s:
         return HELD
-    if state.stuck == HELD and not state.way_count and moved < config.another_target_m:
+    hand_moved = max(
+        distance(state.hands[0, 0], state.stuck_hands[0]),
+        distance(state.hands[1, 0], state.stuck_hands[1]),
+    )
+    if (
+        state.stuck == HELD
+        and not state.way_count
+        and max(moved, hand_moved) < config.another_target_m
+    ):
         return HELD
     state.way_next = state.way_count = 0
     if state.stuck == NOTICED:
@@ -318,6 +320,10 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
         state.stuck_tick = state.tick
         state.stuck_gap = gap
         state.stuck_target[:] = frame.target
+        for side in range(2):
+            state.stuck_hands[side] = state.hands[side, 0]
+        if gap < config.stuck_gap_m or moved > config.stuck_gap_m:
+            state.way_tried = 0
         return 0
     return NOTICED if passed_s >= config.stuck_s else 0
 

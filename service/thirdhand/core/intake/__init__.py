@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from thirdhand.contract.records import PER_JOINT, Cause, Field
 
-MODES = 3  # modes of the hand filter: rest, reach, change
+MODES = 4  # modes of the hand filter: rest, steady, reach, change
 # states of each mode and axis: position, velocity, acceleration, tremor and its velocity
 STATES = 5
 # rates of tremor that are distinguished, from slow to fast, and the usual one
@@ -98,7 +98,6 @@ STATE = (
     Field("trembles", "uint8", (2,)),  # 1: the hand's tremor is evident
     Field("clock", "uint8", (2,)),  # `codes.ClockTrust`: trust in a tracker's clock
     Field("kept_restarts", "uint8", (2, KEPT)),  # 1: the filter started anew with this sample
-    Field("jump_is_swap", "uint8", (2,)),  # 1: the hand jumped to where the other one had been
 )
 FRAME = (
     Field("hand_stamp_ns", "int64"),  # stamp of the newest hand sample; 0: none yet

@@ -1,13 +1,14 @@
 """Position, velocity, acceleration and stillness of each hand, estimated from its tracker's
 samples.
 
-The estimator is an interacting-multiple-model filter (`mode_filter`) with the modes rest, reach and
-change. The modes share one measurement noise variance r, which is estimated from the third
-differences of the samples: smooth motion leaves almost nothing in them, and white noise of variance
-r leaves the variance 20 r on each axis.
+The estimator is an interacting-multiple-model filter (`mode_filter`) with the modes rest, steady,
+reach and change. The modes share one measurement noise variance r, which is estimated from the
+third differences of the samples: smooth motion leaves almost nothing in them, and white noise of
+variance r leaves the variance 20 r on each axis.
 
 Stillness, 0 to 1, distinguishes a hand that waits at a via-point from one on its way. It rises
-slowly and falls fast. A tremor does not lower it, and a turning point on the way hardly raises it.
+slowly and falls at once. A tremor does not lower it, and a turning point on the way hardly raises
+it.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ STILL = np.ones(2)  # stillness of two hands that rest
 
 
 def smoothing(period_s: float, numbers: IntakeTuning = TUNING.intake) -> Vector:
-    """Filter gains (3,) of one period for the lowpass velocity, rising stillness and falling
-    stillness: 1 - exp(-period / time constant).
+    """Filter gains (2,) of one period for the lowpass velocity and rising stillness: 1 -
+    exp(-period / time constant).
     """
-    times_s = numbers.stillness_lowpass_s, numbers.hand_still_s, numbers.stillness_fall_s
+    times_s = numbers.stillness_lowpass_s, numbers.hand_still_s
     return 1.0 - np.array([exp(-period_s / time_s) for time_s in times_s])
 
 
@@ -52,7 +53,7 @@ def stillness_after(
     updated in place):
 
         u = u + g_0 (v - u),   n = exp(-(|u| / still_speed)⁴)
-        s = s + (g_1 if n > s else g_2) (n - s)
+        s = s + (g_1 if n > s else 1) (n - s)
     """
     square = 0.0
     for axis in range(3):
@@ -63,7 +64,7 @@ def stillness_after(
         square += lowpass[axis] * lowpass[axis]
     share = square / still_speed**2
     now = exp(-share * share)
-    after = stillness + (gains[1] if now > stillness else gains[2]) * (now - stillness)
+    after = stillness + (gains[1] if now > stillness else 1.0) * (now - stillness)
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 
 
@@ -119,7 +120,7 @@ class HandEstimator:
         """Advance the state by some ticks, and both hands with it. A hand without a sample for
         `stale_ticks` is assumed to stand still.
         """
-        _advance_both(as_array(state), ticks, stale_ticks, self._model(ticks), self._models)
+        _advance_both(as_array(state), ticks, stale_ticks, self._model(ticks))
 
 
 @compiled
@@ -165,12 +166,10 @@ def _update_noise(
 
 
 @compiled
-def _advance_both(
-    states: Records, ticks: int, stale_ticks: int, overs: Records, models: Records
-) -> None:
+def _advance_both(states: Records, ticks: int, stale_ticks: int, overs: Records) -> None:
     """Advance the state by some ticks: modes, estimate and stillness of both hands. `overs` (1,)
-    is the record of `HandEstimator._model_over`, `models` those of `motion_model.models`. A stale
-    hand stands still: its velocity, acceleration and tremor are set to zero.
+    is the record of `HandEstimator._model_over`. A stale hand stands still: its velocity,
+    acceleration and tremor are set to zero.
     """
     state = states[0]
     over = overs[0]
@@ -179,7 +178,7 @@ def _advance_both(
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
             advance_hand(states, side, overs)
-            look_ahead(states, models, side)
+            estimate(states, side)
         else:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
@@ -191,26 +190,19 @@ def _advance_both(
 
 
 @compiled
-def look_ahead(states: Records, models: Records, side: int) -> None:
-    """Extrapolate one hand to the current tick: x = Σ_j μ_j O_j m_j, written to `hands` (3, 3) of
-    the state, by position, velocity and acceleration.
-
-    μ_j and m_j (3, 3) are probability and mean of mode j after the newest sample, O_j (3, 3) is
-    `onward` of `motion_model.models` for the time since then.
+def estimate(states: Records, side: int) -> None:
+    """Position, velocity and acceleration of one hand, Σ_j μ_j m_j, written to `hands` (3, 3) of
+    the state. μ_j and m_j are probability and mean of mode j at the current tick.
     """
     state = states[0]
-    estimate = states[0].hands[side]
-    newest = slot(states, side, 0)
-    means = state.kept_means[side, newest]
-    modes = state.kept_probabilities[side, newest]
-    onward = models[min(state.tick - state.kept_ticks[side, newest], len(models) - 1)].onward
+    means = state.mode_means[side]
+    modes = state.mode_probabilities[side]
     for row in range(3):
         for axis in range(3):
             total = 0.0
             for mode in range(MODES):
-                for k in range(3):
-                    total += modes[mode] * onward[mode, row, k] * means[mode, k, axis]
-            estimate[row, axis] = total
+                total += modes[mode] * means[mode, row, axis]
+            state.hands[side, row, axis] = total
 
 
 @compiled
@@ -407,7 +399,7 @@ def take(
     interval_s = parameters[0].tracker_memory_s if ticks < 0 else ticks * parameters[0].period_s
     filter_in(states, parameters, side, newest, interval_s, restarts or ticks < 0)
     settle(states, parameters, models, side)
-    look_ahead(states, models, side)
+    estimate(states, side)
 
 
 @compiled

@@ -22,8 +22,8 @@ from thirdhand.core.frame import Record, Records, Vector
 from thirdhand.core.intake import KEPT, SETTLED_SAMPLES
 from thirdhand.core.intake.hand_estimator import (
     advance_hand,
+    estimate,
     filter_in,
-    look_ahead,
     order_of,
     seconds_after,
     settle,
@@ -101,7 +101,7 @@ def _fits(
     """True if a sample x (3,) [m] made at a tick fits a hand's filter as it was after the retained
     sample of this `order`:
 
-        |x - p|² < outlier_variances (P + r)
+        |x - p|² < jump_noise_stds² (P + r)
 
     p is the expected position then, P its variance in the mode CHANGE, r the noise variance.
     """
@@ -120,7 +120,8 @@ def _fits(
                 * over.transition[CHANGE, 0, column]
             )
     variance += over.noise[CHANGE, 0, 0] + state.kept_noise[side, index, 0]
-    return bool(squared_distance(position, expected_m) < parameters[0].outlier_variances * variance)
+    most_m2 = parameters[0].jump_noise_stds ** 2 * variance
+    return bool(squared_distance(position, expected_m) < most_m2)
 
 
 @compiled
@@ -152,8 +153,7 @@ def wrong_samples(
 @compiled
 def drop(states: Records, side: int, count: int) -> None:
     """Drop the newest retained samples of a hand; `take_late` then restores the filter as it was
-    before them. They remain among the `past_samples`, as evidence of a second source, but no noise
-    variance is computed from them.
+    before them. No noise variance is computed from them.
     """
     state = states[0]
     state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
@@ -247,7 +247,7 @@ def take_late(
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
     settle(states, parameters, models, side)
-    look_ahead(states, models, side)
+    estimate(states, side)
 
 
 @compiled

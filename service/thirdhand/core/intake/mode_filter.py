@@ -1,18 +1,20 @@
 """Interacting-multiple-model filter of one hand (Blom and Bar-Shalom, IEEE TAC 33(8), 1988).
 
-A hand rests, reaches, or changes its motion. Each mode is a Kalman filter with the linear system of
-`motion_model`: position p, velocity v, acceleration a, tremor y and its velocity w. A sample
-measures p + y; tremor is seen by the tracker but is no part of the hand's motion.
+A hand rests, moves slowly and steadily, reaches, or changes its motion. Each mode is a Kalman
+filter with the linear system of `motion_model`: position p, velocity v, acceleration a, tremor y
+and its velocity w. A sample measures p + y; tremor is seen by the tracker but is no part of the
+hand's motion.
 
 Modes are mixed at the time of a sample, after the prediction. Three rules are added to the
 published filter:
 
 * The mode CHANGE has no tremor (σ = 0) until one is evident (`tremor`), because the beginning of a
   change would otherwise be explained as tremor. An evident tremor is the same in all modes.
-* A resting hand is slow and its tremor is bounded (`_beyond_rest`). No mode explains the fastest
-  motions; without the bound, the mode that allows the largest change between two samples wins.
-* A hand enters REST only when it is slow (`_switched`), conditioned on being slow
-  (`_come_to_rest`). On leaving REST, its tremor becomes motion (`_leave_rest`).
+* In the calm modes REST and STEADY, a hand is slow and its tremor is bounded (`_beyond_calm`). No
+  mode explains the fastest motions; without the bound, the mode that allows the largest change
+  between two samples wins.
+* A hand enters a calmer mode only when it is slow (`_switched`), conditioned on being slow
+  (`_calm_down`). On leaving the calm modes, its tremor becomes motion (`_leave_calm`).
 
 Arrays of one hand: `means` (MODES, STATES, 3) hold (p, v, a, y, w) of each mode, by axis [m, m/s,
 m/s², m, m/s]; `covariances` (MODES, STATES, STATES) are shared by the three axes; `modes` (MODES,)
@@ -27,7 +29,7 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.intake import MODES, STATES
-from thirdhand.core.intake.motion_model import CHANGE, REACH, REST, STEADY
+from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, STEADY
 from thirdhand.core.vectors import square
 
 
@@ -70,11 +72,11 @@ def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremo
     """Prediction of all modes over an interval. `overs` (1,) is a record of `motion_model.model`,
     `rate` the index of the tremor's rate, and `tremor` (1 + MODES,) has its variance in each mode.
 
-    With an evident tremor, REACH has the motion STEADY: otherwise the steady innovation of a hand
+    With an evident tremor, REACH has the motion ENDLESS: otherwise the steady innovation of a hand
     whose velocity does not revert would count as a change, and a change follows the tremor.
     """
     for mode in range(MODES):
-        motion = STEADY if mode == REACH and tremor[1 + CHANGE] > 0.0 else mode
+        motion = ENDLESS if mode == REACH and tremor[1 + CHANGE] > 0.0 else mode
         move_on(means[mode], covariances[mode], overs, motion, rate, tremor[1 + mode])
 
 
@@ -169,12 +171,12 @@ def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> Non
 
 
 @compiled
-def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None:
-    """Condition a moving mode on being slow: a Kalman update by v = 0 with standard deviation
-    rest_speed_std_mps, then by a = 0 with the same number in m/s²: the drift of a resting hand
-    changes within a second.
+def _calm_down(parameters: Records, mean: Vector, covariance: Vector, mode: int) -> None:
+    """Condition a faster mode on being as slow as a calm `mode`: a Kalman update by v = 0 with
+    standard deviation σ_v = calm_speed_stds_mps, then by a = 0 with the same number in m/s²: the
+    drift of a resting hand changes within a second.
     """
-    spread = parameters[0].rest_speed_std_mps
+    spread = parameters[0].calm_speed_stds_mps[mode]
     for order in range(1, 3):
         row_of = covariance[order].copy()
         variance = row_of[order] + spread * spread
@@ -188,8 +190,8 @@ def _come_to_rest(parameters: Records, mean: Vector, covariance: Vector) -> None
 
 
 @compiled
-def _leave_rest(mean: Vector, covariance: Vector) -> None:
-    """Turn the tremor of the mode REST into motion: p = p + y and v = v + w, in mean and
+def _leave_calm(mean: Vector, covariance: Vector) -> None:
+    """Turn the tremor of a calm mode into motion: p = p + y and v = v + w, in mean and
     covariance. The samples showed both, so the filter restarts from the unsmoothed state.
     """
     for row in range(2):
@@ -226,9 +228,9 @@ def _switched(
         s_ij = μ_i ((1 - exp(-λ_i Δ)) ρ_j + δ_ij exp(-λ_i Δ))
 
     μ are the probabilities `modes`, λ is mode_switch_rates_per_s, ρ is mode_prior. The transition
-    from a moving mode i to REST is weighted by how slow that mode is; s_ii keeps the rest:
+    from a faster mode i to a calm mode j is weighted by how slow mode i is; s_ii keeps the rest:
 
-        slow_i = exp(-½ bounded(|v_i|² / (P_i[v, v] + rest_speed_std_mps²)))
+        slow_ij = exp(-½ bounded(|v_i|² / (P_i[v, v] + σ_j²))),   σ_j = calm_speed_stds_mps
     """
     config = parameters[0]
     for i in range(MODES):
@@ -237,12 +239,11 @@ def _switched(
             shares[i, j] = modes[i] * (
                 (1.0 - stay) * config.mode_prior[j] + (stay if i == j else 0.0)
             )
-        if i != REST:
-            speed = square(means[i, 1])
-            variance = covariances[i, 1, 1] + config.rest_speed_std_mps * config.rest_speed_std_mps
-            slow = exp(-0.5 * bounded(parameters, speed / variance))
-            shares[i, i] += (1.0 - slow) * shares[i, REST]
-            shares[i, REST] *= slow
+        for calm in range(min(i, REACH)):
+            variance = covariances[i, 1, 1] + config.calm_speed_stds_mps[calm] ** 2
+            slow = exp(-0.5 * bounded(parameters, square(means[i, 1]) / variance))
+            shares[i, i] += (1.0 - slow) * shares[i, calm]
+            shares[i, calm] *= slow
 
 
 @compiled
@@ -260,9 +261,10 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
         c_j = Σ_i s_ij,   m_j = Σ_i s_ij m_ij / c_j
         P_j = Σ_i s_ij (P_ij + Σ_axes (m_ij - m_j)(m_ij - m_j)ᵀ / 3) / c_j
 
-    m_ij and P_ij are those of mode i; for i ≠ j, after `_come_to_rest` (j = REST). Without an
-    evident tremor (σ = 0 in CHANGE), also after `_leave_rest` (i = REST), and with the tremor of
-    mode j reset. Of each P_j, only the upper triangle is computed.
+    m_ij and P_ij are those of mode i; for a faster i and a calm j, after `_calm_down`. Between a
+    calm mode and another one, without an evident tremor (σ = 0 in CHANGE), the tremor of mode j is
+    reset, after `_leave_calm` (i is calm); so is that between REACH and CHANGE. Of each P_j, only
+    the upper triangle is computed.
     """
     of_means = np.empty((MODES, MODES, STATES, 3))
     of_covariances = np.empty((MODES, MODES, STATES, STATES))
@@ -271,11 +273,11 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
         for i in range(MODES):
             of_means[j, i] = means[i]
             of_covariances[j, i] = covariances[i]
-            if i != j and j == REST:
-                _come_to_rest(parameters, of_means[j, i], of_covariances[j, i])
-            if i != j and not is_evident:
-                if i == REST:
-                    _leave_rest(of_means[j, i], of_covariances[j, i])
+            if j < min(i, REACH):
+                _calm_down(parameters, of_means[j, i], of_covariances[j, i], j)
+            if i != j and max(i, j) >= REACH and not is_evident:
+                if i <= STEADY:
+                    _leave_calm(of_means[j, i], of_covariances[j, i])
                 _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
 
     for j in range(MODES):
@@ -303,21 +305,20 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
 
 
 @compiled
-def _beyond_rest(parameters: Records, mean: Vector, tremor: Vector) -> float:
-    """Squared, normalised excess of the speed and tremor of the mode REST over their bounds:
+def _beyond_calm(parameters: Records, mean: Vector, tremor: Vector, mode: int) -> float:
+    """Squared, normalised excess of the speed and tremor of a calm mode over their bounds:
 
-        max(|v|² - v_max², 0) / σ_v² + max(|y|² + |w|² / ω² - y_max², 0) / σ²
+        max(|v|² / σ_v² - outlier_variances, 0) + max(|y|² + |w|² / ω² - y_max², 0) / σ²
 
-    with v_max = rest_max_speed_mps, σ_v = rest_speed_std_mps, y_max = max_tremor_m and the tremor's
-    σ.
+    with σ_v = calm_speed_stds_mps, y_max = max_tremor_m and the tremor's σ.
     """
     config = parameters[0]
-    speed = square(mean[1])
+    speed = square(mean[1]) / config.calm_speed_stds_mps[mode] ** 2
     amplitude = 0.0
     for axis in range(3):
         amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
-    trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + REST])
-    drifts: float = max(speed - config.rest_max_speed_mps**2, 0.0) / config.rest_speed_std_mps**2
+    trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + mode])
+    drifts: float = max(speed - config.outlier_variances, 0.0)
     return drifts + trembles
 
 
@@ -341,8 +342,8 @@ def update(
 
         log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
-    The innovation in log L is that before the update. For REST, log L is reduced by half of
-    `_beyond_rest`. The probabilities μ stay above about least_mode_probability.
+    The innovation in log L is that before the update. In the calm modes, log L is reduced by half
+    of `_beyond_calm`. The probabilities μ stay above about least_mode_probability.
     """
     shares = np.empty((MODES, MODES))
     expected = np.empty(MODES)
@@ -361,8 +362,8 @@ def update(
                 p[row, column] = p[column, row]
         variance, error = measure(mean, p, noise, position)
         likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(parameters, error)
-        if i == REST:
-            likelihood[i] -= 0.5 * _beyond_rest(parameters, mean, tremor)
+        if i <= STEADY:
+            likelihood[i] -= 0.5 * _beyond_calm(parameters, mean, tremor, i)
         best = max(best, likelihood[i])
 
     # Relative to the best one, no likelihood underflows in all modes.

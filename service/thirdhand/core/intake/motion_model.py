@@ -1,8 +1,8 @@
 """Motion of a hand over an interval: transition and process noise of the hand filter's modes.
 
-The filter has MODES = 3 modes, REST, REACH and CHANGE. Each describes every axis by the same linear
-system with STATES = 5 states: position p [m], velocity v [m/s], acceleration a [m/s²], tremor y [m]
-and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each other:
+The filter has MODES = 4 modes: REST, STEADY, REACH and CHANGE. Each describes every axis by the
+same linear system with STATES = 5 states: position p [m], velocity v [m/s], acceleration a [m/s²],
+tremor y [m] and its velocity w [m/s]. Motion (p, v, a) and tremor (y, w) do not drive each other:
 
     dp = v dt,   dv = a dt,   da = (-k_v v - k_a a) dt + sqrt(q) dW1
     dy = w dt,   dw = (-ω² y - 2 ζ ω w) dt + sqrt(4 ζ ω³ σ²) dW2
@@ -12,10 +12,6 @@ Velocity and acceleration revert to zero by k_v (mode_velocity_reversions_per_s2
 tremor's stationary standard deviation σ differ between the modes; ω, one of tremor_rates_per_s, and
 ζ = tremor_damping are shared. Rate and strength of a hand's tremor are estimated (`tremor`). W1 and
 W2 are independent Wiener processes.
-
-The estimate between two samples is extrapolated differently: for max_late_s after the newest
-sample, the velocity of a hand that reaches or changes does not revert to zero: otherwise the end of
-a motion would be reported although the next sample may only be late.
 """
 
 from __future__ import annotations
@@ -31,35 +27,22 @@ from thirdhand.core.intake.tuning import IntakeTuning
 from thirdhand.core.numerics import SERIES_TERMS
 from thirdhand.core.tuning import TUNING
 
-REST, REACH, CHANGE = range(MODES)  # a hand rests, reaches, or changes its motion
-STEADY = MODES  # motion of the bank of tremor filters: REACH that does not end
+# A hand rests, moves slowly and steadily, reaches, or changes its motion.
+REST, STEADY, REACH, CHANGE = range(MODES)
+ENDLESS = MODES  # motion of the bank of tremor filters: REACH that does not end
 
 
 @functools.cache
 def models(period_s: float, count: int, numbers: IntakeTuning = TUNING.intake) -> Records:
-    """Transition, process noise and extrapolation of all modes over 0 to `count` - 1 periods.
-
-    Record n holds, for the interval t = n `period_s`, the fields of `model`, and `onward` (MODES,
-    3, 3), which extrapolates (p, v, a) from the newest sample. With h = min(t, max_late_s):
-
-        onward = F(t - h)[:3, :3] expm(D h),   D = [[0, 1, 0], [0, 0, 1], [0, 0, -k_a]]
-
-    For REST, onward = F(t)[:3, :3].
+    """Transition and process noise of all modes over 0 to `count` - 1 periods: record n holds the
+    fields of `model` for n `period_s`.
     """
     motions = [(name, np.float64, (MODES + 1, 3, 3)) for name in ("transition", "noise")]
     tremors = [(name, np.float64, (TREMOR_RATES, 2, 2)) for name in ("tremor", "tremor_noise")]
-    out = structured(count, [*motions, *tremors, ("onward", np.float64, (MODES, 3, 3))])
+    out = structured(count, [*motions, *tremors])
     times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
-    steady_s: Vector = np.minimum(times_s, numbers.max_late_s)
     for name, values in model(times_s, numbers).items():
         out[name] = values
-    for mode in (REACH, CHANGE):
-        fades = numbers.mode_acceleration_reversions_per_s[mode]
-        ending = _over(
-            _motion(numbers.mode_velocity_reversions_per_s2[mode], fades), times_s - steady_s
-        )[0]
-        out["onward"][:, mode] = _product(ending, _over(_motion(0.0, fades), steady_s)[0])
-    out["onward"][:, REST] = out["transition"][:, REST]
     return out
 
 
@@ -68,7 +51,7 @@ def model(interval_s: float | Vector, numbers: IntakeTuning = TUNING.intake) -> 
     tremor of unit variance at each of the tremor_rates_per_s:
 
     * `transition`, `noise` (..., MODES + 1, 3, 3), with A = [[0, 1, 0], [0, 0, 1], [0, -k_v, -k_a]]
-      and c = q; the last one, STEADY, is REACH with k_v = 0
+      and c = q; the last one, ENDLESS, is REACH with k_v = 0
     * `tremor`, `tremor_noise` (..., TREMOR_RATES, 2, 2), with A = [[0, 1], [-ω², -2 ζ ω]] and
       c = 4 ζ ω³
 
@@ -79,8 +62,11 @@ def model(interval_s: float | Vector, numbers: IntakeTuning = TUNING.intake) -> 
     interval_s = np.asarray(interval_s, np.float64)
     transition, noise = np.empty((2, *interval_s.shape, MODES + 1, 3, 3))
     reversions = [*numbers.mode_velocity_reversions_per_s2, 0.0]
-    for motion, mode in enumerate((REST, REACH, CHANGE, REACH)):
-        dynamics = _motion(reversions[motion], numbers.mode_acceleration_reversions_per_s[mode])
+    for motion, mode in enumerate((REST, STEADY, REACH, CHANGE, REACH)):
+        revert_a = numbers.mode_acceleration_reversions_per_s[mode]
+        dynamics = np.array(
+            [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -reversions[motion], -revert_a]]
+        )
         transition[..., motion, :, :], driven = _over(dynamics, interval_s)
         noise[..., motion, :, :] = numbers.mode_intensities_m2ps5[mode] * driven
     tremor, tremor_noise = np.empty((2, *interval_s.shape, TREMOR_RATES, 2, 2))
@@ -94,13 +80,6 @@ def model(interval_s: float | Vector, numbers: IntakeTuning = TUNING.intake) -> 
         "tremor": tremor,
         "tremor_noise": tremor_noise,
     }
-
-
-def _motion(revert_v: float, revert_a: float) -> Vector:
-    """Dynamics A (3, 3) of position, velocity and acceleration: [[0, 1, 0], [0, 0, 1], [0, -k_v,
-    -k_a]].
-    """
-    return np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -revert_v, -revert_a]])
 
 
 def _over(dynamics: Vector, interval_s: Vector) -> tuple[Vector, Vector]:

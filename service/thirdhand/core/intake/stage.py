@@ -103,22 +103,23 @@ class Intake:
             unseen_ticks=unseen_ticks,
             silent_ticks=self._silent_ticks,
             still_ticks=self._still_ticks,
-            joint_jump_speed=max(
-                numbers.joint_jump_radps, float((np.array(joints.velocity) / per_rad).max())
-            ),
+            joint_jump_speed=float((np.array(joints.velocity) / per_rad).max()),
             plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
             has_clutch=int(hands.clutch == "key"),
             **numbers._asdict(),
             start_speed_std_mps=numbers.start_speed_std_mps,
-            # A faster hand does not rest: reaches are seen at once.
-            rest_max_speed_mps=numbers.outlier_stds * numbers.rest_speed_std_mps,
+            # A hand that is faster than any resting one may still move steadily.
+            calm_speed_stds_mps=numbers.rest_speed_std_mps * np.array([1.0, numbers.outlier_stds]),
             # Squared deviation / variance of an outlier; what differs by less continues its filter.
             outlier_variances=numbers.outlier_stds**2,
             # No mode becomes less probable than an outlier on two axes, so that each can return.
             least_mode_probability=round(math.exp(-(numbers.outlier_stds**2)), 9),
             tremor_rates_per_s=numbers.tremor_rates_per_s,
             jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
+            arm_still_rad=numbers.arm_still_rad,
+            confirmed_s=numbers.confirmed_s,
+            delay_tolerance_s=numbers.delay_tolerance_s,
             contested_off_share=numbers.contested_off_share,
             max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),

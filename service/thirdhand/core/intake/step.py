@@ -33,7 +33,7 @@ from thirdhand.core.intake.hand_estimator import (
     turn_to,
 )
 from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
-from thirdhand.core.intake.plausibility import is_confirmed, is_swapped
+from thirdhand.core.intake.plausibility import is_confirmed
 from thirdhand.core.vectors import distance, squared_distance
 
 NOT_FINITE = int(Cause.NOT_FINITE)
@@ -43,7 +43,6 @@ REPEATED = int(Cause.REPEATED)
 OLDER = int(Cause.OLDER)
 AHEAD = int(Cause.AHEAD)
 JUMPED = int(Cause.JUMPED)
-SWAPPED = int(Cause.SWAPPED)
 
 
 @compiled
@@ -297,10 +296,6 @@ def _jump(
         if jumped and order == 0:
             wrong = wrong_samples(states, parameters, models, side, made, position)
             jumped = wrong == 0
-
-    # A hand may also reappear where the other hand was.
-    if order == 0 and not jumped and (state.jump_is_swap[side] or not fresh):
-        jumped = is_swapped(states, parameters, side, position)
     return jumped, wrong
 
 
@@ -322,7 +317,7 @@ def _judge_hand(
         return cause, order, made, False, 0
     jumped, wrong = _jump(states, parameters, models, side, order, made, position, fresh)
     if jumped and (order > 0 or not is_confirmed(states, parameters, side, position)):
-        cause = SWAPPED if states[0].jump_is_swap[side] else JUMPED
+        cause = JUMPED
     return cause, order, made, jumped, wrong
 
 
@@ -378,7 +373,6 @@ def take_hand(
     if order == 0:
         _note_correction(states, parameters, side, wrong, before)
         state.jump_count[side] = 0
-        state.jump_is_swap[:] = 0  # this hand is seen, so the other one is not taken for it
         turn_to(states, side, turn, mapping)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick

@@ -1,7 +1,7 @@
 """Rate and strength of each hand's tremor, estimated by a bank of Kalman filters.
 
-The first two filters of the bank have no tremor, and the motions STEADY and CHANGE
-(`motion_model`). Each of the others has the motion STEADY and a tremor of one of the
+The first two filters of the bank have no tremor, and the motions ENDLESS and CHANGE
+(`motion_model`). Each of the others has the motion ENDLESS and a tremor of one of the
 tremor_rates_per_s, so tremor is found at rest and in a reach. It is evident when the recent samples
 are much more probable with it than with any motion without one.
 
@@ -19,7 +19,7 @@ from thirdhand.core.frame import Records, Vector
 from thirdhand.core.geometry import ROUND_TO
 from thirdhand.core.intake import BANK, MODES, NO_TREMOR, USUAL_RATE
 from thirdhand.core.intake.mode_filter import measure, move_on
-from thirdhand.core.intake.motion_model import CHANGE, REST, STEADY
+from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REST
 
 
 @compiled
@@ -77,7 +77,7 @@ def note_tremor(states: Records, parameters: Records, models: Records, side: int
         rate = max(k - NO_TREMOR, 0)
         if ticks > 0:
             driven = config.tremor_stds_m[REST] ** 2 if k >= NO_TREMOR else 0.0
-            move_on(mean, covariance, overs, CHANGE if k == 1 else STEADY, rate, driven)
+            move_on(mean, covariance, overs, CHANGE if k == 1 else ENDLESS, rate, driven)
         variance, error = measure(mean, covariance, noise, position)
         likelihood = -1.5 * log(variance) - 0.5 * min(error, config.outlier_variances)
         if k == 0:  # the others are compared with it

@@ -13,8 +13,8 @@ import numpy as np
 
 from thirdhand.core.frame import Vector
 
-Modes: TypeAlias = tuple[float, float, float]
-"""A number for each mode of the hand filter: rest, reach, change."""
+Modes: TypeAlias = tuple[float, float, float, float]
+"""A number for each mode of the hand filter: rest, steady, reach, change."""
 
 
 class IntakeTuning(NamedTuple):
@@ -28,24 +28,25 @@ class IntakeTuning(NamedTuple):
     # a hold for a measured reason lasts until its measure is below this share of the threshold
     end_share: float = 0.8
 
-    # The hand filter's modes: rest, reach, change.
+    # The hand filter's modes: rest, steady, reach, change.
     # 0.05 to 0.8. More: a mode is entered more often. Less: a mode is entered less often.
     # probabilities before anything is known, and after a switch
-    mode_prior: Modes = (0.3, 0.5, 0.2)
+    mode_prior: Modes = (0.3, 0.1, 0.4, 0.2)
     # 0.01 to 10. More: changes are seen sooner. Less: estimates are smoother.
     # [1/s] rates at which the mode is drawn anew; low in rest
-    mode_switch_rates_per_s: Modes = (0.03, 3.0, 3.0)
+    mode_switch_rates_per_s: Modes = (0.03, 1.0, 3.0, 3.0)
     # 1e-7 to 100. More: the estimate follows faster. Less: noise is reduced more.
-    mode_intensities_m2ps5: Modes = (1e-6, 1.0, 30.0)  # [m²/s⁵] intensity of the white jerk
+    # [m²/s⁵] intensity of the white jerk
+    mode_intensities_m2ps5: Modes = (1e-6, 3e-3, 1.0, 30.0)
     # 3 to 40. More: accelerations end sooner. Less: accelerations last longer.
     # [1/s] decay of the acceleration
-    mode_acceleration_reversions_per_s: Modes = (10.0, 14.0, 14.0)
-    # 0.1 to 300. More: motions are expected to end sooner. Less: motions are expected to go on.
-    # [1/s²] low in rest, where drift goes on; reaches end
-    mode_velocity_reversions_per_s2: Modes = (0.3, 95.0, 95.0)
+    mode_acceleration_reversions_per_s: Modes = (10.0, 10.0, 14.0, 14.0)
+    # 0 to 300. More: motions are expected to end sooner. Less: motions are expected to go on.
+    # [1/s²] low in rest, where drift goes on, and 0 in steady motion; reaches end
+    mode_velocity_reversions_per_s2: Modes = (0.3, 0.0, 95.0, 95.0)
     # 0 to 2e-3. More: more motion counts as tremor. Less: more tremor reaches the estimate.
     # standard deviation on each axis; larger tremor has the same frequency
-    tremor_stds_m: Modes = (5e-4, 3e-4, 0.0)
+    tremor_stds_m: Modes = (5e-4, 5e-4, 3e-4, 0.0)
     # 40 to 90. More: faster tremor is removed. Less: slower tremor is removed.
     # [1/s] usual angular frequency; physiological tremor has 8 to 12 Hz
     tremor_rate_per_s: float = 20.0 * math.pi
@@ -65,10 +66,6 @@ class IntakeTuning(NamedTuple):
     # 20 to 300. More: the noise is steadier. Less: the noise adapts faster.
     noise_samples: int = 60  # number of samples over which the noise is averaged
 
-    # Stillness, which distinguishes a hand that waits from one on its way.
-    # 0.01 to 0.1. More: stillness ends later. Less: stillness ends sooner.
-    stillness_fall_s: float = 0.03  # time constant with which stillness ends
-
     # Late samples.
     # 0.03 to 0.3. More: later samples are used. Less: late samples are rejected sooner.
     # samples older than the newest one by more are rejected; longer delays count as this
@@ -76,16 +73,11 @@ class IntakeTuning(NamedTuple):
     # 0.3 to 5. More: judgements are steadier. Less: drift and a second arm are seen sooner.
     # time over which a tracker's minimum delay and the arm's contradictions are judged
     tracker_memory_s: float = 1.0
-    # 2e-3 to 0.05. More: worse clocks are trusted. Less: good clocks are doubted.
-    # minimum delays of two windows agree within this: 1 % of drift between two clocks
-    delay_tolerance_s: float = 0.01
 
     # Jumps, and two sources of the arm.
     # 2 to 10. More: wrong units pass. Less: far trackers are rejected.
     # samples farther from the base plate are rejected; their unit is probably wrong
     max_hand_distance_m: float = 5.0
-    # 0.005 to 0.1. More: jumps are followed later. Less: outliers are followed.
-    confirmed_s: float = 0.02  # successive samples that confirm a jump span at least this time
     # 0.1 to 0.5. More: two arms are tolerated longer. Less: outliers hold the arm.
     # the arm is contested above this share of contradicting states
     contested_on_share: float = 0.25
@@ -94,26 +86,14 @@ class IntakeTuning(NamedTuple):
     # 0.05 to 1. More: jumps of the arm pass. Less: coarse joint states are rejected.
     # a joint may differ from its newest sample by this + jump speed * elapsed time
     joint_jump_rad: float = 0.2
-    # 1 to 20. More: jumps of the arm pass. Less: an arm moved by hand is rejected.
-    # least jump speed, as an arm can be moved by hand; else the fastest joint's limit
-    joint_jump_radps: float = 5.0
-    # 2e-3 to 0.1. More: a moving arm counts as still. Less: a noisy arm never starts.
-    # an arm is at rest if no joint moves by more than this within max_late_s
-    arm_still_rad: float = 0.02
 
-    # Hands without an estimate yet, and hands that move.
-    # 1e-4 to 0.01. More: the first second is filtered more. Less: the first second is noisier.
-    noise_std_m: float = 0.002  # noise of each axis before it is estimated
+    # Hands that move.
     # 0.01 to 0.5. More: slow reaches count as rest. Less: trembling hands are in motion.
     hand_still_mps: float = 0.05  # a faster hand is in motion
-    # 0.02 to 2. More: rest is recognised later. Less: turning points look like rest.
-    hand_still_s: float = 0.2  # a slow hand counts as still after this time
     # 0.005 to 0.3. More: outliers are followed. Less: quick reaches are rejected.
     jump_m: float = 0.04  # a sample farther from its prediction is a jump
     # 0 to 5. More: outliers after a pause are followed. Less: hands that reappear are rejected.
     jump_speed_mps: float = 1.5  # after a pause the limit of a jump grows at this speed
-    # 0.1 to 10. More: a true exchange is rejected longer. Less: swapped hands are followed.
-    swapped_s: float = 2.0  # exchanged hands are accepted after this time
 
     @property
     def tremor_rates_per_s(self) -> Vector:
@@ -133,6 +113,31 @@ class IntakeTuning(NamedTuple):
             self.mode_velocity_reversions_per_s2[-1] * self.mode_acceleration_reversions_per_s[-1]
         )
         return self.outlier_stds * math.sqrt(self.mode_intensities_m2ps5[-1] / (2.0 * reversion))
+
+    @property
+    def noise_std_m(self) -> float:
+        """Noise of each axis before it is estimated."""
+        return self.outlier_stds * self.least_noise_m
+
+    @property
+    def hand_still_s(self) -> float:
+        """A slow hand counts as still after two periods of tremor."""
+        return 2.0 * self.stillness_lowpass_s
+
+    @property
+    def confirmed_s(self) -> float:
+        """Samples that confirm a jump span at least this time: a hand is not yet stale then."""
+        return 0.5 * self.max_late_s
+
+    @property
+    def delay_tolerance_s(self) -> float:
+        """Minimum delays of two windows agree within 1 %, the largest drift between two clocks."""
+        return 0.01 * self.tracker_memory_s
+
+    @property
+    def arm_still_rad(self) -> float:
+        """An arm is at rest if no joint moves by more than this within max_late_s."""
+        return self.joint_jump_rad / 10.0
 
     @property
     def stillness_lowpass_s(self) -> float:

@@ -96,13 +96,15 @@ class Separation:
             # A hand approaches at `unknown_speed` until its velocity is better known than after
             # its first sample.
             unknown_velocity_std_mps=2.0 * tuning.intake.start_speed_std_mps / 3.0,
-            unseen_acceleration_mps2=numbers.unseen_acceleration_mps2,
+            # A hand out of sight accelerates toward the arm as much as a hand brakes.
+            unseen_acceleration_mps2=tuning.setpoint.hand_brake_mps2,
             contact_margin_m=numbers.contact_margin_m,
             contact_speed=float(people.contact_speed),
             unknown_speed=numbers.unknown_speed_mps,
             unseen_s=np.array([settings.hands.longest_stale_ms, settings.hands.unseen_ms]) / 1000,
             period_s=settings.period_s,
-            tremor_speed=numbers.tremor_speed_mps,
+            # A slower hand's motion is ignored as tremor; from twice that it counts in full.
+            tremor_speed=2.0 * tuning.intake.hand_still_mps,
             hand_radius=float(people.radius),
             forearm=people.length / np.linalg.norm(direction) * direction,
             frames=body.frames,

@@ -36,17 +36,11 @@ class SeparationTuning(NamedTuple):
     # Speeds of hands.
     # 0.5 to 3. More: the arm keeps farther away from a hand that appears. Less: it reacts later.
     unknown_speed_mps: float = 1.6  # assumed speed of a hand that was only just seen
-    # 0.02 to 0.3. More: slow approaches are ignored. Less: the arm gives way to a tremor.
-    # a slower hand's motion is ignored as tremor; from twice that it counts in full
-    tremor_speed_mps: float = 0.1
 
     # Hands: what may happen until the arm reacts.
     # 0.03 to 0.2. More: the arm slows down earlier. Less: ramps are too short.
     # time until a deceleration has built up, and until a hand's new velocity is measured
     brake_ramp_s: float = 0.08
-    # 1 to 20. More: the arm retreats sooner. Less: hands may appear closer than planned.
-    # [m/s²] a hand out of sight is assumed to accelerate toward the arm at this
-    unseen_acceleration_mps2: float = 5.0
     # 5e-3 to 0.1. More: contact is allowed wider. Less: a reached via-point blocks the tool.
     # a hand may be touched this far beyond a via-point's radius, on each axis
     contact_margin_m: float = 0.02

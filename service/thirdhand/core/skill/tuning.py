@@ -41,8 +41,7 @@ SEGMENT_CYCLE_PER_S = 0.2
 # 1 to 100. More: the first segment is favoured. Less: any segment may be first.
 # probability of the first segment / probability of any other, at the start
 FIRST_SEGMENT_ODDS = 10.0
-# 0.05 to 1. More: the belief is slower. Less: the belief is faster.
-SAMPLE_CORRELATION_S = 0.2  # samples within this time carry the same evidence
+SAMPLE_CORRELATION_S = TUNING.intake.hand_still_s  # samples within it carry the same evidence
 # larger deviations from a path carry no more evidence
 MAX_SQUARED_DEVIATION = TUNING.intake.outlier_stds**2
 # 0.05 to 0.5. More: slow motions weigh less. Less: slow motions weigh more.
@@ -104,8 +103,7 @@ TURN_WEIGHT_M = 0.1
 CLOCK_START_MPS = 0.08  # a faster hand has begun the task; tremor and drift are slower
 # time constant with which the clock's rate changes, as stillness does
 CLOCK_LAG_S = TUNING.intake.stillness_lowpass_s
-# 0.03 to 0.08. More: more rests within a task count as its begin. Less: fewer returns count.
-OWN_NEAR_M = 0.05  # [m] hands this near to where they began the task have returned there
+OWN_NEAR_M = PATH_END_M  # hands this near to where they began the task have returned there
 
 # The gripper.
 # 0.02 to 0.3. More: the gripper acts sooner. Less: the gripper acts later.
