@@ -111,7 +111,7 @@ _TEST, _TUNING, _LEARNED = (GROUP_SEEDS[group] for group in ("test", "tuning", "
 _PEOPLE = Seeds(
     {
         "people": Stream("person", _TEST, range(24)),
-        "breaking": Stream("breaking scene", _TEST, range(40)),
+        "breaking": Stream("breaking scene", _TEST, range(20)),
     },
     tuning={
         "people": Stream("person", _TUNING, range(10)),

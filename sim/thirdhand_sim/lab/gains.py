@@ -57,7 +57,7 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
                     color=colour,
                     label=f"{label}: {path}",
                 )
-        panel.set(title=f"small motion of {kind}", xlabel="frequency [Hz]", ylim=(0, None))
+        panel.set(title=kind, xlabel="frequency [Hz]", ylim=(0, None))
         panel.set_xticks(range(1, 13))
     axes[0].set_ylabel("gain, from the target for true hands")
     figure.legend(

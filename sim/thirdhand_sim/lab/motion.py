@@ -24,7 +24,7 @@ from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import decoded
 from thirdhand.workbench.learning.learn import learn
-from thirdhand_sim.lab import gains, spectra
+from thirdhand_sim.lab import gains, slow_hands, spectra
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.open_loop import targets
 from thirdhand_sim.lab.people.moving_hands import (
@@ -36,6 +36,7 @@ from thirdhand_sim.lab.people.moving_hands import (
     person,
     reaches,
     recorded,
+    slow,
     small_motion,
     stops,
 )
@@ -254,6 +255,16 @@ def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     return [gains.gain(target, path, rate_hz) for path in (followed.setpoint, followed.tool)]
 
 
+def measure_slow(task: tuple[str, float, float, int]) -> list[list[float]]:
+    """Speeds of target and tool while a hand begins to move at a speed [m/s], see `slow_hands`."""
+    name, speed_mps, rate_hz, number = task
+    skill, settings, by_name = _known[SHIPPED_SKILL_HANDS]
+    noise = slow_hands.TRACKERS[round(rate_hz)]
+    hands = slow(skill.hands.mean(axis=0), speed_mps, rate_hz, noise, number)
+    target = targets(skill, hands.truth, settings)
+    return slow_hands.curves(target, by_name[name](hands).tool)
+
+
 def figures(name: str, hands: Moving, target: Array, seen: Followed) -> MotionFigures:
     """Figures of a path against the truth's target (N, 3) [m], from BEGUN_S on."""
     tool = seen.tool
@@ -325,6 +336,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "by_person": _by_person(results, [row for row in measured if math.isnan(row.overshoot_mm)]),
         "best_linear_filter": _floors(floor_hands, skill),
         "gain_by_frequency": _gains(results, options, {"ours": "ours", "chase": chase}),
+        "slow_hands": _slow(results, options, {"ours": "ours", "chase": chase}),
         "joint_speeds_in_the_scene": _joint_speeds(measured, (TRUTH, *by_both, "no smoothing")),
         "by_sequence": [msgspec.to_builtins(row) for row in measured if row.follower == "ours"],
         "by_arm": _by_arm(results, options, floor_hands),
@@ -431,6 +443,30 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
             for follower, of in zip(names, of_kind, strict=True)
         }
         results.say(f"gain of {kind}, by Hz: {brief(out[kind])}")
+    return out
+
+
+def _slow(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
+    """Evenness of the tool's motion, and the first curve, by speed and tracker, and follower."""
+    numbers = STOPS.share(options.share / 3.0, least=2)
+    begin = functools.partial(prepare, options.share, options.arm)
+    kinds = list(itertools.product(slow_hands.SLOW_MPS, slow_hands.TRACKERS))
+    tasks = [
+        (name, speed_mps, float(rate_hz), number)
+        for speed_mps, rate_hz in kinds
+        for name in names.values()
+        for number in numbers
+    ]
+    values = np.array(list(shared_out(measure_slow, tasks, options.workers, prepare=begin)))
+    values = values.reshape(len(kinds), len(names), len(numbers), *values.shape[1:])
+    out: dict[str, Any] = {}
+    for (speed_mps, rate_hz), of_kind in zip(kinds, values, strict=True):
+        found = {name: slow_hands.evenness(rows) for name, rows in zip(names, of_kind, strict=True)}
+        results.say(f"{1000 * speed_mps:g} mm/s, {rate_hz} Hz: {brief(found)}")
+        out[f"{1000 * speed_mps:g} mm/s, {rate_hz} Hz"] = {
+            name: {**found[name], "first": np.round(rows[0], 5).tolist()}
+            for name, rows in zip(names, of_kind, strict=True)
+        }
     return out
 
 
@@ -605,9 +641,8 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             results,
             {kind: row["bands"] for kind, row in numbers["joint_speeds_in_the_scene"].items()},
         )
-    # older results have no gains
-    if "gain_by_frequency" in numbers:
         gains.draw(results, numbers["gain_by_frequency"])
+        slow_hands.draw(results, numbers["slow_hands"])
 
 
 def _draw_followers(

@@ -39,10 +39,15 @@ MOST_LATE_S = 0.06  # largest delay of a wireless tracker's samples
 # one hand is not seen at these shares of a recording, for 0.1 to 0.5 s
 UNSEEN_AT = (0.3, 0.7)
 UNSEEN_S = (0.1, 0.5)
-SMALL_KINDS = {  # amplitude [m], speed of the drift [m/s]
-    "3 mm in a drift of 0.1 m/s": (0.003, 0.1),
-    "2 mm at rest": (0.002, 0.0),
+# largest amplitude [m], largest speed of the oscillation [m/s], speed of the drift [m/s]
+SMALL_KINDS = {
+    "3 mm in a drift of 0.1 m/s": (0.003, math.inf, 0.1),
+    "2 mm at rest": (0.002, math.inf, 0.0),
+    "20 mm, at most 0.4 m/s": (0.02, 0.4, 0.0),
 }
+SLOW_S = 3.5  # duration of a slow motion
+SLOW_BEGINS_S = 1.0
+SLOW_RISE_S = 0.1
 # duration, duration of the judged end, duration of the rise at the begin
 SMALL_S = 3.5
 SMALL_JUDGED_S = 2.0
@@ -299,8 +304,9 @@ def reaches(*, seeds: Sequence[int]) -> list[Moving]:
 
 
 def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Moving:
-    """A hand that oscillates by millimetres at a frequency, at rest or in a steady drift."""
-    amplitude_m, drift_mps = SMALL_KINDS[kind]
+    """A hand that trembles or waves at a frequency, at rest or in a steady drift."""
+    amplitude_m, wave_mps, drift_mps = SMALL_KINDS[kind]
+    amplitude_m = min(amplitude_m, wave_mps / (2 * math.pi * rate_hz))
     random = np.random.default_rng([number, 8])
     directions = random.standard_normal((2, 3)) * (1.0, 1.0, 0.5)
     shake, drift = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -317,3 +323,20 @@ def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Movin
     samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
     samples += 0.0005 * random.standard_normal(samples.shape)
     return Moving(f"{kind}, {rate_hz:g} Hz", "small motion", truth, stamps, samples)
+
+
+def slow(middle: Array, speed_mps: float, rate_hz: float, noise: float, number: int) -> Moving:
+    """One hand rests for SLOW_BEGINS_S, then moves at a constant speed."""
+    random = np.random.default_rng([number, 11])
+    direction = random.standard_normal(3) * (1.0, 1.0, 0.5)
+    direction /= np.linalg.norm(direction)
+    t = np.arange(round(SLOW_S / PERIOD_S)) * PERIOD_S
+    rise = np.clip((t - SLOW_BEGINS_S) / SLOW_RISE_S, 0.0, 1.0)
+    travel_m = np.cumsum(speed_mps * rise) * PERIOD_S
+    side = 3 * (number % 2)
+    truth = np.tile(middle, (len(t), 1))
+    truth[:, side : side + 3] += (travel_m - travel_m[-1] / 2)[:, None] * direction
+    stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
+    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
+    samples += noise * random.standard_normal(samples.shape)
+    return Moving(f"slow {number + 1}", "slow", truth, stamps, samples)
