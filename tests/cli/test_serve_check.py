@@ -69,6 +69,7 @@ def test_check_of_a_good_cell_writes_nothing(tmp_path: Path) -> None:
         "ok configuration",
         "ok imports",
         "ok arm",
+        "ok hands",
         "ok skill",
         "ok state",
         "ok descriptors",
@@ -76,6 +77,7 @@ def test_check_of_a_good_cell_writes_nothing(tmp_path: Path) -> None:
         "ok disk",
         "ok port",
     ]
+    assert checks["ok hands"] == ["samples needed every 100 ms ([hands] stale_ms), from 10 Hz"]
     assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
 
 

@@ -55,6 +55,7 @@ def check(args: argparse.Namespace) -> int:
     conditions: list[tuple[Any, ...]] = [
         ("imports", _imports),
         ("arm", _arm, settings),
+        ("hands", _hands, settings),
         ("skill", _skill, settings, skill_path(settings, args)),
         ("state", lambda: _folder(state_folder(settings))),
         ("descriptors", lambda: f"{allow_descriptors()} open files"),
@@ -82,6 +83,11 @@ def _arm(settings: Settings) -> str:
     return (
         f"{urdf_path(settings)}, {len(settings.joints.names)} joints, tool on {settings.arm.plate}"
     )
+
+
+def _hands(settings: Settings) -> str:
+    stale_ms = settings.hands.stale_ms
+    return f"samples needed every {stale_ms:g} ms ([hands] stale_ms), from {1000 / stale_ms:g} Hz"
 
 
 def _skill(settings: Settings, path: Path) -> str:

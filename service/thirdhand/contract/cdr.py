@@ -75,21 +75,24 @@ class Writer(bytearray):
         self.string(frame)
 
 
-def _posed(message: PoseStamped | PoseWithCovarianceStamped) -> Writer:
+@functools.lru_cache(maxsize=_MOST_LAYOUTS)
+def _frame_bytes(frame_id: str) -> bytes:
+    """The bytes between stamp and pose of a message in this frame."""
     out = Writer()
-    out.header(message.stamp_ns, message.frame_id)
-    out.pack(_POSE, *message.position, *message.orientation, align=8)
-    return out
+    out.header(0, frame_id)
+    return bytes(out[_STAMPED:]) + bytes(-(len(out) - 4) % 8)
 
 
-def encode_pose(message: PoseStamped) -> bytes:
-    """CDR bytes of a PoseStamped."""
-    return bytes(_posed(message))
+def encode_pose(message: PoseStamped | PoseWithCovarianceStamped) -> bytes:
+    """CDR bytes of a PoseStamped, or of the begin of a message with a covariance."""
+    stamp = _STAMP.pack(*_stamp(message.stamp_ns))
+    pose = _POSE.pack(*message.position, *message.orientation)
+    return CDR_HEADER + stamp + _frame_bytes(message.frame_id) + pose
 
 
 def encode_pose_with_covariance(message: PoseWithCovarianceStamped) -> bytes:
     """CDR bytes of a PoseWithCovarianceStamped."""
-    return bytes(_posed(message) + _COVARIANCE.pack(*message.covariance))
+    return encode_pose(message) + _COVARIANCE.pack(*message.covariance)
 
 
 def encode_joints(message: JointState) -> bytes:
@@ -346,9 +349,26 @@ def _read_pose(data: bytes, *layouts: struct.Struct) -> tuple[Any, ...]:
     return stamp, frame, pose[:3], pose[3:], *more
 
 
+_frames: dict[bytes, str] = {}  # by the bytes between stamp and pose
+
+
 def decode_pose(data: bytes) -> PoseStamped:
-    """The PoseStamped in CDR bytes. Raises WireError."""
-    return PoseStamped(*_read_pose(data, _POSE))
+    """The PoseStamped in CDR bytes. Raises WireError.
+
+    A source repeats the name of its frame, so that is read only once.
+    """
+    known = data[_STAMPED : -_POSE.size]
+    frame = _frames.get(known)
+    if frame is not None and data.startswith(CDR_HEADER):
+        pose = _POSE.unpack_from(data, len(data) - _POSE.size)
+        return PoseStamped(_stamp_ns(*_STAMP.unpack_from(data, 4)), frame, pose[:3], pose[3:])
+
+    message = PoseStamped(*_read_pose(data, _POSE))
+    if encode_pose(message) == data:  # not another writer's padding
+        if len(_frames) >= _MOST_LAYOUTS:
+            _frames.clear()
+        _frames[known] = message.frame_id
+    return message
 
 
 def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:

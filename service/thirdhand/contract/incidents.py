@@ -225,8 +225,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
             Mode.HOLD,
             "tool blocked",
             "joint limits or things around the arm keep the tool from its target",
-            "wait while the arm looks for a way out and takes it; if it finds none, move the "
-            "hands: it tries again with another target",
+            "wait while the arm looks for a way out and takes it; if that does not lead to the "
+            "target, move the hands: it tries again with another target",
         ),
         Incident(
             Reason.AMBIGUOUS,

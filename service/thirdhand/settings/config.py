@@ -357,12 +357,20 @@ class RecordingSettings(Section, frozen=True):
     frames_hz: Annotated[float, msgspec.Meta(ge=0)] = 25.0
 
 
+class LoopSettings(Section, frozen=True):
+    """The loop's use of the processor."""
+
+    # rehearse each tick before its deadline, which shortens it and takes about a fifth of a core
+    prepare: bool = True
+
+
 class Settings(Section, frozen=True):
     """All settings of one cell."""
 
     cell: CellName = "thirdhand"  # prefix of all keys on Zenoh
     # ticks of the loop in a second
     rate_hz: Annotated[int, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])] = 500
+    loop: LoopSettings = msgspec.field(default_factory=LoopSettings)
     hands: HandSettings = msgspec.field(default_factory=HandSettings)
     trackers: dict[str, TrackerSettings] = {}
     tool: ToolSettings = msgspec.field(default_factory=ToolSettings)
