@@ -84,7 +84,6 @@ class Person(NamedTuple):
     tremor: float
     tracker: TrackerModel
     mistakes: float = 0.25  # probability of a mistake in a session
-    swaps: float = 0.25  # probability that the tracker swaps left and right for a moment
     shapes: Sequence[
         tuple[Array, Array]
     ] = ()  # recorded reaches along x: shares (M,), deviations (M, 3) per metre
@@ -140,5 +139,4 @@ PLAIN_PERSON = Person(
     tremor=0.0005,
     tracker=TrackerModel(),
     mistakes=0.0,
-    swaps=0.0,
 )

@@ -73,7 +73,6 @@ class Session:
     windows: tuple[tuple[float, float], ...]
     lasts_s: float
     seed: tuple[int, ...]
-    swapped_s: tuple[float, float] = (np.inf, np.inf)
     mistake: str = ""
 
     def hands(self, times: Array) -> Array:
@@ -140,8 +139,6 @@ class Session:
                 keep[index : index + int(0.1 * 10 ** random.random() * tracker.rate_hz), side] = (
                     False
                 )
-        swapped = (stamps >= self.swapped_s[0]) & (stamps < self.swapped_s[1])
-        positions[swapped] = np.roll(positions[swapped], 3, axis=1)
         return (stamps[keep[:, 0]], positions[keep[:, 0], :3]), (
             stamps[keep[:, 1]],
             positions[keep[:, 1], 3:],
@@ -284,10 +281,6 @@ def played(
             1, soldered + 0.8, right[2], right[2] + 0.5 * (right[1] - right[2]), (2.0, 1.5)
         )
     end = soldered + LAST_S
-    swapped = (np.inf, np.inf)
-    if random.random() < who.swaps:
-        begin = float(random.uniform(REST_S, end - 1.5))
-        swapped = (begin, begin + float(random.uniform(0.2, 1.0)))
     windows = ((handover_s, taken), (max(brought, fetched), leaves), (soldered, end))
     return Session(
         who,
@@ -298,7 +291,6 @@ def played(
         windows,
         end,
         seed,
-        swapped,
         mistake,
     )
 
@@ -336,10 +328,7 @@ def demonstrations(people: int, *, sigma_m: float = 0.005) -> list[SessionDemons
     """Two demonstrations of each person, with things in their nominal places and with things moved
     by up to 10 cm. There are no mistakes, because a person repeats a failed demonstration.
     """
-    careful = [
-        person("demonstrations", number)._replace(mistakes=0.0, swaps=0.0)
-        for number in range(people)
-    ]
+    careful = [person("demonstrations", number)._replace(mistakes=0.0) for number in range(people)]
     return [
         demonstration(
             session(subject, number, group="demonstrations", sigma_m=sigma_m, moved_m=moved)

@@ -110,7 +110,7 @@ class TestJudging:
         assert not any(event.reached for event in judgement.events)
         assert all(event.held for event in judgement.events)
         due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
-        # holds for stale and swapped hands are right
+        # holds for stale hands are right
         assert judgement.falsely_held == pytest.approx(1.0 - due)
 
     def test_a_passage_by_a_hand_is_no_success(self, as_seen: SeenSession) -> None:

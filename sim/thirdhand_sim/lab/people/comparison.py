@@ -278,8 +278,6 @@ def summary(rows: Sequence[TrialOutcome]) -> dict[str, Any]:
         out[f"{name[:-3]}_rms_mm"] = float(
             np.sqrt(np.mean([getattr(row, name) ** 2 for row in rows]))
         )
-    swapped = sum(row.swapped for row in rows)
-    out["swapped_held"] = sum(row.swapped_held for row in rows) / swapped if swapped else None
     out["events"] = [float(np.mean([row.events[i].reached for row in rows])) for i in range(3)]
     for name in ("error_mm", "true_error_mm"):
         out[f"event_{name}_median"] = [

@@ -43,9 +43,6 @@ SMOOTHED = 5  # ticks over which the velocity of a rival's target is computed, i
 LONGEST_DELAY_S = 0.6
 # on the teacher's path, at most this share of the time is falsely followed
 MAX_ASTRAY_SHARE = 0.05
-# a swap of hands must be noticed in 0.3 s, and decays in 0.2 s
-SWAP_NOTICED_S = 0.3
-SWAP_OVER_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +55,13 @@ class SeenSession:
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
     rest: Array  # (T, 2) stillness of each hand, 0 to 1
     fresh: Mask  # (T,) true if both hands are seen, each by one source
-    swapped: Mask  # (T,) true if the tracker exchanges the hands
     hands: Array  # (T, 6) true positions
     tool: Array  # (T, 3) the teacher's tool
 
     @property
     def due(self) -> Mask:
         """True where holding is right (T,)."""
-        return np.asarray(~self.fresh | self.swapped)
+        return ~self.fresh
 
 
 def settings() -> Settings:
@@ -98,8 +94,6 @@ def seen(session: Session) -> SeenSession:
         state = core.state
         estimates[k] = state["hands"].transpose(1, 0, 2).reshape(3, 6)
         stillness[k] = state["hand_stillness"]
-    begin, end = session.swapped_s
-    swapped = (times >= begin) & (times < end + SWAP_OVER_S)
     return SeenSession(
         session,
         all_ticks,
@@ -107,7 +101,6 @@ def seen(session: Session) -> SeenSession:
         estimates,
         stillness,
         fresh,
-        swapped,
         session.hands(times),
         session.tool(times),
     )
@@ -138,8 +131,6 @@ class TrialOutcome(NamedTuple):
     held: float
     falsely_held: float
     falsely_followed: float
-    swapped: float  # share after 0.3 s of exchanged hands
-    swapped_held: float  # held share of the session with exchanged hands
     negative_log_likelihood: float
     inside: tuple[float, ...]  # share of the ticks in the region of each of LEVELS
     predicted_mm: float  # rms that the covariance predicts
@@ -180,11 +171,6 @@ def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
     radii = placed.regions.radii if isinstance(placed, Skill) else CHI_SQUARE
     likelihood = 0.5 * (squares + np.linalg.slogdet(covariance)[1] + 3.0 * np.log(2.0 * np.pi))
     wrong = np.linalg.norm(target - teacher_tool, axis=1) > WRONG_M
-    planted = (
-        (one.times >= one.session.swapped_s[0] + SWAP_NOTICED_S)
-        & (one.times < one.session.swapped_s[1])
-        & judged
-    )
     return TrialOutcome(
         one.session.person.name,
         one.session.number,
@@ -197,8 +183,6 @@ def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
         float(held[judged].mean()),
         float((held & good).sum() / judged.sum()),
         float((~held & wrong & judged).sum() / judged.sum()),
-        float(planted.sum() / judged.sum()),
-        float((held & planted).sum() / judged.sum()),
         float(np.minimum(likelihood, 1e3).mean()),
         tuple(float((squares <= radius).mean()) for radius in radii),
         1000 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())),
