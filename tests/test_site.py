@@ -243,6 +243,7 @@ def test_errors_with_and_without_jumps_are_shown() -> None:
         "ours_median": 1.5,
         "chase_median": 2.5,
         "ratio": 0.75,
+        "ratio_of_medians": 0.6,
         "lag_ms": 30.0,
     }
     groups = ("clean", "recorded", "recorded, jumps in the truth")

@@ -450,7 +450,7 @@ def _slow(results: Results, options: Options, names: dict[str, str]) -> dict[str
     """Evenness of the tool's motion, and the first curve, by speed and tracker, and follower."""
     numbers = STOPS.share(options.share / 3.0, least=2)
     begin = functools.partial(prepare, options.share, options.arm)
-    kinds = list(itertools.product(slow_hands.SLOW_MPS, slow_hands.TRACKERS))
+    kinds = list(itertools.product(slow_hands.SLOW_HANDS_MPS, slow_hands.TRACKERS))
     tasks = [
         (name, speed_mps, float(rate_hz), number)
         for speed_mps, rate_hz in kinds

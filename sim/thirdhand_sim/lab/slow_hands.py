@@ -10,11 +10,11 @@ from thirdhand_sim.lab.gains import FOLLOWER_LABELS
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S, SLOW_BEGINS_S, SLOW_RISE_S
 from thirdhand_sim.lab.results import REFERENCE, Array, Results, pyplot
 
-SLOW_MPS = (0.01, 0.05)
+SLOW_HANDS_MPS = (0.01, 0.05)
 TRACKERS = {100: 0.0005, 30: 0.002}  # noise [m] by rate [Hz]
 EVERY = 10  # ticks from one point of a curve to the next
 BEGIN = round(0.8 / PERIOD_S / EVERY)  # first point that is shown
-MOVES = round((SLOW_BEGINS_S + SLOW_RISE_S) / PERIOD_S / EVERY)
+RISEN = round((SLOW_BEGINS_S + SLOW_RISE_S) / PERIOD_S / EVERY)
 EVEN = round(2.5 / PERIOD_S / EVERY)  # from this point on the motion should be even
 
 
@@ -33,7 +33,7 @@ def evenness(speeds: Array) -> dict[str, float]:
     wanted, seen = speeds[:, 0], speeds[:, 1]
     even = wanted[:, EVEN:-1].mean(axis=1)
     return {
-        "largest": float(np.mean(seen[:, MOVES:-1].max(axis=1) / even)),
+        "largest": float(np.mean(seen[:, RISEN:-1].max(axis=1) / even)),
         "mean": float(np.mean(seen[:, EVEN:-1].mean(axis=1) / even)),
         "deviation": float(np.mean(seen[:, EVEN:-1].std(axis=1) / even)),
     }
