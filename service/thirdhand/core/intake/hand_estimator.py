@@ -53,7 +53,7 @@ def stillness_after(
     updated in place):
 
         u = u + g_0 (v - u),   n = exp(-(|u| / still_speed)⁴)
-        s = s + (g_1 if n > s else 1) (n - s)
+        s = s + g_1 (n - s) if n > s else n
     """
     square = 0.0
     for axis in range(3):
@@ -64,7 +64,7 @@ def stillness_after(
         square += lowpass[axis] * lowpass[axis]
     share = square / still_speed**2
     now = exp(-share * share)
-    after = stillness + (gains[1] if now > stillness else 1.0) * (now - stillness)
+    after = stillness + gains[1] * (now - stillness) if now > stillness else now
     return float(np.rint(after * ROUND_TO) / ROUND_TO)
 
 
