@@ -142,6 +142,18 @@ def test_flood_of_samples_is_taken() -> None:
     np.testing.assert_allclose(hands.state["hands"][LEFT_SIDE, 0], PLACE, atol=0.002)
 
 
+def test_one_hand_may_go_where_the_other_is() -> None:
+    hands = Hands()
+    for k in range(120):
+        hands.advance(5)
+        stamp_ns = 10**9 + int(hands.state["tick"])
+        left_y = 0.1 if k < 100 else 0.46
+        hands.hand(stamp_ns, (0.5, left_y, 0.2), side=0)
+        hands.hand(stamp_ns, (0.5, 0.5, 0.2), side=1)
+    assert hands.fresh(0)
+    assert hands.state["hands"][0, 0, 1] == pytest.approx(0.46, abs=0.01)
+
+
 NUMBERS = st.one_of(
     st.floats(width=64),
     st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e-310, 1.0, 0.5, math.nan, math.inf, 1e308, 5.0]),

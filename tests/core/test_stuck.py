@@ -124,6 +124,13 @@ def stuck(taught: Skill) -> tuple[Settings, Vector, Vector]:
     return cell, free_postures(cell, STUCK + 1, 1)[STUCK], drawn[STUCK]
 
 
+def stuck_controller(taught: Skill, stuck: tuple[Settings, Vector, Vector]) -> Controller:
+    cell, start, _ = stuck
+    state = start_state(cell, taught)
+    state["joints"][0] = start
+    return Controller(cell, taught, state, urdf=URDF)
+
+
 def test_stuck_tool_is_reported_and_led_out(
     taught: Skill, stuck: tuple[Settings, Vector, Vector], tmp_path: Path
 ) -> None:
@@ -160,10 +167,8 @@ def test_after_a_way_that_leads_nowhere_it_waits(
     taught: Skill, stuck: tuple[Settings, Vector, Vector]
 ) -> None:
     """The arm does not swing again until a hand has moved."""
-    cell, start, hands = stuck
-    state = start_state(cell, taught)
-    state["joints"][0] = start
-    controller = Controller(cell, taught, state, urdf=URDF)
+    cell, _, hands = stuck
+    controller = stuck_controller(taught, stuck)
     ticks = round(14.0 / cell.period_s)
     moves = round(12.0 / cell.period_s)
     reasons = []
@@ -183,10 +188,8 @@ def test_way_from_elsewhere_is_ignored(
     taught: Skill, stuck: tuple[Settings, Vector, Vector]
 ) -> None:
     """The path does not begin at the arm's posture."""
-    cell, start, hands = stuck
-    state = start_state(cell, taught)
-    state["joints"][0] = start
-    controller = Controller(cell, taught, state, urdf=URDF)
+    _, start, hands = stuck
+    controller = stuck_controller(taught, stuck)
     far = json.dumps([(start + 0.5).tolist(), start.tolist()])
     for k in range(1, 2000):
         controller.step(
