@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S, SMALL_JUDGED_S, SMALL_KINDS
-from thirdhand_sim.lab.results import ADAPTED, TOOL_COLOUR, Array, Results, pyplot
+from thirdhand_sim.lab.results import ADAPTED, TOOL_COLOUR, Array, Results, legend_below, pyplot
 
 PATHS = ("setpoint", "tool")
 FOLLOWER_LABELS = {
@@ -60,11 +60,5 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
         panel.set(title=kind, xlabel="frequency [Hz]", ylim=(0, None))
         panel.set_xticks(range(1, 13))
     axes[0].set_ylabel("gain, from the target for true hands")
-    figure.legend(
-        *axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=2,
-        frameon=False,
-        fontsize=8,
-    )
+    legend_below(figure, axes[0], columns=2)
     results.figure(figure, "gain")

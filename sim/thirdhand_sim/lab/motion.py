@@ -51,6 +51,7 @@ from thirdhand_sim.lab.results import (
     Options,
     Results,
     brief,
+    legend_below,
     pyplot,
     rgb,
 )
@@ -255,11 +256,11 @@ def measure_gain(task: tuple[str, str, float, int]) -> list[float]:
     return [gains.gain(target, path, rate_hz) for path in (followed.setpoint, followed.tool)]
 
 
-def measure_slow(task: tuple[str, float, float, int]) -> list[list[float]]:
+def measure_slow(task: tuple[str, float, int, int]) -> list[list[float]]:
     """Speeds of target and tool while a hand begins to move at a speed [m/s], see `slow_hands`."""
     name, speed_mps, rate_hz, number = task
     skill, settings, by_name = _known[SHIPPED_SKILL_HANDS]
-    noise = slow_hands.TRACKERS[round(rate_hz)]
+    noise = slow_hands.TRACKERS[rate_hz]
     hands = slow(skill.hands.mean(axis=0), speed_mps, rate_hz, noise, number)
     target = targets(skill, hands.truth, settings)
     return slow_hands.curves(target, by_name[name](hands).tool)
@@ -452,7 +453,7 @@ def _slow(results: Results, options: Options, names: dict[str, str]) -> dict[str
     begin = functools.partial(prepare, options.share, options.arm)
     kinds = list(itertools.product(slow_hands.SLOW_HANDS_MPS, slow_hands.TRACKERS))
     tasks = [
-        (name, speed_mps, float(rate_hz), number)
+        (name, speed_mps, rate_hz, number)
         for speed_mps, rate_hz in kinds
         for name in names.values()
         for number in numbers
@@ -628,13 +629,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             _draw_people(panel, numbers["by_person"][group])
             recorded_title = "as recorded"
         panel.set_title("clean, 100 Hz" if group == "clean" else recorded_title)
-    figure.legend(
-        *axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=3,
-        frameon=False,
-        fontsize=8,
-    )
+    legend_below(figure, axes[0], columns=3)
     results.figure(figure)
     if "by_follower" in numbers:
         spectra.draw(

@@ -195,6 +195,17 @@ def equal_box(axes: Any, points: Array) -> None:
     axes.set_box_aspect(half, zoom=1.1)
 
 
+def legend_below(figure: Figure, panel: Axes, *, columns: int) -> None:
+    """Add the legend of one panel below all panels of a figure."""
+    figure.legend(
+        *panel.get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        fontsize=8,
+    )
+
+
 def ellipse(axes: Axes, mean: Array, covariance: Array, **style: Any) -> None:
     """Draw the ellipse of one standard deviation of a 2-D normal (2,), (2, 2)."""
     from matplotlib.patches import Ellipse

@@ -8,7 +8,7 @@ import numpy as np
 
 from thirdhand_sim.lab.gains import FOLLOWER_LABELS
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S, SLOW_BEGINS_S, SLOW_RISE_S
-from thirdhand_sim.lab.results import REFERENCE, Array, Results, pyplot
+from thirdhand_sim.lab.results import REFERENCE, Array, Results, legend_below, pyplot
 
 SLOW_HANDS_MPS = (0.01, 0.05)
 TRACKERS = {100: 0.0005, 30: 0.002}  # noise [m] by rate [Hz]
@@ -30,12 +30,12 @@ def evenness(speeds: Array) -> dict[str, float]:
     """Largest speed of the tool, its mean, and its standard deviation around that, as shares of the
     target's speed; the mean of (K, 2, T) curves over K hands.
     """
-    wanted, seen = speeds[:, 0], speeds[:, 1]
-    even = wanted[:, EVEN:-1].mean(axis=1)
+    wanted = speeds[:, 0, EVEN:-1].mean(axis=1)
+    even = speeds[:, 1, EVEN:-1]
     return {
-        "largest": float(np.mean(seen[:, RISEN:-1].max(axis=1) / even)),
-        "mean": float(np.mean(seen[:, EVEN:-1].mean(axis=1) / even)),
-        "deviation": float(np.mean(seen[:, EVEN:-1].std(axis=1) / even)),
+        "largest": float(np.mean(speeds[:, 1, RISEN:-1].max(axis=1) / wanted)),
+        "mean": float(np.mean(even.mean(axis=1) / wanted)),
+        "deviation": float(np.mean(even.std(axis=1) / wanted)),
     }
 
 
@@ -51,11 +51,5 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
         panel.plot(times_s[BEGIN:-1], wanted[BEGIN:-1], "--", color=REFERENCE, label="target")
         panel.set(title=kind, xlabel="time [s]")
     axes[0].set_ylabel("speed of the tool [mm/s]")
-    figure.legend(
-        *axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=3,
-        frameon=False,
-        fontsize=8,
-    )
+    legend_below(figure, axes[0], columns=3)
     results.figure(figure, "slow")

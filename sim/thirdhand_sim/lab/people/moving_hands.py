@@ -251,6 +251,13 @@ def _spoilt(
     return stamps[keep], samples[keep]
 
 
+def _tracked(truth: Array, stamps: Array, noise: float, random: np.random.Generator) -> Array:
+    """Samples (M, 6) [m] of a truth (N, 6) with the noise of a tracker."""
+    t = np.arange(len(truth)) * PERIOD_S
+    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
+    return samples + noise * random.standard_normal(samples.shape)
+
+
 def stops(
     middle: Array,
     *,
@@ -280,8 +287,7 @@ def stops(
         end = middle + random.uniform(-0.05, 0.05, 6) * (1.0, 1.0, 0.5, 1.0, 1.0, 0.3)
         truth = end + direction * (travel_m - travel_m[-1])[:, None]
         stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
-        samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
-        samples += noise * random.standard_normal(samples.shape)
+        samples = _tracked(truth, stamps, noise, random)
         out.append(Moving(f"stop {number + 1}", group, truth, stamps, samples, stop_s))
     return out
 
@@ -320,8 +326,7 @@ def small_motion(middle: Array, kind: str, rate_hz: float, number: int) -> Movin
     truth = np.tile(middle, (len(t), 1))
     truth[:, 3 * (number % 2) : 3 * (number % 2) + 3] += motion_m
     stamps = np.arange(0.0, t[-1], 0.01)
-    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
-    samples += 0.0005 * random.standard_normal(samples.shape)
+    samples = _tracked(truth, stamps, 0.0005, random)
     return Moving(f"{kind}, {rate_hz:g} Hz", "small motion", truth, stamps, samples)
 
 
@@ -337,6 +342,5 @@ def slow(middle: Array, speed_mps: float, rate_hz: float, noise: float, number: 
     truth = np.tile(middle, (len(t), 1))
     truth[:, side : side + 3] += (travel_m - travel_m[-1] / 2)[:, None] * direction
     stamps = np.arange(random.uniform(0.0, 0.01), t[-1], 1 / rate_hz)
-    samples = np.stack([np.interp(stamps, t, column) for column in truth.T], axis=1)
-    samples += noise * random.standard_normal(samples.shape)
+    samples = _tracked(truth, stamps, noise, random)
     return Moving(f"slow {number + 1}", "slow", truth, stamps, samples)
