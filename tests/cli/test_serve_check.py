@@ -77,7 +77,7 @@ def test_check_of_a_good_cell_writes_nothing(tmp_path: Path) -> None:
         "ok disk",
         "ok port",
     ]
-    assert checks["ok hands"] == ["samples needed every 100 ms ([hands] stale_ms), from 10 Hz"]
+    assert checks["ok hands"] == ["samples needed every 100 ms ([hands] stale_ms), 10 Hz or more"]
     assert [path.name for path in tmp_path.iterdir()] == ["cell.toml"]
 
 

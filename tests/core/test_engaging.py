@@ -30,7 +30,7 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
 BRIEF_HOLD_S = TUNING.intake.tracker_memory_s
-ENGAGED_GAP_M = TUNING.decision.stuck_gap_m
+ENGAGED_GAP_M = 2.0 * TUNING.decision.stuck_gap_m
 
 
 E = 0.15  # [m/s]

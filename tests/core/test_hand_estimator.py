@@ -35,10 +35,10 @@ def test_reach_is_known_between_samples(rate_hz: int) -> None:
     assert np.abs(states[100:, 1] - velocity[100:]).max() < (0.25 if rate_hz < 100 else 0.1)
 
 
-@pytest.mark.parametrize(("speed_mps", "kept"), [(0.01, 0.99), (0.05, 0.95), (0.3, 0.7)])
+@pytest.mark.parametrize(("speed_mps", "kept"), [(0.01, 0.99), (0.05, 0.95), (0.3, 0.85)])
 def test_slow_motion_is_expected_to_go_on(speed_mps: float, kept: float) -> None:
     """The speed of a slow hand is estimated without a bias, and kept for 60 ms without a sample; a
-    faster hand is expected to stop.
+    faster hand loses at most 15 % of it.
     """
     noise = np.random.default_rng(2).normal(0.0, 5e-4, (300, 3))
     hands = Hands()

@@ -87,7 +87,8 @@ def _arm(settings: Settings) -> str:
 
 def _hands(settings: Settings) -> str:
     stale_ms = settings.hands.stale_ms
-    return f"samples needed every {stale_ms:g} ms ([hands] stale_ms), from {1000 / stale_ms:g} Hz"
+    needed = f"samples needed every {stale_ms:g} ms ([hands] stale_ms)"
+    return f"{needed}, {1000 / stale_ms:g} Hz or more"
 
 
 def _skill(settings: Settings, path: Path) -> str:

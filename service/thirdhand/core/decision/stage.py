@@ -55,7 +55,7 @@ class Decision:
             too_fast_s=0.6 * tuning.intake.confirmed_s,  # one late command is shorter
             **tuning.decision._asdict(),
             freed_share=3.0 * tuning.decision.progress_share,  # more than chance
-            another_target_m=2.0 * tuning.decision.stuck_gap_m,
+            another_target_m=4.0 * tuning.decision.stuck_gap_m,
         )
         self._brief_ticks = round(tuning.intake.tracker_memory_s / settings.period_s)
         # A joint outside its limits is back within 2 s.

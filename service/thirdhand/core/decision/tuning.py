@@ -15,7 +15,7 @@ class DecisionTuning(NamedTuple):
     # A tool that is stuck: it comes no nearer to its target.
     # 5e-3 to 0.05. More: fewer tools are stuck. Less: a lag looks stuck.
     # a tool nearer than this is at its target; a target that moves farther is a new one
-    stuck_gap_m: float = 0.02
+    stuck_gap_m: float = 0.01
     # 0.3 to 3. More: a stuck tool is noticed later. Less: slow progress looks stuck.
     # time within which progress is expected, toward a target or out of a thing
     stuck_s: float = 0.8

@@ -23,9 +23,9 @@ from kmp.elementary import exp
 from thirdhand.core.codes import DOUBTED, LEARNING, TRUSTED
 from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
 from thirdhand.core.geometry import ROUND_TO
-from thirdhand.core.intake import KEPT, MODES, SETTLED_SAMPLES
+from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, MODES, SETTLED_SAMPLES
 from thirdhand.core.intake.mode_filter import advance, start, update
-from thirdhand.core.intake.motion_model import CHANGE, model
+from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, model
 from thirdhand.core.intake.tremor import no_tremor, note_tremor
 from thirdhand.core.intake.tuning import IntakeTuning
 from thirdhand.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
@@ -120,7 +120,9 @@ class HandEstimator:
         """Advance the state by some ticks, and both hands with it. A hand without a sample for
         `stale_ticks` is assumed to stand still.
         """
-        _advance_both(as_array(state), ticks, stale_ticks, self._model(ticks))
+        _advance_both(
+            as_array(state), self._intake, self._models, ticks, stale_ticks, self._model(ticks)
+        )
 
 
 @compiled
@@ -166,7 +168,14 @@ def _update_noise(
 
 
 @compiled
-def _advance_both(states: Records, ticks: int, stale_ticks: int, overs: Records) -> None:
+def _advance_both(
+    states: Records,
+    parameters: Records,
+    models: Records,
+    ticks: int,
+    stale_ticks: int,
+    overs: Records,
+) -> None:
     """Advance the state by some ticks: modes, estimate and stillness of both hands. `overs` (1,)
     is the record of `HandEstimator._model_over`. A stale hand stands still: its velocity,
     acceleration and tremor are set to zero.
@@ -178,7 +187,7 @@ def _advance_both(states: Records, ticks: int, stale_ticks: int, overs: Records)
         hand = state.hands[side]
         if is_fresh(states, side, stale_ticks):
             advance_hand(states, side, overs)
-            estimate(states, side)
+            estimate(states, parameters, models, side)
         else:
             state.mode_means[side, :, 1:] = 0.0
             hand[1:] = 0.0
@@ -190,19 +199,43 @@ def _advance_both(states: Records, ticks: int, stale_ticks: int, overs: Records)
 
 
 @compiled
-def estimate(states: Records, side: int) -> None:
+def estimate(states: Records, parameters: Records, models: Records, side: int) -> None:
     """Position, velocity and acceleration of one hand, Σ_j μ_j m_j, written to `hands` (3, 3) of
     the state. μ_j and m_j are probability and mean of mode j at the current tick.
+
+    After its newest sample, a hand that reaches or changes its motion goes on without an end
+    (ENDLESS) for max_late_s - CONFIRMED_SAMPLES sample intervals: a late sample, or one that is not
+    seen, does not end a reach. With a slow tracker a reach ends in between.
     """
     state = states[0]
-    means = state.mode_means[side]
+    config = parameters[0]
     modes = state.mode_probabilities[side]
+    at = slot(states, side, 0)
+    passed = state.tick - state.kept_ticks[side, at]
+    going_s = config.max_late_s - CONFIRMED_SAMPLES * state.sample_interval_s[side]
+    going_on = min(passed, int(going_s / config.period_s + TICK_ROUNDING))
+    state.hands[side] = 0.0
+    for mode in range(MODES):
+        means = state.mode_means[side, mode, :3]
+        if mode >= REACH and going_on > 0:
+            last = len(models) - 1
+            means = state.kept_means[side, at, mode, :3]
+            means = _moved(models[min(going_on, last)].transition[ENDLESS], means)
+            means = _moved(models[min(passed - going_on, last)].transition[mode], means)
+        for row in range(3):
+            for axis in range(3):
+                state.hands[side, row, axis] += modes[mode] * means[row, axis]
+
+
+@compiled
+def _moved(transition: Vector, means: Vector) -> Vector:
+    """F m (3, 3) of a motion's transition F (3, 3) and its mean m (3, 3), by axis."""
+    out = np.zeros((3, 3))
     for row in range(3):
-        for axis in range(3):
-            total = 0.0
-            for mode in range(MODES):
-                total += modes[mode] * means[mode, row, axis]
-            state.hands[side, row, axis] = total
+        for k in range(3):
+            for axis in range(3):
+                out[row, axis] += transition[row, k] * means[k, axis]
+    return out
 
 
 @compiled
@@ -399,7 +432,7 @@ def take(
     interval_s = parameters[0].tracker_memory_s if ticks < 0 else ticks * parameters[0].period_s
     filter_in(states, parameters, side, newest, interval_s, restarts or ticks < 0)
     settle(states, parameters, models, side)
-    estimate(states, side)
+    estimate(states, parameters, models, side)
 
 
 @compiled

@@ -157,9 +157,7 @@ def drop(states: Records, side: int, count: int) -> None:
     """
     state = states[0]
     state.kept_newest[side], state.kept[side] = slot(states, side, count), state.kept[side] - count
-    index = slot(states, side, 0)
-    state.kept_past[side, index] = state.past_samples[side]
-    state.kept_noise[side, index, 2] = 0.0
+    state.kept_noise[side, slot(states, side, 0), 2] = 0.0
 
 
 @compiled
@@ -247,7 +245,7 @@ def take_late(
     ticks = state.tick - state.kept_ticks[side, slot(states, side, 0)]
     _advance_by(states, models, side, ticks)
     settle(states, parameters, models, side)
-    estimate(states, side)
+    estimate(states, parameters, models, side)
 
 
 @compiled

@@ -13,7 +13,7 @@ A step is taken only if the stop after it keeps every limit. Otherwise the setpo
 that the step before has checked. So these limits hold by induction, whatever the target does:
 
 * the norms of speed, acceleration and jerk are at most `max_speed`, `max_acceleration`, `max_jerk`;
-* after a start or a hold, until the setpoint is within stuck_gap_m of its target, the norm of its
+* after a start or a hold, until the setpoint is within 2 stuck_gap_m of its target, the norm of its
   speed is at most `engaging_speed`, and the tool turns at the same share of its limit;
 * the setpoint stays inside the workspace, and within hull_margin_m of the box around the targets of
   the last hull_time_s. If that box has moved away, or if following began outside of it, the
@@ -88,7 +88,7 @@ class SetpointGenerator:
         self._engaging = self._parameters.copy()
         self._engaging["max_speed"] = tool.engaging_speed
         self._engages = tool.engaging_speed < tool.max_speed
-        self._engaged_gap_m = tuning.decision.stuck_gap_m
+        self._engaged_gap_m = 2.0 * tuning.decision.stuck_gap_m
 
     def begin(self, state: Record, setpoint: Vector, *, engages: bool = True) -> None:
         """Start from the motion of the tool (3, 3), which becomes the only known target.
@@ -105,7 +105,7 @@ class SetpointGenerator:
         return self._engaging if as_array(state)["engaging"][0] else self._parameters
 
     def engage(self, state: Record, target: Vector) -> None:
-        """End the engaging of a setpoint that is within stuck_gap_m of its target (3,) [m]."""
+        """End the engaging of a setpoint that is within 2 stuck_gap_m of its target (3,) [m]."""
         if not as_array(state)["engaging"][0]:
             return
         if math.dist(target.tolist(), state["setpoint"][0].tolist()) < self._engaged_gap_m:
