@@ -464,7 +464,7 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_mm.samples == far_ticks
     assert report.initial_s == pytest.approx(far_ticks * columns.period_s)
     assert report.lag_mm is not None
-    assert report.lag_mm.largest < 200.0
+    assert report.lag_mm.largest < 300.0
 
 
 @pytest.mark.thorough
