@@ -175,7 +175,7 @@ def test_learn_takes_a_clock_for_a_timetable(
     assert task_clock is not None
     assert not task_clock.waits
     assert clock(back) == task_clock
-    assert clock(learn(kind_of_takes(6, timetable=False))) is None
+    assert clock(learn(kind_of_takes(8, timetable=False))) is None
     assert figures.taken.endswith("and a clock")
     assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
     assert figures.all.error_mm < 30.0
