@@ -43,7 +43,7 @@ def test_two_recordings_are_compared_on_a_page(
     verdict = output.splitlines()[0]
     counted = r"It followed 9\d % of 20\.0 s, from 0\.\d s on, with 4 holds and no faults"
     assert re.fullmatch(
-        rf"{counted}; the worst was hold: far_from_demonstrations, for 0\.\d s from 13\.\d s on\.",
+        rf"{counted}; the worst was hold: far_from_demonstrations, for 0\.8 s from 13\.3 s on\.",
         verdict,
     )
 

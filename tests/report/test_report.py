@@ -450,6 +450,7 @@ def test_names_have_no_effect_on_tables_and_page(
 @pytest.mark.parametrize("far_ticks", [900, None])
 def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: int | None) -> None:
     columns = read(Recording.open(golden))
+    as_recorded = Report(columns).lag_mm
     follows = np.flatnonzero(columns.frames["mode"] == Mode.FOLLOW)
     columns.frames["tool"][follows[:far_ticks]] += (0.473, 0.0, 0.0)
     report = Report(columns)
@@ -464,7 +465,8 @@ def test_the_initial_approach_is_no_error_of_following(golden: Path, far_ticks: 
     assert report.initial_mm.samples == far_ticks
     assert report.initial_s == pytest.approx(far_ticks * columns.period_s)
     assert report.lag_mm is not None
-    assert report.lag_mm.largest < 300.0
+    assert as_recorded is not None
+    assert report.lag_mm.largest <= as_recorded.largest
 
 
 @pytest.mark.thorough

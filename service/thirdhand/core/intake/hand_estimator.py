@@ -210,26 +210,27 @@ def estimate(states: Records, parameters: Records, models: Records, side: int) -
     state = states[0]
     config = parameters[0]
     modes = state.mode_probabilities[side]
-    at = slot(states, side, 0)
-    passed = state.tick - state.kept_ticks[side, at]
+    newest = slot(states, side, 0)
+    passed = state.tick - state.kept_ticks[side, newest]
     going_s = config.max_late_s - CONFIRMED_SAMPLES * state.sample_interval_s[side]
     going_on = min(passed, int(going_s / config.period_s + TICK_ROUNDING))
     state.hands[side] = 0.0
     for mode in range(MODES):
         means = state.mode_means[side, mode, :3]
         if mode >= REACH and going_on > 0:
-            last = len(models) - 1
-            means = state.kept_means[side, at, mode, :3]
-            means = _moved(models[min(going_on, last)].transition[ENDLESS], means)
-            means = _moved(models[min(passed - going_on, last)].transition[mode], means)
+            means = _moved(models, going_on, ENDLESS, state.kept_means[side, newest, mode, :3])
+            means = _moved(models, passed - going_on, mode, means)
         for row in range(3):
             for axis in range(3):
                 state.hands[side, row, axis] += modes[mode] * means[row, axis]
 
 
 @compiled
-def _moved(transition: Vector, means: Vector) -> Vector:
-    """F m (3, 3) of a motion's transition F (3, 3) and its mean m (3, 3), by axis."""
+def _moved(models: Records, ticks: int, motion: int, means: Vector) -> Vector:
+    """F m (3, 3), by axis: the mean m (3, 3) of a mode some ticks later, if it moves by a `motion`
+    with the transition F.
+    """
+    transition = models[min(ticks, len(models) - 1)].transition[motion]
     out = np.zeros((3, 3))
     for row in range(3):
         for k in range(3):
