@@ -109,7 +109,7 @@ class TestJudging:
         assert judgement.falsely_followed == 0.0
         assert not any(event.reached for event in judgement.events)
         assert all(event.held for event in judgement.events)
-        due = (as_seen.due & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
+        due = (~as_seen.fresh & (as_seen.times > 0.5)).sum() / (as_seen.times > 0.5).sum()
         # holds for stale hands are right
         assert judgement.falsely_held == pytest.approx(1.0 - due)
 

@@ -60,5 +60,5 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
         panel.set(title=kind, xlabel="frequency [Hz]", ylim=(0, None))
         panel.set_xticks(range(1, 13))
     axes[0].set_ylabel("gain, from the target for true hands")
-    legend_below(figure, axes[0], columns=2)
+    legend_below(figure, axes[0].get_legend_handles_labels()[0], columns=2)
     results.figure(figure, "gain")

@@ -629,7 +629,7 @@ def draw_numbers(results: Results, numbers: dict[str, Any]) -> None:
             _draw_people(panel, numbers["by_person"][group])
             recorded_title = "as recorded"
         panel.set_title("clean, 100 Hz" if group == "clean" else recorded_title)
-    legend_below(figure, axes[0], columns=3)
+    legend_below(figure, axes[0].get_legend_handles_labels()[0], columns=3)
     results.figure(figure)
     if "by_follower" in numbers:
         spectra.draw(

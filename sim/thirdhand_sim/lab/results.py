@@ -195,10 +195,10 @@ def equal_box(axes: Any, points: Array) -> None:
     axes.set_box_aspect(half, zoom=1.1)
 
 
-def legend_below(figure: Figure, panel: Axes, *, columns: int) -> None:
-    """Add the legend of one panel below all panels of a figure."""
+def legend_below(figure: Figure, handles: Sequence[Any], *, columns: int) -> None:
+    """Add a legend of labelled artists below all panels of a figure."""
     figure.legend(
-        *panel.get_legend_handles_labels(),
+        handles=handles,
         loc="outside lower center",
         ncols=columns,
         frameon=False,

@@ -51,5 +51,5 @@ def draw(results: Results, numbers: dict[str, Any]) -> None:
         panel.plot(times_s[BEGIN:-1], wanted[BEGIN:-1], "--", color=REFERENCE, label="target")
         panel.set(title=kind, xlabel="time [s]")
     axes[0].set_ylabel("speed of the tool [mm/s]")
-    legend_below(figure, axes[0], columns=3)
+    legend_below(figure, axes[0].get_legend_handles_labels()[0], columns=3)
     results.figure(figure, "slow")

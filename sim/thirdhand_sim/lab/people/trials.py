@@ -54,14 +54,9 @@ class SeenSession:
     times: Array  # (T,) [s]
     estimates: Array  # (T, 3, 6): position, velocity, acceleration of both hands
     rest: Array  # (T, 2) stillness of each hand, 0 to 1
-    fresh: Mask  # (T,) true if both hands are seen, each by one source
+    fresh: Mask  # (T,) true if both hands are seen, each by one source; else a hold is right
     hands: Array  # (T, 6) true positions
     tool: Array  # (T, 3) the teacher's tool
-
-    @property
-    def due(self) -> Mask:
-        """True where holding is right (T,)."""
-        return ~self.fresh
 
 
 def settings() -> Settings:
@@ -157,7 +152,7 @@ def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
     )
     too_near = bool(((hand_distance_m < NEAR_HAND_M) & (speed > FAST_MPS)).any())
     judged = one.times > 0.5
-    good = judged & ~one.due
+    good = judged & one.fresh
     delay, _ = _delayed(target, one.tool, good)
     tool_delay, _ = _delayed(tool, one.tool, good & ~held)
     teacher_tool = np.concatenate(

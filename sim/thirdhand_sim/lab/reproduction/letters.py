@@ -20,6 +20,7 @@ from thirdhand_sim.lab.results import (
     Options,
     Results,
     ellipse,
+    legend_below,
     pyplot,
     rgb,
 )
@@ -309,13 +310,7 @@ def _draw(results: Results, sets: dict[str, list[Letter]]) -> None:
             label="desired points",
         ),
     ]
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=5 if len(sets) > 1 else 3,
-        frameon=False,
-        fontsize=8,
-    )
+    legend_below(figure, handles, columns=5 if len(sets) > 1 else 3)
     results.figure(figure)
 
 
