@@ -88,6 +88,23 @@ def test_hands_that_begin_with_an_exact_rest_are_accepted(rate_hz: float) -> Non
         assert not len(refused(np.concatenate(pieces), rate_hz))
 
 
+@pytest.mark.parametrize("last_step_m", [1e-7, 1e-8, 1e-15])
+@pytest.mark.parametrize("rate_hz", [40.0, 80.0, 160.0])
+def test_hands_that_approach_their_goal_ever_more_slowly_are_accepted(
+    rate_hz: float, last_step_m: float
+) -> None:
+    """A page's hand is dragged at once, comes to rest by steps that shrink to the last bits of a
+    number, and leaps whenever the page is loaded again.
+    """
+    for approach_per_s in (4.0, 8.0, 16.0):
+        decay = approach_per_s / rate_hz
+        count = round(np.log(0.4 * decay / last_step_m) / decay)
+        reach = np.outer(1 - np.exp(-decay * np.arange(count)), (0.4, 0.1, 0.05)) + LEFT
+        dragged = np.concatenate((reach, np.tile(reach[-1], (round(2 * rate_hz), 1))))
+        hand = np.concatenate([dragged + away_m for away_m in (0.0, 0.3, 0.1, 0.4)])
+        assert not len(refused(hand, rate_hz)), approach_per_s
+
+
 def test_noise_is_never_frozen() -> None:
     assert not len(refused(measured(30.0, 100.0), 100.0))
     coarse = np.round(measured(30.0, 100.0), 3)  # a tracker that reports whole millimetres

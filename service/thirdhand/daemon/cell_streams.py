@@ -40,6 +40,9 @@ EXACT_REST_S = 0.1  # a pose that is repeated for so long is a rest
 # a hand that was lost appears this many steps away; one that rested goes on from where it was
 LEAP_STEPS = 5.0
 SMOOTH_SHARE = 0.05  # a smooth step / the median step: noise makes one in 10 000 as small
+# a last step / the distance from the origin below this is no measurement: a millionth of a metre
+# for a hand one metre away
+UNMEASURED_SHARE = 1e-6
 LEAST_BATCHES = 3  # with fewer pauses than this, a hand was out of sight
 ARM_STATE = "joints/state"
 # channels that are heard with some settings only
@@ -178,7 +181,11 @@ class FrozenHand:
             is_exact = self._begins_exactly or 2 * self._leaps < self._rests
             if not self._is_tracked or lasts_s < FROZEN_S or is_exact:
                 return False
-            return self._steps[-1] > SMOOTH_SHARE * median(self._steps)
+            smooth = max(
+                SMOOTH_SHARE * median(self._steps),
+                UNMEASURED_SHARE * math.hypot(*pose.position),
+            )
+            return self._steps[-1] > smooth
         else:
             step = math.dist(pose.position, before.position)
             if self._repeated_ns - before.stamp_ns >= 1e9 * EXACT_REST_S:
