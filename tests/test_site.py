@@ -71,6 +71,7 @@ DIMENSIONLESS = {  # weights, exponents, counts, and numbers in the units of a p
     "PLANNED_BRAKE_LIMITS",
     "MAX_SQUARED_DEVIATION",
     "SUPPORT_MASS",
+    "NEIGHBOUR_MASS",
     "SUPPORT_SHARPNESS",
 }
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")

@@ -190,6 +190,14 @@ class DirectSelection:
         """The residuals (N, 3) of each point without its group."""
         return np.asarray(self._residuals(ell, np.array([noise]), (ridge,))[0, 0])
 
+    def by_group(self, residuals: Array) -> Array:
+        """The squared residuals (G,) of each judged group, weighted by its points so that their
+        mean is that of all points.
+        """
+        squares = (residuals[self._counted] ** 2).sum(axis=1)
+        groups, numbers = np.unique(self.group[self._counted], return_inverse=True)
+        return np.asarray(np.bincount(numbers, squares) * len(groups) / len(squares))
+
     def _residuals(self, ell: float, noises: Array, ridges: Sequence[float | None]) -> Array:
         """The residuals (J, R, N, 3) for noises (J,) and prior means of these ridges (R,)."""
         kernel = np.exp(-ell * self._squares)

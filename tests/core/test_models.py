@@ -22,7 +22,7 @@ STILL = np.array([[1.0, 1.0]])
 H = 0.02
 # arrays that files may lack
 LATER = {
-    "HandsKMP": {"error_inputs", "error_samples", "error_unknown_std"},
+    "HandsKMP": {"error_inputs", "error_samples", "error_unknown_std", "neighbours"},
     "SegmentedKMP": {"levers"},
 }
 

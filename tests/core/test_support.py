@@ -13,7 +13,7 @@ from kmp import KMP, GaussianKernel, Gaussians
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import blank, frame_layout
 from thirdhand.core.numerics import UNPRIMED_DECIDED
-from thirdhand.core.skill.model import LEVELS, NORMAL_RATIOS
+from thirdhand.core.skill.model import NORMAL_WEIGHTS
 from thirdhand.core.skill.segmented import SegmentedKMP, Unknown
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.skill.stage import SkillStage
@@ -59,30 +59,28 @@ def test_covariance_is_scatter_of_near_errors(errors: LocalErrors) -> None:
     assert (np.diff(grows) >= -1e-12).all()
 
 
-def test_error_probability_follows_levels() -> None:
-    """An error probability is the share of errors beyond each level and grows with the
-    covariance.
-    """
-    ratios = np.array(NORMAL_RATIOS)
-    at_levels = [
-        error_probability(UNSURE_M**2 / (3 * ratio) * np.eye(3), 0.0, ratios) for ratio in ratios
-    ]
-    np.testing.assert_allclose(at_levels, 1.0 - np.array(LEVELS), atol=1e-6)
+def test_error_probability_is_about_a_normal_distributions() -> None:
+    """Without a detector, it grows with the covariance, and is near the share of larger errors."""
+    weights = np.array(NORMAL_WEIGHTS)
     stds = np.geomspace(0.005, 3.0, 60)
-    probabilities = [error_probability(std**2 * np.eye(3), 0.0, ratios) for std in stds]
+    probabilities = [error_probability(std**2 * np.eye(3), 0.0, 0.0, weights) for std in stds]
     assert (np.diff(probabilities) >= 0.0).all()
     assert probabilities[0] < 1e-4
     assert probabilities[-1] > 0.99
-    drawn = (
-        np.linalg.norm(0.05 * np.random.default_rng(2).normal(size=(20_000, 3)), axis=1) > UNSURE_M
+    random = np.random.default_rng(2)
+    for std in (0.04, 0.05, 0.06, 0.08):
+        drawn = np.linalg.norm(std * random.normal(size=(20_000, 3)), axis=1) > UNSURE_M
+        assert error_probability(std**2 * np.eye(3), 0.0, 0.0, weights) == pytest.approx(
+            drawn.mean(), abs=0.05
+        )
+    assert error_probability(0.05**2 * np.eye(3), 0.0075, 0.0, weights) == error_probability(
+        0.005 * np.eye(3), 0.0, 0.0, weights
     )
-    assert error_probability(0.05**2 * np.eye(3), 0.0, ratios) == pytest.approx(
-        drawn.mean(), abs=0.02
+    assert error_probability(np.zeros((3, 3)), 0.0, 5.0, weights) == 0.0
+    surer, less_sure = (
+        error_probability(0.05**2 * np.eye(3), 0.0, signs, weights) for signs in (-1.0, 1.0)
     )
-    assert error_probability(0.05**2 * np.eye(3), 0.0075, ratios) == error_probability(
-        0.005 * np.eye(3), 0.0, ratios
-    )
-    assert error_probability(np.zeros((3, 3)), 0.0, ratios) == 0.0
+    assert surer < less_sure
 
 
 def segmented(**more: object) -> SegmentedKMP:
@@ -148,7 +146,7 @@ def test_possible_other_segment_is_unsure() -> None:
     it.
     """
     shipped = shipped_skill()
-    regions = shipped.regions._replace(ratios=NORMAL_RATIOS, alarm=0.2)
+    regions = shipped.regions._replace(weights=NORMAL_WEIGHTS, alarm=0.2)
     model = segmented()
     begin = model.hands[0].reshape(2, 3)
     places = model.nominal.at.copy()

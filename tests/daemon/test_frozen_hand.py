@@ -90,7 +90,7 @@ def test_hands_that_begin_with_an_exact_rest_are_accepted(rate_hz: float) -> Non
 
 @pytest.mark.parametrize("last_step_m", [1e-7, 1e-8, 1e-15])
 @pytest.mark.parametrize("rate_hz", [40.0, 80.0, 160.0])
-def test_hands_that_approach_their_goal_ever_more_slowly_are_accepted(
+def test_hands_that_come_to_rest_ever_more_slowly_are_accepted(
     rate_hz: float, last_step_m: float
 ) -> None:
     """A page's hand is dragged at once, comes to rest by steps that shrink to the last bits of a

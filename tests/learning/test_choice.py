@@ -8,7 +8,13 @@ import pytest
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.criteria.cross_validation import rms
 from kmp.criteria.direct import DirectSelection, ridge_mean
-from thirdhand.workbench.learning.choice import MAX_GAIN, POSITION_SCALES, RIDGE_M, selection_of
+from thirdhand.workbench.learning.choice import (
+    MAX_GAIN,
+    POSITION_SCALES,
+    RIDGE_M,
+    sampled,
+    selection_of,
+)
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript, Teacher
 
@@ -61,3 +67,23 @@ def test_choice_is_the_best_tried(choice: DirectSelection) -> None:
     }
     assert errors[parameters.ell, parameters.noise] == min(errors.values())
     assert choice.parameters(8.0).ell == 8.0
+
+
+@pytest.mark.parametrize("earlier", [0, 30])
+@pytest.mark.parametrize("new", [1, 7, 12, 150, 600, 5000])
+def test_many_takes_have_few_points(new: int, earlier: int) -> None:
+    """Each take has its least number of points while these are few; then takes are sampled at
+    different shares, and their points stay as many.
+    """
+    shares = sampled(200, new, earlier, 4, 600)
+    assert len(shares) == new + earlier
+    total = sum(map(len, shares))
+    assert total <= 600
+    assert total >= (100 if earlier else min(200, 4 * new)) - new % 200
+    assert all(len(one) >= 4 for one in shares) or total > 100
+    everything = np.concatenate(shares)
+    assert everything.min() >= 0.0
+    assert everything.max() <= 1.0
+    if new >= 600:
+        occupied = np.histogram(everything, bins=20, range=(0.0, 1.0))[0]
+        assert occupied.min() > 0.5 * occupied.mean(), "the points are everywhere in the takes"

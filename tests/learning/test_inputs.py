@@ -13,8 +13,10 @@ from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.skills.demonstration import Demonstration, persons
 from thirdhand.skills.skill_file import StoredSkill
 from thirdhand.workbench.learning.learn import learn
-from thirdhand.workbench.learning.methods.inputs import KINDS
+from thirdhand.workbench.learning.methods.inputs import KINDS, Inputs, _simplest
+from thirdhand.workbench.learning.records import MOST_FOLDS, folds_of
 from thirdhand.workbench.learning.table import table
+from thirdhand.workbench.learning.takes import takes_of
 from thirdhand_sim.lab.people.left_out import judged, left_out, predicted
 
 TIMES = np.arange(0.0, 6.0, 0.04)
@@ -123,3 +125,44 @@ def test_persons_are_left_out_together() -> None:
     assert table(by_person).startswith("held out by person")
     assert not table(alone).startswith("held out by")
     assert by_person.all.error_mm > alone.all.error_mm  # half of the takes remain to learn from
+
+
+def squares(errors_mm: np.ndarray) -> np.ndarray:
+    return np.asarray((errors_mm / 1000) ** 2)
+
+
+def test_a_simpler_kind_is_within_a_standard_error() -> None:
+    """A kind that is worse in each group is not taken, however little; one that is worse in half of
+    the groups is, and one hand only if its memory is as good too.
+    """
+    simple, rich = Inputs("simple"), Inputs("rich", order=4)
+    alone, alone_rich = Inputs("alone", alone=0), Inputs("alone rich", order=4, alone=0)
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        best = random.uniform(30.0, 60.0, 8)
+        worse = squares(best + 0.5 + 0.1 * random.random(8))
+        noise = np.tile([0.6, -0.6], 4)
+        alike = squares(best + noise + 0.05)
+        assert _simplest([simple, rich], {"simple": worse, "rich": squares(best)}) == rich
+        assert _simplest([simple, rich], {"simple": alike, "rich": squares(best)}) == simple
+        of_hand = {"alone": alike, "alone rich": squares(best + 5.0), "rich": squares(best)}
+        kinds = [alone, simple, alone_rich, rich]
+        assert _simplest(kinds, {**of_hand, "simple": worse}) == rich
+        of_hand["alone rich"] = alike
+        assert _simplest(kinds, {**of_hand, "simple": worse}) == alone
+
+
+@pytest.mark.parametrize("count", [1, 3, 10, 11, 64])
+def test_there_are_at_most_ten_folds(count: int) -> None:
+    """A person's takes are in one fold, and folds have about as many persons."""
+    demonstrations = [shown(i, "both", f"person {i % count}") for i in range(2 * count)]
+    takes = takes_of(demonstrations, [str(i) for i in range(2 * count)])
+    folds = folds_of(takes)
+    assert len(np.unique(folds)) == min(count, MOST_FOLDS)
+    for person in range(count):
+        assert len({f for f, take in zip(folds, takes, strict=True) if take.person == person}) == 1
+    sizes = np.bincount(folds)
+    assert sizes.max() - sizes.min() <= 2
+    both = folds_of([*takes, *takes], len(takes))
+    np.testing.assert_array_equal(both[: len(takes)], folds)
+    assert not set(both[: len(takes)]) & set(both[len(takes) :])

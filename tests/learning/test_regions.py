@@ -10,6 +10,7 @@ import pytest
 from support.skills import figures_of, made
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import blank, frame_layout
+from thirdhand.core.skill import SIGNS
 from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Regions
 from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.skill.step import calibrate
@@ -26,6 +27,8 @@ from thirdhand.workbench.learning.regions import (
     calibrated_without,
 )
 
+NO_SIGNS = np.zeros((150, SIGNS))
+
 
 def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
     """Errors on a demonstration that are not normal: three times the covariance, heavy tails, early
@@ -37,7 +40,7 @@ def apart(rng: np.random.Generator, *, times: float = 1.0) -> TimedErrors:
     velocity = np.clip(rng.normal(size=(count, 3)), -1, 1) * (rng.random(count) < 0.5)[:, None]
     tails = rng.standard_t(4, size=(count, 3)) * np.sqrt(np.diagonal(covariance[0]))
     errors = times * (3.0 * person * tails + 0.2 * rng.normal(size=(count, 1)) * velocity)
-    return TimedErrors(errors, covariance, velocity)
+    return TimedErrors(errors, covariance, velocity, NO_SIGNS)
 
 
 @pytest.mark.parametrize("count", [6, 12, 40])
@@ -65,7 +68,7 @@ def places(rng: np.random.Generator) -> TimedErrors:
     std = np.where(rng.random(150) < 0.1, 0.1, 0.01)
     covariance = std[:, None, None] ** 2 * np.eye(3)
     return TimedErrors(
-        std[:, None] * rng.normal(size=(150, 3)), 0.3 * covariance, np.zeros((150, 3))
+        std[:, None] * rng.normal(size=(150, 3)), 0.3 * covariance, np.zeros((150, 3)), NO_SIGNS
     )
 
 
@@ -80,6 +83,37 @@ def test_unsure_where_wrong() -> None:
     assert (probabilities > regions.alarm)[wrong].mean() > 0.9
     assert (probabilities > regions.alarm)[~wrong].mean() < 0.15
     assert probabilities[wrong].mean() > 5 * probabilities[~wrong].mean()
+
+
+def test_detector_learns_which_signs_tell() -> None:
+    """A sign that tells large errors, beside a covariance that does not, raises the alarm at them;
+    signs that tell nothing are hardly weighed, and where no error is large, no probability is.
+    """
+    rng = np.random.default_rng(5)
+
+    def take(wrong_share: float) -> TimedErrors:
+        is_large = rng.random(150) < wrong_share
+        signs = rng.normal(size=(150, SIGNS))
+        signs[:, 3] += 2.5 * is_large
+        length = np.where(is_large, 0.15, 0.02)
+        errors = length[:, None] * rng.normal(size=(150, 3))
+        covariance = np.tile(1e-3 * np.eye(3), (150, 1, 1))
+        return TimedErrors(errors, covariance, np.zeros((150, 3)), signs)
+
+    takes = [take(0.15) for _ in range(12)]
+    regions = calibrated(takes, np.arange(12))
+    weights = np.array(regions.weights[2:])
+    assert weights[3] > 5 * np.abs(np.delete(weights, 3)).max()
+    asked = [take(0.15) for _ in range(40)]
+    wrong = np.concatenate([case.is_wrong for case in asked])
+    probabilities = np.concatenate([case.probabilities(regions) for case in asked])
+    assert (probabilities > regions.alarm)[wrong].mean() > 0.8
+    assert (probabilities > regions.alarm)[~wrong].mean() < 0.17
+    constant = wrong.mean() * (1 - wrong.mean())
+    assert ((probabilities - wrong) ** 2).mean() < 0.6 * constant
+    good = [take(0.0) for _ in range(12)]
+    calm = calibrated(good, np.arange(12))
+    assert max(case.probabilities(calm).max() for case in good) < 0.05
 
 
 def test_own_region_has_no_part_in_judgement() -> None:
@@ -173,8 +207,8 @@ def test_wrong_regions_in_file_are_refused(learned: StoredSkill) -> None:
         learned.regions._replace(radii=learned.regions.radii[::-1]),
         learned.regions._replace(radii=learned.regions.radii[1:]),
         learned.regions._replace(radii=tuple(2 * radius for radius in learned.regions.radii)),
-        learned.regions._replace(ratios=learned.regions.ratios[::-1]),
+        learned.regions._replace(weights=learned.regions.weights[1:]),
         learned.regions._replace(alarm=1.5),
     ):
-        with pytest.raises(SkillError, match=r"region|radii|alarm"):
+        with pytest.raises(SkillError, match=r"region|radii|alarm|detector"):
             decoded(with_file(replace(learned, regions=spoilt)).file, origin="memory")

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from support.skills import at_rest, figures_of, file_with, made, turns_of
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill import TURNS
+from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import turn_lag_s
 from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.core.skill.segments import LEFT, NONE
@@ -274,3 +275,32 @@ def test_carried_tool_has_velocity_of_turn(carried: StoredSkill) -> None:
     untold = at_rest(carried, hands, belief=belief.copy())
     assert not untold.velocity.any()
     np.testing.assert_allclose(untold.position, model.nominal.at[1, 6:], atol=0.02)
+
+
+def test_via_points_that_mislead_are_left_out() -> None:
+    """If the tool is where the hands are, and via-points are given some centimetres off, it is
+    learned from the hands, and said.
+    """
+    random = np.random.default_rng(7)
+    demonstrations = []
+    for demonstration in made("path", range(6), each=1):
+        tool = demonstration.tool.copy()
+        hands = demonstration.hands
+        tool[:, :3] = 0.5 * (hands[:, :3] + hands[:, 3:]) + (0.0, 0.0, 0.2)
+        points = tuple(
+            msgspec.structs.replace(
+                point,
+                follow="none",
+                tool=tuple((0.5 * np.add(point.left, point.right) + off).tolist()),
+            )
+            for point in demonstration.via_points
+            for off in [np.array([0.0, 0.0, 0.2]) + 0.04 * random.standard_normal(3)]
+        )
+        demonstrations.append(demonstration._replace(tool=tool, via_points=points).every(4))
+    learned = learn(demonstrations)
+    assert isinstance(learned.model, HandsKMP)
+    (said,) = [
+        text for text in figures_of(learned).warnings if "not between its via-points" in text
+    ]
+    assert said.startswith("it is learned where the hands are")
+    assert figures_of(learned).conclusion.startswith("conclusion: learned well")

@@ -39,7 +39,7 @@ from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
 from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.skill import UNTOLD, Skill
 from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.support import error_table, local_scatter
+from thirdhand.core.skill.support import LocalErrors
 from thirdhand.core.skill.unseen import deviation_m
 from thirdhand.core.vectors import norm, times
 from thirdhand.settings.config import Settings
@@ -64,7 +64,9 @@ def warm_up(settings: Settings, skill: Skill, *, urdf: str) -> None:
     for variant in (plain, extended):
         variant.predict(*np.zeros((3, 2, 3)))
     plain.model.elsewhere(np.zeros((3, 6)), STILL, settings.period_s, *np.zeros((2, MOST_SEGMENTS)))
-    other = replace(plain, model=HandsKMP(KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)))
+    primitive = KMP.fit(*_point(np.zeros((1, 6)), 3), **FLAT)
+    errors = LocalErrors.of(primitive, np.zeros((1, 6)), np.zeros((1, 3)), 1.0)
+    other = replace(plain, model=HandsKMP(primitive, errors=errors, neighbours=0.5))
     other.predict(*np.zeros((3, 2, 3)))
     other.model.mean(np.zeros((1, 6)))
     rehearse_motion(settings, urdf)
@@ -121,13 +123,6 @@ def rehearse_motion(settings: Settings, urdf: str) -> None:
     joints_limiter.speed_in_stop(joints_limiter.stop(posture, still, still), kinematics)
     delayed(np.zeros((3, 6)), np.zeros((ORDER, 6)), 0.1, np.empty((3, 6)))
     turning(np.zeros((TURNS, 18)), 0.1, np.empty((3, 18)))
-    local_scatter(
-        np.zeros(6),
-        np.zeros(6),
-        error_table(np.zeros((1, 6)), np.zeros((1, 3))),
-        1.0,
-        np.empty((3, 3)),
-    )
     moving_features(np.zeros((3, 6)), np.zeros((ORDER, 6)), UNTOLD, np.empty((3, 6 * (1 + ORDER))))
 
 

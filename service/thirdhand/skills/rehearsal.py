@@ -8,11 +8,12 @@ from kmp import KMP, GaussianKernel, Gaussians
 from kmp.arrays.immutable import frozen
 from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import ORDER
+from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import along
-from thirdhand.core.skill.model import LEVELS
+from thirdhand.core.skill.model import NORMAL_WEIGHTS
 from thirdhand.core.skill.segments import MOST_SEGMENTS, SEGMENT
 from thirdhand.core.skill.step import recent
-from thirdhand.core.skill.support import LocalErrors, error_probabilities
+from thirdhand.core.skill.support import LocalErrors, error_probability
 from thirdhand.core.skill.task_clock import BEGIN_AT, counted
 from thirdhand.skills.recognition import all_followed, covered, recognised
 
@@ -36,5 +37,8 @@ def rehearse() -> None:
     recent(np.zeros(3), SAMPLE_PERIOD_S, np.zeros(3))
     reference = Gaussians(np.zeros((1, 3)), np.eye(3)[None])
     primitive = KMP.fit(hands[:1], reference, kernel=GaussianKernel(1.0), lambda_mean=1.0)
-    LocalErrors.of(primitive, hands, np.zeros((2, 3)), 0.1).covariances(hands)
-    error_probabilities(np.ones((1, 3, 3)), np.arange(1.0, 1.0 + len(LEVELS)), np.empty(1))
+    errors = LocalErrors.of(primitive, hands, np.zeros((2, 3)), 0.1)
+    errors.covariances(hands)
+    model = HandsKMP(primitive, errors=errors, neighbours=0.5)
+    model.signs(hands, model.tools(hands))
+    error_probability(np.ones((3, 3)), 0.0, 0.0, np.array(NORMAL_WEIGHTS))

@@ -28,7 +28,7 @@ from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
 from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Model, Regions
+from thirdhand.core.skill.model import LEVELS, NORMAL, NORMAL_WEIGHTS, REGION_95, Model, Regions
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
 from thirdhand.core.skill.skill import MODELS, Skill
 from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, MOST_CLOCK_WEIGHT
@@ -64,13 +64,15 @@ RANGES = {  # minimum, maximum and unit of the numbers in each array
     **dict.fromkeys(("base_covariance", "via_covariance"), (-100.0, 100.0, "m²")),
     **dict.fromkeys(("base_weights", "weights"), (-1e12, 1e12, "")),
 }
-# The array of `Regions`: a scale, a time [s], squared distances, and for a skill with an alarm,
-# ratios and the alarm.
+# The arrays of `Regions`: a scale, a time [s] and squared distances; and, for a skill with an
+# alarm, the weights and the alarm.
 REGIONS = "regions"
+DETECTOR = "detector"
 FARTHEST_RADIUS = 1e6
+LARGEST_WEIGHT = 1e3
 ALL_RANGES = (
     RANGES
-    | {REGIONS: (0.0, FARTHEST_RADIUS, "")}
+    | {REGIONS: (0.0, FARTHEST_RADIUS, ""), DETECTOR: (-LARGEST_WEIGHT, LARGEST_WEIGHT, "")}
     | {name: bounds for model in MODELS for name, bounds in model.ranges.items()}
 )
 INPUT_ARRAYS = ("base_inputs", "via_inputs", "error_inputs")
@@ -167,8 +169,10 @@ def with_file(skill: StoredSkill) -> StoredSkill:
     if skill.conductor is not None:
         arrays["conductor"] = np.array(skill.conductor)
     if skill.regions != NORMAL:
-        scale, std_s, radii, ratios, alarm = skill.regions
-        arrays[REGIONS] = np.array([scale, std_s, *radii, *((*ratios, alarm) if alarm else ())])
+        scale, std_s, radii, weights, alarm = skill.regions
+        arrays[REGIONS] = np.array([scale, std_s, *radii])
+        if alarm:
+            arrays[DETECTOR] = np.array([*weights, alarm])
     if skill.figures:
         arrays["figures"] = np.array(skill.figures)
     if skill.demonstrations:
@@ -259,7 +263,7 @@ def _assembled(arrays: Mapping[str, NDArray[Any]], data: bytes) -> StoredSkill:
         file=bytes(data),
         digest=_digest(data),
         conductor=int(arrays["conductor"]) if "conductor" in arrays else None,
-        regions=_regions(arrays[REGIONS].tolist()) if REGIONS in arrays else NORMAL,
+        regions=_regions(arrays) if REGIONS in arrays else NORMAL,
         residual_risk=ResidualRisk.of(figures).accepted,
     )
 
@@ -272,16 +276,13 @@ def skill_in(path: Path) -> StoredSkill:
         raise SkillError(f"cannot read skill {path}: {in_words(error, named=False)}") from None
 
 
-def _regions(numbers: list[float]) -> Regions:
-    scale, std_s = numbers[:2]
-    radii = numbers[2 : 2 + len(LEVELS)]
-    remainder = numbers[2 + len(LEVELS) :]
+def _regions(arrays: Mapping[str, NDArray[Any]]) -> Regions:
+    scale, std_s, *radii = arrays[REGIONS].tolist()
     regions = Regions(scale, std_s, tuple(radii))
-    return (
-        regions._replace(ratios=tuple(remainder[:-1]), alarm=remainder[-1])
-        if remainder
-        else regions
-    )
+    if DETECTOR not in arrays:
+        return regions
+    *weights, alarm = arrays[DETECTOR].tolist()
+    return regions._replace(weights=tuple(weights), alarm=alarm)
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
@@ -312,8 +313,10 @@ def _spoilt(arrays: Mapping[str, NDArray[Any]]) -> Iterator[str]:
     if (side := arrays.get("conductor", np.array(0)).tolist()) not in (0, 1):
         yield f"conductor is {side!r}: 0 for the left hand or 1 for the right one accepted"
     if REGIONS in arrays:
-        yield from _beyond(arrays, [REGIONS], "")
+        yield from _beyond(arrays, [name for name in (REGIONS, DETECTOR) if name in arrays], "")
         yield from _no_regions(arrays[REGIONS])
+    if DETECTOR in arrays:
+        yield from _no_detector(arrays[DETECTOR])
     yield from _spoilt_texts(arrays)
 
     if len(arrays["base_inputs"]) > MOST_POINTS:
@@ -379,17 +382,22 @@ def _beyond(arrays: Mapping[str, NDArray[Any]], names: Iterable[str], prefix: st
 def _no_regions(array: NDArray[Any]) -> Iterator[str]:
     """Faults of the array of regions."""
     count = len(LEVELS)
-    if array.shape not in ((2 + count,), (3 + 2 * count,)):
-        yield f"regions of shape {array.shape}, ({2 + count},) or ({3 + 2 * count},) needed"
-    elif not (array[0] > 0 and (np.diff(array[2 : 2 + count]) >= 0).all()):
+    if array.shape != (2 + count,):
+        yield f"regions of shape {array.shape}, ({2 + count},) needed"
+    elif not (array[0] > 0 and (np.diff(array[2:]) >= 0).all()):
         yield f"regions are {array.tolist()}: a scale above 0, a time, and growing radii needed"
-    elif not ((array[2 + count :] > 0).all() and (np.diff(array[2 + count : -1]) >= 0).all()):
-        yield f"regions are {array.tolist()}: growing ratios above 0 needed"
-    elif len(array) > 2 + count and not 0 < array[-1] <= 1:
-        yield f"an alarm at the error probability {array[-1]:g}: above 0, and up to 1, accepted"
     elif abs(array[2 + LEVELS.index(0.95)] - REGION_95) > 0.01:
         region = array[2 + LEVELS.index(0.95)]
         yield f"a 95 % region of {region:g}: the scale makes it {REGION_95:g}"
+
+
+def _no_detector(array: NDArray[Any]) -> Iterator[str]:
+    """Faults of the array of weights and alarm."""
+    count = len(NORMAL_WEIGHTS) + 1
+    if array.shape != (count,):
+        yield f"detector of shape {array.shape}, ({count},) needed"
+    elif not 0 < array[-1] <= 1:
+        yield f"an alarm at the error probability {array[-1]:g}: above 0, and up to 1, accepted"
 
 
 def _is_json(array: NDArray[Any]) -> bool:

@@ -10,6 +10,7 @@ from thirdhand.contract.records import Field
 ORDER = 4
 # cascaded filters of a hand's orientation, so that its angular acceleration is continuous
 TURNS = 3
+SIGNS = 8  # of an error, beside the covariance; see `support`
 
 MAX_SKILL_DISTANCE_M = 10.0  # largest distance of anything in a skill's file from the base plate
 STATE = (
@@ -19,6 +20,7 @@ STATE = (
     Field("orientation_covariance", "float64", (3, 3)),
     Field("closure", "float64"),  # of the gripper, as predicted at the newest hand sample
     Field("known_gate_m", "float64"),  # `gate_m` at the newest hand sample [m]
+    Field("signs", "float64"),  # of an error at the newest hand sample, weighted and added
     Field("unsure", "uint8"),  # 1: the tool may be too far from its target
     Field("trail", "float64", (3,)),  # lowpass of the predicted positions [m]
     Field("trail_tick", "int64"),  # tick of the newest prediction in `trail`

@@ -19,11 +19,13 @@ from kmp.named_arrays import from_arrays
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import round_to
-from thirdhand.core.skill import MAX_SKILL_DISTANCE_M, ORDER, TURNS
+from thirdhand.core.skill import MAX_SKILL_DISTANCE_M, ORDER, SIGNS, TURNS
 from thirdhand.core.skill.memory import moving_features
 from thirdhand.core.skill.model import (
     COVARIANCE_ROUND_TO,
+    KNOWN_SIGNS,
     MOTION_ROUND_TO,
+    NO_SIGNS,
     Arrays,
     Motion,
     Seen,
@@ -31,7 +33,14 @@ from thirdhand.core.skill.model import (
     standard_deviations,
 )
 from thirdhand.core.skill.segments import MOST_SEGMENTS
-from thirdhand.core.skill.support import LocalErrors, local_scatter
+from thirdhand.core.skill.support import (
+    LocalErrors,
+    average,
+    local_scatter,
+    mix,
+    stretch_of,
+    write_signs,
+)
 from thirdhand.core.skill.task import check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import TURN_WEIGHT_M
@@ -52,14 +61,19 @@ class HandsKMP:
     A hand of unknown orientation is assumed to have the mean orientation of the demonstrations.
     Where no clock is known, as at a via-point, it is that of the nearest reference point.
 
-    With the `errors` of held-out demonstrations, the covariance is their local scatter; without
-    them, it is the primitive's. The gate always compares the primitive's.
+    The mean is a mixture of the primitive's and, with the share `neighbours`, of the average tool
+    at the reference points nearby, see `thirdhand.core.skill.support`.
+
+    With the `errors` of held-out demonstrations, the covariance is their local scatter, and there
+    are signs of an error; without them, it is the primitive's. The gate always compares the
+    primitive's.
     """
 
     primitive: KMP
     turned: bool = False  # true if the hands' orientation is an input
     clock: TaskClock | None = None
     errors: LocalErrors | None = None
+    neighbours: float = 0.0
 
     measure: ClassVar[str] = "the target's standard deviation"
     units: ClassVar[str] = (
@@ -69,6 +83,7 @@ class HandsKMP:
         "error_inputs": (-1e3, 1e3, ""),
         "error_samples": (-MAX_SKILL_DISTANCE_M, MAX_SKILL_DISTANCE_M, "m"),
         "error_unknown_std": (0.0, MAX_SKILL_DISTANCE_M, "m"),
+        "neighbours": (0.0, 1.0, ""),
     }
     # [1/m²] the kernel's standard deviation is 2 cm of a hand's motion
     gripper_ell: ClassVar[float] = 1000.0
@@ -128,16 +143,56 @@ class HandsKMP:
         covariance = motion.covariance if known is None else known
         assert covariance is not None
         out = np.empty((6, 3))
-        deviation = _rounded(motion.mean, motion.velocity, motion.acceleration, covariance, out)
+        out[:3] = motion.mean, motion.velocity, motion.acceleration
+        if self.neighbours:
+            mix(np.ascontiguousarray(moving), *self._near, self.neighbours, out[:3])
+        deviation = _rounded(covariance, out)
+        signs = NO_SIGNS if known is None else KNOWN_SIGNS
         if known is None and self.errors is not None:
             errors = self.errors
             inputs = np.ascontiguousarray(moving[0])
             local_scatter(inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
+            signs = self.signs(inputs[None], out[:1])[0]
         if known is not None and self.errors is not None:
             # the gate compares the primitive's own covariance, which was not computed
             deviation = math.nan
-        return Motion(out[0], out[1], out[2], out[3:], deviation)
+        return Motion(out[0], out[1], out[2], out[3:], deviation, signs=signs)
+
+    @cached_property
+    def _near(self) -> tuple[Vector, Vector]:
+        """Reference points (R, I + 3) and stretch (I,), as in `mix`."""
+        base = self.primitive.base
+        stretch = stretch_of(self.clock, base.inputs)
+        return np.hstack([base.inputs * stretch, base.reference.mean]), stretch
+
+    def tools(self, inputs: Vector) -> Vector:
+        """Mean tool (T, 3) [m] at inputs (T, I)."""
+        out = np.array(self.primitive.mean(inputs))
+        if self.neighbours:
+            shares, averages = self._averages(inputs)
+            out += self.neighbours * (averages - shares * out)
+        return out
+
+    def _averages(self, inputs: Vector) -> tuple[Vector, Vector]:
+        """Shares (T, 1) and averages (T, 3) [m] of neighbours at inputs (T, I), see `average`."""
+        averages = np.empty((len(inputs), 3))
+        rows = zip(np.array(inputs, order="C"), averages, strict=True)
+        shares = [average(row, *self._near, out) for row, out in rows]
+        return np.array(shares)[:, None], averages
+
+    def signs(self, inputs: Vector, tools: Vector) -> Vector:
+        """Signs (T, SIGNS) of errors of these tools (T, 3) [m] at inputs (T, I); zeros without
+        held-out errors.
+        """
+        out = np.zeros((len(inputs), SIGNS))
+        if (errors := self.errors) is not None:
+            near = self._near
+            for row, tool, signs in zip(np.array(inputs, order="C"), tools, out, strict=True):
+                write_signs(
+                    row, tool, *near, errors.rows, errors.stretch, errors.unknown_std_m, signs
+                )
+        return out
 
     def elsewhere(
         self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector
@@ -145,7 +200,7 @@ class HandsKMP:
         return 0.0
 
     def mean(self, hands: Vector, names: Sequence[str] = ()) -> Vector:
-        return self.primitive.mean(self.inputs(hands))
+        return self.tools(self.inputs(hands))
 
     def covariances(self, hands: Vector) -> Vector:
         if self.errors is not None:
@@ -191,9 +246,14 @@ class HandsKMP:
     def through(
         self, via_points: Sequence[ViaPoint], *, tolerance: float, weight: float
     ) -> HandsKMP:
-        """Model adapted to via-points by Algorithm 1 of Huang et al. 2019."""
+        """Model adapted to via-points by Algorithm 1 of Huang et al. 2019. The primitive passes
+        through where the mixture with the neighbours then passes through the via-points.
+        """
         hands, outputs, deviations = neighbourhoods(via_points)
         inputs = self.inputs(hands)
+        if self.neighbours and len(inputs):
+            shares, averages = self._averages(inputs)
+            outputs = (outputs - self.neighbours * averages) / (1.0 - self.neighbours * shares)
         desired = Gaussians(outputs, weight * deviations[:, None, None] ** 2 * np.eye(3))
         return replace(
             self, primitive=self.primitive.base.adapt(inputs, desired, tolerance=tolerance)
@@ -206,6 +266,8 @@ class HandsKMP:
         out: dict[str, NDArray[Any]] = {"turned": np.array(1)} if self.turned else {}
         if self.clock is not None:
             out["task_clock"] = self.clock.numbers
+        if self.neighbours:
+            out["neighbours"] = np.array(self.neighbours)
         if self.errors is not None:
             out["error_inputs"] = self.errors.inputs
             out["error_samples"] = self.errors.errors
@@ -228,19 +290,15 @@ class HandsKMP:
             errors = LocalErrors.of(
                 primitive, arrays["error_inputs"], arrays["error_samples"], unknown_std_m
             )
-        return cls(primitive, "turned" in arrays, clock, errors)
+        neighbours = float(arrays.get("neighbours", 0.0))
+        return cls(primitive, "turned" in arrays, clock, errors, neighbours)
 
 
 @compiled
-def _rounded(
-    mean: Vector, velocity: Vector, acceleration: Vector, covariance: Vector, out: Vector
-) -> float:
-    """Round a prediction into `out` (6, 3): position, velocity, acceleration and covariance (3, 3).
-    Returns the standard deviation [m] of the rounded covariance.
+def _rounded(covariance: Vector, out: Vector) -> float:
+    """Round the position, velocity and acceleration in `out` (6, 3), and write the rounded
+    covariance (3, 3) below them. Returns the standard deviation [m] of that covariance.
     """
-    out[0] = mean
-    out[1] = velocity
-    out[2] = acceleration
     out[3:] = covariance
     round_to(out[:3], MOTION_ROUND_TO)
     round_to(out[3:], COVARIANCE_ROUND_TO)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kmp.compiled import compiled
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
+from thirdhand.core.skill import SIGNS
 from thirdhand.core.skill.task_clock import TaskClock
 
 if TYPE_CHECKING:
@@ -22,11 +23,14 @@ COVARIANCE_ROUND_TO = 1e10  # [1/m²] covariances are rounded to 1e-10 m²
 LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)  # confidence levels of the calibrated regions
 # χ² with 3 degrees of freedom
 CHI_SQUARE = (0.5844, 1.2125, 2.3660, 4.1083, 6.2514, 7.8147, 11.3449)
-# |e|² / tr C of isotropic normal errors
-NORMAL_RATIOS = tuple(square / 3.0 for square in CHI_SQUARE)
 REGION_95 = CHI_SQUARE[LEVELS.index(0.95)]
 Arrays = Mapping[str, NDArray[Any]]
 NO_CLOCK = np.zeros(3)
+NO_SIGNS = np.zeros(SIGNS)
+KNOWN_SIGNS = np.zeros(0)
+# For a normal distribution with tr C = t UNSURE_M², the logit of the probability that an error is
+# larger than UNSURE_M is about -0.4 + 2 log t: its line through probabilities of 0.4 and 0.1.
+NORMAL_WEIGHTS = (-0.4, 2.0, *SIGNS * [0.0])
 
 
 class Regions(NamedTuple):
@@ -38,16 +42,16 @@ class Regions(NamedTuple):
     Mahalanobis distances under it that bound the regions of LEVELS; the one of 95 % is always that
     of a normal distribution.
 
-    `ratios` are the quantiles at LEVELS of |e|² / tr C, with the error e of a prediction and its
-    published covariance C: they make an error probability of a covariance. The skill is unsure
-    where that probability is above the `alarm`; without one, where the 95 % region reaches farther
-    than UNSURE_M.
+    `weights` are those of a logistic regression, which makes an error probability of the published
+    covariance and of signs, see `support.error_probability`. The skill is unsure where that
+    probability is above the `alarm`; without one, where the 95 % region reaches farther than
+    UNSURE_M.
     """
 
     scale: float = 1.0
     std_s: float = 0.0
     radii: tuple[float, ...] = CHI_SQUARE
-    ratios: tuple[float, ...] = NORMAL_RATIOS
+    weights: tuple[float, ...] = NORMAL_WEIGHTS
     alarm: float = 0.0
 
 
@@ -66,6 +70,8 @@ class Motion(NamedTuple):
     # the prediction before
     gate_m: float
     ambiguity: float = 0.0  # probability that the tool belongs elsewhere, in another segment
+    # (SIGNS,) of an error; (0,) if the covariance was known, with which they are computed
+    signs: Vector = NO_SIGNS
 
 
 class Seen(NamedTuple):

@@ -164,6 +164,7 @@ class Prediction(NamedTuple):
     covariance: Vector  # (3, 3) [m²] of the model, before the calibration by `Regions`
     gate_m: float  # [m] distance that is compared with the skill's threshold, see `Model.measure`
     ambiguity: float  # probability that the tool belongs elsewhere, in another segment
+    signs: Vector  # (SIGNS,) of an error, see `support`
     turn: Turn
     closure: float  # of the gripper, 0 (open) to 1 (closed); NO_GRIPPER if the skill has none
 

@@ -68,7 +68,7 @@ class SkillStage:
             reach=reach_of(self._reach),
             scale=regions.scale,
             std_s=regions.std_s,
-            ratios=regions.ratios,
+            weights=regions.weights,
             alarm=regions.alarm,
         )
 
@@ -149,7 +149,7 @@ class SkillStage:
             states,
             frames,
             rules,
-            prediction[:6],
+            prediction[:7],
             prediction.turn,
             prediction.closure,
             error_m,

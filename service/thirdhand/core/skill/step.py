@@ -75,7 +75,7 @@ def conclude(
     states: Records,
     frames: Records,
     rules: Records,
-    motion: tuple[Vector, Vector, Vector, Vector, float, float],
+    motion: tuple[Vector, Vector, Vector, Vector, float, float, Vector],
     turn: tuple[Vector, Vector, Vector],
     closure: float,
     off: float,
@@ -86,9 +86,9 @@ def conclude(
 
     `motion` are the first parts of a `Prediction`, `turn` its `Turn`; `off` [m] is the possible
     error because a hand is not seen, and `doubt` the probability that the task did not begin at its
-    first segment:
+    first segment. If there are no signs, those of the newest sample of a hand are kept:
 
-        p = p_C + (1 - p_C) doubt,   p_C = error_probability(C, off² / REGION_95)
+        p = p_C + (1 - p_C) doubt,   p_C = error_probability(C, off² / REGION_95, signs)
 
     The skill is unsure if p is above its alarm, or without an alarm, if its region reaches farther
     than UNSURE_M. Returns IS_AMBIGUOUS if the segment has been ambiguous for longer than
@@ -97,7 +97,7 @@ def conclude(
     state = states[0]
     frame = frames[0]
     rule = rules[0]
-    position, velocity, acceleration, covariance, gate_m, ambiguity = motion
+    position, velocity, acceleration, covariance, gate_m, ambiguity, signs = motion
     frame.target[:] = position
     frame.target_velocity[:] = velocity
     frame.target_acceleration[:] = acceleration
@@ -112,7 +112,13 @@ def conclude(
     state.trail_tick = state.tick
     moved = recent(position, passed_s, state.trail)
     reach_m = calibrate(covariance, moved, rule.scale, rule.std_s, frame.covariance)
-    probability = error_probability(frame.covariance, off * off / REGION_95, rule.ratios)
+    if len(signs):
+        state.signs = 0.0
+        for i in range(len(signs)):
+            state.signs += rule.weights[2 + i] * signs[i]
+    probability = error_probability(
+        frame.covariance, off * off / REGION_95, state.signs, rule.weights
+    )
     frame.error_probability = probability + (1.0 - probability) * doubt
 
     # An unsure skill remains so until the measure is below `end_share` of its limit.

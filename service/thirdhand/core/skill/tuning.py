@@ -76,6 +76,15 @@ AMBIGUOUS_M = 0.5 * UNSURE_M
 # mean velocity over this time, by the error of timing, adds to the covariance
 TRAIL_S = SAMPLE_CORRELATION_S
 
+# Neighbours.
+# 0.05 to 0.2. More: the average is wider. Less: it is that of fewer moments.
+# distance in the inputs within which reference points are neighbours
+NEIGHBOUR_M = 0.1
+# 1e-4 to 1e-2. More: the average ends nearer to what was shown. Less: it reaches farther.
+NEIGHBOUR_MASS = 1e-3  # neighbours count where they weigh more than this
+# 0.2 to 1. More: neighbours are of the same moment. Less: they are of any moment.
+NEIGHBOUR_CLOCK_MPS = 0.5  # largest weight of the clock in the distance of neighbours
+
 # Motion of the target.
 # a slower hand may tremble: its velocity does not predict its motion
 CALM_MPS = DIRECTION_SPEED_MPS

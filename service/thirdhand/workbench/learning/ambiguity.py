@@ -14,6 +14,7 @@ from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.records import HeldOut
 
 COMPARED = 100  # samples of a take that are compared with those of all takes
+MOST_COMPARED = 10_000  # of all takes: the time to compare them grows with its square
 COMPARED_AT_ONCE = 256  # samples that are compared with all others at once, which bounds the memory
 # hands up to this distance are the same if predictions cannot tell their tools apart either
 ALIKE_M = 0.02
@@ -74,8 +75,9 @@ def contradictions(
     the tool (T,) by more than half of `different`. `distances` (M, N) are those between tools
     (M, O) and (N, O).
     """
+    count = min(COMPARED, max(1, MOST_COMPARED // len(held_out)))
     sampled_rows = [
-        np.linspace(0, len(result.known) - 1, min(COMPARED, len(result.known))).round().astype(int)
+        np.linspace(0, len(result.known) - 1, min(count, len(result.known))).round().astype(int)
         for result in held_out
     ]
     known_m, outputs, errors = (

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thirdhand.core.frame import Vector
-from thirdhand.workbench.learning.records import Take
+from thirdhand.workbench.learning.records import Take, folds_of
 
 Predictor = Callable[[Vector, Vector, Vector], Vector]
 # in a skill's figures
@@ -18,28 +18,27 @@ SAME_TIME = "same elapsed time"
 
 
 def baselines(takes: Sequence[Take]) -> dict[str, list[Vector]]:
-    """The errors (T, 3) [m] of each take by baselines from other persons' takes, by name; empty if
-    there is one person only.
+    """The errors (T, 3) [m] of each take by baselines from the takes of other folds, by name; empty
+    if there is one person only.
     """
     if len({take.person for take in takes}) < 2:
         return {}
     return {
         LINEAR: held_out_errors(takes, linear),
         LOOK_UP: held_out_errors(takes, look_up),
-        SAME_TIME: [
-            take.demonstration.tool[:, :3] - same_time(take, others)
-            for take, others in _with_others(takes)
-        ],
+        SAME_TIME: held_out(takes, same_time),
     }
 
 
 def constant_errors(takes: Sequence[Take]) -> list[Vector]:
-    """The errors (T, 3) [m] of each take by the mean position of the tool in other persons' takes;
-    empty if there is one person only.
+    """The errors (T, 3) [m] of each take by the mean position of the tool in the takes of other
+    folds; empty if there is one person only.
     """
     if len({take.person for take in takes}) < 2:
         return []
-    return held_out_errors(takes, lambda hands, tool, queries: tool.mean(axis=0))
+    return held_out_errors(
+        takes, lambda hands, tool, queries: np.tile(tool.mean(axis=0), (len(queries), 1))
+    )
 
 
 def linear(hands: Vector, tool: Vector, queries: Vector) -> Vector:
@@ -56,31 +55,40 @@ def look_up(hands: Vector, tool: Vector, queries: Vector) -> Vector:
 
 
 def held_out_errors(takes: Sequence[Take], predict: Predictor) -> list[Vector]:
-    """The errors (T, 3) [m] of each take, predicted from other persons' takes."""
-    errors = []
-    for take, others in _with_others(takes):
-        hands, tool = (
-            np.concatenate(parts)
-            for parts in zip(*((o.hands, o.position) for o in others), strict=True)
-        )
-        errors.append(take.position - predict(hands, tool, take.hands))
-    return errors
+    """The errors (T, 3) [m] of each take, predicted from the samples of other folds."""
+
+    def predicted(asked: Sequence[Take], others: Sequence[Take]) -> list[Vector]:
+        hands = np.concatenate([take.hands for take in others])
+        tool = np.concatenate([take.position for take in others])
+        ends = np.cumsum([len(take.hands) for take in asked])[:-1]
+        return np.split(predict(hands, tool, np.concatenate([take.hands for take in asked])), ends)
+
+    return held_out(takes, predicted)
 
 
-def same_time(take: Take, others: Sequence[Take]) -> Vector:
-    """The mean position (T, 3) [m] of the other takes' tool after the same time."""
-    seconds = take.demonstration.seconds
-    demonstrations = [other_take.demonstration for other_take in others]
-    means = [
-        np.mean(
-            [np.interp(seconds, other.seconds, other.tool[:, axis]) for other in demonstrations],
-            axis=0,
-        )
-        for axis in range(3)
-    ]
-    return np.stack(means, axis=1)
+def held_out(
+    takes: Sequence[Take], predicted: Callable[[Sequence[Take], Sequence[Take]], list[Vector]]
+) -> list[Vector]:
+    """The errors (T, 3) [m] of each take; each fold is `predicted` from the takes of the others."""
+    folds = folds_of(takes)
+    out: dict[int, Vector] = {}
+    for fold in np.unique(folds).tolist():
+        asked, others = (np.flatnonzero(part).tolist() for part in (folds == fold, folds != fold))
+        tools = predicted([takes[i] for i in asked], [takes[i] for i in others])
+        out |= {i: takes[i].position - tool for i, tool in zip(asked, tools, strict=True)}
+    return [out[i] for i in range(len(takes))]
 
 
-def _with_others(takes: Sequence[Take]) -> list[tuple[Take, list[Take]]]:
-    """Each take, and those of other persons."""
-    return [(take, [other for other in takes if other.person != take.person]) for take in takes]
+def same_time(asked: Sequence[Take], others: Sequence[Take]) -> list[Vector]:
+    """The mean positions (T, 3) [m] of the other takes' tool after the same time."""
+    period_s = min(take.demonstration.period_s for take in others)
+    grid = np.arange(0.0, max(take.demonstration.seconds[-1] for take in others), period_s)
+    mean = np.zeros((len(grid), 3))
+    for take in others:
+        mean += _at(grid, take.demonstration.seconds, take.position) / len(others)
+    return [_at(take.demonstration.seconds, grid, mean) for take in asked]
+
+
+def _at(times: Vector, known: Vector, values: Vector) -> Vector:
+    """Values (K, D) at the times `known` (K,), interpolated at `times` (T,)."""
+    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)

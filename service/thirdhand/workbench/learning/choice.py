@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,6 +19,11 @@ RIDGE_M = 0.005
 NOISE_M = 0.001  # noise of a good tracker on each axis
 # this share of the reference points is even in time, the rest along the hands' path
 DWELL_SHARE = 0.25
+LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to compare or to calibrate by
+# The demonstrations together have at most this many reference points, or about this many: the time
+# and the memory to learn grow with its cube and its square.
+MOST_SAMPLED = 600
+GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples are even in every interval of length 1
 LEAST_POINTS = 4  # reference points of a demonstration
 POSITION_SCALES = Scales(
     ells=(
@@ -55,10 +61,10 @@ def selection_of(
     last `earlier` pairs are of a skill that is refined: their points have this `factor` on their
     noise, and are not judged.
     """
-    counts = shared_counts(points, len(pairs) - earlier, earlier, LEAST_POINTS)
+    shares = sampled(points, len(pairs) - earlier, earlier, LEAST_POINTS)
     parts = [
-        (even_in_time if rich else thinned)(*pair, count)
-        for pair, count in zip(pairs, counts, strict=True)
+        (even_in_time if rich else thinned)(*pair, take_shares)
+        for pair, take_shares in zip(pairs, shares, strict=True)
     ]
     numbers = np.arange(len(parts), dtype=np.intp) if persons is None else persons
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -73,28 +79,50 @@ def selection_of(
     return DirectSelection(inputs, outputs, group, scales, isotropic, rich, factors, is_new)
 
 
-def shared_counts(count: int, new: int, earlier: int, least: int) -> list[int]:
-    """The numbers of points of each new and each earlier take, of about `count` in all and at least
-    `least` each: with earlier takes, half of them are for the new ones.
+def is_clear(gains: Vector) -> bool:
+    """True if the mean of gains (B,) in blocks is above one standard error of it."""
+    return len(gains) < LEAST_BLOCKS or bool(
+        gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains))
+    )
+
+
+def sampled(
+    count: int, new: int, earlier: int, least: int, most: int = MOST_SAMPLED
+) -> list[Vector]:
+    """The shares, from 0 to 1, at which each new and each earlier take is sampled: about `count` in
+    all and at least `least` in each, but at most `most` in all. With earlier takes, half of them
+    are in the new ones.
+
+    Where takes have fewer than `least`, each is sampled elsewhere than the one before.
     """
-    if not earlier:
-        return [max(least, count // new)] * new
-    return [max(least, count // 2 // new)] * new + [max(least, count // 2 // earlier)] * earlier
+    if earlier:
+        return [
+            *sampled(count // 2, new, 0, least, most // 2),
+            *sampled(count // 2, earlier, 0, least, most // 2),
+        ]
+    each = max(count // new, min(least, most // new))
+    if each >= least:
+        return [np.linspace(0.0, 1.0, each)] * new
+    counts = [each] * new if each else np.diff(np.arange(new + 1) * most // new).tolist()
+    return [(np.arange(n) + i * GOLDEN % 1.0) / max(n, 1) for i, n in enumerate(counts)]
 
 
-def thinned(hands: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
-    """About `count` samples of hands (T, 6) and tool (T, 3) [m], evenly along the hands' path and,
-    so that rests keep some, a little along time.
+def thinned(hands: Vector, tool: Vector, shares: Vector) -> tuple[Vector, Vector]:
+    """Samples of hands (T, 6) and tool (T, 3) [m] at shares of the hands' path and, so that rests
+    keep some, a little of the time.
     """
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(hands, axis=0), axis=1))])
     along = path / max(path[-1], 1e-9) + DWELL_SHARE * np.linspace(0.0, 1.0, len(path))
-    rows = np.unique(
-        np.searchsorted(along, np.linspace(0.0, along[-1], count)).clip(0, len(path) - 1)
-    )
+    rows = np.unique(np.searchsorted(along, shares * along[-1]).clip(0, len(path) - 1))
     return hands[rows], tool[rows]
 
 
-def even_in_time(inputs: Vector, tool: Vector, count: int) -> tuple[Vector, Vector]:
-    """About `count` samples of inputs (T, I) and tool (T, 3), evenly in time."""
-    rows = np.unique(np.linspace(0.0, len(inputs) - 1, count).round().astype(int))
+def even_in_time(inputs: Vector, tool: Vector, shares: Vector) -> tuple[Vector, Vector]:
+    """Samples of inputs (T, I) and tool (T, 3) at shares of the time."""
+    rows = rows_at(shares, len(inputs))
     return inputs[rows], tool[rows]
+
+
+def rows_at(shares: Vector, count: int) -> NDArray[np.intp]:
+    """The different rows, of some `count`, at shares from 0 to 1."""
+    return np.unique((shares * (count - 1)).round().astype(np.intp))

@@ -263,13 +263,13 @@ class Encoded(Divided):
             np.isin(self.labels, segments) & (np.abs(self.along - corner).max(axis=1) < NEAR)
         )
 
-    def rows(self, count: int) -> Indices:
-        """About `count` rows, evenly along the path of hands and tool, and a little along time."""
+    def rows(self, shares: Vector) -> Indices:
+        """Rows at shares of the path of hands and tool, and a little of the time."""
         steps = np.abs(np.diff(np.column_stack([self.along, self.wanted[:, 0]]), axis=0)).sum(
             axis=1
         )
         path = np.concatenate([[0.0], np.cumsum(steps + 0.05 * self.period_s)])
-        rows = np.searchsorted(path, np.linspace(0.0, path[-1], count)).clip(0, len(path) - 1)
+        rows = np.searchsorted(path, shares * path[-1]).clip(0, len(path) - 1)
         return np.asarray(np.unique(rows), np.int64)
 
 

@@ -23,6 +23,7 @@ from thirdhand.workbench.learning.records import (
     HeldOut,
     Pose,
     Row,
+    Spread,
     TimedErrors,
     Verdict,
     persons_of,
@@ -34,7 +35,7 @@ from thirdhand.workbench.learning.regions import (
     unknown_std,
 )
 from thirdhand.workbench.learning.takes import Division, conductor_of
-from thirdhand.workbench.learning.verdicts import Subject, verdicts
+from thirdhand.workbench.learning.verdicts import Subject, conclusion, verdicts
 
 CONTRADICTION_M = 0.10  # tools this far from each other contradict each other at the same hands
 
@@ -79,6 +80,7 @@ def judged(
         orientation_error_deg=pose.turn_error_deg,
         gripper_right=pose.gripper_right,
         by_person=len(np.unique(persons)) < len(takes),
+        spread=_spread(checked, persons),
         alone=True if conductor_of(division, fitted) is not None else msgspec.UNSET,
         **_of_choice(fitted),
     )
@@ -93,6 +95,9 @@ def judged(
     )
     remarks = (*division.remarks, *fitted.remarks)
     figures = _with_verdicts(figures, [*verdicts(subject), *pose.verdicts], remarks, accepted_by)
+    figures = msgspec.structs.replace(
+        figures, conclusion=conclusion(subject._replace(figures=figures))
+    )
     inside = np.mean([errors.inside(regions) for errors, regions in checked], axis=0)
     return Judgement(figures, calibrated(timed, persons), inside)
 
@@ -170,6 +175,30 @@ def _with_verdicts(
         residual=residual,
         accepted_by=accepted_by if residual else "",
         unsafe=unsafe,
+    )
+
+
+def _spread(
+    checked: Sequence[tuple[TimedErrors, Regions]], persons: NDArray[np.intp]
+) -> Spread | None:
+    """The spread of the error over these persons (H,)."""
+    own = [
+        [checked[i] for i in np.flatnonzero(persons == person).tolist()]
+        for person in np.unique(persons)
+    ]
+    if len(own) < 2:
+        return None
+    errors_mm = [1000 * rms(np.concatenate([timed.errors for timed, _ in part])) for part in own]
+    expected_mm = [
+        1000 * rms(np.concatenate([timed.expected_m(regions) for timed, regions in part])[:, None])
+        for part in own
+    ]
+    return Spread(
+        len(own),
+        min(errors_mm),
+        max(errors_mm),
+        float(np.std(errors_mm, ddof=1)),
+        int(np.sum(np.array(errors_mm) <= expected_mm)),
     )
 
 

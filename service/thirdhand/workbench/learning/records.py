@@ -15,13 +15,14 @@ from kmp.criteria.cross_validation import mahalanobis
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.model import Model, Regions, standard_deviations
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
-from thirdhand.core.skill.support import error_probabilities
+from thirdhand.core.skill.support import error_probability
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import StoredSkill
 from thirdhand.workbench.learning.gate import Gate
 
 Progress = Callable[[str], None]
+MOST_FOLDS = 10
 Severity = Literal["warning", "residual", "unsafe"]
 
 
@@ -41,7 +42,7 @@ class Take(NamedTuple):
     """A demonstration with its name, the number of its person, and the T samples that are learned
     from: hands (T, 6), tool (T, 7) and the gripper's closure (T,), if it is known.
 
-    All takes of a person are held out at once.
+    All takes of a person are held out at once, see `folds_of`.
     """
 
     name: str
@@ -62,6 +63,23 @@ def persons_of(takes: Sequence[Take]) -> NDArray[np.intp]:
     return np.array([take.person for take in takes], np.intp)
 
 
+def folds_of(takes: Sequence[Take], earlier: int = 0) -> NDArray[np.intp]:
+    """The numbers (H,) of the folds in which takes are held out: by person, or if there are more
+    than MOST_FOLDS, by blocks of persons whose numbers follow each other. The last `earlier` takes,
+    of a skill that is refined, are in folds of their own.
+    """
+    folds = list[NDArray[np.intp]]()
+    first = 0
+    for part in (takes[: len(takes) - earlier], takes[len(takes) - earlier :]):
+        numbers, ranks = np.unique(persons_of(part), return_inverse=True)
+        count = max(1, min(MOST_FOLDS, len(numbers)))
+        blocks = np.array_split(np.arange(len(numbers)), count)
+        own = np.repeat(np.arange(count), [len(block) for block in blocks])[ranks]
+        folds.append(first + own)
+        first += count
+    return np.concatenate(folds)
+
+
 class Taught(NamedTuple):
     """The takes that a skill is learned from.
 
@@ -71,6 +89,11 @@ class Taught(NamedTuple):
 
     new: Sequence[Take]
     earlier: Sequence[Take] = ()
+
+    @property
+    def folds(self) -> NDArray[np.intp]:
+        """The folds (H,) of all takes."""
+        return folds_of(self.all, len(self.earlier))
 
     @property
     def all(self) -> Sequence[Take]:
@@ -96,6 +119,7 @@ class TimedErrors(NamedTuple):
     errors: Vector
     covariance: Vector
     velocity: Vector
+    signs: Vector  # (S, SIGNS) of an error
 
     def with_timing(self, std_s: float) -> Vector:
         """The covariances (S, 3, 3) [m²] for this deviation of the timing: C + std_s² v vᵀ."""
@@ -116,11 +140,16 @@ class TimedErrors(NamedTuple):
         """The calibrated covariances (S, 3, 3) [m²]."""
         return np.asarray(regions.scale * self.with_timing(regions.std_s))
 
+    def features(self, regions: Regions) -> Vector:
+        """What `error_probability` weighs (S, 2 + SIGNS), in the order of the weights."""
+        traces = np.trace(self.published(regions), axis1=1, axis2=2)
+        return np.column_stack([np.ones(len(traces)), np.log(traces / UNSURE_M**2), self.signs])
+
     def probabilities(self, regions: Regions) -> Vector:
         """The error probabilities (S,)."""
-        out = np.empty(len(self.errors))
-        error_probabilities(self.published(regions), np.array(regions.ratios), out)
-        return out
+        weights = np.array(regions.weights)
+        rows = zip(self.published(regions), self.signs @ weights[2:], strict=True)
+        return np.array([error_probability(row, 0.0, signs, weights) for row, signs in rows])
 
     def expected_m(self, regions: Regions) -> Vector:
         """The expected distances (S,) [m] of tool and prediction, root mean square."""
@@ -219,6 +248,16 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     other_mm: dict[str, float] = {}  # errors of baselines
 
 
+class Spread(msgspec.Struct, frozen=True):
+    """The spread of the error over people, whose takes are held out at once."""
+
+    people: int
+    least_mm: float
+    most_mm: float
+    std_mm: float
+    as_said: int  # people whose error is at most the one that the skill expects
+
+
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
     """The figures that a skill's file holds. Shares are in per cent."""
 
@@ -247,6 +286,8 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     weight: str = ""  # weight of a new take against an earlier one; empty if no skill is refined
     weights_mm: dict[str, float] = {}  # held-out error of the new takes with each weight
     by_person: bool = False  # true if all demonstrations of a person were held out at once
+    spread: Spread | None = None  # None for fewer than two people
+    conclusion: str = ""  # whether the task suits the method, and what would help
     delay_s: float | None = None  # the teacher's delay; None if it was not learned
     delay_std_s: float = 0.0  # its standard deviation over the demonstrations
     # true if one hand conducts alone, and `beside` refers to it

@@ -15,33 +15,48 @@ other. The second factor widens a region until it holds on blocks of takes that 
 (conformal prediction across folds; Barber et al. 2021). The published covariance is scaled by
 ρ_0.95 / χ²_0.95.
 
-The error probability, that the tool is farther than UNSURE_M from its prediction, follows from the
-quantiles of |e|² / tr C of the published covariances C. The skill is unsure where it is above the
-alarm: the smallest probability that is exceeded at FALSE_ALARM_SHARE of the moments at which the
-tool is nearer; or a larger one that is still exceeded at ALARM_SHARE of the other moments.
+The error probability, that the tool is farther than UNSURE_M from its prediction, is that of a
+logistic regression on the trace of the published covariance and the signs of an error, whose
+weights w are the most probable ones with the normal distribution's weights n as their mean before:
+
+    argmin -Σ log p(wrong or not) + DETECTOR_PENALTY |w - n|² / 2
+
+The skill is unsure where it is above the alarm: the smallest probability, by weights from the other
+blocks, that is exceeded at FALSE_ALARM_SHARE of the moments at which the tool is nearer; or a
+larger one that is still exceeded at ALARM_SHARE of the other moments.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from kmp import KMP, ViaPointMissed
 from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.frame import Vector
+from thirdhand.core.skill import SIGNS
 from thirdhand.core.skill.hands_kmp import HandsKMP
-from thirdhand.core.skill.model import LEVELS, NORMAL, REGION_95, Regions
+from thirdhand.core.skill.model import (
+    LEVELS,
+    NORMAL,
+    NORMAL_WEIGHTS,
+    REGION_95,
+    Regions,
+)
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.support import LocalErrors
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import check_agreement
+from thirdhand.workbench.learning.choice import LEAST_BLOCKS, rows_at, sampled
 from thirdhand.workbench.learning.records import HeldOut, Take, TimedErrors, persons_of
 
-LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to calibrate by
 # largest number of blocks of successive takes, often of one person or hour, that are held out
 REGION_BLOCKS = 6
 JUDGED_SAMPLES = 150  # samples of a take that are judged, at most
@@ -52,14 +67,17 @@ WIDEST = 100.0  # a region's squared radius is widened at most by this factor
 LEAST_SQUARE = 1e-12  # squared Mahalanobis distances below this one count as this one
 LEAST_RADIUS = 1e-9  # a squared radius is at least this large
 # shares of the right and of the wrong moments at which the skill is unsure
-FALSE_ALARM_SHARE = 0.12
+FALSE_ALARM_SHARE = 0.14
 ALARM_SHARE = 0.95
 LEAST_WRONG = 10  # fewer wrong moments do not show which share of them an alarm detects
 # range of the alarm: a smaller probability is no alarm, and a larger one always is
 ALARMS = (0.005, 0.5)
+# Penalty on the squared deviation of the detector's weights. A tenth and ten times of it detect the
+# same errors of recorded partners.
+DETECTOR_PENALTY = 10.0
+WEIGHT_DECIMALS = 6
 # errors that a model of the hands' inputs keeps, which bound the duration of a tick
 LOCAL_ERRORS_RETAINED = 300
-LEAST_RETAINED = 4  # errors of a demonstration
 
 
 def blocks_of(persons: NDArray[np.intp], most: int = REGION_BLOCKS) -> list[list[int]]:
@@ -73,26 +91,9 @@ def blocks_of(persons: NDArray[np.intp], most: int = REGION_BLOCKS) -> list[list
 
 def timed_errors(one: HeldOut) -> TimedErrors:
     """The errors of a held-out take at the same moment."""
-    return _timed(one.take, one.take.position - one.errors, one.covariance[_rows(len(one.errors))])
-
-
-def refitted_errors(
-    takes: Sequence[Take], inputs: Sequence[Vector], fitted: Callable[[list[int]], HandsKMP]
-) -> list[TimedErrors]:
-    """The errors at the same moment of takes with these inputs (T, I), by models that are `fitted`
-    to all blocks of takes but their own.
-
-    Hyper-parameters are chosen without the held-out block, too. A model passes through the
-    via-points of the demonstration, as it will in use.
-    """
-    out: dict[int, TimedErrors] = {}
-    for block in blocks_of(persons_of(takes)):
-        model = fitted([i for i in range(len(takes)) if i not in block])
-        for i in block:
-            primitive = _through_via_points(model, takes[i].demonstration).primitive
-            covariance = primitive.predict(inputs[i][_rows(len(inputs[i]))]).covariance
-            out[i] = _timed(takes[i], primitive.mean(inputs[i]), covariance)
-    return [out[i] for i in range(len(takes))]
+    rows = _judged_rows(len(one.errors))
+    signs = np.zeros((len(rows), SIGNS))
+    return _timed(one.take, one.take.position - one.errors, one.covariance[rows], signs)
 
 
 def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regions:
@@ -107,21 +108,38 @@ def calibrated(errors: Sequence[TimedErrors], persons: NDArray[np.intp]) -> Regi
     radii = np.maximum.accumulate([_radius(squares, blocks, level) for level in LEVELS])
     scale = float(radii[LEVELS.index(0.95)]) / REGION_95
     regions = Regions(scale, std_s, tuple((radii / scale).tolist()))
-    relative = [
-        (take_errors.errors**2).sum(axis=1)
-        / np.trace(take_errors.published(regions), axis1=1, axis2=2)
-        for take_errors in errors
-    ]
-    ratios = np.maximum.accumulate(
-        [max(_quantile(relative, level), LEAST_RADIUS) for level in LEVELS]
-    )
-    regions = regions._replace(ratios=tuple(ratios.tolist()))
-    return regions._replace(alarm=_alarm(errors, regions))
+    probabilities: dict[int, Vector] = {}
+    for block in blocks:
+        without = regions._replace(
+            weights=_weights([part for i, part in enumerate(errors) if i not in block], regions)
+        )
+        probabilities |= {i: errors[i].probabilities(without) for i in block}
+    alarm = _alarm(errors, [probabilities[i] for i in range(len(errors))])
+    return regions._replace(weights=_weights(errors, regions), alarm=alarm)
 
 
-def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
-    """The error probability above which a skill with these errors is unsure."""
-    probabilities = [take_errors.probabilities(regions) for take_errors in errors]
+def _weights(errors: Sequence[TimedErrors], regions: Regions) -> tuple[float, ...]:
+    """The weights of a detector of the wrong samples among these."""
+    signs = np.concatenate([take_errors.features(regions) for take_errors in errors])
+    wrong = np.concatenate([take_errors.is_wrong for take_errors in errors])
+    normal = np.array(NORMAL_WEIGHTS)
+
+    def cost(weights: Vector) -> tuple[float, Vector]:
+        logits = signs @ weights
+        away = weights - normal
+        total = (
+            np.logaddexp(0.0, logits) - wrong * logits
+        ).sum() + 0.5 * DETECTOR_PENALTY * away @ away
+        return float(total), signs.T @ (expit(logits) - wrong) + DETECTOR_PENALTY * away
+
+    best = minimize(cost, normal, jac=True, method="L-BFGS-B").x
+    return tuple(np.round(best, WEIGHT_DECIMALS).tolist())
+
+
+def _alarm(errors: Sequence[TimedErrors], probabilities: Sequence[Vector]) -> float:
+    """The error probability above which a skill with these errors is unsure; `probabilities` (S,)
+    of each take are those of a detector that was learned without its block.
+    """
     wrong = [take_errors.is_wrong for take_errors in errors]
     right = [
         values[~is_wrong]
@@ -136,33 +154,47 @@ def _alarm(errors: Sequence[TimedErrors], regions: Regions) -> float:
 
 
 def local_errors(
-    timed: Sequence[TimedErrors], inputs: Sequence[Vector], takes: Sequence[Take], primitive: KMP
+    takes: Sequence[Take],
+    inputs: Sequence[Vector],
+    primitive: KMP,
+    refitted: Callable[[list[int]], HandsKMP],
 ) -> tuple[list[TimedErrors], LocalErrors]:
-    """The errors of takes with inputs (T, I), each with covariances by the errors of the other
-    blocks; and those that a model with this primitive keeps.
+    """The errors at the same moment of takes with inputs (T, I), by models that are `refitted` to
+    all blocks of takes but their own, with covariances and signs by the errors of the other blocks;
+    and those errors that a model with this primitive keeps.
+
+    Hyper-parameters are chosen without the held-out block, too. A model passes through the
+    via-points of the demonstration, as it will in use.
     """
-    count = max(LEAST_RETAINED, LOCAL_ERRORS_RETAINED // len(takes))
-    persons = persons_of(takes)
-    used_inputs = [values[_rows(len(values))] for values in inputs]
-    retained_rows = [
-        np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
-        for values in used_inputs
-    ]
+    blocks = blocks_of(persons_of(takes))
     unknown_std_m = unknown_std(takes)
-
-    def of(numbers: Sequence[int]) -> LocalErrors:
-        retained_inputs, errors = (
-            np.concatenate([values[i][retained_rows[i]] for i in numbers])
-            for values in (used_inputs, [take_errors.errors for take_errors in timed])
-        )
-        return LocalErrors.of(primitive, retained_inputs, errors, unknown_std_m)
-
-    out = list(timed)
-    for block in blocks_of(persons):
-        others = of([i for i in range(len(takes)) if i not in block])
+    models = [refitted([i for i in range(len(takes)) if i not in block]) for block in blocks]
+    tools: dict[int, Vector] = {}
+    for block, model in zip(blocks, models, strict=True):
         for i in block:
-            out[i] = timed[i]._replace(covariance=others.covariances(used_inputs[i]))
-    return out, of(range(len(takes)))
+            through = _through_via_points(model, takes[i].demonstration)
+            tools[i] = through.tools(inputs[i])
+    errors = [take.position - tools[i] for i, take in enumerate(takes)]
+    shares = sampled(LOCAL_ERRORS_RETAINED, len(takes), 0, 1, LOCAL_ERRORS_RETAINED)
+
+    def retained(kmp: KMP, numbers: Sequence[int]) -> LocalErrors:
+        rows = [rows_at(shares[i], len(inputs[i])) for i in numbers]
+        kept_inputs, kept_errors = (
+            np.concatenate([values[i][kept] for i, kept in zip(numbers, rows, strict=True)])
+            for values in (inputs, errors)
+        )
+        return LocalErrors.of(kmp, kept_inputs, kept_errors, unknown_std_m)
+
+    out: dict[int, TimedErrors] = {}
+    for block, model in zip(blocks, models, strict=True):
+        others = retained(model.primitive, [i for i in range(len(takes)) if i not in block])
+        of_others = replace(model, errors=others)
+        for i in block:
+            rows = _judged_rows(len(tools[i]))
+            at_rows = inputs[i][rows]
+            signs = of_others.signs(at_rows, tools[i][rows])
+            out[i] = _timed(takes[i], tools[i], others.covariances(at_rows), signs)
+    return [out[i] for i in range(len(takes))], retained(primitive, range(len(takes)))
 
 
 def unknown_std(takes: Sequence[Take]) -> float:
@@ -182,13 +214,16 @@ def calibrated_without(
     return [out[i] for i in range(len(errors))]
 
 
-def _rows(count: int) -> NDArray[np.intp]:
-    return np.linspace(0, count - 1, min(JUDGED_SAMPLES, count)).round().astype(np.intp)
+def _judged_rows(count: int) -> NDArray[np.intp]:
+    """The rows that are judged, of some `count`, even in time."""
+    return rows_at(np.linspace(0.0, 1.0, min(JUDGED_SAMPLES, count)), count)
 
 
-def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
-    """The errors of a mean (T, 3) [m], with covariances (S, 3, 3) [m²] at the judged samples."""
-    rows = _rows(len(mean))
+def _timed(take: Take, mean: Vector, covariance: Vector, signs: Vector) -> TimedErrors:
+    """The errors of a mean (T, 3) [m], with covariances (S, 3, 3) [m²] and signs (S, SIGNS) at the
+    judged samples.
+    """
+    rows = _judged_rows(len(mean))
     trail = mean[0].copy()
     velocity = np.empty_like(mean)
     begins = take.demonstration.begins if len(mean) == len(take.demonstration.tool) else ()
@@ -196,7 +231,7 @@ def _timed(take: Take, mean: Vector, covariance: Vector) -> TimedErrors:
         if i in begins:
             trail[:] = position
         velocity[i] = recent(position, take.demonstration.period_s, trail)
-    return TimedErrors((take.position - mean)[rows], covariance, velocity[rows])
+    return TimedErrors((take.position - mean)[rows], covariance, velocity[rows], signs)
 
 
 def _through_via_points(model: HandsKMP, demonstration: Demonstration) -> HandsKMP:

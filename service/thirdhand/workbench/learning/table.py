@@ -21,6 +21,7 @@ def table(found: Figures) -> str:
         "",
         *_gate(found),
         *_told(found),
+        *_spread(found),
         f"{found.ambiguous:.1f} % of the samples contradict others: the same hands with the tool "
         f"elsewhere; {found.beyond_reach:.1f} % of the tool's path is out of the arm's reach",
         *_pose(found),
@@ -37,6 +38,7 @@ def table(found: Figures) -> str:
         *(f"warning: {text}" for text in found.warnings),
         *(f"residual risk: {text}" for text in found.residual),
         *(f"unsafe: {text}" for text in found.unsafe),
+        found.conclusion,
     ]
     return "\n".join(lines)
 
@@ -157,6 +159,17 @@ def _told(found: Figures) -> list[str]:
         else f"; the skill is unsure at {found.all.told:.0f} % of these"
     )
     return [f"{wrong}{unsure_text}, and at {found.all.falsely_told:.0f} % of the others"]
+
+
+def _spread(found: Figures) -> Iterator[str]:
+    """The spread of the error over people, or over demonstrations if each is by another one."""
+    if (spread := found.spread) is not None:
+        of = "people" if found.by_person else "demonstrations"
+        yield (
+            f"over {spread.people} {of} the error is {spread.least_mm:.0f} to "
+            f"{spread.most_mm:.0f} mm, standard deviation {spread.std_mm:.0f} mm; "
+            f"{spread.as_said} of {spread.people} are within the error that the skill expects"
+        )
 
 
 def _caught(found: Figures) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from kmp.criteria.cross_validation import rms
 from thirdhand.contract.records import SIDES
-from thirdhand.core.frame import Vector
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.skills.demonstration import (
     LEAST_M,
@@ -284,14 +283,15 @@ def standing_out(held_out: Sequence[HeldOut]) -> dict[str, float]:
 
 def _repeats(demonstrations: Sequence[Demonstration]) -> dict[int, int]:
     """The demonstrations that repeat an earlier one, at any sampling rate, and which one."""
-    paths: list[Vector] = []
+    paths = np.empty((len(demonstrations), COMPARED_TIMES, 9))
     out: dict[int, int] = {}
     for i, demonstration in enumerate(demonstrations):
         motion = np.hstack([demonstration.hands, demonstration.tool[:, :3]])
         grid = np.linspace(0.0, 1.0, COMPARED_TIMES)
         shares = np.linspace(0.0, 1.0, len(motion))
-        paths.append(np.stack([np.interp(grid, shares, column) for column in motion.T], axis=1))
-        twins = (j for j in range(i) if j not in out and rms(paths[i] - paths[j]) < REPEATED_M)
-        if (twin := next(twins, None)) is not None:
-            out[i] = twin
+        paths[i] = np.stack([np.interp(grid, shares, column) for column in motion.T], axis=1)
+        squares = ((paths[:i] - paths[i]) ** 2).sum(axis=2).mean(axis=1)
+        twins = [j for j in np.flatnonzero(squares < REPEATED_M**2).tolist() if j not in out]
+        if twins:
+            out[i] = twins[0]
     return out

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from thirdhand.core.numerics import MOTION_STEP_S
-from thirdhand.core.skill.model import Seen
+from thirdhand.core.skill.model import Motion, Seen
 from thirdhand.core.skill.pose import NO_GRIPPER
 from thirdhand.core.skill.skill import Earlier, Prediction, Skill
 from thirdhand.core.skill.tuning import CALM_MPS, MAX_TARGET_MPS2
@@ -72,9 +72,8 @@ class Rival(Skill):
         position, velocity, acceleration = np.round(prediction.motion, 6)
         turn = self.constant_turn
         gate_m = float(prediction.far)
-        return Prediction(
-            position, velocity, acceleration, prediction.covariance, gate_m, 0.0, turn, NO_GRIPPER
-        )
+        motion = Motion(position, velocity, acceleration, prediction.covariance, gate_m)
+        return Prediction(*motion, turn, NO_GRIPPER)
 
 
 def rival(skill: Skill, says: Callable[[Array, Array, Array], RivalSaid], **changed: Any) -> Skill:

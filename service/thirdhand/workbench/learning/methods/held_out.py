@@ -8,34 +8,38 @@ import numpy as np
 
 from kmp import KMP
 from thirdhand.core.frame import Vector
-from thirdhand.core.skill.hands_kmp import TURN_INPUTS
+from thirdhand.core.skill.hands_kmp import TURN_INPUTS, HandsKMP
 from thirdhand.core.skill.model import standard_deviations
 from thirdhand.skills.skill_file import HIGHEST_GATE_M
 from thirdhand.workbench.learning.gate import Gate, every_few, gate_between, nonsense
-from thirdhand.workbench.learning.records import HeldOut, Progress, Take, persons_of
+from thirdhand.workbench.learning.records import HeldOut, Progress, Take, folds_of
 
-Fit = Callable[[int | None], KMP]  # the primitive without a person's takes, or of all
+Fit = Callable[[int | None], KMP]  # the primitive without a fold's takes, or of all
 ROWS = 500  # inputs that are predicted at once, which bounds the memory
 
 
 def held_out_takes(
-    takes: Sequence[Take], inputs: Sequence[Vector], fit: Fit, progress: Progress
+    takes: Sequence[Take],
+    inputs: Sequence[Vector],
+    fit: Fit,
+    progress: Progress,
+    model_of: Callable[[KMP], HandsKMP] = HandsKMP,
 ) -> list[HeldOut]:
-    """The takes, with inputs (T, I), as predicted by the primitive without their person; by that of
-    all takes if there is one person only.
+    """The takes, with inputs (T, I), as predicted by a model of the primitive without their fold,
+    or by that of all takes if there is one fold only.
     """
-    persons = persons_of(takes)
-    numbers = np.unique(persons)
+    folds = folds_of(takes)
+    numbers = np.unique(folds)
     out: dict[int, HeldOut] = {}
-    for person in numbers.tolist():  # one primitive at a time: each holds its factors
-        primitive = fit(person if len(numbers) > 1 else None)
-        for h in np.flatnonzero(persons == person).tolist():
+    for fold in numbers.tolist():  # one primitive at a time: each holds its factors
+        primitive = fit(fold if len(numbers) > 1 else None)
+        for h in np.flatnonzero(folds == fold).tolist():
             progress(f"holding out demonstration {h + 1} of {len(takes)}")
             take = takes[h]
-            predicted = primitive.predict(inputs[h])
-            deviations = standard_deviations(predicted.covariance)
-            errors = take.position - predicted.mean
-            out[h] = HeldOut(take, errors, predicted.covariance, deviations, inputs[h], inputs[h])
+            covariance = primitive.predict(inputs[h]).covariance
+            deviations = standard_deviations(covariance)
+            errors = take.position - model_of(primitive).tools(inputs[h])
+            out[h] = HeldOut(take, errors, covariance, deviations, inputs[h], inputs[h])
     return [out[h] for h in range(len(takes))]
 
 

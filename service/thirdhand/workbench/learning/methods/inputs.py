@@ -10,35 +10,55 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.criteria.cross_validation import preferred
+from kmp import KMP
+from kmp.criteria.cross_validation import preferred, squared_distances
 from kmp.criteria.direct import DirectSelection
 from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import features
+from thirdhand.core.skill.support import stretch_of
 from thirdhand.core.skill.task_clock import TaskClock
+from thirdhand.core.skill.tuning import NEIGHBOUR_M, NEIGHBOUR_MASS
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.choice import selection_of
+from thirdhand.workbench.learning.choice import is_clear, selection_of
 from thirdhand.workbench.learning.division import task_of
 from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.clock import Tempo, clock_of, paired, remark_on
 from thirdhand.workbench.learning.methods.held_out import Fit, gate_of, held_out_takes
 from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
-from thirdhand.workbench.learning.records import Fitted, Options, Progress, Take, Taught, persons_of
-from thirdhand.workbench.learning.regions import local_errors, refitted_errors
+from thirdhand.workbench.learning.records import (
+    Fitted,
+    Options,
+    Progress,
+    Take,
+    Taught,
+    folds_of,
+    persons_of,
+)
+from thirdhand.workbench.learning.regions import local_errors
 
+# Shares of the neighbours in the mean. A quarter and three quarters err like one of these on
+# recorded partners.
+MIXED_SHARES = (0.0, 0.5)
+MIXED = (
+    "the tool is half that of the most similar moments of the demonstrations, as this predicts "
+    "held-out ones better than the primitive alone"
+)
 # an error is as good up to this multiple of the least error, or up to this difference from it
 AS_GOOD = 1.02
 AS_GOOD_M = 0.002
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
 LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
+COMPARABLE = 5  # fewer takes may not tell kinds of inputs apart
+LEAST_GROUPS = 3  # the differences of fewer groups show no standard error
 # hyper-parameters are chosen anew without each block of takes from this number of persons on
 LEAST_PERSONS = 3
 
@@ -53,6 +73,7 @@ class Inputs(NamedTuple):
     turned: bool = False  # true if the orientation is an input
     alone: int | None = None  # the side of the only hand
     clock: TaskClock | None = None
+    neighbours: float = 0.0  # share of the neighbours in the mean
 
     @property
     def is_rich(self) -> bool:
@@ -76,6 +97,10 @@ class Inputs(NamedTuple):
             return inputs
         assert tempo is not None
         return np.column_stack([inputs, self.clock.weight * tempo.seconds(self.clock, self.alone)])
+
+    def model(self, primitive: KMP) -> HandsKMP:
+        """The model of a primitive with these inputs."""
+        return HandsKMP(primitive, self.turned, self.clock, neighbours=self.neighbours)
 
 
 POSITIONS = Inputs("positions")
@@ -129,27 +154,30 @@ class HandInputs:
         progress(f"learning from all {count}")
         primitive = fit(None)
         inputs = used.inputs[: len(takes)]
-        held_out = held_out_takes(takes, inputs, fit, progress)
+        held_out = held_out_takes(takes, inputs, fit, progress, kind.model)
+        model = kind.model(primitive)
         gate = gate_of(primitive, held_out, kind.order, CEILING_M)
 
-        errors = None
         if len({take.person for take in takes}) >= LEAST_PERSONS:
             progress("calibrating the covariance")
-            timed, errors = local_errors(
-                refitted_errors(takes, inputs, used.refitted), inputs, takes, primitive
-            )
+            timed, errors = local_errors(takes, inputs, primitive, used.refitted)
+            model = replace(model, errors=errors)
             held_out = [
                 result._replace(timed=take_errors)
                 for result, take_errors in zip(held_out, timed, strict=True)
             ]
         return Fitted(
-            HandsKMP(primitive, kind.turned, kind.clock, errors),
+            model,
             held_out,
             gate,
             conductor=kind.alone,
             taken=kind.name,
             tried_m=outcome.tried_m,
-            remarks=[*filter(None, [self.why_not_segmented]), *_remarks(outcome.kind)],
+            remarks=[
+                *filter(None, [self.why_not_segmented]),
+                *_remarks(outcome.kind),
+                *_noise(len(takes), outcome.alike),
+            ],
             weights=weights if taught.earlier else None,
         )
 
@@ -163,6 +191,8 @@ def _with_memory_clock(kind: Inputs, tempos: Sequence[Tempo]) -> Inputs:
 
 def _remarks(kind: Inputs) -> Iterator[str]:
     """Sentences on a chosen kind of inputs."""
+    if kind.neighbours:
+        yield MIXED
     if kind.clock is not None:
         yield (
             f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where "
@@ -173,6 +203,15 @@ def _remarks(kind: Inputs) -> Iterator[str]:
         yield (
             f"the {SIDES[kind.alone]} hand alone predicts the tool as well: it conducts alone, "
             "and the other one makes no difference, and may be absent"
+        )
+
+
+def _noise(count: int, alike: int) -> Iterator[str]:
+    """A sentence on `alike` other kinds of inputs of some `count` takes, if these are few."""
+    if count < COMPARABLE and alike > 0:
+        yield (
+            f"with {count} demonstrations, the errors of {alike} other kinds of inputs differ from "
+            f"that of the one taken by no more than chance: record at least {COMPARABLE}"
         )
 
 
@@ -225,7 +264,7 @@ class _Used(NamedTuple):
         subset = self._replace(
             takes=[self.takes[i] for i in rows], inputs=[self.inputs[i] for i in rows]
         )
-        return HandsKMP(subset.fit()(None), self.kind.turned, self.kind.clock)
+        return self.kind.model(subset.fit()(None))
 
 
 def _weighted(
@@ -282,11 +321,10 @@ def refit(
     is_rich = kind.is_rich
     pairs = [(take_inputs, take.position) for take_inputs, take in zip(inputs, takes, strict=True)]
     count = RICH_TIMES * points if is_rich else points
-    persons = persons_of(takes)
     choice = selection_of(
         pairs,
         count,
-        persons=persons,
+        persons=folds_of(takes, earlier),
         isotropic=is_rich,
         rich=is_rich,
         earlier=earlier,
@@ -298,13 +336,14 @@ def refit(
 
 
 class Chosen(NamedTuple):
-    """A kind of inputs, the error [m] of each kind, and the errors of the chosen kind with each
-    weight.
+    """A kind of inputs, the error [m] of each kind, the errors of the chosen kind with each weight,
+    and the number of other kinds whose errors are not clearly larger.
     """
 
     kind: Inputs
     tried_m: Mapping[str, float]
     by_weight_m: Mapping[float, float]
+    alike: int = 0
 
 
 def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Progress) -> Chosen:
@@ -314,30 +353,55 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     `paired` are held out; if a skill is refined, the new takes show the pace that counts, and are
     held out one by one.
     """
-    trial = _Trial(taught, tempos, points, persons_of(taught.all))
+    trial = _Trial(taught, tempos, points, taught.folds)
     kinds = candidates([take.demonstration for take in taught.all])
-    errors_m = dict[str, dict[float, float]]()
+    by_weight = dict[str, dict[float, Vector]]()
     for kind in kinds:
         progress(f"trying {kind.name}")
-        errors_m[kind.name] = trial.by_weight_m(kind)
-    tried_m = {name: min(kind_errors_m.values()) for name, kind_errors_m in errors_m.items()}
-    simplest = _simplest(kinds, [tried_m[kind.name] for kind in kinds])
-    without_clock = Chosen(simplest, tried_m, errors_m[simplest.name])
+        by_weight[kind.name] = trial.by_weight(kind)
+    squares = {kind.name: min(by_weight[kind.name].values(), key=np.mean) for kind in kinds}
+    tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
+    simplest = _simplest(kinds, squares)
+    without_clock = Chosen(
+        trial.mixed(simplest),
+        tried_m,
+        _errors_m(by_weight[simplest.name]),
+        _alike(simplest, squares),
+    )
 
-    blocks = trial.persons if taught.earlier else paired(trial.persons)
+    blocks = trial.folds if taught.earlier else paired(persons_of(taught.new))
     if not blocks.any():
         return without_clock
     best = min(kinds, key=lambda kind: tried_m[kind.name])
     first = next(kind for kind in kinds if kind.alone == simplest.alone)
     bases = sorted({first, simplest, best}, key=kinds.index)
     weights = {
-        kind: min(errors_m[kind.name], key=errors_m[kind.name].__getitem__) for kind in bases
+        kind: min(errors_m, key=errors_m.__getitem__)
+        for kind in bases
+        for errors_m in [_errors_m(by_weight[kind.name])]
     }
-    timed = _timed(trial, weights, blocks, tried_m, progress)
+    timed = _timed(trial, weights, blocks, squares, progress)
+    tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
     if not timed:
-        return without_clock
-    kind = _simplest(timed, [tried_m[kind.name] for kind in timed])
-    return Chosen(kind, tried_m, trial.by_weight_m(kind))
+        return without_clock._replace(tried_m=tried_m)
+    kind = _simplest(timed, squares)
+    by_clock = _errors_m(trial.by_weight(kind))
+    return Chosen(trial.mixed(kind), tried_m, by_clock, _alike(kind, squares))
+
+
+def _alike(taken: Inputs, squares: Mapping[str, Vector]) -> int:
+    """The number of other kinds whose squared errors (G,) [m²] are not clearly larger."""
+    least = squares[taken.name]
+    return sum(not is_clear(own - least) for own in squares.values()) - 1
+
+
+def _error_m(squares: Vector) -> float:
+    """The error [m] of squared errors (G,) [m²]."""
+    return math.sqrt(squares.mean())
+
+
+def _errors_m(by_weight: Mapping[float, Vector]) -> dict[float, float]:
+    return {weight: _error_m(squares) for weight, squares in by_weight.items()}
 
 
 class _Trial(NamedTuple):
@@ -346,31 +410,54 @@ class _Trial(NamedTuple):
     taught: Taught
     tempos: Sequence[Tempo]
     points: int
-    persons: NDArray[np.intp]  # (H,) of the takes
+    folds: NDArray[np.intp]  # (H,) of the takes
 
-    def error_m(self, kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> float:
-        """The error [m] with this weight of new takes, if blocks (H,) are held out."""
+    def squares(self, kind: Inputs, weight: float, held_out: NDArray[np.intp]) -> Vector:
+        """The squared errors (G,) [m²] of each of the blocks (H,) that are held out, with this
+        weight of new takes and the better share of neighbours.
+        """
+        return min(self.by_share(kind, weight, held_out).values(), key=np.mean)
+
+    def by_share(
+        self, kind: Inputs, weight: float, held_out: NDArray[np.intp]
+    ) -> dict[float, Vector]:
+        """The squared errors (G,) [m²] of `squares` with each share of neighbours."""
         selection = _weighted(kind, self.taught, self.tempos, weight, self.points, held_out)
-        return selection.best_mean(may_be_linear=True)[0]
+        _, best = selection.best_mean(may_be_linear=True)
+        residuals = selection.residuals(best.ell, best.noise, best.ridge)
+        tools = selection.outputs - residuals
+        is_other = selection.group[:, None] != selection.group
+        squares = squared_distances(selection.inputs * stretch_of(kind.clock, selection.inputs))
+        near = is_other * np.exp(-squares / (2.0 * NEIGHBOUR_M**2))
+        masses = near.sum(axis=1)[:, None]
+        away = (near @ selection.outputs - masses * tools) / (NEIGHBOUR_MASS + masses)
+        return {share: selection.by_group(residuals - share * away) for share in MIXED_SHARES}
 
-    def by_weight_m(self, kind: Inputs) -> dict[float, float]:
-        """The errors [m] by weight, if persons are held out."""
+    def mixed(self, kind: Inputs) -> Inputs:
+        """The kind with the better share of neighbours, of its best weight."""
+        by_weight = self.by_weight(kind)
+        weight = min(by_weight, key=lambda candidate: by_weight[candidate].mean())
+        by_share = self.by_share(kind, weight, self.folds)
+        return kind._replace(neighbours=min(by_share, key=lambda share: by_share[share].mean()))
+
+    def by_weight(self, kind: Inputs) -> dict[float, Vector]:
+        """The squared errors (G,) [m²] by weight, if the folds are held out."""
         weights = WEIGHTS if self.taught.earlier else WEIGHTS[:1]
-        return {weight: self.error_m(kind, weight, self.persons) for weight in weights}
+        return {weight: self.squares(kind, weight, self.folds) for weight in weights}
 
 
 def _timed(
     trial: _Trial,
     weights: Mapping[Inputs, float],
     blocks: NDArray[np.intp],
-    tried_m: dict[str, float],
+    squares: dict[str, Vector],
     progress: Progress,
 ) -> list[Inputs]:
-    """The kinds with each clock that predicts clearly better than all without one; the errors [m]
-    of all clocks are added to `tried_m`.
+    """The kinds with each clock that predicts clearly better than all without one; the squared
+    errors (G,) [m²] of all clocks are added to `squares`.
     """
     limit_m = clock_limit_m(
-        min(trial.error_m(kind, weight, blocks) for kind, weight in weights.items())
+        min(_error_m(trial.squares(kind, weight, blocks)) for kind, weight in weights.items())
     )
     timed = list[Inputs]()
     for kind, (waits, name) in itertools.product(weights, CLOCKS.items()):
@@ -380,9 +467,11 @@ def _timed(
             kind._replace(name=kind.name + name, clock=clock._replace(weight=weight_mps))
             for weight_mps in WEIGHTS_MPS
         ]
-        errors_m = [trial.error_m(candidate, weights[kind], blocks) for candidate in weighted]
+        errors_m = [
+            _error_m(trial.squares(candidate, weights[kind], blocks)) for candidate in weighted
+        ]
         weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))
-        tried_m[weighed.name] = trial.error_m(weighed, weights[kind], trial.persons)
+        squares[weighed.name] = trial.squares(weighed, weights[kind], trial.folds)
         if min(errors_m) < limit_m:
             timed.append(weighed)
     return timed
@@ -398,6 +487,21 @@ def as_good_m(least_m: float) -> float:
     return max(AS_GOOD * least_m, least_m + AS_GOOD_M)
 
 
-def _simplest(kinds: Sequence[Inputs], errors_m: Sequence[float]) -> Inputs:
-    """The first of the kinds whose error is as good as their least error."""
-    return preferred(kinds, errors_m, as_good_m(min(errors_m)))
+def _simplest(kinds: Sequence[Inputs], squares: Mapping[str, Vector]) -> Inputs:
+    """The first of the kinds that is as good as the best one, by the squared errors (G,) [m²] of
+    held-out groups: by its error, and within one standard error of the groups' differences. Of a
+    single hand, the richest kind has to be as good, too.
+    """
+    best = min(kinds, key=lambda kind: squares[kind.name].mean())
+    least = squares[best.name]
+
+    def is_as_good(kind: Inputs) -> bool:
+        own = squares[kind.name]
+        is_close = _error_m(own) <= as_good_m(_error_m(least))
+        return is_close and (len(own) < LEAST_GROUPS or not is_clear(own - least))
+
+    for kind in kinds:
+        richest = [other for other in kinds if other.alone == kind.alone][-1]
+        if is_as_good(kind) and (kind.alone is None or is_as_good(richest)):
+            return kind
+    return best

@@ -17,7 +17,15 @@ from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.held_out import gate_of, held_out_takes
-from thirdhand.workbench.learning.records import Fitted, HeldOut, Options, Progress, Take, Taught
+from thirdhand.workbench.learning.records import (
+    Fitted,
+    HeldOut,
+    Options,
+    Progress,
+    Take,
+    Taught,
+    folds_of,
+)
 
 # the kernel's ell and lambda, unless they are given
 ELL_PER_M2 = 5.0
@@ -42,10 +50,13 @@ class Mixture:
         inputs = [take.hands for take in takes]
         progress(f"learning from all {len(takes)}")
         primitive = self._primitive(takes)
+        folds = folds_of(takes)
         held_out = held_out_takes(
             takes,
             inputs,
-            lambda person: self._primitive([take for take in takes if take.person != person]),
+            lambda fold: self._primitive(
+                [take for take, number in zip(takes, folds, strict=True) if number != fold]
+            ),
             progress,
         )
         ceiling_m = CEILING_M * _calibration(held_out)

@@ -17,6 +17,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -34,7 +35,7 @@ from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import SEGMENT_DISTANCE, SEGMENT_DISTANCE_BESIDE, TURN_WEIGHT_M
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.recognition import covered, recognised
-from thirdhand.workbench.learning.choice import shared_counts
+from thirdhand.workbench.learning.choice import is_clear, rows_at, sampled, selection_of
 from thirdhand.workbench.learning.division import (
     NEAR,
     Divided,
@@ -59,15 +60,14 @@ from thirdhand.workbench.learning.methods.clock import (
     remark_on,
     segment_clock_of,
 )
-from thirdhand.workbench.learning.methods.held_out import held_out_takes
 from thirdhand.workbench.learning.methods.inputs import (
     AS_GOOD,
     CLOCKS,
     LEAST_TURN_RAD,
     POSITIONS,
+    HandInputs,
     as_good_m,
     clock_limit_m,
-    refit,
 )
 from thirdhand.workbench.learning.methods.weights import WEIGHTS, chosen
 from thirdhand.workbench.learning.records import (
@@ -79,9 +79,10 @@ from thirdhand.workbench.learning.records import (
     Take,
     Taught,
     Weights,
+    folds_of,
     persons_of,
 )
-from thirdhand.workbench.learning.regions import LEAST_BLOCKS, blocks_of, unknown_std
+from thirdhand.workbench.learning.regions import blocks_of, unknown_std
 
 SAMPLES_LEARNED = 600  # samples of all demonstrations that are learned from
 LEAST_HELD_OUT_SAMPLES = 10  # samples of a demonstration that are learned from
@@ -140,11 +141,11 @@ class Samples(NamedTuple):
     def of(cls, encoded: Sequence[Encoded], new: int) -> Self:
         """The samples of demonstrations, of which the first `new` are new, without a clock."""
         count = len(encoded[0].segments)
-        counts = shared_counts(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_HELD_OUT_SAMPLES)
+        shares = sampled(SAMPLES_LEARNED, new, len(encoded) - new, LEAST_HELD_OUT_SAMPLES)
         sampled_rows = [
-            demo.rows(row_count) for demo, row_count in zip(encoded, counts, strict=True)
+            demo.rows(take_shares) for demo, take_shares in zip(encoded, shares, strict=True)
         ]
-        shares, labels, outputs = (
+        along, labels, outputs = (
             np.concatenate(
                 [values[rows] for values, rows in zip(column, sampled_rows, strict=True)]
             )
@@ -153,7 +154,7 @@ class Samples(NamedTuple):
             )
         )
         owner = np.repeat(np.arange(len(encoded)), [len(rows) for rows in sampled_rows])
-        return cls(encoded, sampled_rows, inputs_of(shares, labels, count), outputs, owner, new)
+        return cls(encoded, sampled_rows, inputs_of(along, labels, count), outputs, owner, new)
 
     def clocked(self, tempos: Sequence[Tempo], clock: TaskClock) -> Self:
         """The samples with a clock as the last input."""
@@ -381,11 +382,9 @@ class _Prediction(NamedTuple):
         ]
         return cls(hands, belief, errors, np.hstack(inputs), tempos)
 
-    def retained(self, count: int) -> Vector:
-        """Errors (M, 6) at up to `count` samples: shares (2,), segment, and error (3,) [m]."""
-        rows = (
-            np.linspace(0, len(self.inputs) - 1, min(count, len(self.inputs))).round().astype(int)
-        )
+    def retained(self, shares: Vector) -> Vector:
+        """Errors (M, 6) at these shares of the time: shares (2,), segment, and error (3,) [m]."""
+        rows = rows_at(shares, len(self.inputs))
         segments = self.belief[rows].argmax(axis=1)
         return np.column_stack([self.inputs[rows, :2], segments, self.errors[rows]])
 
@@ -461,13 +460,6 @@ class Candidate(NamedTuple):
         return math.sqrt(self.squares(blocks).mean())
 
 
-def is_clear(gains: Vector) -> bool:
-    """True if the mean of gains (B,) in blocks is above one standard error of it."""
-    return len(gains) < LEAST_BLOCKS or bool(
-        gains.mean() > gains.std(ddof=1) / math.sqrt(len(gains))
-    )
-
-
 def with_delay(
     task: Task,
     shown: Sequence[Divided],
@@ -539,10 +531,25 @@ class Segmented:
             progress(f"holding out demonstrations {', '.join(names[h] for h in block)}")
             by_take |= best.held_out(block, blocks)
         predictions = [by_take[h] for h in range(len(takes))]
+        without = self._without_via_points(takes, progress)
+        if self.options.delay_s is None and _are_better(without, predictions, blocks):
+            between, simply = (
+                1000 * rms(np.concatenate(errors))
+                for errors in ([prediction.errors for prediction in predictions], without)
+            )
+            why = (
+                "it is learned where the hands are, not between its via-points, as this predicts "
+                f"held-out demonstrations within {simply:.0f} mm, and that within {between:.0f} mm"
+            )
+            return HandInputs(self.options, why).fit(taught, progress)
 
         progress(f"learning from all {len(takes)}")
-        errors = [prediction.retained(ERRORS_RETAINED // len(takes)) for prediction in predictions]
-        model = self._model(best, choice.delay, takes, np.concatenate(errors))
+        shares = sampled(ERRORS_RETAINED, len(takes), 0, 1, ERRORS_RETAINED)
+        errors = [
+            prediction.retained(take_shares)
+            for prediction, take_shares in zip(predictions, shares, strict=True)
+        ]
+        model = self._model(choice, takes, np.concatenate(errors))
         placements = _placements(best, model.primitive, takes, blocks, errors)
         held_out = list(map(_held_out, takes, best.encoded, placements, predictions))
         return Fitted(
@@ -552,23 +559,24 @@ class Segmented:
             choice.delay,
             taken=choice.name,
             tried_m=choice.tried_m if len(choice.tried_m) > 1 else {},
-            baselines={WITHOUT_VIA_POINTS: self._without_via_points(takes, progress)},
+            baselines={WITHOUT_VIA_POINTS: without},
             remarks=remarks,
             weights=weights,
         )
 
-    def _model(
-        self, best: Candidate, delay: Delay, takes: Sequence[Take], errors: Vector
-    ) -> SegmentedKMP:
-        """The skill of a candidate, with held-out errors (M, 6) as in `_Prediction.retained`."""
+    def _model(self, choice: _Choice, takes: Sequence[Take], errors: Vector) -> SegmentedKMP:
+        """The skill of a choice, with held-out errors (M, 6) as in `_Prediction.retained`."""
+        best = choice.best
+        tempos = choice.tempos[: len(takes)]
         return SegmentedKMP(
             best.samples.fitted(best.parameters),
             best.task,
             self._nominal(takes),
             best.off,
             errors,
-            delay.mean_s,
-            clock=best.samples.clock or _clock_without_weight(best, takes),
+            choice.delay.mean_s,
+            clock=best.samples.clock
+            or _clock_of(best.encoded[: len(takes)], tempos, waits=False)._replace(weight=0.0),
             unknown=Unknown(unknown_std(takes), _scatters(best.task, best.encoded)),
         )
 
@@ -585,9 +593,17 @@ class Segmented:
     def _without_via_points(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
         """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
         progress("learning without the via-points, for comparison")
-        inputs = [take.hands for take in takes]
-        fit = refit(POSITIONS, takes, inputs, self.options.points, None)
-        return [take.errors for take in held_out_takes(takes, inputs, fit, progress)]
+        folds = folds_of(takes)
+        pairs = [(take.hands, take.position) for take in takes]
+        choice = selection_of(pairs, self.options.points, persons=folds)
+        _, best = choice.best_mean(may_be_linear=True)
+        residuals = choice.residuals(best.ell, best.noise, best.ridge)
+        errors = dict[int, Vector]()
+        for fold in np.unique(folds).tolist():
+            primitive = choice.primitive(best, residuals, without=fold)
+            for h in np.flatnonzero(folds == fold).tolist():
+                errors[h] = takes[h].position - primitive.mean(takes[h].hands)
+        return [errors[h] for h in range(len(takes))]
 
 
 @dataclass
@@ -640,6 +656,11 @@ class _Choice:
         )
         return choice
 
+    @cached_property
+    def tempos(self) -> list[Tempo]:
+        """The tempos of all takes, the new ones first."""
+        return [Tempo.of(take.demonstration) for take in self.taught.all]
+
     def of_everybody(self, task: Task) -> Candidate:
         """The candidate of a task with the demonstrations of all persons, which count alike."""
         return Candidate.of(task, [*self.new, *self.earlier], self.delay.mean_s)
@@ -679,7 +700,8 @@ class _Choice:
 
     def choose_clock(self) -> None:
         """Choose a clock, if one predicts the new takes clearly better."""
-        clocked = _with_clocks(self.best, self.taught, self.progress)
+        tempos = self.tempos[: len(self.new)]
+        clocked = _with_clocks(self.best, self.taught, tempos, self.progress)
         if not clocked:
             return
         errors_m = {
@@ -724,11 +746,26 @@ class _Choice:
         )
         if (clock := self.best.samples.clock) is None:
             return candidate
-        takes = self.taught.all[: len(candidate.encoded)]
-        return candidate.clocked([Tempo.of(take.demonstration) for take in takes], clock)
+        return candidate.clocked(self.tempos[: len(candidate.encoded)], clock)
 
 
-def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[str, Candidate]:
+def _are_better(
+    errors: Sequence[Vector], predictions: Sequence[_Prediction], blocks: Sequence[Sequence[int]]
+) -> bool:
+    """True if these errors (T, 3) [m] of the takes are clearly smaller than those of the
+    predictions, which are not as good.
+    """
+    predicted = np.concatenate([prediction.errors for prediction in predictions])
+    if rms(predicted) <= as_good_m(rms(np.concatenate(errors))):
+        return False
+    gains = [rms(predictions[h].errors) ** 2 - rms(errors[h]) ** 2 for h in range(len(errors))]
+    by_block = np.array([np.mean([gains[h] for h in block]) for block in blocks])
+    return is_clear(by_block)
+
+
+def _with_clocks(
+    best: Candidate, taught: Taught, tempos: Sequence[Tempo], progress: Progress
+) -> dict[str, Candidate]:
     """The candidate with those clocks that may predict clearly better, by the clock's name.
 
     This comparison ignores where the tool is known to be, and holds out the blocks of `paired`. If
@@ -742,7 +779,6 @@ def _with_clocks(best: Candidate, taught: Taught, progress: Progress) -> dict[st
     def error_m(samples: Samples) -> float:
         return min(map(rms, samples.held_out(best.parameters.ell, TRIED_NOISES, 1.0, block_of)))
 
-    tempos = [Tempo.of(take.demonstration) for take in taught.new]
     limit_m = clock_limit_m(error_m(best.samples))
     out = dict[str, Candidate]()
     for waits, name in CLOCKS.items():
@@ -759,12 +795,6 @@ def _clock_of(demos: Sequence[Encoded], tempos: Sequence[Tempo], *, waits: bool)
     """The clock of the segments of demonstrations with these tempos, with a weight of 1."""
     segments = [demo.segments for demo in demos]
     return segment_clock_of(tempos, segments, [demo.labels for demo in demos], waits=waits)
-
-
-def _clock_without_weight(best: Candidate, takes: Sequence[Take]) -> TaskClock:
-    """The clock of a skill that does not use it."""
-    tempos = [Tempo.of(take.demonstration) for take in takes]
-    return _clock_of(best.encoded[: len(takes)], tempos, waits=False)._replace(weight=0.0)
 
 
 def _placements(
