@@ -102,7 +102,7 @@ def _derive(
 
 
 @compiled
-def _sum(a: Array, b: Array) -> float:
+def sum_products(a: Array, b: Array) -> float:
     """sum_r a_r b_r (P,)."""
     # Signed indices may count from the end, which costs a check each.
     unit = np.uint64(1)
@@ -126,7 +126,7 @@ def add_table(x: Array, table: Array, scale: float, values: Array, room: Array, 
     """
     _kernel_values(x, table, scale, values, room)
     for o in range(len(out)):
-        out[o] += _sum(values, table[len(x) + o])
+        out[o] += sum_products(values, table[len(x) + o])
 
 
 @compiled
@@ -160,7 +160,7 @@ def means(
         _kernel_values(x, table, scale, values, room)
         _derive(x, table, places, along, scale, values)
         for o in range(outputs):
-            mean = _sum(values, table[inputs + o]) + prior[o, 0]
+            mean = sum_products(values, table[inputs + o]) + prior[o, 0]
             for i in range(prior.shape[1] - 1):
                 mean += prior[o, 1 + i] * queries[m, i]
             out[m, o] = mean
@@ -208,7 +208,7 @@ def slopes(
         for r in range(len(values)):
             pull[r] = values[r] * weights[r]
         for i in range(inputs):
-            slope = -2.0 * scale * (out[o, i] + _sum(pull, offsets[i])) * stretch[i]
+            slope = -2.0 * scale * (out[o, i] + sum_products(pull, offsets[i])) * stretch[i]
             out[o, i] = slope + prior[o, 1 + i] if prior.shape[1] > 1 else slope
             total += out[o, i] + x[i]
     return math.isfinite(total)

@@ -13,8 +13,14 @@ from thirdhand.core.frame import Vector
 from thirdhand.core.skill import SIGNS
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.model import NO_CLOCK, Seen
-from thirdhand.core.skill.support import LocalErrors, mix
-from thirdhand.core.skill.tuning import NEIGHBOUR_M, UNSURE_M
+from thirdhand.core.skill.support import LocalErrors, mix, neighbour_table
+from thirdhand.core.skill.tuning import (
+    LEAST_STD_M,
+    NEIGHBOUR_M,
+    NEIGHBOUR_MASS,
+    SUPPORT_MASS,
+    UNSURE_M,
+)
 
 UNKNOWN_STD_M = 0.3
 
@@ -73,8 +79,8 @@ def test_without_a_share_the_motion_stays(model: HandsKMP) -> None:
     random = np.random.default_rng(5)
     motion = random.normal(size=(3, 3))
     mixed = motion.copy()
-    points = np.ones((4, 9))
-    mix(random.normal(size=(3, 6)), points, np.ones(6), 0.0, mixed)
+    table = neighbour_table(np.ones((4, 6)), np.ones((4, 3)))
+    mix(random.normal(size=(3, 6)), table, np.ones(6), 0.0, 0.1, mixed, np.empty(SIGNS))
     np.testing.assert_array_equal(mixed, motion)
 
 
@@ -113,3 +119,28 @@ def test_signs_grow_where_the_tool_is_doubtful(model: HandsKMP) -> None:
         calm, abs=1e-3
     )
     assert not len(model.predict(seen(inside[0], *np.zeros((2, 6))), np.eye(3)).signs)
+
+
+def test_signs_are_those_of_their_equations(model: HandsKMP) -> None:
+    errors = model.errors
+    assert errors is not None
+    base = model.primitive.base
+    hands = np.random.default_rng(7).uniform(-0.4, 0.4, (10, 6))
+    tools = model.tools(hands) + 0.02
+    for row, tool, signs in zip(hands, tools, model.signs(hands, tools), strict=True):
+        squares = ((base.inputs - row) ** 2).sum(axis=1)
+        expected = []
+        for width_m in NEIGHBOUR_M * np.array([1.0, 2.0, 4.0]):
+            g = np.exp(-squares / (2 * width_m**2))
+            mass, total = g.sum(), g.sum() + NEIGHBOUR_MASS
+            off = base.reference.mean - tool
+            scattered = g @ (base.reference.mean**2).sum(axis=1)
+            scattered -= ((g @ base.reference.mean) ** 2).sum() / max(mass, NEIGHBOUR_MASS)
+            spread = (3 * NEIGHBOUR_MASS * UNKNOWN_STD_M**2 + scattered) / total
+            expected += [spread, ((g @ off / total) ** 2).sum()]
+        near = np.exp(-(((errors.inputs - row) * errors.stretch) ** 2).sum(axis=1))
+        for g in (near**2, near**0.25):
+            scatter = g @ (errors.errors**2).sum(axis=1) + 3 * SUPPORT_MASS * UNKNOWN_STD_M**2
+            expected.append(scatter / (SUPPORT_MASS + g.sum()))
+        lengths = 0.5 * np.log(np.array(expected) / UNSURE_M**2 + (LEAST_STD_M / UNSURE_M) ** 2)
+        np.testing.assert_allclose(signs, lengths, atol=1e-6)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from kmp import KMP, Gaussians
 from kmp.compiled import compiled
@@ -35,15 +36,14 @@ from thirdhand.core.skill.model import (
 from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.support import (
     LocalErrors,
-    average,
     local_scatter,
     mix,
+    neighbour_table,
     stretch_of,
-    write_signs,
 )
 from thirdhand.core.skill.task import check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
-from thirdhand.core.skill.tuning import TURN_WEIGHT_M
+from thirdhand.core.skill.tuning import NEIGHBOUR_M, NEIGHBOUR_MASS, TURN_WEIGHT_M
 from thirdhand.core.skill.via_points import neighbourhoods
 
 TURN_INPUTS = 18  # the entries of both hands' rotation matrices
@@ -144,27 +144,39 @@ class HandsKMP:
         assert covariance is not None
         out = np.empty((6, 3))
         out[:3] = motion.mean, motion.velocity, motion.acceleration
-        if self.neighbours:
-            mix(np.ascontiguousarray(moving), *self._near, self.neighbours, out[:3])
-        deviation = _rounded(covariance, out)
         signs = NO_SIGNS if known is None else KNOWN_SIGNS
-        if known is None and self.errors is not None:
-            errors = self.errors
+        errors = self.errors if known is None else None
+        if errors is not None:
+            signs = np.empty(SIGNS)
+            self._mix(moving, self.neighbours, out[:3], signs)
+        elif self.neighbours:
+            self._mix(moving, self.neighbours, out[:3], KNOWN_SIGNS)
+        deviation = _rounded(covariance, out)
+        if errors is not None:
             inputs = np.ascontiguousarray(moving[0])
-            local_scatter(inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:])
+            local_scatter(
+                inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:], signs[-2:]
+            )
             round_to(out[3:], COVARIANCE_ROUND_TO)
-            signs = self.signs(inputs[None], out[:1])[0]
         if known is not None and self.errors is not None:
             # the gate compares the primitive's own covariance, which was not computed
             deviation = math.nan
         return Motion(out[0], out[1], out[2], out[3:], deviation, signs=signs)
 
+    def _mix(self, moving: Vector, share: float, motion: Vector, signs: Vector) -> None:
+        """Mix the neighbours into a motion (3, 3) and write the first signs of an error, unless
+        there are none, see `mix`.
+        """
+        table, stretch = self._near
+        unknown_std_m = 0.0 if self.errors is None else self.errors.unknown_std_m
+        mix(np.ascontiguousarray(moving), table, stretch, share, unknown_std_m, motion, signs)
+
     @cached_property
     def _near(self) -> tuple[Vector, Vector]:
-        """Reference points (R, I + 3) and stretch (I,), as in `mix`."""
+        """The `neighbour_table` of the reference points, and the stretch (I,) of their inputs."""
         base = self.primitive.base
         stretch = stretch_of(self.clock, base.inputs)
-        return np.hstack([base.inputs * stretch, base.reference.mean]), stretch
+        return neighbour_table(base.inputs * stretch, base.reference.mean), stretch
 
     def tools(self, inputs: Vector) -> Vector:
         """Mean tool (T, 3) [m] at inputs (T, I)."""
@@ -175,23 +187,36 @@ class HandsKMP:
         return out
 
     def _averages(self, inputs: Vector) -> tuple[Vector, Vector]:
-        """Shares (T, 1) and averages (T, 3) [m] of neighbours at inputs (T, I), see `average`."""
-        averages = np.empty((len(inputs), 3))
-        rows = zip(np.array(inputs, order="C"), averages, strict=True)
-        shares = [average(row, *self._near, out) for row, out in rows]
-        return np.array(shares)[:, None], averages
+        """D / (ν + D) (T, 1) and Y / (ν + D) (T, 3) [m] of `support` at inputs (T, I)."""
+        base = self.primitive.base
+        stretch = self._near[1]
+        squares = cdist(inputs * stretch, base.inputs * stretch, "sqeuclidean")
+        near = np.exp(-squares / (2.0 * NEIGHBOUR_M**2))
+        mass = near.sum(axis=1, keepdims=True)
+        return mass / (NEIGHBOUR_MASS + mass), near @ base.reference.mean / (NEIGHBOUR_MASS + mass)
 
     def signs(self, inputs: Vector, tools: Vector) -> Vector:
         """Signs (T, SIGNS) of errors of these tools (T, 3) [m] at inputs (T, I); zeros without
         held-out errors.
         """
         out = np.zeros((len(inputs), SIGNS))
-        if (errors := self.errors) is not None:
-            near = self._near
-            for row, tool, signs in zip(np.array(inputs, order="C"), tools, out, strict=True):
-                write_signs(
-                    row, tool, *near, errors.rows, errors.stretch, errors.unknown_std_m, signs
-                )
+        if (errors := self.errors) is None:
+            return out
+        moving = np.zeros((3, inputs.shape[1]))
+        motion = np.empty((3, 3))
+        covariance = np.empty((3, 3))
+        for row, tool, signs in zip(inputs, tools, out, strict=True):
+            moving[0] = row
+            motion[0] = tool
+            self._mix(moving, 0.0, motion, signs)
+            local_scatter(
+                moving[0],
+                errors.stretch,
+                errors.table,
+                errors.unknown_std_m,
+                covariance,
+                signs[-2:],
+            )
         return out
 
     def elsewhere(

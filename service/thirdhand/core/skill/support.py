@@ -19,8 +19,8 @@ the inputs: away from all points, f is k. Along x' and x'', with u_n = -c² (x -
 
 The signs are taken with g_n, g_n^(1/4) and g_n^(1/16), that is with h, 2 h and 4 h:
 
-    spread²    (3 ν σ² + Σ_n g_n |y_n - m|²) / (ν + D),   m = Y / D
-    distance   D |m - f| / (ν + D)
+    spread²    (3 ν σ² + Σ_n g_n |y_n|² - |Y|² / max(D, ν)) / (ν + D)
+    distance   |Y - D f| / (ν + D)
 
 with the standard deviation σ of the tool where nothing was demonstrated. Each is the logarithm of a
 length in UNSURE_M.
@@ -37,7 +37,7 @@ from kmp import KMP
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
 from kmp.elementary import exp, log
-from kmp.loops.mean import add_table, table_of
+from kmp.loops.mean import add_table, exponentials, sum_products, table_of
 from thirdhand.core.frame import Vector
 from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.task_clock import TaskClock
@@ -51,8 +51,6 @@ from thirdhand.core.skill.tuning import (
     UNSURE_M,
 )
 
-WIDTHS = 3  # in which signs are taken
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LocalErrors(Immutable):
@@ -62,7 +60,6 @@ class LocalErrors(Immutable):
     * `errors` (M, 3) [m].
     * `stretch` (I,): factors c_i of the kernel exp(-Σ_i (c_i (x_i - x_mi))²).
     * `table`: both, as in `error_table`.
-    * `rows` (M, I + 3): c_i x_mi and the errors, as in `write_signs`.
     * `unknown_std_m`: standard deviation of the tool on each axis where no demonstration was.
     """
 
@@ -70,11 +67,10 @@ class LocalErrors(Immutable):
     errors: Vector
     stretch: Vector
     table: Vector
-    rows: Vector
     unknown_std_m: float
 
     def __post_init__(self) -> None:
-        for part in (self.inputs, self.errors, self.stretch, self.table, self.rows):
+        for part in (self.inputs, self.errors, self.stretch, self.table):
             frozen(part)
 
     @classmethod
@@ -87,21 +83,16 @@ class LocalErrors(Immutable):
         scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
         factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
         table = error_table(inputs * factors, errors)
-        rows = np.hstack([inputs * factors, errors])
         return cls(
-            np.array(inputs, order="C"),
-            np.array(errors, order="C"),
-            factors,
-            table,
-            rows,
-            unknown_std_m,
+            np.array(inputs, order="C"), np.array(errors, order="C"), factors, table, unknown_std_m
         )
 
     def covariances(self, inputs: Vector) -> Vector:
         """Covariances (T, 3, 3) [m²] at inputs (T, I), see `local_scatter`."""
         out = np.empty((len(inputs), 3, 3))
+        signs = np.empty(2)
         for row, covariance in zip(np.array(inputs, order="C"), out, strict=True):
-            local_scatter(row, self.stretch, self.table, self.unknown_std_m, covariance)
+            local_scatter(row, self.stretch, self.table, self.unknown_std_m, covariance, signs)
         return out
 
 
@@ -115,7 +106,7 @@ def error_table(inputs: Vector, errors: Vector) -> Vector:
 
 @compiled
 def local_scatter(
-    at: Vector, stretch: Vector, table: Vector, unknown_std_m: float, out: Vector
+    at: Vector, stretch: Vector, table: Vector, unknown_std_m: float, out: Vector, signs: Vector
 ) -> None:
     """Covariance C (3, 3) [m²] of the tool at an input x (I,), written to `out`:
 
@@ -125,15 +116,38 @@ def local_scatter(
     So C is the scatter of the errors e_m at similar inputs x_m, and grows to σ² away from all of
     them. It is the posterior mean of a variance whose prior σ² weighs as much as ν errors. `table`
     is the `error_table` of c_i x_mi.
+
+    The lengths of the scatter with g_m² and g_m^(1/4) are two signs of an error, written to `signs`
+    (2,).
     """
     near = np.zeros(1 + out.size)
     padded = table.shape[1]
-    add_table(at * stretch, table, 1.0, np.empty(padded), np.empty(padded), near)
+    g = np.empty(padded)
+    other = np.empty(padded)
+    add_table(at * stretch, table, 1.0, g, other, near)
     total = SUPPORT_MASS + near[0]
     for i in range(3):
         for j in range(3):
             out[i, j] = near[1 + 3 * i + j] / total
         out[i, i] += SUPPORT_MASS * unknown_std_m**2 / total + LEAST_STD_M**2
+
+    products = table[len(at) :]
+    for m in range(padded):
+        other[m] = g[m] * g[m]
+        g[m] = math.sqrt(math.sqrt(g[m]))
+    signs[0] = _scatter_length(other, products, unknown_std_m)
+    signs[1] = _scatter_length(g, products, unknown_std_m)
+
+
+@compiled
+def _scatter_length(weights: Vector, products: Vector, unknown_std_m: float) -> float:
+    """Length of the scatter of errors with these weights (P,), as a sign of an error; `products`
+    (10, P) are the last rows of their `error_table`.
+    """
+    scatter = 3.0 * SUPPORT_MASS * unknown_std_m**2
+    for i in range(3):
+        scatter += sum_products(weights, products[1 + 4 * i])
+    return _log_length(scatter / (SUPPORT_MASS + sum_products(weights, products[0])))
 
 
 @compiled
@@ -166,128 +180,104 @@ def stretch_of(clock: TaskClock | None, inputs: Vector) -> Vector:
 @compiled
 def _log_length(square: float) -> float:
     """Logarithm of the length in UNSURE_M whose square [m²] is given, and at least LEAST_STD_M."""
-    return 0.5 * log(square / UNSURE_M**2 + (LEAST_STD_M / UNSURE_M) ** 2)
+    return 0.5 * log(max(square, 0.0) / UNSURE_M**2 + (LEAST_STD_M / UNSURE_M) ** 2)
+
+
+def neighbour_table(inputs: Vector, tools: Vector) -> Vector:
+    """Reference points, inputs c x_n (R, I) and tools y_n (R, 3) [m], as a table of
+    `kmp.loops.mean` with the weights 1, y_n and |y_n|².
+    """
+    squares = (tools**2).sum(axis=1, keepdims=True)
+    return table_of(inputs, np.hstack([np.ones_like(squares), tools, squares]))
 
 
 @compiled
-def mix(moving: Vector, points: Vector, stretch: Vector, share: float, motion: Vector) -> None:
+def mix(
+    moving: Vector,
+    table: Vector,
+    stretch: Vector,
+    share: float,
+    unknown_std_m: float,
+    motion: Vector,
+    signs: Vector,
+) -> None:
     """Mix the neighbours with the `share` a into the motion k, k', k'' (3, 3) [m, m/s, m/s²], in
-    place; see the equations of this module.
+    place, and write the signs of an error of the result to `signs` (6,), unless that is
+    empty; see the equations of this module.
 
-    `moving` (3, I) are the inputs with their velocity and acceleration. `points` (R, I + 3) are
-    the reference points, in the inputs c x, with their tools. `stretch` (I,) is c.
+    `moving` (3, I) are the inputs with their velocity and acceleration. `table` is the
+    `neighbour_table` of the reference points. `stretch` (I,) is c.
     """
     inputs = len(stretch)
-    sums = np.zeros((3, 4))  # D and Y with their derivatives
+    padded = table.shape[1]
+    g = np.zeros(padded)
+    along = np.zeros(padded)
+    bend = np.zeros(padded)
+    wide = np.empty(padded)
+    middle = np.empty(padded)
     speed = 0.0
     for i in range(inputs):
-        speed += (stretch[i] * moving[1, i]) ** 2
-    for n in range(len(points)):
-        square = first = second = 0.0
-        for i in range(inputs):
-            offset = stretch[i] * moving[0, i] - points[n, i]
-            square += offset * offset
-            first += offset * stretch[i] * moving[1, i]
-            second += offset * stretch[i] * moving[2, i]
-        g = exp(-square / (2.0 * NEIGHBOUR_M**2))
-        along = -first / NEIGHBOUR_M**2
-        bend = along * along - (speed + second) / NEIGHBOUR_M**2
-        for j in range(4):
-            part = g
-            if j > 0:
-                part = g * points[n, inputs + j - 1]
-            sums[0, j] += part
-            sums[1, j] += part * along
-            sums[2, j] += part * bend
-    mass = NEIGHBOUR_MASS + sums[0, 0]
-    b = share / mass
-    rate = sums[1, 0] / mass
-    b_rate = -b * rate
-    b_bend = b * (2.0 * rate * rate - sums[2, 0] / mass)
-    for j in range(3):
-        k, v, w = motion[0, j], motion[1, j], motion[2, j]
-        away = sums[0, 1 + j] - sums[0, 0] * k
-        away_rate = sums[1, 1 + j] - sums[1, 0] * k - sums[0, 0] * v
-        away_bend = sums[2, 1 + j] - sums[2, 0] * k - 2.0 * sums[1, 0] * v - sums[0, 0] * w
-        motion[0, j] = k + b * away
-        motion[1, j] = v + b_rate * away + b * away_rate
-        motion[2, j] = w + b_bend * away + 2.0 * b_rate * away_rate + b * away_bend
+        x = stretch[i] * moving[0, i]
+        v = stretch[i] * moving[1, i]
+        w = stretch[i] * moving[2, i]
+        speed += v * v
+        centres = table[i]
+        for n in range(padded):
+            offset = x - centres[n]
+            g[n] += offset * offset
+            along[n] += offset * v
+            bend[n] += offset * w
+    wide[:] = g
+    exponentials(wide, 1.0 / (32.0 * NEIGHBOUR_M**2), middle)
+    for n in range(padded):
+        square = wide[n] * wide[n]
+        middle[n] = square * square
+        square = middle[n] * middle[n]
+        g[n] = square * square
+        slope = -along[n] / NEIGHBOUR_M**2
+        bend[n] = g[n] * (slope * slope - (speed + bend[n]) / NEIGHBOUR_M**2)
+        along[n] = g[n] * slope
 
-
-@compiled
-def average(at: Vector, points: Vector, stretch: Vector, out: Vector) -> float:
-    """Y / (ν + D) at an input (I,), written to `out` (3,); returns D / (ν + D)."""
-    inputs = len(stretch)
-    mass = 0.0
-    out[:] = 0.0
-    for n in range(len(points)):
-        square = 0.0
-        for i in range(inputs):
-            square += (stretch[i] * at[i] - points[n, i]) ** 2
-        g = exp(-square / (2.0 * NEIGHBOUR_M**2))
-        mass += g
+    rows = table[inputs:]
+    if share > 0.0:
+        mass = NEIGHBOUR_MASS + sum_products(g, rows[0])
+        near = mass - NEIGHBOUR_MASS
+        near_rate = sum_products(along, rows[0])
+        near_bend = sum_products(bend, rows[0])
+        b = share / mass
+        rate = near_rate / mass
+        b_rate = -b * rate
+        b_bend = b * (2.0 * rate * rate - near_bend / mass)
         for j in range(3):
-            out[j] += g * points[n, inputs + j]
-    out /= NEIGHBOUR_MASS + mass
-    return mass / (NEIGHBOUR_MASS + mass)
+            tools = rows[1 + j]
+            k, v, w = motion[0, j], motion[1, j], motion[2, j]
+            away = sum_products(g, tools) - near * k
+            away_rate = sum_products(along, tools) - near_rate * k - near * v
+            away_bend = sum_products(bend, tools) - near_bend * k
+            away_bend -= 2.0 * near_rate * v + near * w
+            motion[0, j] = k + b * away
+            motion[1, j] = v + b_rate * away + b * away_rate
+            motion[2, j] = w + b_bend * away + 2.0 * b_rate * away_rate + b * away_bend
+    if len(signs):
+        _write_signs(g, rows, motion[0], unknown_std_m, signs[:2])
+        _write_signs(middle, rows, motion[0], unknown_std_m, signs[2:4])
+        _write_signs(wide, rows, motion[0], unknown_std_m, signs[4:6])
 
 
 @compiled
-def write_signs(
-    at: Vector,
-    tool: Vector,
-    points: Vector,
-    stretch: Vector,
-    errors: Vector,
-    error_stretch: Vector,
-    unknown_std_m: float,
-    out: Vector,
+def _write_signs(
+    weights: Vector, rows: Vector, tool: Vector, unknown_std_m: float, out: Vector
 ) -> None:
-    """Signs of an error of the `tool` (3,) [m] that is predicted at an input (I,), written to `out`
-    (SIGNS,): spread and distance of each width, then the scatter of the held-out errors with their
-    kernel's square and its fourth root.
-
-    `errors` (M, I + 3) are inputs of held-out errors, stretched by `error_stretch`, and the errors.
+    """Spread and distance from the `tool` (3,) [m] of neighbours with these weights (P,), written
+    to `out` (2,); `rows` (5, P) are the last ones of their `neighbour_table`.
     """
-    inputs = len(stretch)
-    weights = np.empty(WIDTHS)
-    masses = np.zeros(WIDTHS)
-    sums = np.zeros((WIDTHS, 4))  # of y - f and |y - f|²
-    for n in range(len(points)):
-        square = 0.0
-        for i in range(inputs):
-            square += (stretch[i] * at[i] - points[n, i]) ** 2
-        wide = exp(-square / (32.0 * NEIGHBOUR_M**2))
-        middle = wide * wide * wide * wide
-        narrow = middle * middle * middle * middle
-        far = 0.0
-        for j in range(3):
-            far += (points[n, inputs + j] - tool[j]) ** 2
-        weights[0], weights[1], weights[2] = narrow, middle, wide
-        for w in range(WIDTHS):
-            masses[w] += weights[w]
-            sums[w, 3] += weights[w] * far
-            for j in range(3):
-                sums[w, j] += weights[w] * (points[n, inputs + j] - tool[j])
-    for w in range(WIDTHS):
-        total = NEIGHBOUR_MASS + masses[w]
-        square = sums[w, 0] ** 2 + sums[w, 1] ** 2 + sums[w, 2] ** 2
-        spread = max(sums[w, 3] - square / max(masses[w], NEIGHBOUR_MASS), 0.0)
-        out[2 * w] = _log_length((3.0 * NEIGHBOUR_MASS * unknown_std_m**2 + spread) / total)
-        out[2 * w + 1] = _log_length(square / (total * total))
-
-    sharp = soft = SUPPORT_MASS
-    scatter = wide_scatter = 3.0 * SUPPORT_MASS * unknown_std_m**2
-    for m in range(len(errors)):
-        square = 0.0
-        for i in range(inputs):
-            square += (error_stretch[i] * at[i] - errors[m, i]) ** 2
-        far = errors[m, inputs] ** 2 + errors[m, inputs + 1] ** 2 + errors[m, inputs + 2] ** 2
-        root = math.sqrt(math.sqrt(exp(-square)))
-        sharper = (root * root * root * root) ** 2
-        sharp += sharper
-        scatter += sharper * far
-        soft += root
-        wide_scatter += root * far
-    out[2 * WIDTHS] = _log_length(scatter / sharp)
-    out[2 * WIDTHS + 1] = _log_length(wide_scatter / soft)
+    mass = sum_products(weights, rows[0])
+    total = NEIGHBOUR_MASS + mass
+    spread = 3.0 * NEIGHBOUR_MASS * unknown_std_m**2 + sum_products(weights, rows[4])
+    square = 0.0
+    for j in range(3):
+        tools = sum_products(weights, rows[1 + j])
+        spread -= tools * tools / max(mass, NEIGHBOUR_MASS)
+        square += (tools - mass * tool[j]) ** 2
+    out[0] = _log_length(spread / total)
+    out[1] = _log_length(square / (total * total))

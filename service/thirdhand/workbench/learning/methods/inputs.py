@@ -49,8 +49,8 @@ from thirdhand.workbench.learning.regions import local_errors
 # recorded partners.
 MIXED_SHARES = (0.0, 0.5)
 MIXED = (
-    "the tool is half that of the most similar moments of the demonstrations, as this predicts "
-    "held-out ones better than the primitive alone"
+    "half of the tool's position is its average at the most similar moments of the demonstrations, "
+    "as this predicts held-out ones better"
 )
 # an error is as good up to this multiple of the least error, or up to this difference from it
 AS_GOOD = 1.02
@@ -361,7 +361,7 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
         by_weight[kind.name] = trial.by_weight(kind)
     squares = {kind.name: min(by_weight[kind.name].values(), key=np.mean) for kind in kinds}
     tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
-    simplest = _simplest(kinds, squares)
+    simplest = simplest_of(kinds, squares)
     without_clock = Chosen(
         trial.mixed(simplest),
         tried_m,
@@ -384,7 +384,7 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
     if not timed:
         return without_clock._replace(tried_m=tried_m)
-    kind = _simplest(timed, squares)
+    kind = simplest_of(timed, squares)
     by_clock = _errors_m(trial.by_weight(kind))
     return Chosen(trial.mixed(kind), tried_m, by_clock, _alike(kind, squares))
 
@@ -487,7 +487,7 @@ def as_good_m(least_m: float) -> float:
     return max(AS_GOOD * least_m, least_m + AS_GOOD_M)
 
 
-def _simplest(kinds: Sequence[Inputs], squares: Mapping[str, Vector]) -> Inputs:
+def simplest_of(kinds: Sequence[Inputs], squares: Mapping[str, Vector]) -> Inputs:
     """The first of the kinds that is as good as the best one, by the squared errors (G,) [m²] of
     held-out groups: by its error, and within one standard error of the groups' differences. Of a
     single hand, the richest kind has to be as good, too.
