@@ -77,12 +77,12 @@ AMBIGUOUS_M = 0.5 * UNSURE_M
 TRAIL_S = SAMPLE_CORRELATION_S
 
 # Neighbours.
-# 0.05 to 0.2. More: the average is wider. Less: it is that of fewer moments.
-# distance in the inputs within which reference points are neighbours
+# 0.05 to 0.2. More: wider averages. Less: fewer moments count.
+# distance in the inputs of neighbours
 NEIGHBOUR_M = 0.1
-# 1e-4 to 1e-2. More: the average ends nearer to what was shown. Less: it reaches farther.
+# 1e-4 to 1e-2. More: averages reach less far. Less: they reach farther.
 NEIGHBOUR_MASS = 1e-3  # neighbours count where they weigh more than this
-# 0.2 to 1. More: neighbours are of the same moment. Less: they are of any moment.
+# 0.2 to 1. More: the moment counts. Less: the hands count.
 NEIGHBOUR_CLOCK_MPS = 0.5  # largest weight of the clock in the distance of neighbours
 
 # Motion of the target.

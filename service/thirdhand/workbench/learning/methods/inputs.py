@@ -55,6 +55,7 @@ MIXED = (
 # an error is as good up to this multiple of the least error, or up to this difference from it
 AS_GOOD = 1.02
 AS_GOOD_M = 0.002
+STEADY_M = 0.005  # nobody holds a tool much steadier, so smaller errors need not be alike
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
 LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
 COMPARABLE = 5  # fewer takes may not tell kinds of inputs apart
@@ -498,7 +499,8 @@ def simplest_of(kinds: Sequence[Inputs], squares: Mapping[str, Vector]) -> Input
     def is_as_good(kind: Inputs) -> bool:
         own = squares[kind.name]
         is_close = _error_m(own) <= as_good_m(_error_m(least))
-        return is_close and (len(own) < LEAST_GROUPS or not is_clear(own - least))
+        is_alike = len(own) < LEAST_GROUPS or not is_clear(own - least)
+        return is_close and (is_alike or _error_m(own) <= STEADY_M)
 
     for kind in kinds:
         richest = [other for other in kinds if other.alone == kind.alone][-1]
