@@ -49,6 +49,10 @@ def seen(hands: Vector, velocity: Vector, acceleration: Vector) -> Seen:
     )  # fmt: skip
 
 
+def signs_of(model: HandsKMP, inputs: Vector, tools: Vector) -> Vector:
+    return model.uncertainty(inputs, tools)[1]
+
+
 def test_the_average_keeps_what_a_smooth_mean_blurs(model: HandsKMP) -> None:
     at = np.array([[-0.1, 0.1, 0, 0, 0, 0], [0.1, 0.1, 0, 0, 0, 0]])
     plain = replace(model, neighbours=0.0)
@@ -105,8 +109,8 @@ def test_signs_grow_where_the_tool_is_doubtful(model: HandsKMP) -> None:
     inside = np.array([[0.25, 0.0, 0, 0, 0, 0]])
     at_jump = np.zeros((1, 6))
     far = np.full((1, 6), 2.0)
-    calm, jumping, beyond = (model.signs(x, model.tools(x))[0] for x in (inside, at_jump, far))
-    moved = model.signs(inside, model.tools(inside) + np.array([0.0, 0.0, 2 * UNSURE_M]))[0]
+    calm, jumping, beyond = (signs_of(model, x, model.tools(x))[0] for x in (inside, at_jump, far))
+    moved = signs_of(model, inside, model.tools(inside) + np.array([0.0, 0.0, 2 * UNSURE_M]))[0]
     spread, distance, scatter = slice(0, 6, 2), slice(1, 6, 2), slice(6, SIGNS)
     assert (jumping[spread] > calm[spread]).all()
     assert (moved[distance] > calm[distance] + 0.5).all()
@@ -127,7 +131,7 @@ def test_signs_are_those_of_their_equations(model: HandsKMP) -> None:
     base = model.primitive.base
     hands = np.random.default_rng(7).uniform(-0.4, 0.4, (10, 6))
     tools = model.tools(hands) + 0.02
-    for row, tool, signs in zip(hands, tools, model.signs(hands, tools), strict=True):
+    for row, tool, signs in zip(hands, tools, signs_of(model, hands, tools), strict=True):
         squares = ((base.inputs - row) ** 2).sum(axis=1)
         expected = []
         for width_m in NEIGHBOUR_M * np.array([1.0, 2.0, 4.0]):

@@ -36,14 +36,14 @@ from thirdhand.core.skill.model import (
 from thirdhand.core.skill.segments import MOST_SEGMENTS
 from thirdhand.core.skill.support import (
     LocalErrors,
-    local_scatter,
+    averages,
     mix,
     neighbour_table,
     stretch_of,
 )
 from thirdhand.core.skill.task import check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
-from thirdhand.core.skill.tuning import NEIGHBOUR_M, NEIGHBOUR_MASS, TURN_WEIGHT_M
+from thirdhand.core.skill.tuning import TURN_WEIGHT_M
 from thirdhand.core.skill.via_points import neighbourhoods
 
 TURN_INPUTS = 18  # the entries of both hands' rotation matrices
@@ -153,10 +153,7 @@ class HandsKMP:
             self._mix(moving, self.neighbours, out[:3], KNOWN_SIGNS)
         deviation = _rounded(covariance, out)
         if errors is not None:
-            inputs = np.ascontiguousarray(moving[0])
-            local_scatter(
-                inputs, errors.stretch, errors.table, errors.unknown_std_m, out[3:], signs[-2:]
-            )
+            errors.scatter(np.ascontiguousarray(moving[0]), out[3:], signs[-2:])
             round_to(out[3:], COVARIANCE_ROUND_TO)
         if known is not None and self.errors is not None:
             # the gate compares the primitive's own covariance, which was not computed
@@ -182,42 +179,32 @@ class HandsKMP:
         """Mean tool (T, 3) [m] at inputs (T, I)."""
         out = np.array(self.primitive.mean(inputs))
         if self.neighbours:
-            shares, averages = self._averages(inputs)
-            out += self.neighbours * (averages - shares * out)
+            shares, average_tools = self._averages(inputs)
+            out += self.neighbours * (average_tools - shares * out)
         return out
 
     def _averages(self, inputs: Vector) -> tuple[Vector, Vector]:
-        """D / (ν + D) (T, 1) and Y / (ν + D) (T, 3) [m] of `support` at inputs (T, I)."""
+        """Shares (T, 1) and average tools (T, 3) [m] at inputs (T, I), see `support.averages`."""
         base = self.primitive.base
         stretch = self._near[1]
         squares = cdist(inputs * stretch, base.inputs * stretch, "sqeuclidean")
-        near = np.exp(-squares / (2.0 * NEIGHBOUR_M**2))
-        mass = near.sum(axis=1, keepdims=True)
-        return mass / (NEIGHBOUR_MASS + mass), near @ base.reference.mean / (NEIGHBOUR_MASS + mass)
+        return averages(squares, base.reference.mean)
 
-    def signs(self, inputs: Vector, tools: Vector) -> Vector:
-        """Signs (T, SIGNS) of errors of these tools (T, 3) [m] at inputs (T, I); zeros without
-        held-out errors.
+    def uncertainty(self, inputs: Vector, tools: Vector) -> tuple[Vector, Vector]:
+        """Covariances (T, 3, 3) [m²] and signs (T, SIGNS) of errors of these tools (T, 3) [m] at
+        inputs (T, I). The model must have held-out errors.
         """
-        out = np.zeros((len(inputs), SIGNS))
-        if (errors := self.errors) is None:
-            return out
+        assert self.errors is not None
+        covariances = np.empty((len(inputs), 3, 3))
+        signs = np.empty((len(inputs), SIGNS))
         moving = np.zeros((3, inputs.shape[1]))
         motion = np.empty((3, 3))
-        covariance = np.empty((3, 3))
-        for row, tool, signs in zip(inputs, tools, out, strict=True):
-            moving[0] = row
-            motion[0] = tool
-            self._mix(moving, 0.0, motion, signs)
-            local_scatter(
-                moving[0],
-                errors.stretch,
-                errors.table,
-                errors.unknown_std_m,
-                covariance,
-                signs[-2:],
-            )
-        return out
+        for t in range(len(inputs)):
+            moving[0] = inputs[t]
+            motion[0] = tools[t]
+            self._mix(moving, 0.0, motion, signs[t])
+            self.errors.scatter(moving[0], covariances[t], signs[t, -2:])
+        return covariances, signs
 
     def elsewhere(
         self, now: Vector, stillness: Vector, period_s: float, belief: Vector, unprimed: Vector
@@ -277,8 +264,9 @@ class HandsKMP:
         hands, outputs, deviations = neighbourhoods(via_points)
         inputs = self.inputs(hands)
         if self.neighbours and len(inputs):
-            shares, averages = self._averages(inputs)
-            outputs = (outputs - self.neighbours * averages) / (1.0 - self.neighbours * shares)
+            shares, average_tools = self._averages(inputs)
+            outputs = outputs - self.neighbours * average_tools
+            outputs /= 1.0 - self.neighbours * shares
         desired = Gaussians(outputs, weight * deviations[:, None, None] ** 2 * np.eye(3))
         return replace(
             self, primitive=self.primitive.base.adapt(inputs, desired, tolerance=tolerance)

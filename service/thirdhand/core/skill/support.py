@@ -92,8 +92,14 @@ class LocalErrors(Immutable):
         out = np.empty((len(inputs), 3, 3))
         signs = np.empty(2)
         for row, covariance in zip(np.array(inputs, order="C"), out, strict=True):
-            local_scatter(row, self.stretch, self.table, self.unknown_std_m, covariance, signs)
+            self.scatter(row, covariance, signs)
         return out
+
+    def scatter(self, at: Vector, out: Vector, signs: Vector) -> None:
+        """Write the covariance at an input (I,) to `out`, and two signs of an error, see
+        `local_scatter`.
+        """
+        local_scatter(at, self.stretch, self.table, self.unknown_std_m, out, signs)
 
 
 def error_table(inputs: Vector, errors: Vector) -> Vector:
@@ -183,6 +189,15 @@ def _log_length(square: float) -> float:
     return 0.5 * log(max(square, 0.0) / UNSURE_M**2 + (LEAST_STD_M / UNSURE_M) ** 2)
 
 
+def averages(squares: Vector, tools: Vector) -> tuple[Vector, Vector]:
+    """D / (ν + D) (T, 1) and Y / (ν + D) (T, 3) [m] of reference points with these tools (R, 3) [m]
+    at squared distances c² |x - x_n|² (T, R).
+    """
+    near = np.exp(-squares / (2.0 * NEIGHBOUR_M**2))
+    mass = near.sum(axis=1, keepdims=True)
+    return mass / (NEIGHBOUR_MASS + mass), near @ tools / (NEIGHBOUR_MASS + mass)
+
+
 def neighbour_table(inputs: Vector, tools: Vector) -> Vector:
     """Reference points, inputs c x_n (R, I) and tools y_n (R, 3) [m], as a table of
     `kmp.loops.mean` with the weights 1, y_n and |y_n|².
@@ -202,8 +217,8 @@ def mix(
     signs: Vector,
 ) -> None:
     """Mix the neighbours with the `share` a into the motion k, k', k'' (3, 3) [m, m/s, m/s²], in
-    place, and write the signs of an error of the result to `signs` (6,), unless that is
-    empty; see the equations of this module.
+    place, and write the signs of an error of the result to `signs` (6,), unless that is empty; see
+    the equations of this module.
 
     `moving` (3, I) are the inputs with their velocity and acceleration. `table` is the
     `neighbour_table` of the reference points. `stretch` (I,) is c.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thirdhand.core.frame import Vector
-from thirdhand.workbench.learning.records import Take, folds_of
+from thirdhand.workbench.learning.records import Take, by_fold
 
 Predictor = Callable[[Vector, Vector, Vector], Vector]
 # in a skill's figures
@@ -70,10 +70,8 @@ def held_out(
     takes: Sequence[Take], predicted: Callable[[Sequence[Take], Sequence[Take]], list[Vector]]
 ) -> list[Vector]:
     """The errors (T, 3) [m] of each take; each fold is `predicted` from the takes of the others."""
-    folds = folds_of(takes)
     out: dict[int, Vector] = {}
-    for fold in np.unique(folds).tolist():
-        asked, others = (np.flatnonzero(part).tolist() for part in (folds == fold, folds != fold))
+    for _, asked, others in by_fold(takes):
         tools = predicted([takes[i] for i in asked], [takes[i] for i in others])
         out |= {i: takes[i].position - tool for i, tool in zip(asked, tools, strict=True)}
     return [out[i] for i in range(len(takes))]

@@ -19,6 +19,7 @@ RIDGE_M = 0.005
 NOISE_M = 0.001  # noise of a good tracker on each axis
 # this share of the reference points is even in time, the rest along the hands' path
 DWELL_SHARE = 0.25
+ADVISED = 5  # demonstrations; fewer may not tell kinds of inputs apart
 LEAST_BLOCKS = 2  # fewer blocks of takes leave nothing to compare or to calibrate by
 # The demonstrations together have at most this many reference points, or about this many: the time
 # and the memory to learn grow with its cube and its square.

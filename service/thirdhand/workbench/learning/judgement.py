@@ -188,11 +188,8 @@ def _spread(
     ]
     if len(own) < 2:
         return None
-    errors_mm = [1000 * rms(np.concatenate([timed.errors for timed, _ in part])) for part in own]
-    expected_mm = [
-        1000 * rms(np.concatenate([timed.expected_m(regions) for timed, regions in part])[:, None])
-        for part in own
-    ]
+    errors_mm = list(map(_moment_mm, own))
+    expected_mm = list(map(_expected_mm, own))
     return Spread(
         len(own),
         min(errors_mm),
@@ -200,6 +197,17 @@ def _spread(
         float(np.std(errors_mm, ddof=1)),
         int(np.sum(np.array(errors_mm) <= expected_mm)),
     )
+
+
+def _moment_mm(checked: Sequence[tuple[TimedErrors, Regions]]) -> float:
+    """The error [mm] at the same moment."""
+    return 1000 * rms(np.concatenate([timed.errors for timed, _ in checked]))
+
+
+def _expected_mm(checked: Sequence[tuple[TimedErrors, Regions]]) -> float:
+    """That error [mm] as the calibrated covariance predicts it."""
+    expected_m = [timed.expected_m(regions) for timed, regions in checked]
+    return 1000 * rms(np.concatenate(expected_m)[:, None])
 
 
 def _share_beyond(held_out: Sequence[HeldOut], reach: Reach) -> float:
@@ -234,7 +242,6 @@ def _row(
 ) -> Row:
     """The figures of errors (T, 3) [m], of one take or of all."""
     inside = 100 * np.mean([timed.inside(regions) for timed, regions in checked], axis=0)
-    expected_m = np.concatenate([timed.expected_m(regions) for timed, regions in checked])
     is_wrong = np.concatenate([timed.is_wrong for timed, _ in checked])
     is_unsure = np.concatenate(
         [timed.probabilities(regions) > (regions.alarm or 1.0) for timed, regions in checked]
@@ -243,8 +250,8 @@ def _row(
         name=name,
         error_mm=1000 * rms(errors),
         worst_mm=1000 * float(np.linalg.norm(errors, axis=1).max()),
-        moment_mm=1000 * rms(np.concatenate([timed.errors for timed, _ in checked])),
-        predicted_mm=1000 * rms(expected_m[:, None]),
+        moment_mm=_moment_mm(checked),
+        predicted_mm=_expected_mm(checked),
         within_50=float(inside[LEVELS.index(0.5)]),
         within_95=float(inside[LEVELS.index(0.95)]),
         held=100 * float(is_held.mean()),

@@ -23,7 +23,7 @@ from thirdhand.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOr
 from thirdhand.skills.flat import UNDECIDED, even
 from thirdhand.workbench.learning.ambiguity import contradictions
 from thirdhand.workbench.learning.choice import selection_of
-from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, folds_of
+from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, by_fold, folds_of
 
 # an orientation that stays this near to its mean counts as constant
 CONSTANT_RAD = math.radians(5.0)
@@ -128,23 +128,22 @@ def _learned_turn(
     """
     if angles(np.concatenate(unit), mean).max() <= CONSTANT_RAD:
         return None, None, []
-    folds = folds_of([result.take for result in held_out])
+    takes = [result.take for result in held_out]
     zetas = [log(q, mean) for q in unit]
     pairs = [(result.inputs, zeta) for result, zeta in zip(held_out, zetas, strict=True)]
-    choice = selection_of(pairs, points, persons=folds, isotropic=True)
-    several = len(np.unique(folds)) > 1
+    choice = selection_of(pairs, points, persons=folds_of(takes), isotropic=True)
+    several = len({take.person for take in takes}) > 1
     parameters = choice.parameters() if several else SINGLE_TAKE
     residuals = choice.residuals(parameters.ell, parameters.noise)
     error_deg = math.degrees(2.0 * rms(residuals)) if several else None
-    missed = []
-    primitives = {
-        number: choice.primitive(parameters, residuals, without=number if several else None)
-        for number in np.unique(folds).tolist()
-    }
-    for result, zeta, fold in zip(held_out, zetas, folds.tolist(), strict=True):
-        others = primitives[fold]
-        missed.append(2.0 * np.linalg.norm(zeta - others.mean(result.inputs), axis=1))
-    return LearnedOrientation(choice.primitive(parameters, residuals), mean), error_deg, missed
+    missed: dict[int, Vector] = {}
+    for fold, members, _ in by_fold(takes):
+        others = choice.primitive(parameters, residuals, without=fold if several else None)
+        for h in members:
+            off = zetas[h] - others.mean(held_out[h].inputs)
+            missed[h] = 2.0 * np.linalg.norm(off, axis=1)
+    learned = LearnedOrientation(choice.primitive(parameters, residuals), mean)
+    return learned, error_deg, [missed[h] for h in range(len(takes))]
 
 
 def _signed(mean: Vector, unit: Sequence[Vector]) -> tuple[Vector, list[Vector]]:

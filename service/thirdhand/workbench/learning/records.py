@@ -4,7 +4,7 @@ fitted model, and the figures that a skill's file holds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import msgspec
@@ -80,6 +80,13 @@ def folds_of(takes: Sequence[Take], earlier: int = 0) -> NDArray[np.intp]:
     return np.concatenate(folds)
 
 
+def by_fold(takes: Sequence[Take]) -> Iterator[tuple[int, list[int], list[int]]]:
+    """The number of each fold, the numbers of its takes, and those of all other takes."""
+    folds = folds_of(takes)
+    for fold in np.unique(folds).tolist():
+        yield fold, np.flatnonzero(folds == fold).tolist(), np.flatnonzero(folds != fold).tolist()
+
+
 class Taught(NamedTuple):
     """The takes that a skill is learned from.
 
@@ -141,7 +148,7 @@ class TimedErrors(NamedTuple):
         return np.asarray(regions.scale * self.with_timing(regions.std_s))
 
     def features(self, regions: Regions) -> Vector:
-        """What `error_probability` weighs (S, 2 + SIGNS), in the order of the weights."""
+        """The inputs (S, 2 + SIGNS) of the logistic regression, in the order of its weights."""
         traces = np.trace(self.published(regions), axis1=1, axis2=2)
         return np.column_stack([np.ones(len(traces)), np.log(traces / UNSURE_M**2), self.signs])
 

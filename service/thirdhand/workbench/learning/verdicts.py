@@ -14,11 +14,10 @@ from typing import NamedTuple
 
 from thirdhand.contract.messages import BASE
 from thirdhand.workbench.learning.baselines import SAME_TIME
-from thirdhand.workbench.learning.choice import NOISE_M
+from thirdhand.workbench.learning.choice import ADVISED, NOISE_M
 from thirdhand.workbench.learning.gate import Gate
 from thirdhand.workbench.learning.records import Figures, Row, Severity, Verdict
 
-ADVISED = 5  # demonstrations
 # an outlier's error is above this multiple of the median, and above this error
 OUTLIER_TIMES = 2.5
 OUTLIER_MM = 25.0
@@ -46,7 +45,7 @@ COVERAGE = {
 # [%] from this share of wrong samples on, the skill must be unsure at this share of them
 WRONG = 0.5
 LEAST_TOLD = 80.0
-UNTOLD_RESIDUAL = 1.0  # [%] of the samples that are wrong and not told
+UNTOLD_RESIDUAL = 1.0  # [%] limit of the samples at which the skill is wrong and not unsure
 
 
 class Subject(NamedTuple):
@@ -120,7 +119,7 @@ def _is_unexplained(s: Subject) -> bool:
 
 
 def _untold(s: Subject) -> float:
-    """The share [%] of the samples at which the skill is wrong and does not tell."""
+    """The share [%] of the samples at which the skill is wrong and not unsure."""
     return s.all.wrong * (1.0 - (s.all.told or 0.0) / 100.0)
 
 
@@ -287,7 +286,7 @@ def conclusion(s: Subject) -> str:
 
 
 def _what_helps(s: Subject) -> str:
-    """What would reduce the error most, as far as the figures tell."""
+    """What probably reduces the error most, by the figures."""
     spread = s.figures.spread
     if len(s.figures.demonstrations) < ADVISED:
         return f"record at least {ADVISED} demonstrations"

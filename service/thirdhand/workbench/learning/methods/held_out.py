@@ -12,7 +12,7 @@ from thirdhand.core.skill.hands_kmp import TURN_INPUTS, HandsKMP
 from thirdhand.core.skill.model import standard_deviations
 from thirdhand.skills.skill_file import HIGHEST_GATE_M
 from thirdhand.workbench.learning.gate import Gate, every_few, gate_between, nonsense
-from thirdhand.workbench.learning.records import HeldOut, Progress, Take, folds_of
+from thirdhand.workbench.learning.records import HeldOut, Progress, Take, by_fold
 
 Fit = Callable[[int | None], KMP]  # the primitive without a fold's takes, or of all
 ROWS = 500  # inputs that are predicted at once, which bounds the memory
@@ -28,12 +28,10 @@ def held_out_takes(
     """The takes, with inputs (T, I), as predicted by a model of the primitive without their fold,
     or by that of all takes if there is one fold only.
     """
-    folds = folds_of(takes)
-    numbers = np.unique(folds)
     out: dict[int, HeldOut] = {}
-    for fold in numbers.tolist():  # one primitive at a time: each holds its factors
-        primitive = fit(fold if len(numbers) > 1 else None)
-        for h in np.flatnonzero(folds == fold).tolist():
+    for fold, members, others in by_fold(takes):  # one primitive at a time: each holds its factors
+        primitive = fit(fold if others else None)
+        for h in members:
             progress(f"holding out demonstration {h + 1} of {len(takes)}")
             take = takes[h]
             covariance = primitive.predict(inputs[h]).covariance

@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,10 @@ from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import features
-from thirdhand.core.skill.support import stretch_of
+from thirdhand.core.skill.support import averages, stretch_of
 from thirdhand.core.skill.task_clock import TaskClock
-from thirdhand.core.skill.tuning import NEIGHBOUR_M, NEIGHBOUR_MASS
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.workbench.learning.choice import is_clear, selection_of
+from thirdhand.workbench.learning.choice import ADVISED, is_clear, selection_of
 from thirdhand.workbench.learning.division import task_of
 from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.clock import Tempo, clock_of, paired, remark_on
@@ -45,6 +44,7 @@ from thirdhand.workbench.learning.records import (
 )
 from thirdhand.workbench.learning.regions import local_errors
 
+Key = TypeVar("Key")
 # Shares of the neighbours in the mean. A quarter and three quarters err like one of these on
 # recorded partners.
 MIXED_SHARES = (0.0, 0.5)
@@ -58,7 +58,6 @@ AS_GOOD_M = 0.002
 STEADY_M = 0.005  # nobody holds a tool much steadier, so smaller errors need not be alike
 RICH_TIMES = 2  # inputs richer than positions have twice as many reference points
 LEAST_TURN_RAD = math.radians(5.0)  # orientations that vary by less are no inputs
-COMPARABLE = 5  # fewer takes may not tell kinds of inputs apart
 LEAST_GROUPS = 3  # the differences of fewer groups show no standard error
 # hyper-parameters are chosen anew without each block of takes from this number of persons on
 LEAST_PERSONS = 3
@@ -209,10 +208,10 @@ def _remarks(kind: Inputs) -> Iterator[str]:
 
 def _noise(count: int, alike: int) -> Iterator[str]:
     """A sentence on `alike` other kinds of inputs of some `count` takes, if these are few."""
-    if count < COMPARABLE and alike > 0:
+    if count < ADVISED and alike > 0:
         yield (
             f"with {count} demonstrations, the errors of {alike} other kinds of inputs differ from "
-            f"that of the one taken by no more than chance: record at least {COMPARABLE}"
+            f"that of the one taken by no more than chance: record at least {ADVISED}"
         )
 
 
@@ -361,11 +360,10 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
         progress(f"trying {kind.name}")
         by_weight[kind.name] = trial.by_weight(kind)
     squares = {kind.name: min(by_weight[kind.name].values(), key=np.mean) for kind in kinds}
-    tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
     simplest = simplest_of(kinds, squares)
     without_clock = Chosen(
-        trial.mixed(simplest),
-        tried_m,
+        trial.mixed(simplest, by_weight[simplest.name]),
+        _errors_m(squares),
         _errors_m(by_weight[simplest.name]),
         _alike(simplest, squares),
     )
@@ -373,21 +371,22 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     blocks = trial.folds if taught.earlier else paired(persons_of(taught.new))
     if not blocks.any():
         return without_clock
-    best = min(kinds, key=lambda kind: tried_m[kind.name])
+    best = min(kinds, key=lambda kind: squares[kind.name].mean())
     first = next(kind for kind in kinds if kind.alone == simplest.alone)
     bases = sorted({first, simplest, best}, key=kinds.index)
-    weights = {
-        kind: min(errors_m, key=errors_m.__getitem__)
-        for kind in bases
-        for errors_m in [_errors_m(by_weight[kind.name])]
-    }
+    weights = {kind: _least(by_weight[kind.name]) for kind in bases}
     timed = _timed(trial, weights, blocks, squares, progress)
-    tried_m = {name: _error_m(kind_squares) for name, kind_squares in squares.items()}
+    tried_m = _errors_m(squares)
     if not timed:
         return without_clock._replace(tried_m=tried_m)
     kind = simplest_of(timed, squares)
-    by_clock = _errors_m(trial.by_weight(kind))
-    return Chosen(trial.mixed(kind), tried_m, by_clock, _alike(kind, squares))
+    timed_by_weight = trial.by_weight(kind)
+    return Chosen(
+        trial.mixed(kind, timed_by_weight),
+        tried_m,
+        _errors_m(timed_by_weight),
+        _alike(kind, squares),
+    )
 
 
 def _alike(taken: Inputs, squares: Mapping[str, Vector]) -> int:
@@ -401,8 +400,13 @@ def _error_m(squares: Vector) -> float:
     return math.sqrt(squares.mean())
 
 
-def _errors_m(by_weight: Mapping[float, Vector]) -> dict[float, float]:
-    return {weight: _error_m(squares) for weight, squares in by_weight.items()}
+def _errors_m(squares: Mapping[Key, Vector]) -> dict[Key, float]:
+    return {key: _error_m(own) for key, own in squares.items()}
+
+
+def _least(squares: Mapping[Key, Vector]) -> Key:
+    """The key of the least squared errors (G,) [m²]."""
+    return min(squares, key=lambda key: float(squares[key].mean()))
 
 
 class _Trial(NamedTuple):
@@ -422,24 +426,23 @@ class _Trial(NamedTuple):
     def by_share(
         self, kind: Inputs, weight: float, held_out: NDArray[np.intp]
     ) -> dict[float, Vector]:
-        """The squared errors (G,) [m²] of `squares` with each share of neighbours."""
+        """The squared errors (G,) [m²] of `squares`, with each share of neighbours."""
         selection = _weighted(kind, self.taught, self.tempos, weight, self.points, held_out)
         _, best = selection.best_mean(may_be_linear=True)
         residuals = selection.residuals(best.ell, best.noise, best.ridge)
         tools = selection.outputs - residuals
-        is_other = selection.group[:, None] != selection.group
         squares = squared_distances(selection.inputs * stretch_of(kind.clock, selection.inputs))
-        near = is_other * np.exp(-squares / (2.0 * NEIGHBOUR_M**2))
-        masses = near.sum(axis=1)[:, None]
-        away = (near @ selection.outputs - masses * tools) / (NEIGHBOUR_MASS + masses)
+        squares[selection.group[:, None] == selection.group] = np.inf  # held out
+        shares, average_tools = averages(squares, selection.outputs)
+        away = average_tools - shares * tools
         return {share: selection.by_group(residuals - share * away) for share in MIXED_SHARES}
 
-    def mixed(self, kind: Inputs) -> Inputs:
-        """The kind with the better share of neighbours, of its best weight."""
-        by_weight = self.by_weight(kind)
-        weight = min(by_weight, key=lambda candidate: by_weight[candidate].mean())
-        by_share = self.by_share(kind, weight, self.folds)
-        return kind._replace(neighbours=min(by_share, key=lambda share: by_share[share].mean()))
+    def mixed(self, kind: Inputs, by_weight: Mapping[float, Vector]) -> Inputs:
+        """The kind with the better share of neighbours, for the best weight of its squared errors
+        (G,) [m²] by weight.
+        """
+        by_share = self.by_share(kind, _least(by_weight), self.folds)
+        return kind._replace(neighbours=_least(by_share))
 
     def by_weight(self, kind: Inputs) -> dict[float, Vector]:
         """The squared errors (G,) [m²] by weight, if the folds are held out."""

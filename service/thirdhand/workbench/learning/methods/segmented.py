@@ -79,6 +79,7 @@ from thirdhand.workbench.learning.records import (
     Take,
     Taught,
     Weights,
+    by_fold,
     folds_of,
     persons_of,
 )
@@ -593,15 +594,14 @@ class Segmented:
     def _without_via_points(self, takes: Sequence[Take], progress: Progress) -> list[Vector]:
         """The errors (T, 3) [m] of held-out takes as functions of the hands' positions."""
         progress("learning without the via-points, for comparison")
-        folds = folds_of(takes)
         pairs = [(take.hands, take.position) for take in takes]
-        choice = selection_of(pairs, self.options.points, persons=folds)
+        choice = selection_of(pairs, self.options.points, persons=folds_of(takes))
         _, best = choice.best_mean(may_be_linear=True)
         residuals = choice.residuals(best.ell, best.noise, best.ridge)
         errors = dict[int, Vector]()
-        for fold in np.unique(folds).tolist():
+        for fold, members, _ in by_fold(takes):
             primitive = choice.primitive(best, residuals, without=fold)
-            for h in np.flatnonzero(folds == fold).tolist():
+            for h in members:
                 errors[h] = takes[h].position - primitive.mean(takes[h].hands)
         return [errors[h] for h in range(len(takes))]
 
