@@ -22,7 +22,7 @@ from thirdhand.workbench.cli.options import WORKBENCH
 GROUPS = {
     "run": ("demo", "serve", "follow", "sim", "hands", "play"),
     "stop and continue": ("hold", "resume", "reset"),
-    "teach": ("record", "learn", "via-points", "segment", "correct"),
+    "teach": ("record", "learn", "via-points", "begin", "segment", "correct"),
     "look": ("status", "view", "report"),
     "check": ("doctor", "metrics", "bundle", "replay", "bench"),
     "set up": ("arm", "calibrate"),

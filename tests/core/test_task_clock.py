@@ -12,6 +12,7 @@ import pytest
 
 from support.kinds import KINDS, learned, named, takes
 from support.skills import at_rest, figures_of
+from thirdhand.core.skill import task_clock
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.core.skill.skill import Prediction
@@ -30,8 +31,9 @@ from thirdhand.skills.skill_file import StoredSkill, decoded
 from thirdhand.workbench.learning.learn import learn
 from thirdhand_sim.lab.people.left_out import judged, left_out, predicted_rounds
 
-RUNS = TaskClock(False, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
-WAITS = RUNS._replace(waits=True)
+RUNS = TaskClock(task_clock.RUNS, 1.0, 5.0, 4.0, 2.0, 0.3, 0.1, (0.5, 0.2, 0.1, 0.5, -0.2, 0.1))
+WAITS = RUNS._replace(pace=task_clock.WAITS)
+REQUESTED = RUNS._replace(pace=task_clock.REQUESTED)
 HOME = np.array(RUNS.begin)
 AWAY = np.array(RUNS.begin) + 0.5
 OWN = HOME + 0.3  # a person's start away from that of the demonstrations
@@ -145,8 +147,10 @@ def test_own_begin_is_kept_through_segments() -> None:
 
 
 def test_numbers_of_no_clock_are_refused() -> None:
-    assert TaskClock.of(RUNS.numbers) == RUNS
-    for bad in (RUNS.numbers[:-1], -RUNS.numbers, np.full(13, np.nan), np.full(13, 1e9)):
+    for good in (RUNS, WAITS, REQUESTED):
+        assert TaskClock.of(good.numbers) == good
+    half = RUNS.numbers + 0.5
+    for bad in (half, RUNS.numbers[:-1], -RUNS.numbers, np.full(13, np.nan), np.full(13, 1e9)):
         with pytest.raises(ValueError, match="task_clock"):
             TaskClock.of(bad)
 
@@ -171,10 +175,10 @@ def test_learn_takes_a_clock_for_a_timetable(
     skill = learn(demonstrations)
     figures = figures_of(skill)
     back = decoded(skill.file, origin="again")
-    task_clock = clock(skill)
-    assert task_clock is not None
-    assert not task_clock.waits
-    assert clock(back) == task_clock
+    learned_clock = clock(skill)
+    assert learned_clock is not None
+    assert learned_clock.pace == task_clock.RUNS
+    assert clock(back) == learned_clock
     assert clock(learn(kind_of_takes(8, timetable=False))) is None
     assert figures.taken.endswith("and a clock")
     assert figures.tried_mm[figures.taken] < 0.5 * figures.tried_mm["positions"]
@@ -192,6 +196,66 @@ def test_learn_takes_a_clock_for_a_timetable(
     np.testing.assert_allclose(
         moving.velocity, (ahead.position - behind.position) / 0.04, atol=2e-3
     )
+
+
+def test_a_request_alone_starts_a_requested_clock() -> None:
+    """Motion starts none, a rest at the begin ends none, and it counts from before the first sample
+    of a take.
+    """
+    parts = [("move", 1.0, AWAY), ("rest", 3.0, HOME), ("move", 1.0, AWAY)]
+    assert not along(REQUESTED, *parts)[:, CLOCK_S].any()
+    counts = {
+        begun_s: counted(
+            np.tile(HOME, (400, 1)),
+            np.zeros(400),
+            np.ones(400),
+            PERIOD_S,
+            REQUESTED.numbers[None],
+            begun_s=begun_s,
+        )
+        for begun_s in (0.0, 1.5)
+    }
+    assert counts[0.0][-1] == pytest.approx(3.9, abs=0.02)
+    assert counts[1.5][0] == pytest.approx(1.4, abs=0.02)
+    assert counts[1.5][-1] == pytest.approx(5.1, abs=0.06)  # the longest demonstration
+
+
+def requested_takes() -> list[Demonstration]:
+    """Takes of a timetable that the teacher's request begins, up to 3 s before the hands move."""
+    random = np.random.default_rng(1)
+    out = []
+    for number, take in enumerate(takes(8, timetable=True)):
+        rest = round(random.uniform(0.5, 3.0) / take.period_s)
+        poses = [np.repeat(part[:1], rest, axis=0) for part in (take.left, take.right)]
+        left, right = (
+            np.concatenate([still, part])
+            for still, part in zip(poses, (take.left, take.right), strict=True)
+        )
+        tool = np.concatenate([take.tool, np.repeat(take.tool[-1:], rest, axis=0)])
+        stamps_ns = np.round(1e9 * (20.0 * number + take.period_s * np.arange(len(tool))))
+        out.append(Demonstration(stamps_ns.astype(np.int64), left, right, tool, begun_s=0.0))
+    return out
+
+
+@pytest.mark.thorough
+def test_a_timetable_from_a_request_is_learned_and_begun() -> None:
+    """The tool moves by the time since the request, whenever the hands move. Without requests, the
+    same takes are learned worse.
+    """
+    *shown, asked = requested_takes()
+    skill = learn(shown)
+    assert clock(skill) is not None
+    assert clock(decoded(skill.file, origin="again")) == clock(skill)
+    assert any("`thirdhand begin` starts" in text for text in figures_of(skill).warnings)
+    without = learn([take._replace(begun_s=None) for take in shown])
+    assert figures_of(skill).all.error_mm < 0.5 * figures_of(without).all.error_mm
+    rounds = [
+        judged(take, said)
+        for take in [left_out("", "", asked)]
+        for said in predicted_rounds(skill, take)
+    ]
+    for one in rounds:
+        assert 1e3 * np.sqrt(one.squares / one.samples) < 2.0 * figures_of(skill).all.error_mm
 
 
 @pytest.mark.parametrize("kind", KINDS)

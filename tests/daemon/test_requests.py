@@ -346,6 +346,17 @@ def test_the_segment_of_the_task_is_told_by_client_and_command(
     assert cell.kinds()[-3:] == ["segment"] * 3
 
 
+def test_the_task_is_begun_by_client_and_command(
+    cell: Cell, sessions: tuple[zenoh.Session, zenoh.Session], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A skill that needs no request says so."""
+    assert "needs no request" in cell.client.begin().note
+    reached = ["--connect", *endpoints(sessions[0]), "--cell", cell.settings.cell]
+    assert main(["begin", *reached]) == 0
+    assert re.search(r"begun at tick \d+: hold \(no_hands\); the", capsys.readouterr().out)
+    assert cell.kinds()[-2:] == ["begin"] * 2
+
+
 def test_skill_out_of_reach_is_refused(
     sessions: tuple[zenoh.Session, zenoh.Session],
     skill: StoredSkill,

@@ -27,7 +27,11 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.settings.config import HandSettings, Settings, ToolSettings, robot_description
 from thirdhand.workbench.takes.demonstration_files import demonstration_paths, summary, table, uncut
-from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
+from thirdhand.workbench.takes.demonstration_reader import (
+    hand_samples,
+    read_demonstration,
+    write_demonstration,
+)
 from thirdhand.workbench.takes.pose_streams import PoseRecording, PoseTopic
 from thirdhand.workbench.trackers.capture import (
     JOINT_STATES,
@@ -137,12 +141,12 @@ def test_what_is_not_heard_is_named(
 def put_until(
     told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event
 ) -> None:
-    """Publish positions by key, again and again."""
+    """Publish positions by key, again and again, with the time as stamp."""
     publishers = {key: told.declare_publisher(key) for key in poses}
-    for i in range(2000):
+    for _ in range(2000):
         for key, position in poses.items():
             publishers[key].put(
-                cdr.encode_pose(PoseStamped(i + 1, "base", position, (0.0, 0.0, 0.0, 1.0)))
+                cdr.encode_pose(PoseStamped(time.time_ns(), "base", position, (0.0, 0.0, 0.0, 1.0)))
             )
         if over.wait(0.01):
             break
@@ -187,6 +191,45 @@ def test_unsuitable_streams_are_reported_before_recording(
     finally:
         over.set()
         tracker.join(10)
+
+
+def test_a_take_that_a_request_begins_tells_when(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
+    """It is told of a rest before the motion, after cutting, and in a take that is written."""
+    over = threading.Event()
+    poses = {f"bench/{key}": (0.1, 0.2, 0.3) for key in ("hands/left", "hands/right", "tool/pose")}
+    tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
+    tracker.start()
+    since_s = time.monotonic()
+    asked = iter([False] * 10 + [True] * 100)
+    lines: list[str] = []
+    try:
+        taken = capture(
+            sessions[0],
+            "bench",
+            Settings(),
+            until="rest",
+            rest_s=1.0,
+            is_ended=lambda: len(lines) > 2 and time.monotonic() - since_s > 2.0,
+            wait_s=20.0,
+            longest_s=1.0,
+            is_begun=lambda: next(asked),
+            say=lines.append,
+        )
+    finally:
+        over.set()
+        tracker.join(10)
+    assert lines[1] == "hands and tool arrive: Enter begins the take"
+    path = tmp_path / "take.mcap"
+    taken.write(path)
+    take = read_demonstration(path)
+    assert take.begun_s == pytest.approx(0.0, abs=0.1)
+    assert main(["record", "take", "--folder", str(tmp_path), "--trim", "0.3", "0.9"]) == 0
+    cut = read_demonstration(path)
+    assert cut.begun_s == pytest.approx(0.3, abs=0.1)
+    write_demonstration(path, cut)
+    assert read_demonstration(path).begun_s == pytest.approx(cut.begun_s, abs=1e-8)
 
 
 def test_take_too_far_away_says_where_and_in_which_unit(

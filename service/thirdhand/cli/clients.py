@@ -1,4 +1,4 @@
-"""`thirdhand via-points`, `segment`, `correct`, `hold`, `resume`, `reset`: requests to a daemon."""
+"""Requests to a daemon: `via-points`, `begin`, `segment`, `correct`, `hold`, `resume`, `reset`."""
 
 from __future__ import annotations
 
@@ -91,6 +91,20 @@ def _complete(args: argparse.Namespace) -> None:
     sides = [side for side in SIDES if getattr(args, side)]
     if args.tool and len(sides) == 1 and ask(args, "status").get("hands") == sides[0]:
         args.left = args.right = args.left or args.right
+
+
+def begin(args: argparse.Namespace) -> int:
+    """Begin the task, once or at each Enter; exit code 0."""
+    with reached(args) as session:
+        client = Client(session, args.cell)
+        for _ in sys.stdin if args.key else ("once",):
+            reply = client.begin()
+            note = f"; {reply.note}" if reply.note else ""
+            print(
+                f"begun at tick {reply.tick}: {in_brief(reply.mode, reply.reason)}{note}",
+                flush=True,
+            )
+    return 0
 
 
 def segment(args: argparse.Namespace) -> int:

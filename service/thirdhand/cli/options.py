@@ -173,6 +173,20 @@ def via_points(add: AddCommand) -> None:
     reach(described(actions, "clear", "remove all via-points", f"{example} clear"))
 
 
+def begin(add: AddCommand) -> None:
+    """Options of `begin`."""
+    c = reach(
+        add(
+            "begin",
+            "Begins the task of a running daemon anew. A skill that was learned from takes that a "
+            "request began needs it.",
+            "thirdhand begin\n  thirdhand begin --key",
+            run="clients.begin",
+        )
+    )
+    flag(c, "--key", "begin at each Enter, until Ctrl-C; a foot pedal is a keyboard")
+
+
 def segment(add: AddCommand) -> None:
     """Options of `segment`."""
     c = reach(
@@ -249,4 +263,4 @@ def holding(add: AddCommand) -> None:
     reach(add("reset", "Ends a fault.", "thirdhand reset", run="clients.reset"))
 
 
-RUN_TIME = (follow, serve, via_points, segment, correct, status, doctor, holding)
+RUN_TIME = (follow, serve, via_points, begin, segment, correct, status, doctor, holding)

@@ -172,7 +172,7 @@ TYPE_OF_METAVAR: dict[str | None, Callable[[str], Any]] = {
 }
 
 WORKERS_HELP = (
-    "share several files out to this number of processes, or to the cluster at dask:ADDRESS (of "
+    "share the work out to this number of processes, or to the cluster at dask:ADDRESS (of "
     "the scheduler); the output is the same (default: one after the other)"
 )
 RATE_HELP = "the rate of the control loop (default: the rate in the cell's settings)"

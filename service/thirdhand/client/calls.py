@@ -73,6 +73,10 @@ class Client:
         """End a fault; returns once that is in force."""
         return self._typed("reset", None, Reply)
 
+    def begin(self) -> Reply:
+        """Begin the task, for a skill whose takes a request began; returns once in force."""
+        return self._typed("begin", None, Reply)
+
     def set_segment(self, name: str) -> Reply:
         """Report that the task has reached this via-point; returns once that is in force."""
         return self._typed("segment", requests.SegmentRequest(name), Reply)

@@ -263,6 +263,14 @@ CHANNELS = (
         queryable=True,
     ),
     Channel(
+        "begin",
+        _request(requests.Nothing),
+        "request",
+        "the task begins now",
+        event=EventKind(10, STRING),
+        queryable=True,
+    ),
+    Channel(
         "segment",
         _request(requests.SegmentRequest),
         "request",

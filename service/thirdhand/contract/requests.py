@@ -146,7 +146,7 @@ CorrectRequest: TypeAlias = Correct | UndoCorrection
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The empty request of status and reset."""
+    """The empty request of status, reset and begin."""
 
 
 class HoldRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

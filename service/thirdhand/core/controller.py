@@ -217,6 +217,8 @@ class Controller:
                 self._adopt(event.value)
             elif event.kind == "segment":
                 self._skill.set_segment(state, cdr.decode_string(event.payload))
+            elif event.kind == "begin":
+                self._skill.begin(state)
             else:
                 self.decision.take(state, event)
         return self.intake.step(state, frame, tick.index - before, samples)

@@ -132,7 +132,7 @@ class Event:
 
 
 def order(kind: str, text: str = "{}") -> Event:
-    """Event of kind hold, resume, reset or fault, with the text that a recording keeps."""
+    """Event of kind hold, resume, reset, begin or fault, with the text that a recording keeps."""
     return Event(kind, cdr.encode_string(text), None)
 
 

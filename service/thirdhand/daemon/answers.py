@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +31,7 @@ from thirdhand.contract.requests import (
     ViaPoint,
 )
 from thirdhand.core.frame import Event, Frame, order
+from thirdhand.core.skill.task_clock import is_requested
 from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.correcting import Corrections, check_same_hold, held_since
 from thirdhand.daemon.saved_via_points import SavedViaPoints
@@ -48,10 +51,11 @@ from thirdhand.skills.via_points import in_force, points_made_of, warnings_of
 
 # limit of via-points that are not the task's, with the points of their neighbourhoods
 MAX_VIA_POINTS = 400
+TEACHING = (Add, Remove, Clear, SkillRequest, Correct, UndoCorrection)
 
 
 class OrderRequest(NamedTuple):
-    """A hold, resume or reset, `by` the one of this name. `holds`, the number of holds that were
+    """A hold, resume, reset or begin, `by` the one of this name. `holds`, the number of holds
     received before a resume, distinguishes resumes before and after a hold.
     """
 
@@ -82,6 +86,7 @@ class Answers:
         self._in_force = functools.lru_cache(2)(in_force)
         self._in_force(cell.skill)  # before a client asks for the list
         self._saved = SavedViaPoints(cell.settings, self._beyond_m)
+        self._teaching = threading.Lock()  # one change of the skill at a time
         self._answered_by: dict[type, Callable[[Any], Answer]] = {
             StatusRequest: self._status,
             OrderRequest: self._order,
@@ -99,13 +104,27 @@ class Answers:
         """The reply to a request; a status is in bytes. The error of an order is returned, that of
         other requests raised: RequestError or SkillError.
         """
-        return self._answered_by[type(request)](request)
+        with self._teaching if isinstance(request, TEACHING) else contextlib.nullcontext():
+            return self._answered_by[type(request)](request)
+
+    def begin_at(self, skill: StoredSkill, points: Sequence[ViaPoint]) -> None:
+        """Begin the task with these via-points of it, unless another skill than the given one is in
+        force by now. Raises RequestError, SkillError.
+        """
+        with self._teaching:
+            if self._cell.skill is skill:
+                self._check(points)
+                named = {point.name: point for point in (*skill.via_points, *points)}
+                after = self.skill_worker.adapt(
+                    skill, tuple(named.values()), tolerance=skill.tolerance
+                )
+                self._adopt(after, order("begin"))
 
     def _status(self, request: StatusRequest) -> bytes:
         return self._cell.newest_status.requested(published=request.published)
 
     def _order(self, request: OrderRequest) -> Reply | RequestError:
-        """The reply to hold, resume or reset with the resulting mode, or the error."""
+        """The reply to an order with the resulting mode, or the error."""
         pending = self._cell.inbox.order(*request)
         try:
             frame = pending.wait()
@@ -119,6 +138,8 @@ class Answers:
             note = "there was no hold to end"
         elif request.kind == "resume" and reply.mode == word(Mode.FAULT):
             note = "resume does not end a fault, reset does"
+        elif request.kind == "begin" and not is_requested(self._cell.skill.model.clock):
+            note = "the skill needs no request: its task begins as the hands move"
         return msgspec.structs.replace(reply, note=note)
 
     def _set_segment(self, request: SegmentRequest) -> Reply:

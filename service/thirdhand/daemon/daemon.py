@@ -76,8 +76,9 @@ class Daemon:
         )
 
         # Threads beside the loop make the status and answer requests.
-        self._status_thread = StatusThread(cell, skill_worker)
-        self._queryables = Queryables(cell, Answers(cell, skill_worker, skills))
+        answers = Answers(cell, skill_worker, skills)
+        self._status_thread = StatusThread(cell, answers)
+        self._queryables = Queryables(cell, answers)
         self._is_open = False  # True once requests are answered
 
     def serve(self, announce: Announce) -> str:

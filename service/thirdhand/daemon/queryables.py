@@ -27,7 +27,7 @@ MAX_WAITING_REQUESTS = 16
 MAX_WAITING_ORDERS = 1024  # more than for other requests, because one tick takes all waiting orders
 MAX_LIST_BYTES = 100  # a longer request is not a `list`
 TEXT = zenoh.Encoding.TEXT_PLAIN
-ORDER_KEYS = ("hold", "resume", "reset")
+ORDER_KEYS = ("hold", "resume", "reset", "begin")
 TOGETHER = (*ORDER_KEYS, "status")  # all waiting requests on one of these keys get the same answer
 COMPUTED = "teaching"  # name of the queue of requests for which the skill worker computes
 

@@ -101,7 +101,7 @@ class RequestInbox:
         return pending
 
     def order(self, kind: str, by: str = "", holds: int = 0) -> PendingRequest:
-        """A hold, resume or reset for the next tick, `by` the one of this name. `holds` is the
+        """An order for the next tick, `by` the one of this name. `holds` is the
         number of holds that were received before it.
         """
         return self.send(order(kind), check=functools.partial(self._check, kind, by, holds))

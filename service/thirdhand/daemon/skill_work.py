@@ -5,26 +5,33 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
-from thirdhand.contract.requests import ToolLimits
+from thirdhand.contract.requests import RequestError, ToolLimits, ViaPoint
 from thirdhand.core.frame import order
+from thirdhand.daemon.answers import Answers
 from thirdhand.daemon.cell_state import CellState
-from thirdhand.daemon.skill_worker import SkillWorker, tool_limits_of, way_out_of
-from thirdhand.skills.skill_file import SkillError
+from thirdhand.daemon.skill_worker import tool_limits_of, way_out_of
+from thirdhand.skills.skill_file import SkillError, StoredSkill
+from thirdhand.skills.start_place import StartPlace
 
 AGAIN_S = 2.0  # a search is repeated after this time, because obstacles may have moved
 
 
 class SkillWork:
-    """Searches for ways out of a stuck posture, whose results are sent to the loop, and the limits
-    of the tool at the positions of the skill in force; one thread for each.
+    """Searches for ways out of a stuck posture, whose results are sent to the loop; the limits of
+    the tool at the positions of the skill in force; and a task's start where the hands rest. Each
+    has one thread.
     """
 
-    def __init__(self, cell: CellState, skill_worker: SkillWorker) -> None:
+    def __init__(self, cell: CellState, answers: Answers) -> None:
         self._cell = cell
-        self._skill_worker = skill_worker
+        self._answers = answers
+        self._skill_worker = answers.skill_worker
+        self._start = StartPlace(cell.settings.period_s)
+        self._beginning = threading.Thread()
         self._search = threading.Thread()
         self._next_search_s = 0.0
         self._computation = threading.Thread()
@@ -63,6 +70,27 @@ class SkillWork:
         self._cell.note_beside(
             f"the tool is stuck: {ways}, found in {time.monotonic() - began_s:.1f} s"
         )
+
+    def begin_where_hands_rest(self) -> None:
+        """Move the start of the task to hands that rest beside it. Never waits."""
+        skill = self._cell.skill
+        state = self._cell.controller.state
+        if self._beginning.is_alive() or state["skill"].tobytes() != skill.digest:
+            return
+        if points := self._start.moved(skill, state):
+            self._beginning = threading.Thread(
+                target=self._begin, args=(skill, points), name="start of the task", daemon=True
+            )
+            self._beginning.start()
+
+    def _begin(self, skill: StoredSkill, points: Sequence[ViaPoint]) -> None:
+        try:
+            self._answers.begin_at(skill, points)
+        except (RequestError, SkillError) as error:
+            self._cell.note_beside(f"the task's start stays where it was: {error}")
+        else:
+            names = ", ".join(point.name for point in points)
+            self._cell.note_beside(f"the task begins where the hands rest: {names} moved there")
 
     def tool_limits(self) -> dict[str, ToolLimits]:
         """The limits for the skill in force; empty until they are known. Never waits."""

@@ -13,6 +13,7 @@ from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import Condition, in_brief, in_full, what_to_do
 from thirdhand.contract.requests import Percentiles, Source, Status, encode_json
 from thirdhand.core.frame import Frame, Record, order
+from thirdhand.daemon.answers import Answers
 from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.clock import SystemClock
 from thirdhand.daemon.machine import BUSY_WINDOW_S, Machine, resident_mb
@@ -20,7 +21,6 @@ from thirdhand.daemon.own_answers import OwnAnswers
 from thirdhand.daemon.saved_segment import SavedSegment
 from thirdhand.daemon.side_streams import side_streams
 from thirdhand.daemon.skill_work import SkillWork
-from thirdhand.daemon.skill_worker import SkillWorker
 from thirdhand.daemon.status import CellStatus, MeasuredArm, outcome
 from thirdhand.settings.config import robot_description
 
@@ -32,7 +32,7 @@ MIN_STATUS_INTERVAL_S = 0.02  # a flood of requests must not take the interprete
 class StatusThread:
     """The work of one thread: it publishes the status, logs changes, and supervises the scribe."""
 
-    def __init__(self, cell: CellState, skill_worker: SkillWorker) -> None:
+    def __init__(self, cell: CellState, answers: Answers) -> None:
         settings = cell.settings
         self._cell = cell
 
@@ -40,7 +40,7 @@ class StatusThread:
         self._measured_arm = MeasuredArm(settings, robot_description(settings))
         self._machine = Machine()
         self._version = version("thirdhand")
-        self._skill_work = SkillWork(cell, skill_worker)
+        self._skill_work = SkillWork(cell, answers)
 
         # What is supervised.
         self._side_streams = side_streams(
@@ -109,6 +109,7 @@ class StatusThread:
         """Supervise the arm, the side streams, the system clock and the scribe."""
         cell = self._cell
         self._skill_work.find_way()
+        self._skill_work.begin_where_hands_rest()
         cell.streams.show(cell.frame, cell.controller.state)
 
         now_ns = cell.clock.stamp_ns  # a recording has one time, which never goes back

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from thirdhand.contract.explain import ExplainedError, in_words
@@ -16,55 +17,78 @@ Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
+class Workers(Protocol):
+    """A function that applies `work`, which can be pickled, to each item. The outcomes are in
+    order, and the same wherever the work is done: each piece has one BLAS thread.
+    """
+
+    def __call__(
+        self, work: Callable[[Item], Outcome], items: Sequence[Item], /
+    ) -> Iterable[Outcome]: ...
+
+
+def here(work: Callable[[Item], Outcome], items: Sequence[Item]) -> Iterable[Outcome]:
+    """The outcome of each item, one after the other in this process."""
+    return map(functools.partial(_alone, work), items)
+
+
+@contextlib.contextmanager
+def workers_of(workers: str = "1") -> Iterator[Workers]:
+    """A context with the function that shares work out to `workers`: a number of processes, or
+    `dask:ADDRESS`. Raises ExplainedError without such workers.
+    """
+    cluster, _, address = workers.partition(":")
+    option = f"--workers {workers}"
+    if workers == "1":
+        yield here
+    elif cluster == "dask":
+        with _cluster(address, option) as client, _explained(option):
+            yield lambda work, items: (
+                future.result()
+                for future in client.map(functools.partial(_alone, work), items, pure=False)
+            )
+    else:
+        processes = multiprocessing.get_context("forkserver")
+        with ProcessPoolExecutor(int(workers), mp_context=processes) as pool, _explained(option):
+            yield lambda work, items: pool.map(functools.partial(_alone, work), items)
+
+
 def spread(
     work: Callable[[Item], Outcome], items: Sequence[Item], workers: str = "1"
 ) -> Iterator[Outcome]:
-    """The outcome of each item, in order.
-
-    `workers` is a number of processes, or `dask:ADDRESS`; `work` must be a function that can be
-    pickled. Each piece of work has one BLAS thread. Raises ExplainedError without such workers.
-    """
-    alone = functools.partial(_alone, work)
-    cluster, _, address = workers.partition(":")
-    if cluster == "dask":
-        yield from _on_cluster(alone, items, address)
-    elif workers == "1":
-        yield from map(alone, items)
-    else:
-        processes = multiprocessing.get_context("forkserver")
-        with ProcessPoolExecutor(int(workers), mp_context=processes) as pool:
-            try:
-                yield from pool.map(alone, items)
-            except BrokenExecutor:
-                raise ExplainedError(
-                    f"--workers {workers}: a worker was killed, perhaps for lack of memory"
-                ) from None
+    """The outcome of each item, in order, by `workers_of`."""
+    with workers_of(workers) as each:
+        yield from each(work, items)
 
 
-def _on_cluster(
-    work: Callable[[Item], Outcome], items: Sequence[Item], address: str
-) -> Iterator[Outcome]:
-    option = f"--workers dask:{address}"
+@contextlib.contextmanager
+def _explained(option: str) -> Iterator[None]:
+    """Raise ExplainedError if a worker is killed."""
     try:
-        from distributed import Client, KilledWorker
+        yield
+    except Exception as error:
+        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+            raise ExplainedError(
+                f"{option}: a worker was killed, perhaps for lack of memory"
+            ) from None
+        raise
+
+
+def _cluster(address: str, option: str) -> Any:
+    """A client of the Dask cluster at this address. Raises ExplainedError without one."""
+    try:
+        from distributed import Client
     except ImportError:
         raise ExplainedError(f"{option}: the package distributed needed here") from None
     try:
         location = urlsplit(address if "://" in address else f"tcp://{address}")
         if not (location.hostname and location.port):  # Dask would wait for the domain name service
             raise ValueError("no host and port")
-        client = Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
+        return Client(address, timeout=CLUSTER_TIMEOUT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:  # no address, or nothing answers there
         raise ExplainedError(
             f"{option}: {in_words(error)}; a running cluster's address needed"
         ) from None
-    with client:
-        try:
-            yield from (future.result() for future in client.map(work, items, pure=False))
-        except KilledWorker:
-            raise ExplainedError(
-                f"{option}: a worker was killed, perhaps for lack of memory"
-            ) from None
 
 
 def attempt(work: Callable[[Item], Outcome], item: Item) -> Outcome | ExplainedError:

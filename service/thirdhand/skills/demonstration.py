@@ -34,6 +34,8 @@ class Demonstration(NamedTuple):
 
     If one hand `conducts` alone, its poses also stand for the other hand. `person` is empty if it
     is unknown. `begins` are the indices of the first samples after stretches that were left out.
+    `begun_s` [s] is the time from the request that began the task to the first sample; None without
+    a request.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -46,6 +48,7 @@ class Demonstration(NamedTuple):
     conducts: Hands = "both"
     person: str = ""
     begins: tuple[int, ...] = ()
+    begun_s: float | None = None
 
     @property
     def hands(self) -> Vector:

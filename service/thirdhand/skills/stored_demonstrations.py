@@ -41,6 +41,7 @@ class _About(msgspec.Struct, frozen=True, kw_only=True):
     person: str
     begins: tuple[int, ...]
     has_gripper: bool
+    begun_s: float | None = None
 
 
 def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
@@ -62,6 +63,7 @@ def packed(demonstrations: Sequence[NamedDemonstration]) -> bytes:
             person=demonstration.person,
             begins=demonstration.begins,
             has_gripper=demonstration.gripper is not None,
+            begun_s=demonstration.begun_s,
         )
         for name, demonstration in thin
     ]
@@ -129,5 +131,6 @@ def _demonstration(
             about.conducts,
             about.person,
             about.begins,
+            about.begun_s,
         ),
     )

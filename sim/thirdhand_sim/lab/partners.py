@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +29,6 @@ from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.people.into_reach import RigidMap
 from thirdhand_sim.lab.people.left_out import (
     JUDGED_HZ,
-    SESSION_RESTS_S,
     Judged,
     LeftOut,
     judged,
@@ -58,19 +58,19 @@ RECORDED = {  # prefixes of the files' names
     "robot holds driver": ("robot_hold_driver",),
     "robot hands over plate": ("robot_hand_over_plate",),
     "robot hands over screw": ("robot_hand_over_screw",),
+    "screw, begun by a request": ("robot_hand_over_screw",),
     "those three in one": ("robot_hold_driver", "robot_hand_over_plate", "robot_hand_over_screw"),
     "give": ("give",),
     "walk": ("walk",),
 }
 GROUPED_BY_PERSON = ("give",)  # tasks whose groups are persons
 NAMES_PLACES = ("give",)  # tasks whose takes begin and end at via-points
+REQUESTED = ("screw, begun by a request",)  # tasks whose takes a request begins
 TAKES_OF_BLOCK = 9  # takes of `walk` that are left out together
 PARTNER_SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
 OWN = 3  # takes by which a person refines the skill of the others
 PARTNERS_SHOWING = len(PARTNER_SEEDS.learned[TASK_KINDS[0]].numbers)
-WANTED_TOLD = 90.0  # [%] of the samples with an error above UNSURE_M should be held or unsure
-ACCEPTED_FALSELY_TOLD = 15.0  # [%] of the other samples may be held or unsure
 # in the figure: label, and colour of refused skills
 GIVEN = ", via-points given"
 REFUSED = "#F6D2BD"
@@ -103,8 +103,8 @@ class SkillFold(NamedTuple):
     residual: tuple[str, ...]  # risks that somebody must accept before the daemon serves it
     figures: Figures | None  # None if nothing could be learned
     model: str
-    accepted: list[Judged | None]  # each take with the command's skill; None: refused
-    again: list[list[Judged]]  # further rounds of each accepted take, by their rests
+    # each round of each take with the command's skill; none if it is refused
+    accepted: list[list[Judged]]
     # each take of a refused fold, with the skill used in spite of the refusal
     in_spite: list[Judged]
     take_refusals: list[str]  # via-points that the skill cannot be adapted to
@@ -148,7 +148,8 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
             path.stem,
             group,
             read(path, named=task in NAMES_PLACES)._replace(
-                person=group * (task in GROUPED_BY_PERSON)
+                person=group * (task in GROUPED_BY_PERSON),
+                begun_s=0.0 if task in REQUESTED else None,
             ),
         )
         for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
@@ -227,11 +228,9 @@ def served(
     """
     skill, refusals = as_command(shown, told=told, refined=refined)
     if skill is None:
-        return SkillFold(refusals, (), None, "", [None] * len(asked), [], [], [])
+        return SkillFold(refusals, (), None, "", [[] for _ in asked], [], [])
     figures = figures_of(skill)
-    fold = SkillFold(
-        refusals, figures.residual, figures, type(skill.model).__name__, [], [], [], []
-    )
+    fold = SkillFold(refusals, figures.residual, figures, type(skill.model).__name__, [], [], [])
     for take in asked:
         rounds: list[Judged] = []
         try:
@@ -244,10 +243,7 @@ def served(
             fold.take_refusals.append(str(error))
         if refusals:
             fold.in_spite.extend(rounds[:1])
-            fold.accepted.append(None)
-        else:
-            fold.accepted.append(rounds[0] if rounds else None)
-            fold.again.extend([rounds[1:]] if rounds else [])
+        fold.accepted.append([] if refusals else rounds)
     return fold
 
 
@@ -288,7 +284,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             for result in by_task[task]
             for fold in result.service.values()
         ]
-        numbers[f"all_{kind}"] = summary(_accepted(folds))
+        numbers[f"all_{kind}"] = _accepted(folds)
     draw_numbers(results, numbers)
     return numbers
 
@@ -310,7 +306,7 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
         numbers["moved"] = [part.moved for part in found]
     own_folds = [part.own for part in found if part.own]
     if own_folds:
-        numbers["own_takes"] = summary(_accepted(own_folds)) | {
+        numbers["own_takes"] = _accepted(own_folds) | {
             "own": OWN,
             "folds_refused": sum(bool(fold.refusals) for fold in own_folds),
             "weights": [fold.figures.weight for fold in own_folds if fold.figures],
@@ -318,24 +314,25 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
     return numbers
 
 
-def _accepted(folds: Sequence[SkillFold]) -> list[Judged]:
-    """The accepted takes of some folds."""
-    takes = [take for fold in folds for take in fold.accepted]
-    return [take for take in takes if take]
+def _accepted(folds: Sequence[SkillFold]) -> dict[str, Any]:
+    """The numbers of all rounds of accepted takes, and the error [mm] by round."""
+    takes = [take for fold in folds for take in fold.accepted if take]
+    rounds = [summary(takes_of_round).get("rms_mm") for takes_of_round in zip(*takes, strict=True)]
+    numbers = summary([one for take in takes for one in take])
+    return numbers | {"takes": len(takes), "rounds_mm": rounds}
 
 
 def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:
     """The numbers of the service in one setting."""
     folds = [part.service[name] for part in found]
-    accepted = [take is not None for fold in folds for take in fold.accepted]
-    return summary(_accepted(folds)) | {
+    accepted = [bool(take) for fold in folds for take in fold.accepted]
+    return _accepted(folds) | {
         "folds": len(folds),
         "folds_refused": sum(bool(fold.refusals) for fold in folds),
         "folds_at_risk": sum(bool(fold.residual and not fold.refusals) for fold in folds),
         "risks": _first_two(fold.residual for fold in folds),
         "refuses": accepted.count(False),
         "reasons": _first_two((*fold.refusals, *fold.take_refusals) for fold in folds),
-        "again": _again(folds),
         "in_spite_of_refusal": summary([take for fold in folds for take in fold.in_spite]),
         "beside_mm": _beside(found, name.removeprefix(SERVICE), accepted),
         "model": next((fold.model for fold in folds if fold.model), None),
@@ -346,15 +343,6 @@ def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:
 def _first_two(texts: Iterable[Iterable[str]]) -> list[str]:
     """The first two different texts."""
     return list(dict.fromkeys(itertools.chain.from_iterable(texts)))[:2]
-
-
-def _again(folds: Sequence[SkillFold]) -> dict[str, dict[str, Any]]:
-    """The numbers of further rounds, by the rest before them [s]."""
-    rounds = [take for fold in folds for take in fold.again]
-    return {
-        f"{rest_s:g}": summary([take[i] for take in rounds])
-        for i, rest_s in enumerate(SESSION_RESTS_S)
-    }
 
 
 def _beside(
@@ -376,6 +364,7 @@ def _said(figures: Sequence[Figures]) -> dict[str, Any]:
         "learn_says_mm": float(np.mean([skill.all.error_mm for skill in figures])),
         "ambiguous": float(np.mean([skill.ambiguous for skill in figures])) / 100,
         "unsafe": sum(bool(skill.unsafe) for skill in figures),
+        "taken": Counter(skill.taken for skill in figures),
         "says": [*figures[0].unsafe, *figures[0].warnings],
     }
 
@@ -400,7 +389,31 @@ def summary(takes: Sequence[Judged]) -> dict[str, Any]:
         # the shares of wrong samples, and of the others, at which the skill held or was unsure
         "told": _share([take.told for take in takes], wrong),
         "falsely_told": _share([take.falsely_told for take in takes], count - wrong),
+        **_detection(takes),
     }
+
+
+def _detection(takes: Sequence[Judged]) -> dict[str, Any]:
+    """How probabilities of an error tell right and wrong samples apart: the shares of right and of
+    wrong ones above each of PROBABILITIES, the area under this curve, and the mean squared
+    difference of the probabilities from the truth, beside that of a constant probability.
+    """
+    counts = [take.by_probability for take in takes if take.by_probability is not None]
+    if not counts:
+        return {}
+    by_probability = np.sum(counts, axis=0)
+    right, wrong = by_probability.sum(axis=1)
+    count = right + wrong
+    numbers = {
+        "brier": sum(take.brier for take in takes) / count,
+        "brier_of_constant": right * wrong / count**2,
+    }
+    if not wrong or not right:
+        return numbers
+    above = np.cumsum(by_probability[:, ::-1], axis=1) / [[right], [wrong]]
+    curve = np.hstack([np.zeros((2, 1)), above])
+    area = float(np.trapezoid(curve[1], curve[0]))
+    return numbers | {"roc": np.round(curve, 4).tolist(), "area_under_roc": area}
 
 
 def _share(counts: Sequence[float | None], total: int) -> float | None:
@@ -413,7 +426,8 @@ def _share(counts: Sequence[float | None], total: int) -> float | None:
 
 def _line(fold: SkillFold) -> str:
     """A fold as a line of progress."""
-    text = brief(summary([row for row in fold.accepted if row] or fold.in_spite))
+    rounds = [one for take in fold.accepted for one in take]
+    text = brief(summary(rounds or fold.in_spite))
     return f"refused ({fold.refusals[0]}), in spite of it {text}" if fold.refusals else text
 
 
@@ -551,7 +565,7 @@ def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
     plt = pyplot()
     figure, (inside, warned) = plt.subplots(1, 2, figsize=(7.5, 3.6))
     inside.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
-    warned.axvspan(0, ACCEPTED_FALSELY_TOLD, ymin=WANTED_TOLD / 105, color="#eeeeee", zorder=0)
+    warned.plot([0, 100], [0, 100], color="#dddddd", zorder=0)
     for part, colour, label in (
         ("recorded", TOOL_COLOUR, "recorded partners"),
         ("made", ADAPTED, "made tasks"),
@@ -560,22 +574,20 @@ def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
             name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
             scores = task["methods"][name]
             if scores["takes"] and scores["coverage"]:
-                inside.plot(
-                    100 * np.array(numbers["levels"]),
-                    100 * np.array(scores["coverage"]),
-                    ".-",
-                    color=colour,
-                    lw=0.8,
+                levels, shares = (
+                    100 * np.array(scores_or)
+                    for scores_or in (numbers["levels"], scores["coverage"])
                 )
-            if scores.get("falsely_told") is not None and scores["told"] is not None:
-                warned.plot(
-                    100 * scores["falsely_told"], 100 * scores["told"], "o", color=colour, ms=5
-                )
+                inside.plot(levels, shares, ".-", color=colour, lw=0.8)
+            if "roc" in scores:
+                warned.plot(*(100 * np.array(scores["roc"])), color=colour, lw=0.8)
+                told = 100 * scores["falsely_told"], 100 * scores["told"]
+                warned.plot(*told, "o", color=colour, ms=4)
         inside.plot([], [], ".-", color=colour, label=label)
     inside.set(
         xlim=(0, 100), ylim=(0, 100), xlabel="confidence region [%]", ylabel="samples inside [%]"
     )
-    warned.set(xlim=(0, 100), ylim=(0, 105), xlabel="right samples held or unsure [%]")
-    warned.set_ylabel("wrong samples held or unsure [%]")
+    warned.set(xlim=(0, 100), ylim=(0, 100), xlabel="right samples above a probability [%]")
+    warned.set_ylabel("wrong samples above it [%]")
     inside.legend(fontsize=8)
     results.figure(figure, "reliability")

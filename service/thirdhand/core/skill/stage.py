@@ -12,7 +12,7 @@ from thirdhand.core.skill.model import Seen, Target, Wanted
 from thirdhand.core.skill.pose import NO_GRIPPER
 from thirdhand.core.skill.skill import NEVER, Skill, clamp, reach_of
 from thirdhand.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_segment
-from thirdhand.core.skill.task_clock import move
+from thirdhand.core.skill.task_clock import GONE, NOT_BEGUN, PROGRESS, forget, is_requested, move
 from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
 from thirdhand.core.skill.unseen import deviation_m, off_m
 from thirdhand.core.tuning import TUNING, Tuning
@@ -51,6 +51,7 @@ class SkillStage:
         self._lag_s = MEMORY_LAG_S if skill.model.remembers else delay_s / ORDER
         self._turn_lag_s = turn_lag_s(delay_s if skill.model.turned else 0.0)
         self._clock = skill.model.clock_rows
+        self._is_requested = is_requested(skill.model.clock)
         side = skill.conductor
         self._sides = np.array([0, 1] if side is None else [side, side])
         regions = skill.regions
@@ -171,13 +172,23 @@ class SkillStage:
 
     def _count(self, state: Record) -> None:
         """Advance the clock of the task to this tick, if the skill has one. While a hand is not
-        seen, it waits.
+        seen, it waits, unless it is REQUESTED.
         """
         if self._clock is None:
             return
         before = int(state["memory_ticks"].max())
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
-        move(as_array(state), self._sides, min(passed_s, MEMORY_LONGEST_STEP_S), self._clock)
+        if not self._is_requested:
+            passed_s = min(passed_s, MEMORY_LONGEST_STEP_S)
+        move(as_array(state), self._sides, passed_s, self._clock)
+
+    def begin(self, state: Record) -> None:
+        """Begin the task anew. A clock that is REQUESTED starts; another one starts as the hands
+        move.
+        """
+        forget(as_array(state))
+        state["task_clock"] = 0.0
+        state["task_clock"][PROGRESS] = GONE if self._is_requested else NOT_BEGUN
 
     def set_segment(self, state: Record, name: str) -> None:
         """Set the belief to the segment that begins at the via-point of this name (at the last

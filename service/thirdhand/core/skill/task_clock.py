@@ -5,6 +5,8 @@ t' [s] it advances at a rate r, which follows its goal g with the time constant 
 
     dt/dt' = r,   dr/dt' = (g - r) / CLOCK_LAG_S
 
+* A clock that was REQUESTED starts by a request alone: t = r = 0 then, and g = 1 from there to
+  `longest_s`. Of what follows, nothing applies to it.
 * g = 1 for a clock that runs. g = 1 - s for a clock that waits, with the stillness s of the hand
   that is less still.
 * g = 0 once t has reached `longest_s`, the end of the longest demonstration.
@@ -42,12 +44,17 @@ from thirdhand.core.vectors import norm, squared_distance
 # entries of `task_clock` in the state
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_SEGMENT, PROGRESS, OWN_BEGIN = range(7)
 CLOCK_SIZE = OWN_BEGIN + 6  # their number
-# values of PROGRESS: hands that rest, that moved, that left where they began
+# values of `TaskClock.pace`: the clock runs on while the hands rest, waits for them, or is started
+# by a request
+RUNS = 0
+WAITS = 1
+REQUESTED = 2
+# values of PROGRESS: hands that rest, that moved, that left where they began; a request is GONE
 NOT_BEGUN = 0.0
 NEAR_BEGIN = 1.0
 GONE = 2.0
 # entries of `TaskClock.numbers`
-WAITS_AT = 0
+PACE_AT = 0
 LONGEST_AT = 2
 OVER_AT = 3
 REST_AT = 4
@@ -62,7 +69,7 @@ MOST_CLOCK_WEIGHT = 100.0
 class TaskClock(NamedTuple):
     """Parameters of the clock of a skill."""
 
-    waits: bool  # true if the clock waits while both hands rest
+    pace: int  # RUNS, WAITS or REQUESTED
     # As an input, a second counts as this length [m], with segments as this share of a path. With
     # 0, the clock is no input, and only shows when a task begins again.
     weight: float
@@ -92,17 +99,27 @@ class TaskClock(NamedTuple):
         values = [float(number) for number in numbers]
         if len(values) != BEGIN_AT + 6:
             raise ValueError(f"task_clock has {len(values)} numbers, {BEGIN_AT + 6} needed")
-        waits, weight, longest_s, over_s, rest_s, home_s, near_m = values[:BEGIN_AT]
-        largest = (1.0, MOST_CLOCK_WEIGHT, *4 * [LONGEST_CLOCK_S], *7 * [MAX_SKILL_DISTANCE_M])
+        pace, weight, longest_s, over_s, rest_s, home_s, near_m = values[:BEGIN_AT]
+        largest = (
+            REQUESTED,
+            MOST_CLOCK_WEIGHT,
+            *4 * [LONGEST_CLOCK_S],
+            *7 * [MAX_SKILL_DISTANCE_M],
+        )
         is_in_range = all(abs(value) <= most for value, most in zip(values, largest, strict=True))
-        if not is_in_range or min(values[:BEGIN_AT]) < 0.0:
+        if not is_in_range or min(values[:BEGIN_AT]) < 0.0 or pace % 1.0:
             raise ValueError(
                 f"task_clock is {values}: numbers from 0 to {largest[:BEGIN_AT]} and a begin [m] "
                 "needed"
             )
         return TaskClock(
-            waits > 0.0, weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:])
+            int(pace), weight, longest_s, over_s, rest_s, home_s, near_m, tuple(values[BEGIN_AT:])
         )
+
+
+def is_requested(clock: TaskClock | None) -> bool:
+    """True if there is a clock that only a request starts."""
+    return clock is not None and clock.pace == REQUESTED
 
 
 @compiled
@@ -146,6 +163,33 @@ def count(
     """
     numbers = rows[segment]
     begins_again = False
+    goal = 0.0
+    if numbers[PACE_AT] == REQUESTED:
+        if clock[PROGRESS] == GONE and clock[CLOCK_S] < numbers[LONGEST_AT]:
+            goal = 1.0
+    else:
+        begins_again = _follow(hands, speed, period_s, segment, still, rows, clock)
+        if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
+            goal = 1.0 - still if numbers[PACE_AT] == WAITS else 1.0
+    clock[CLOCK_RATE] += (1.0 - exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
+    clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
+    clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
+    return begins_again
+
+
+@compiled
+def _follow(
+    hands: Vector,
+    speed: float,
+    period_s: float,
+    segment: int,
+    still: float,
+    rows: Vector,
+    clock: Vector,
+) -> bool:
+    """Start and end a clock by the hands, see `count`; true if the task begins again."""
+    numbers = rows[segment]
+    begins_again = False
     if clock[CLOCK_SEGMENT] != segment:
         clock[:CLOCK_SEGMENT] = 0.0
         clock[CLOCK_SEGMENT] = segment
@@ -174,13 +218,6 @@ def count(
             and _are_near(hands, numbers[BEGIN_AT:], numbers[NEAR_AT])
         ):
             clock[CLOCK_S] = clock[CLOCK_RATE] = 0.0
-
-    goal = 0.0
-    if clock[REST_LEFT_S] > 0.0 and clock[CLOCK_S] < numbers[LONGEST_AT]:
-        goal = 1.0 - still if numbers[WAITS_AT] > 0.0 else 1.0
-    clock[CLOCK_RATE] += (1.0 - exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
-    clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
-    clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
     return begins_again
 
 
@@ -203,9 +240,15 @@ def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vecto
         if state.segment_belief[k] > state.segment_belief[segment]:
             segment = k
     if count(hands, speed, still, passed_s, segment, rows, state.task_clock):
-        state.memory_ticks[:] = -1
-        state.segment_belief[:] = 0.0
-        state.unprimed_belief[:] = 0.0
+        forget(states)
+
+
+@compiled
+def forget(states: Records) -> None:
+    """End the memory of the hands and the belief: the task begins again."""
+    states[0].memory_ticks[:] = -1
+    states[0].segment_belief[:] = 0.0
+    states[0].unprimed_belief[:] = 0.0
 
 
 @compiled
@@ -214,11 +257,18 @@ def _counted(
     segments: NDArray[np.int64],
     period_s: float,
     steps: int,
+    ahead: int,
     rows: Vector,
     out: Vector,
 ) -> None:
-    """Compiled part of `counted`; `moving` (T, 8) are hands, speed and stillness."""
+    """Compiled part of `counted`; `moving` (T, 8) are hands, speed and stillness, and a clock that
+    was REQUESTED started `ahead` steps before them.
+    """
     clock = np.zeros(CLOCK_SIZE)
+    if rows[0, PACE_AT] == REQUESTED:
+        clock[PROGRESS] = GONE
+        for _ in range(ahead):
+            count(moving[0, :6], 0.0, 1.0, period_s / steps, 0, rows, clock)
     for t in range(len(moving)):
         for step in range(steps if t else 0):
             now = moving[t - 1] + (step + 1) / steps * (moving[t] - moving[t - 1])
@@ -233,14 +283,17 @@ def counted(
     period_s: float,
     rows: Vector,
     segments: NDArray[np.int64] | None = None,
+    begun_s: float = 0.0,
 ) -> Vector:
     """The clock (T,) [s] along hands (T, 6) [m], in the `segments` (T,). `speeds` (T,) [m/s] are
     those of the faster hand, `stillness` (T,) is that of the less still one. `rows` are those of
-    `count`.
+    `count`. A clock that was REQUESTED started `begun_s` [s] before the first sample.
     """
     out = np.empty(len(hands))
     steps = max(1, math.ceil(period_s / MEMORY_STEP_S))
     if segments is None:
         segments = np.zeros(len(hands), np.int64)
-    _counted(np.column_stack([hands, speeds, stillness]), segments, period_s, steps, rows, out)
+    moving = np.column_stack([hands, speeds, stillness])
+    ahead = round(begun_s * steps / period_s)
+    _counted(moving, segments, period_s, steps, ahead, rows, out)
     return out

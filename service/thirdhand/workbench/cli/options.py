@@ -242,6 +242,7 @@ def learn(add: AddCommand) -> None:
         "errors)"
     )
     option(c, "--delay", "S", delay, type=within(float, 0.0, 1.0, " s"))
+    option(c, "--workers", "WORKERS", WORKERS_HELP)
     option(
         c,
         "--config",

@@ -131,7 +131,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     cell = args.cell or settings.cell
     ended = EnterPressed()
     with inputs_session(args, CONNECT_TIMEOUT_S, settings) as session:
-        if args.until == "key":
+        if args.until == "key" and not args.begin:
             say("Enter or Ctrl-C ends it")
         captured = capture(
             session,
@@ -142,6 +142,7 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
             conducts=args.hands,
             person=args.person or "",
             is_ended=ended,
+            is_begun=ended if args.begin else None,
             wait_s=args.wait,
             longest_s=args.seconds,
             progress=_progress if sys.stderr.isatty() else lambda line: None,

@@ -40,6 +40,10 @@ def add_options(c: argparse.ArgumentParser) -> None:
         "person together"
     )
     option(c, "--person", "NAME", person)
+    begin = (
+        "begin the take at Enter, and store that: for a timetable, which `thirdhand begin` begins"
+    )
+    flag(c, "--begin", begin)
     until = (
         "end the take by a key (Enter or Ctrl-C), or also once hands and tool rest after they "
         "moved: all stay within 15 mm, joints within 0.02 rad (of the rest before and after, 0.3 s "

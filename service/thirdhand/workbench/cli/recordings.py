@@ -148,6 +148,7 @@ def learn(args: argparse.Namespace) -> int:
             name=name,
             names=names,
             delay_s=args.delay,
+            workers=args.workers or "1",
             reach=settings.reach if settings else None,
             accepted_by=accepted_by,
             refined=refined,

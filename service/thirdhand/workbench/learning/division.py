@@ -259,9 +259,10 @@ class Encoded(Divided):
 
     def near(self, corner: tuple[float, float], segments: Sequence[int]) -> NDArray[np.bool_]:
         """Return whether the hands' shares are near these in one of these segments (T,)."""
-        return np.asarray(
-            np.isin(self.labels, segments) & (np.abs(self.along - corner).max(axis=1) < NEAR)
+        left, right = (
+            np.abs(share - place) < NEAR for share, place in zip(self.along.T, corner, strict=True)
         )
+        return np.asarray(np.isin(self.labels, segments) & left & right)
 
     def rows(self, shares: Vector) -> Indices:
         """Rows at shares of the path of hands and tool, and a little of the time."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from kmp.criteria.cross_validation import rms
+from thirdhand.process.parallel import workers_of
 from thirdhand.settings.config import Reach
 from thirdhand.skills.demonstration import Demonstration, exchanged
 from thirdhand.skills.skill_file import SkillError, StoredSkill
@@ -35,6 +36,7 @@ def learn(
     spread_m: float = 0.01,
     seed: int = 0,
     delay_s: float | None = None,
+    workers: str = "1",
     reach: Reach | None = None,
     accepted_by: str = "",
     refined: StoredSkill | None = None,
@@ -51,6 +53,7 @@ def learn(
     * `spread_m`: added to the standard deviation of a mixture's reference [m].
     * `seed`: seed of the mixture.
     * `delay_s`: the teacher's delay [s] between via-points; None to choose it.
+    * `workers`: number of processes that share the work, or `dask:ADDRESS`; the skill is the same.
     * `reach`: reach of the arm, in which the tool's path should be.
     * `accepted_by`: person who accepts the residual risks of the skill; empty for nobody.
     * `refined`: skill that is refined by the demonstrations. Those in its file are learned from as
@@ -60,21 +63,22 @@ def learn(
 
     Raises SkillError if nothing can be learned.
     """
-    options = Options(points, ell, components, penalty, spread_m, seed, delay_s)
     before = stored_demonstrations(refined) if refined else ()
-    division = divided(demonstrations, names, options, before)
-    fitted, pose = _fitted(division, progress)
-    if odd_m := standing_out(fitted.held_out):
-        named = {take.name: take.demonstration for take in division.takes}
-        remarks = [
-            _remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()
-        ]
-        inliers = {
-            name: demonstration for name, demonstration in named.items() if name not in odd_m
-        }
-        division = divided(list(inliers.values()), list(inliers), options, before)
-        division = division._replace(remarks=[*remarks, *division.remarks])
+    with workers_of(workers) as spread:
+        options = Options(points, ell, components, penalty, spread_m, seed, delay_s, spread)
+        division = divided(demonstrations, names, options, before)
         fitted, pose = _fitted(division, progress)
+        if odd_m := standing_out(fitted.held_out):
+            named = {take.name: take.demonstration for take in division.takes}
+            remarks = [
+                _remark(name, error_m, named, options, progress) for name, error_m in odd_m.items()
+            ]
+            inliers = {
+                name: demonstration for name, demonstration in named.items() if name not in odd_m
+            }
+            division = divided(list(inliers.values()), list(inliers), options, before)
+            division = division._replace(remarks=[*remarks, *division.remarks])
+            fitted, pose = _fitted(division, progress)
     judgement = judged(division, fitted, pose, reach or Reach(), accepted_by=accepted_by)
     skill = stored(name, division, fitted, pose, judgement)
     show(Evidence(skill, judgement.figures, fitted.held_out, judgement.inside))

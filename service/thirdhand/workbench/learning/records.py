@@ -17,6 +17,7 @@ from thirdhand.core.skill.model import Model, Regions, standard_deviations
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
 from thirdhand.core.skill.support import error_probability
 from thirdhand.core.skill.tuning import UNSURE_M
+from thirdhand.process.parallel import Workers, here
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import StoredSkill
 from thirdhand.workbench.learning.gate import Gate
@@ -36,6 +37,7 @@ class Options(NamedTuple):
     spread_m: float
     seed: int
     delay_s: float | None = None  # of the teacher, between via-points; None: chosen
+    spread: Workers = here
 
 
 class Take(NamedTuple):

@@ -51,6 +51,7 @@ from thirdhand.core.skill.model import (
 )
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.support import LocalErrors
+from thirdhand.process.parallel import Workers
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import SkillError
 from thirdhand.skills.via_points import check_agreement
@@ -157,6 +158,7 @@ def local_errors(
     inputs: Sequence[Vector],
     primitive: KMP,
     refitted: Callable[[list[int]], HandsKMP],
+    spread: Workers,
 ) -> tuple[list[TimedErrors], LocalErrors]:
     """The errors at the same moment of takes with inputs (T, I), by models that are `refitted` to
     all blocks of takes but their own, with covariances and signs by the errors of the other blocks;
@@ -167,7 +169,8 @@ def local_errors(
     """
     blocks = blocks_of(persons_of(takes))
     unknown_std_m = unknown_std(takes)
-    models = [refitted([i for i in range(len(takes)) if i not in block]) for block in blocks]
+    others = [[i for i in range(len(takes)) if i not in block] for block in blocks]
+    models = list(spread(refitted, others))
     tools: dict[int, Vector] = {}
     for block, model in zip(blocks, models, strict=True):
         for i in block:
@@ -185,8 +188,7 @@ def local_errors(
         return LocalErrors.of(kmp, kept_inputs, kept_errors, unknown_std_m)
 
     out: dict[int, TimedErrors] = {}
-    for block, model in zip(blocks, models, strict=True):
-        numbers = [i for i in range(len(takes)) if i not in block]
+    for block, numbers, model in zip(blocks, others, models, strict=True):
         of_others = replace(model, errors=retained(model.primitive, numbers))
         for i in block:
             rows = _judged_rows(len(tools[i]))

@@ -26,6 +26,7 @@ from thirdhand.settings.config import HandSettings, Settings
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.takes.hands_and_tool import chosen
 from thirdhand.workbench.takes.pose_streams import (
+    BEGIN_TOPIC,
     GRIPPER_STATE,
     VIA_POINTS_TOPIC,
     PoseRecording,
@@ -52,10 +53,11 @@ def write_demonstration(
     """Write a demonstration in frame `base`.
 
     Equal arrays give equal bytes. Raises ValueError for arrays of a wrong shape, or that are not
-    finite, and for stamps that are not integers from 0 on.
+    finite, and for stamps that are not integers from 0 on, also that of a request.
     """
     stamps_ns = np.asarray(demonstration.stamps_ns)
-    _check_stamps(stamps_ns)
+    begun_ns = stamps_ns[:1] - round(1e9 * (demonstration.begun_s or 0.0))
+    _check_stamps(np.append(stamps_ns, begun_ns))
     count = len(stamps_ns)
     poses = _poses_of(demonstration)
     for name, stream in poses.items():
@@ -76,15 +78,13 @@ def write_demonstration(
             if gripper is not None:
                 data = cdr.encode_joints(JointState(stamp, (GRIPPER,), (float(gripper[i]),), ()))
                 file.put(topic(cell, GRIPPER_STATE), JOINTS.type, data, stamp, i)
+        texts = {}
         if demonstration.via_points:
-            text = encode_json(demonstration.via_points).decode()
-            file.put(
-                topic(cell, VIA_POINTS_TOPIC),
-                STRING.type,
-                cdr.encode_string(text),
-                int(stamps_ns[0]),
-                0,
-            )
+            texts[VIA_POINTS_TOPIC] = encode_json(demonstration.via_points).decode(), stamps_ns[0]
+        if demonstration.begun_s is not None:
+            texts[BEGIN_TOPIC] = "{}", begun_ns[0]
+        for name, (text, at_ns) in texts.items():
+            file.put(topic(cell, name), STRING.type, cdr.encode_string(text), int(at_ns), 0)
 
 
 def _check_stamps(stamps_ns: NDArray[Any]) -> None:
@@ -175,7 +175,18 @@ def read_demonstration(
         common.conducts,
         recorded.person,
         common.begins,
+        _begun_s(recorded, one_clock.tracks, int(common.stamps_ns[0])),
     )
+
+
+def _begun_s(recorded: PoseRecording, tracks: Sequence[Track], first_ns: int) -> float | None:
+    """The time [s] from the request that began the task to the stamp `first_ns`; None without one.
+    A request has a time of recording only, from which stamps may differ by a constant.
+    """
+    if recorded.begun_ns is None:
+        return None
+    ahead_ns = np.median([np.median(track.stamps_ns - track.logged_ns) for track in tracks])
+    return max(0.0, (first_ns - recorded.begun_ns - float(ahead_ns)) / 1e9)
 
 
 def _settings_of(recorded: PoseRecording, cell: Settings | None) -> Settings:

@@ -49,6 +49,7 @@ TRACK_NAMES = ("left", "right", "tool")
 JOINT_STATES = "joints/state"
 GRIPPER_STATE = "gripper/state"
 VIA_POINTS_TOPIC = "via_points"
+BEGIN_TOPIC = "begin"
 STATE_PARTS_TIMEOUT_S = 0.1  # an arm's state may arrive in several messages within this time
 FROM_ARRAYS = "A few lines of Python make a take from arrays: docs/arrays.md"
 NOT_READ = {
@@ -142,6 +143,7 @@ class PoseRecording:
         self.via_points: tuple[ViaPoint, ...] = ()  # recorded via-points of the task
         self.conducts: Hands = "both"  # the hands that lead the tool in a take
         self.person = ""  # the person who demonstrates in a take
+        self.begun_ns: int | None = None  # when a request began the take
         self._raw: dict[
             str, list[tuple[int, bytes]]
         ] = {}  # time of recording [ns] and bytes of messages by topic
@@ -185,6 +187,8 @@ class PoseRecording:
                 self._raw.setdefault(channel.topic, []).append((message.log_time, message.data))
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{VIA_POINTS_TOPIC}"):
                 self._read_via_points(message.data)
+            elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{BEGIN_TOPIC}"):
+                self.begun_ns = message.log_time
         self.faults = messages.faults
         about = messages.metadata.get("thirdhand", {})
         self.conducts = next(

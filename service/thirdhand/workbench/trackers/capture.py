@@ -37,7 +37,12 @@ from thirdhand.workbench.takes.demonstration_reader import (
     unknown_frame,
 )
 from thirdhand.workbench.takes.dwells import REST_M
-from thirdhand.workbench.takes.pose_streams import GRIPPER_STATE, JOINT_STATES, VIA_POINTS_TOPIC
+from thirdhand.workbench.takes.pose_streams import (
+    BEGIN_TOPIC,
+    GRIPPER_STATE,
+    JOINT_STATES,
+    VIA_POINTS_TOPIC,
+)
 from thirdhand.workbench.takes.tool_poses import tool_poses
 from thirdhand.workbench.takes.track import Track
 
@@ -97,6 +102,7 @@ class Capture:
         self.settings = settings
         self.conducts = conducts
         self.person = person
+        self.begun_ns: int | None = None  # when a request began the demonstration
         self._urdf = robot_description(settings)
         self.hands = HAND_KEYS if conducts == "both" else (TAKE_KEYS[conducts],)
         self.samples: dict[str, list[Sample]] = {
@@ -280,6 +286,8 @@ class Capture:
         """
         times_ns = [sample.arrived_ns for samples in self.streams.values() for sample in samples]
         start_ns, end_ns = self.span_of_motion()
+        if self.begun_ns is not None:
+            start_ns = min(times_ns)
         for key, samples in self.samples.items():
             self.samples[key] = [
                 sample for sample in samples if start_ns <= sample.arrived_ns <= end_ns
@@ -324,9 +332,12 @@ class Capture:
             for arrived_ns, stamp_ns, pose_row in rows:
                 pose = PoseStamped(stamp_ns, BASE, tuple(pose_row[:3]), tuple(pose_row[3:]))
                 messages.append((arrived_ns, TOOL_KEY, channels.POSE.encode(pose)))
+        texts = {}
         if via_points:
-            text = cdr.encode_string(encode_json(tuple(via_points)).decode())
-            messages.append((min(messages)[0], VIA_POINTS_TOPIC, text))
+            texts[VIA_POINTS_TOPIC] = min(messages)[0], encode_json(tuple(via_points)).decode()
+        if self.begun_ns is not None:
+            texts[BEGIN_TOPIC] = self.begun_ns, "{}"
+        messages += [(at_ns, key, cdr.encode_string(text)) for key, (at_ns, text) in texts.items()]
         with whole_file(path, joints=len(self.settings.joints.names)) as file:
             now_ns = time.time_ns()
             about = {"cell": self.cell, "hands": self.conducts, "person": self.person, **machine()}
@@ -334,7 +345,7 @@ class Capture:
             file.attach("settings.json", msgspec.json.encode(self.settings), now_ns)
             file.attach("arm.urdf", self._urdf.encode(), now_ns)
             for i, (arrived_ns, key, payload) in enumerate(sorted(messages)):
-                codec = channels.STRING if key == VIA_POINTS_TOPIC else channels.BY_KEY[key].codec
+                codec = channels.STRING if key in texts else channels.BY_KEY[key].codec
                 file.put(channels.key(self.cell, key), codec.type, payload, arrived_ns, i)
 
     def tool_by(self, states: Sequence[Sample]) -> Track:
@@ -374,11 +385,13 @@ def capture(
     is_ended: Callable[[], bool],
     wait_s: float,
     longest_s: float,
+    is_begun: Callable[[], bool] | None = None,
     progress: Callable[[str], None] = lambda line: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Capture:
     """Capture a demonstration, from the first messages of hands and tool until `is_ended`, until
     everything rests for `rest_s` [s] after a motion, or until CAPTURE_SILENCE_S without a message.
+    If `is_begun` is given, it begins once that is true, as at a request.
 
     Raises CaptureError if hands and tool are not received within `wait_s` [s].
     """
@@ -390,6 +403,12 @@ def capture(
         _await_streams(captured, others, is_ended, wait_s)
         others.close()
         captured.check()
+        if is_begun is not None:
+            say("hands and tool arrive: Enter begins the take")
+            while not is_begun():
+                time.sleep(CAPTURE_POLL_S)
+                captured.collect()
+            captured.begun_ns = time.time_ns()
         captured.begin()
         say(f"recording{f'; it ends once {end.at_rest} after a motion' if until == 'rest' else ''}")
         if reason := _collect(captured, is_ended, end, progress):

@@ -39,6 +39,7 @@ from thirdhand_sim.lab.rivals.method import Observed, Predicted
 CORE_HZ = 125
 JUDGED_HZ = 25
 LONGEST_SHIFT_S = 1.0
+PROBABILITIES = np.logspace(-4.0, 0.0, 60)
 SESSION_RESTS_S = (0.5, 1.0, 3.0, 6.0)  # rests before the further rounds of a session
 BACK_S = 2.0  # duration of the hands' return to the begin of the take
 UNBOUNDED_M = 1e3  # corners of a workspace that does not clamp
@@ -82,6 +83,9 @@ class Judged(NamedTuple):
     # number of wrong samples, and of the others, at which the skill held or was unsure
     told: int | None
     falsely_told: int | None
+    # numbers (2, B) of right and wrong samples by their probability of an error, at PROBABILITIES
+    by_probability: Array | None
+    brier: float  # sum of the squared differences of these probabilities from 0 and 1
 
 
 @cache
@@ -113,11 +117,12 @@ def predicted_rounds(
     `predicted`.
     """
     hands, begins = session_of(take.demonstration, broken_share)
-    prediction = _through_core(hands, skill, reach)[2]
+    prediction = _through_core(hands, skill, reach, begins)[2]
     count = len(take.times)
     assert prediction.covariance is not None
     assert prediction.held is not None
     assert prediction.uncertain is not None
+    assert prediction.probability is not None
     parts = [slice(begin, begin + count) for begin in begins]
     return [
         Predicted(
@@ -126,6 +131,7 @@ def predicted_rounds(
             prediction.held[part],
             prediction.uncertain[part],
             prediction.radii,
+            prediction.probability[part],
         )
         for part in parts
     ]
@@ -185,11 +191,15 @@ def _way(first: Array, last: Array, shares: Array) -> Array:
 
 
 def _through_core(
-    demonstration: Demonstration, skill: Skill | None = None, reach: Reach | None = None
+    demonstration: Demonstration,
+    skill: Skill | None = None,
+    reach: Reach | None = None,
+    begins: Sequence[int] = (0,),
 ) -> tuple[Array, Array, Predicted]:
     """Times (T,) [s]; positions and velocities (T, 2, 6) of both hands; and a skill's predictions.
 
-    While no hands are known, the last prediction is kept.
+    While no hands are known, the last prediction is kept. If a request began the demonstration, so
+    does one each round, at the samples `begins`.
     """
     settings = _settings(reach or UNBOUNDED_REACH)
     used = skill or shipped_skill()
@@ -207,8 +217,11 @@ def _through_core(
     covariances = []
     held = []
     unsure = []
+    probabilities = []
     for tick, inbox in enumerate(received):
         intake_flags = intake.step(state, frame, 1, inbox)
+        if demonstration.begun_s is not None and tick % every == 0 and tick // every in begins:
+            stage.begin(state)
         hands = state["hands"]
         if alone is not None:
             intake_flags = HANDS_KNOWN * bool(
@@ -225,12 +238,19 @@ def _through_core(
             covariances.append(frame["covariance"].copy())
             held.append(not goes)
             unsure.append(bool(state["unsure"]))
+            probabilities.append(float(frame["error_probability"]))
     times = np.arange(len(moving)) / JUDGED_HZ
     flags = (np.array(held), np.array(unsure))
     return (
         times,
         np.array(moving),
-        Predicted(np.array(means), np.array(covariances), *flags, used.regions.radii),
+        Predicted(
+            np.array(means),
+            np.array(covariances),
+            *flags,
+            used.regions.radii,
+            np.array(probabilities),
+        ),
     )
 
 
@@ -268,6 +288,14 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
     unsure = said.uncertain
     wrong = lengths > UNSURE_M
     warned = None if held is None or unsure is None else held | unsure
+    by_probability = None
+    brier = 0.0
+    if said.probability is not None:
+        bins = np.searchsorted(PROBABILITIES, said.probability)
+        by_probability = np.array(
+            [np.bincount(bins[rows], minlength=len(PROBABILITIES)) for rows in (~wrong, wrong)]
+        )
+        brier = float(np.sum((said.probability - wrong) ** 2))
     return Judged(
         count,
         float(np.sum(errors**2)),
@@ -280,6 +308,8 @@ def judged(take: LeftOut, said: Predicted) -> Judged:
         int(wrong.sum()),
         None if warned is None else int((wrong & warned).sum()),
         None if warned is None else int((~wrong & warned).sum()),
+        by_probability,
+        brier,
     )
 
 

@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from thirdhand.contract.records import SIDES, Mode
-from thirdhand.core.frame import Event, Tick
+from thirdhand.core.frame import Event, Tick, order
 from thirdhand.core.skill.model import CHI_SQUARE
 from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
+from thirdhand.skills.skill_file import StoredSkill
+from thirdhand.skills.start_place import StartPlace
+from thirdhand.skills.via_points import adapted
 from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.open_loop import controller, frames
 from thirdhand_sim.lab.results import Array
@@ -187,8 +190,9 @@ def judge(placed: PlacedModel | Skill | None, one: SeenSession) -> TrialOutcome:
 
 def served(placed: PlacedModel | Skill | None, one: SeenSession) -> NDArray[np.void]:
     """The service's frames (T,) of a session, with its skill or a rival."""
-    if isinstance(placed, Skill):
-        return frames(placed, one.ticks, settings())
+    if isinstance(placed, StoredSkill):
+        return _of_service(placed, one)
+    assert not isinstance(placed, Skill)
     predicted, motion = _moving(placed, one)
     assert predicted.covariance is not None
     covariance = predicted.covariance
@@ -209,6 +213,22 @@ def served(placed: PlacedModel | Skill | None, one: SeenSession) -> NDArray[np.v
         via_points=via_points_of(one.session.told),
     )
     return frames(skill, counted(), settings())
+
+
+def _of_service(skill: StoredSkill, one: SeenSession) -> NDArray[np.void]:
+    """The frames (T,) with the service's skill, whose start is moved as the daemon does."""
+    core = controller(skill, settings())
+    start = StartPlace(settings().period_s)
+    out = []
+    events: tuple[Event, ...] = ()
+    for tick in one.ticks:
+        out.append(core.step(Tick(tick.index, (*events, *tick.inbox))))
+        events = ()
+        if points := start.moved(skill, core.state):
+            named = {point.name: point for point in (*skill.via_points, *points)}
+            skill = adapted(skill, tuple(named.values()), tolerance=skill.tolerance)
+            events = Event("skill", skill.file, skill.for_loop()), order("begin")
+    return np.array(out)
 
 
 def _moving(placed: PlacedModel | None, one: SeenSession) -> tuple[Predicted, Array]:

@@ -49,8 +49,8 @@ class Observed(NamedTuple):
 
 class Predicted(NamedTuple):
     """The predicted tool: means (T, 3) [m], covariances (T, 3, 3) [m²] or None, True (T,) where the
-    method holds and where it reports uncertainty, and the squared Mahalanobis distances of the
-    regions of LEVELS.
+    method holds and where it reports uncertainty, the squared Mahalanobis distances of the regions
+    of LEVELS, and the probabilities (T,) of an error.
     """
 
     mean: Array
@@ -58,6 +58,7 @@ class Predicted(NamedTuple):
     held: Mask | None = None
     uncertain: Mask | None = None
     radii: tuple[float, ...] = CHI_SQUARE
+    probability: Array | None = None
 
 
 class PlacedModel(Protocol):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from thirdhand.contract.messages import BASE, PoseStamped
 from thirdhand.core.frame import Records, Vector, blank, state_layout
 from thirdhand.core.intake.stage import Intake
-from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, TaskClock, counted
+from thirdhand.core.skill.task_clock import LONGEST_CLOCK_S, REQUESTED, WAITS, TaskClock, counted
 from thirdhand.core.skill.tuning import CLOCK_START_MPS, LEAST_PATH_M, OWN_NEAR_M
 from thirdhand.settings.config import Settings
 from thirdhand.skills.demonstration import Demonstration
@@ -41,6 +41,7 @@ class Tempo(NamedTuple):
     speeds: Vector
     stillness: Vector
     period_s: float
+    begun_s: float | None = None  # since a request, see `Demonstration`
 
     @classmethod
     def of(cls, demonstration: Demonstration) -> Self:
@@ -77,7 +78,13 @@ class Tempo(NamedTuple):
         columns = np.stack(
             [np.interp(times_s, sampled_s, column) for column in np.array(samples).T], axis=1
         )
-        return cls(demonstration.hands, columns[:, :2], columns[:, 2:], demonstration.period_s)
+        return cls(
+            demonstration.hands,
+            columns[:, :2],
+            columns[:, 2:],
+            demonstration.period_s,
+            demonstration.begun_s,
+        )
 
     def seconds(self, clock: TaskClock, alone: int | None) -> Vector:
         """The clock (T,) [s]; `alone` is the side of the only hand that matters."""
@@ -91,6 +98,7 @@ class Tempo(NamedTuple):
             self.stillness[:, sides].min(axis=1),
             self.period_s,
             clock.numbers[None],
+            begun_s=self.begun_s or 0.0,
         )
 
     def in_segments(self, rows: Vector, segments: NDArray[np.int64]) -> Vector:
@@ -129,7 +137,7 @@ class Tempo(NamedTuple):
         )
 
 
-def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> TaskClock:
+def clock_of(tempos: Sequence[Tempo], alone: int | None, *, pace: int) -> TaskClock:
     """The clock of demonstrations with these tempos, with a weight of 1 m/s."""
     begins, ends = (
         np.array([_conducting(tempo.hands[row], alone) for tempo in tempos]) for row in (0, -1)
@@ -138,7 +146,7 @@ def clock_of(tempos: Sequence[Tempo], alone: int | None, *, waits: bool) -> Task
     off_m = float(np.linalg.norm((begins - begin).reshape(-1, 2, 3), axis=2).max())
     ends_m = np.linalg.norm((ends - begin).reshape(-1, 2, 3), axis=2).max(axis=1)
     near_m = max(LEAST_NEAR_M, min(NEAR_TIMES * off_m, HALF_WAY * float(np.median(ends_m))))
-    free = _endless(tempos, [begin] * len(tempos), near_m, alone, waits=waits)._replace(
+    free = _endless(tempos, [begin] * len(tempos), near_m, alone, pace=pace)._replace(
         begin=tuple(begin.tolist())
     )
     ends_s = [float(tempo.seconds(free, alone)[-1]) for tempo in tempos]
@@ -156,7 +164,7 @@ def _endless(
     near_m: float,
     alone: int | None,
     *,
-    waits: bool,
+    pace: int,
 ) -> TaskClock:
     """A clock that does not stop by itself, whose rests are longer than those of demonstrations
     that begin with these hands (6,) [m].
@@ -174,7 +182,7 @@ def _endless(
     rest_s = max(rest_s, LEAST_REST_S)
     home_s = max(home_s, LEAST_HOME_S)
     return TaskClock(
-        waits, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6
+        pace, 1.0, LONGEST_CLOCK_S, LONGEST_CLOCK_S, rest_s, home_s, near_m, (0.0,) * 6
     )
 
 
@@ -183,14 +191,14 @@ def segment_clock_of(
     placed: Sequence[Records],
     labels: Sequence[NDArray[np.int64]],
     *,
-    waits: bool,
+    pace: int,
 ) -> TaskClock:
     """The clock of the segments (K,) of demonstrations with these tempos and labels (T,), with a
     weight of 1. Only where a segment begins does a rest start it anew.
     """
     begins = [begins_of(segments) for segments in placed]
     near_m = min(LEAST_NEAR_M, *(HALF_WAY * _nearest_m(hands) for hands in begins))
-    free = _endless(tempos, [hands[0] for hands in begins], near_m, None, waits=waits)
+    free = _endless(tempos, [hands[0] for hands in begins], near_m, None, pace=pace)
     ends_s = [
         float(tempo.in_segments(free.rows(hands), label).max())
         for tempo, hands, label in zip(tempos, begins, labels, strict=True)
@@ -227,7 +235,12 @@ def paired(persons: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def remark_on(clock: TaskClock) -> str:
     """The remark on a skill that has a clock."""
-    rests = "waits while the hands rest" if clock.waits else "runs on while the hands rest"
+    if clock.pace == REQUESTED:
+        return (
+            "the tool follows a timetable: a clock, which `thirdhand begin` starts, predicts it "
+            f"better. It stops after {clock.longest_s:.1f} s"
+        )
+    rests = "waits while the hands rest" if clock.pace == WAITS else "runs on while the hands rest"
     return (
         "the tool partly follows a timetable: a clock, which starts when a hand moves faster than "
         f"{CLOCK_START_MPS} m/s, predicts it better. It {rests}, and stops after "

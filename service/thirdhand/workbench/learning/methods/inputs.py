@@ -7,6 +7,7 @@ is given, the inputs are the positions.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +26,8 @@ from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import features
 from thirdhand.core.skill.support import averages, stretch_of
-from thirdhand.core.skill.task_clock import TaskClock
+from thirdhand.core.skill.task_clock import REQUESTED, RUNS, WAITS, TaskClock
+from thirdhand.process.parallel import Workers, here
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.choice import ADVISED, is_clear, selection_of
 from thirdhand.workbench.learning.division import task_of
@@ -112,9 +114,10 @@ KINDS = (  # from simple to rich
 )
 # names; the first is simpler
 CLOCKS = {
-    True: ", and a clock that waits for resting hands",
-    False: ", and a clock",
+    WAITS: ", and a clock that waits for resting hands",
+    RUNS: ", and a clock",
 }
+CLOCK_BY_REQUEST = {REQUESTED: ", and a clock that a request starts"}
 WEIGHTS_MPS = (0.25, 0.5, 1.0, 2.0)  # candidates for the weight of a clock
 # a user may pause, so a clock must reduce the error to this share, and by AS_GOOD_M
 CLOCK_ERROR_SHARE = 0.9
@@ -143,11 +146,12 @@ class HandInputs:
         outcome = (
             Chosen(POSITIONS, {}, {1.0: 0.0})
             if ell is not None
-            else _chosen(taught, tempos, self.options.points, progress)
+            else _chosen(taught, tempos, self.options, progress)
         )
         kind = _with_memory_clock(outcome.kind, tempos)
         weight, weights = chosen(outcome.by_weight_m)
-        used = _Used.of(kind, taught, tempos, weight, self.options)
+        alone = self.options._replace(spread=here)  # a worker has no workers
+        used = _Used.of(kind, taught, tempos, weight, alone)
         count = len(used.takes)
         progress(f"choosing parameters over {count} demonstrations")
         fit = used.fit()
@@ -160,7 +164,9 @@ class HandInputs:
 
         if len({take.person for take in takes}) >= LEAST_PERSONS:
             progress("calibrating the covariance")
-            timed, errors = local_errors(takes, inputs, primitive, used.refitted)
+            timed, errors = local_errors(
+                takes, inputs, primitive, used.refitted, self.options.spread
+            )
             model = replace(model, errors=errors)
             held_out = [
                 result._replace(timed=take_errors)
@@ -186,14 +192,16 @@ def _with_memory_clock(kind: Inputs, tempos: Sequence[Tempo]) -> Inputs:
     """The kind; inputs with memory and no clock get one without weight."""
     if not kind.order or kind.clock is not None:
         return kind
-    return kind._replace(clock=clock_of(tempos, kind.alone, waits=False)._replace(weight=0.0))
+    return kind._replace(clock=clock_of(tempos, kind.alone, pace=RUNS)._replace(weight=0.0))
 
 
 def _remarks(kind: Inputs) -> Iterator[str]:
     """Sentences on a chosen kind of inputs."""
     if kind.neighbours:
         yield MIXED
-    if kind.clock is not None:
+    if kind.clock is not None and kind.clock.pace == REQUESTED:
+        yield remark_on(kind.clock)
+    elif kind.clock is not None:
         yield (
             f"{remark_on(kind.clock)}. A rest of more than {kind.clock.home_s:.1f} s where "
             "demonstrations begin starts it anew, and one of more than "
@@ -346,19 +354,21 @@ class Chosen(NamedTuple):
     alike: int = 0
 
 
-def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Progress) -> Chosen:
+def _chosen(
+    taught: Taught, tempos: Sequence[Tempo], options: Options, progress: Progress
+) -> Chosen:
     """The simplest kind of inputs that is as good as any, each with its best weight.
 
     A clock is tried with positions, and with the best kinds without it. For it, the blocks of
     `paired` are held out; if a skill is refined, the new takes show the pace that counts, and are
     held out one by one.
     """
-    trial = _Trial(taught, tempos, points, taught.folds)
+    trial = _Trial(taught, tempos, options.points, taught.folds)
     kinds = candidates([take.demonstration for take in taught.all])
     by_weight = dict[str, dict[float, Vector]]()
-    for kind in kinds:
-        progress(f"trying {kind.name}")
-        by_weight[kind.name] = trial.by_weight(kind)
+    for kind, errors in zip(kinds, options.spread(trial.by_weight, kinds), strict=True):
+        by_weight[kind.name] = errors
+        progress(f"tried {kind.name}")
     squares = {kind.name: min(by_weight[kind.name].values(), key=np.mean) for kind in kinds}
     simplest = simplest_of(kinds, squares)
     without_clock = Chosen(
@@ -375,7 +385,7 @@ def _chosen(taught: Taught, tempos: Sequence[Tempo], points: int, progress: Prog
     first = next(kind for kind in kinds if kind.alone == simplest.alone)
     bases = sorted({first, simplest, best}, key=kinds.index)
     weights = {kind: _least(by_weight[kind.name]) for kind in bases}
-    timed = _timed(trial, weights, blocks, squares, progress)
+    timed = _timed(trial, weights, blocks, squares, options.spread, progress)
     tried_m = _errors_m(squares)
     if not timed:
         return without_clock._replace(tried_m=tried_m)
@@ -455,6 +465,7 @@ def _timed(
     weights: Mapping[Inputs, float],
     blocks: NDArray[np.intp],
     squares: dict[str, Vector],
+    spread: Workers,
     progress: Progress,
 ) -> list[Inputs]:
     """The kinds with each clock that predicts clearly better than all without one; the squared
@@ -464,21 +475,34 @@ def _timed(
         min(_error_m(trial.squares(kind, weight, blocks)) for kind, weight in weights.items())
     )
     timed = list[Inputs]()
-    for kind, (waits, name) in itertools.product(weights, CLOCKS.items()):
-        progress(f"trying {kind.name}{name}")
-        clock = clock_of(trial.tempos, kind.alone, waits=waits)
-        weighted = [
-            kind._replace(name=kind.name + name, clock=clock._replace(weight=weight_mps))
-            for weight_mps in WEIGHTS_MPS
-        ]
-        errors_m = [
-            _error_m(trial.squares(candidate, weights[kind], blocks)) for candidate in weighted
-        ]
-        weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))
-        squares[weighed.name] = trial.squares(weighed, weights[kind], trial.folds)
-        if min(errors_m) < limit_m:
+    is_begun = all(tempo.begun_s is not None for tempo in trial.tempos)
+    clocks = CLOCKS | (CLOCK_BY_REQUEST if is_begun else {})
+    tried = [
+        (kind._replace(name=kind.name + name), pace, weights[kind])
+        for kind, (pace, name) in itertools.product(weights, clocks.items())
+    ]
+    for weighed, least_m, errors in spread(functools.partial(_weighed, trial, blocks), tried):
+        squares[weighed.name] = errors
+        progress(f"tried {weighed.name}")
+        if least_m < limit_m:
             timed.append(weighed)
     return timed
+
+
+def _weighed(
+    trial: _Trial, blocks: NDArray[np.intp], tried: tuple[Inputs, int, float]
+) -> tuple[Inputs, float, Vector]:
+    """A kind of inputs with a clock of this pace and the best weight, for a weight of new takes;
+    the error [m] over the blocks (H,), and the squared errors (G,) [m²] of the folds.
+    """
+    kind, pace, weight = tried
+    clock = clock_of(trial.tempos, kind.alone, pace=pace)
+    weighted = [
+        kind._replace(clock=clock._replace(weight=weight_mps)) for weight_mps in WEIGHTS_MPS
+    ]
+    errors_m = [_error_m(trial.squares(candidate, weight, blocks)) for candidate in weighted]
+    weighed = preferred(weighted, errors_m, AS_GOOD * min(errors_m))
+    return weighed, min(errors_m), trial.squares(weighed, weight, trial.folds)
 
 
 def clock_limit_m(least_m: float) -> float:

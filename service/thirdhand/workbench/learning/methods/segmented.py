@@ -13,6 +13,7 @@ Held-out predictions use the belief that the filter has along the take, and the 
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +32,7 @@ from thirdhand.core.skill.memory import along
 from thirdhand.core.skill.segmented import NO_ERRORS, Placed, SegmentedKMP, Unknown
 from thirdhand.core.skill.segments import LEFT, MOST_SEGMENTS, NONE, OUTPUTS, RIGHT, STAYS
 from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
-from thirdhand.core.skill.task_clock import TaskClock
+from thirdhand.core.skill.task_clock import RUNS, WAITS, TaskClock
 from thirdhand.core.skill.tuning import SEGMENT_DISTANCE, SEGMENT_DISTANCE_BESIDE, TURN_WEIGHT_M
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.recognition import covered, recognised
@@ -246,7 +247,7 @@ class Samples(NamedTuple):
         for row, share, is_end, is_begin in zip(at, shares, ends, begins, strict=True):
             is_between = not (is_end or is_begin)
             for time in KNOWN_TIMES:
-                if clock.waits or is_between or time == float(is_end):
+                if clock.pace == WAITS or is_between or time == float(is_end):
                     timed_rows.append((row, share, time))
         rows, known_shares, times = (np.array(column) for column in zip(*timed_rows, strict=True))
         return np.column_stack([rows, clock.weight * clock.longest_s * times]), known_shares
@@ -465,19 +466,20 @@ def with_delay(
     task: Task,
     shown: Sequence[Divided],
     blocks: Sequence[Sequence[int]],
+    options: Options,
     usual_s: float | None = None,
-    given_s: float | None = None,
 ) -> tuple[Candidate, Delay, float]:
     """The candidate with the delay of DELAYS_S that predicts held-out demonstrations best, the same
     in all of them; that delay, with the standard deviation of the best delays of the single
     demonstrations; and the error [m]. There is none unless it reduces the mean squared error by
     more than one standard error over the blocks. If `usual_s` is given, it is the delay unless
     another one predicts much better: a teacher's delay varies between takes, and there may be only
-    a few. A delay that is `given_s` is taken as it is.
+    a few. The delay of the options is taken as it is.
     """
-    delays_s = DELAYS_S if given_s is None else (given_s,)
-    candidates = [Candidate.of(task, shown, late_s) for late_s in delays_s]
-    squares = np.array([candidate.squares(blocks) for candidate in candidates])
+    delays_s = DELAYS_S if options.delay_s is None else (options.delay_s,)
+    tried = options.spread(functools.partial(_late, task, shown, blocks), delays_s)
+    candidates, each = zip(*tried, strict=True)
+    squares = np.array(each)
     best = int(squares.sum(axis=1).argmin())
     each_s = np.array(delays_s)[squares.argmin(axis=0)]
     if usual_s is not None:
@@ -491,6 +493,14 @@ def with_delay(
         Delay(delays_s[best], float(each_s.std())),
         math.sqrt(float(squares[best].mean())),
     )
+
+
+def _late(
+    task: Task, shown: Sequence[Divided], blocks: Sequence[Sequence[int]], late_s: float
+) -> tuple[Candidate, Vector]:
+    """The candidate with this delay [s], and its squared errors by block."""
+    candidate = Candidate.of(task, shown, late_s)
+    return candidate, candidate.squares(blocks)
 
 
 @dataclass(frozen=True)
@@ -521,7 +531,7 @@ class Segmented:
         )
         progress(f"learning between the via-points {', '.join(self.task.names)}")
         blocks = blocks_of(persons_of(takes))
-        choice = _Choice.of(self.task, taught, blocks, self.options.delay_s, progress)
+        choice = _Choice.of(self.task, taught, blocks, self.options, progress)
         weights = choice.make()
         best = choice.best
         if best.samples.clock is not None:
@@ -577,7 +587,7 @@ class Segmented:
             errors,
             choice.delay.mean_s,
             clock=best.samples.clock
-            or _clock_of(best.encoded[: len(takes)], tempos, waits=False)._replace(weight=0.0),
+            or _clock_of(best.encoded[: len(takes)], tempos, pace=RUNS)._replace(weight=0.0),
             unknown=Unknown(unknown_std(takes), _scatters(best.task, best.encoded)),
         )
 
@@ -621,7 +631,7 @@ class _Choice:
     blocks: Sequence[Sequence[int]]  # of new takes
     all_blocks: Sequence[Sequence[int]]
     usual_s: float | None  # delay of all persons; None if no skill is refined
-    fixed_s: float | None  # the delay of the options
+    options: Options
     progress: Progress
     best: Candidate
     delay: Delay
@@ -634,7 +644,7 @@ class _Choice:
         task: Task,
         taught: Taught,
         blocks: Sequence[Sequence[int]],
-        fixed_s: float | None,
+        options: Options,
         progress: Progress,
     ) -> Self:
         """The choice of the delay alone."""
@@ -646,10 +656,10 @@ class _Choice:
         all_blocks = blocks_of(persons_of(taught.all))
         usual_s = None
         if earlier:
-            usual_s = with_delay(task, [*new, *earlier], all_blocks, given_s=fixed_s)[1].mean_s
-        best, delay, error_m = with_delay(task, new, blocks, usual_s, fixed_s)
+            usual_s = with_delay(task, [*new, *earlier], all_blocks, options)[1].mean_s
+        best, delay, error_m = with_delay(task, new, blocks, options, usual_s)
         choice = cls(
-            taught, new, earlier, blocks, all_blocks, usual_s, fixed_s, progress, best, delay, {}
+            taught, new, earlier, blocks, all_blocks, usual_s, options, progress, best, delay, {}
         )
         choice.tried_m[choice.name] = (
             choice.of_everybody(task).error_m(all_blocks) if earlier else error_m
@@ -692,7 +702,7 @@ class _Choice:
         )
         if self.name in tasks:
             self.best, self.delay, error_m = with_delay(
-                tasks[self.name], self.new, self.blocks, self.usual_s, self.fixed_s
+                tasks[self.name], self.new, self.blocks, self.options, self.usual_s
             )
             if not self.earlier:
                 errors_m[self.name] = error_m
@@ -726,9 +736,7 @@ class _Choice:
             "earlier ones"
         )
         earlier_blocks = blocks_of(persons_of(self.taught.earlier))
-        earlier_delay = with_delay(
-            self.best.task, self.earlier, earlier_blocks, given_s=self.fixed_s
-        )[1]
+        earlier_delay = with_delay(self.best.task, self.earlier, earlier_blocks, self.options)[1]
         weighted = {weight: self.weighted(weight, earlier_delay.mean_s) for weight in WEIGHTS}
         weight, weights = chosen(
             {weight: candidate.error_m(self.blocks) for weight, candidate in weighted.items()}
@@ -781,9 +789,9 @@ def _with_clocks(
 
     limit_m = clock_limit_m(error_m(best.samples))
     out = dict[str, Candidate]()
-    for waits, name in CLOCKS.items():
+    for pace, name in CLOCKS.items():
         progress(f"trying {POSITIONS.name}{name}")
-        clock = _clock_of(best.encoded, tempos, waits=waits)
+        clock = _clock_of(best.encoded, tempos, pace=pace)
         tried = [clock._replace(weight=weight) for weight in CLOCK_WEIGHTS_PER_S]
         errors_m = [error_m(best.samples.clocked(tempos, tried_clock)) for tried_clock in tried]
         if min(errors_m) < limit_m:
@@ -791,10 +799,10 @@ def _with_clocks(
     return out
 
 
-def _clock_of(demos: Sequence[Encoded], tempos: Sequence[Tempo], *, waits: bool) -> TaskClock:
+def _clock_of(demos: Sequence[Encoded], tempos: Sequence[Tempo], *, pace: int) -> TaskClock:
     """The clock of the segments of demonstrations with these tempos, with a weight of 1."""
     segments = [demo.segments for demo in demos]
-    return segment_clock_of(tempos, segments, [demo.labels for demo in demos], waits=waits)
+    return segment_clock_of(tempos, segments, [demo.labels for demo in demos], pace=pace)
 
 
 def _placements(
