@@ -30,6 +30,13 @@ def test_order_of_files_makes_no_difference(named: bool) -> None:
         assert relearned.file == first.file
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("named", [True, False])
+def test_workers_make_no_difference(named: bool) -> None:
+    demonstrations = [take if named else take._replace(via_points=()) for take in shown()]
+    assert learn(demonstrations, workers="2").file == learn(demonstrations).file
+
+
 def test_sitting_is_held_out_together() -> None:
     base = shown()[0]
     hour_ns = 3600 * 10**9

@@ -267,7 +267,7 @@ CHANNELS = (
         _request(requests.Nothing),
         "request",
         "the task begins now",
-        event=EventKind(10, STRING),
+        event=EventKind(13, STRING),
         queryable=True,
     ),
     Channel(
