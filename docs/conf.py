@@ -40,6 +40,7 @@ GROUPS = {
         "hardware",
         "own-arm",
         "franka",
+        "universal-robots",
         "ros2-control",
         "near-people",
         "rate",

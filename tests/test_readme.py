@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
-from support.cell import serving
+from support.cell import Tracker, serving
 from support.installed import isolated, unpacked, wheel_of
 from support.paths import ROOT
 
@@ -41,6 +42,19 @@ def test_program_runs_as_it_stands_by_the_client_alone(tmp_path: Path) -> None:
         done.stdout
         == "mode follow: the tool is at (0.5, -0.2, 0.4), its target at (0.5, -0.2, 0.4)\n"
     )
+
+
+def test_the_arm_follows_as_it_stands(tmp_path: Path) -> None:
+    """Ten lines are an arm, which follows the service's commands."""
+    (code,) = re.findall(r"<!-- arm -->\n```python\n(.*?)```", README, re.DOTALL)
+    assert len([line for line in code.splitlines() if line]) <= 10
+    (tmp_path / "my_arm.py").write_text(code)
+    with serving(tmp_path) as daemon, Tracker(daemon.session):
+        command = [sys.executable, "-m", "thirdhand", "follow", f"{tmp_path}/my_arm.py:MyArm"]
+        arm = subprocess.Popen([*command, "--connect", daemon.endpoint], cwd=ROOT)
+        daemon.until(lambda status: status["mode"] == "follow", 60.0)
+        arm.send_signal(signal.SIGINT)
+        assert arm.wait(20) == 0
 
 
 def test_the_tracker_of_the_tutorial_moves_the_tool(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ watch, teach, request. See `thirdhand.client`.
 # for type checkers; this module imports nothing, as each command begins with it
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from thirdhand.arms.arm import Arm as Arm
     from thirdhand.client import *  # noqa: F403
 
 
@@ -12,6 +13,8 @@ def __getattr__(name: str) -> object:
     """A name of the client, which is imported when it is first needed."""
     import importlib
 
+    if name == "Arm":
+        return importlib.import_module("thirdhand.arms.arm").Arm
     client = importlib.import_module("thirdhand.client")
     if name not in client.__all__:
         raise AttributeError(f"module 'thirdhand' has no name {name!r}")

@@ -22,6 +22,8 @@ from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
+from thirdhand.arms import DriveError, place_of
+from thirdhand.arms.arm import arm_class
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import UnreachableError, endpoints, open_session
@@ -180,7 +182,9 @@ def refused(*arguments: str) -> str:
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
-    assert "no arm 'frankia'; franka or simulated accepted" in refused("frankia")
+    assert "no arm 'frankia'; franka, simulated, ur accepted, or one of your own" in refused(
+        "frankia"
+    )
     assert "is a daemon or a router running" in refused(
         "simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2"
     )
@@ -227,6 +231,46 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
         "50 Hz is too slow: commands would arrive every 20 ms, and an arm brakes 20 ms after its "
         "last command; 67 Hz or more needed"
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("class A: pass", "is no class of thirdhand.Arm"),
+        ("import nothing_like_this", "No module named 'nothing_like_this'"),
+        ("class B: pass", "has no attribute 'A'"),
+        ("return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; 7 of each needed"),
+        ("return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
+        ("return 1 / 0", "A stopped: ZeroDivisionError('division by zero')"),
+    ],
+)
+def test_what_is_wrong_with_an_arm_of_ones_own_is_said(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.py"
+    if text.startswith("return"):
+        text = f"import math, thirdhand\nclass A(thirdhand.Arm):\n  def read(self): {text}"
+    file.write_text(text)
+
+    def run() -> None:
+        with open_session() as session:
+            arm = arm_class(place_of(f"{file}:A"))(Settings())
+            follow(arm, session, "thirdhand", stop=threading.Event())
+
+    with pytest.raises(DriveError, match=re.escape(message)):
+        run()
+
+
+def test_an_arm_of_another_distribution_is_found_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "theirs-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[thirdhand.arms]\ntheirs = their_arm:Their\n")
+    (tmp_path / "their_arm.py").write_text("import thirdhand\nclass Their(thirdhand.Arm): pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert arm_class(place_of("theirs")).__name__ == "Their"
 
 
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:

@@ -11,15 +11,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import zenoh
 
 from support.cell import LEFT, Daemon, Tracker, until
 from support.cell_commands import started
-from support.examples import example
 from thirdhand.arms.drive import follow
+from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import endpoints, open_session
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, messages
@@ -42,10 +41,10 @@ OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 @contextlib.contextmanager
-def driven(own_arm: ModuleType, endpoint: str) -> Iterator[object]:
-    """The template's fake arm, driven on a session of its own."""
+def driven(endpoint: str) -> Iterator[SimulatedArm]:
+    """A simulated arm, driven on a session of its own."""
     stop = threading.Event()
-    arm = own_arm.FakeArm(Settings())
+    arm = SimulatedArm(Settings())
     with open_session(connect=[endpoint]) as session:
         driver = threading.Thread(
             target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
@@ -89,7 +88,6 @@ def findings(
 def test_a_cell_with_ones_own_arm_and_tracker(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own_arm = example("own_arm")
     with (
         launched(tmp_path, record=tmp_path / "records", network=PATIENT) as service,
         open_session(connect=[service.endpoint]) as session,
@@ -110,7 +108,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
             "let it publish under the cell's key, thirdhand/hands/left; or start the tracker"
         )
 
-        with driven(own_arm, daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
+        with driven(daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
             # the rate is known some time after the driver's first state
             for _ in range(5):
@@ -123,7 +121,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
             }
 
             tracker.left = NEAR_LEFT
-            daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
+            daemon.until(lambda status: any(arm.velocity))
             assert main(["resume", "--connect", daemon.endpoint]) == 0
             assert "there was no hold to end" in capsys.readouterr().out
 
@@ -152,10 +150,10 @@ def test_a_cell_with_ones_own_arm_and_tracker(
             assert set(refusal["hands_m"]) == {"left", "right"}
             time.sleep(1.5)  # for a line of the watch
             tracker.left = LEFT
-            daemon.until(lambda status: any(arm.velocity))  # type: ignore[attr-defined]
+            daemon.until(lambda status: any(arm.velocity))
             daemon.process.kill()
             daemon.process.wait()
-            until(lambda: not any(arm.velocity))  # type: ignore[attr-defined]
+            until(lambda: not any(arm.velocity))
         output, ended = watch.communicate(timeout=20)
         assert "hold (stale_hand)" in output
         assert "left not seen for" in output

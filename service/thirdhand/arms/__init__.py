@@ -1,1 +1,32 @@
-"""The arm's side: playback of commands, the loop around a drive, and one small file an arm."""
+"""The arm's side: playback of commands, the loop around an arm, and one small file an arm."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+
+from thirdhand.contract.explain import ExplainedError
+
+GROUP = "thirdhand.arms"  # of the entry points with which other distributions name their arms
+SHIPPED = {
+    "franka": "thirdhand.arms.franka:FrankaArm",
+    "simulated": "thirdhand.arms.simulated:SimulatedArm",
+    "ur": "thirdhand.arms.universal_robots:UniversalRobotsArm",
+}
+
+
+class DriveError(ExplainedError, RuntimeError):
+    """A drive cannot be reached, belongs to another arm, or stopped; the message has the remedy."""
+
+
+def place_of(name: str) -> str:
+    """The place, MODULE:CLASS or FILE.py:CLASS, of an arm of this name, or which is this place.
+    Raises DriveError.
+    """
+    known = SHIPPED | {entry.name: entry.value for entry in entry_points(group=GROUP)}
+    place = known.get(name, name)
+    if ":" not in place:
+        raise DriveError(
+            f"no arm {name!r}; {', '.join(known)} accepted, or one of your own as MODULE:CLASS or "
+            "FILE.py:CLASS"
+        )
+    return place

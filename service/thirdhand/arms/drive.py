@@ -1,61 +1,23 @@
-"""The loop around a drive: publish the measured joints, play back the commands, write them."""
+"""The loop around an arm: publish the measured joints, play back the commands, write them."""
 
 from __future__ import annotations
 
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any, NamedTuple, Protocol
 
 import zenoh
 
-from thirdhand.arms.playback import Playback, SpeedLimits
+from thirdhand.arms import DriveError
+from thirdhand.arms.arm import Arm
+from thirdhand.arms.playback import Playback
 from thirdhand.client import Follower, UnreachableError
 from thirdhand.contract.channels import key
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.core.frame import Vector
-from thirdhand.settings.config import RATES_HZ, JointSettings
+from thirdhand.settings.config import RATES_HZ
 
 SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
-
-
-class DriveError(ExplainedError, RuntimeError):
-    """A drive cannot be reached, belongs to another arm, or stopped; the message has the remedy."""
-
-
-class Measured(NamedTuple):
-    """An arm's joints (J,) [rad, rad/s] at the begin of a period, and the time since the
-    last reading.
-    """
-
-    position: Vector
-    velocity: Vector
-    elapsed_s: float
-
-
-class Drive(AbstractContextManager[Any], Protocol):
-    """The drive of one arm. Its context controls the arm; it begins and ends with the arm at rest.
-    All methods raise DriveError.
-    """
-
-    limits: JointSettings
-    """Names and limits of the joints; nothing that is written exceeds them."""
-    speed_limits: SpeedLimits | None
-    """Velocity limits that depend on the position, if the drive has such."""
-    period_s: float
-    """Period of the drive [s]."""
-    takes_velocity: bool
-    """True if the drive follows velocities; the measured joints then close the loop."""
-
-    def stands_at(self) -> Vector:
-        """The joints (J,) [rad] before the arm is controlled."""
-
-    def read(self) -> Measured:
-        """The joints at the begin of the drive's next period, for which it waits."""
-
-    def write(self, position: Vector, velocity: Vector) -> None:
-        """Move joints (J,) to a position and velocity [rad, rad/s] at the end of this period."""
 
 
 def say(line: str) -> None:
@@ -64,7 +26,7 @@ def say(line: str) -> None:
 
 
 def follow(
-    drive: Drive,
+    arm: Arm,
     session: zenoh.Session,
     cell: str,
     *,
@@ -77,29 +39,34 @@ def follow(
     Raises DriveError, also if commands arrive too slowly to be followed, and UnreachableError if no
     command arrives within `wait_s` [s].
     """
-    playback = Playback(
-        drive.limits, drive.stands_at(), period_s=drive.period_s, speed_limits=drive.speed_limits
-    )
-    with Follower(session, drive.limits.names, cell) as follower, drive:
-        driving = _Driving(drive, playback, follower, cell, wait_s, say)
-        while not driving.step(stop):
-            pass
+    try:
+        playback = Playback(
+            arm.limits, arm.measured()[0], period_s=arm.period_s, speed_limits=arm.speed_limits
+        )
+        with Follower(session, arm.limits.names, cell) as follower, arm:
+            driving = _Driving(arm, playback, follower, cell, wait_s, say)
+            while not driving.step(stop):
+                pass
+    except ExplainedError:
+        raise
+    except Exception as error:  # of the maker's library
+        raise DriveError(f"{type(arm).__name__} stopped: {error!r}") from error
     return playback
 
 
 class _Driving:
-    """The periods of a drive, one after the other, and the messages about them."""
+    """The periods of an arm, one after the other, and the messages about them."""
 
     def __init__(
         self,
-        drive: Drive,
+        arm: Arm,
         playback: Playback,
         follower: Follower,
         cell: str,
         wait_s: float,
         say: Callable[[str], None],
     ) -> None:
-        self._drive = drive
+        self._arm = arm
         self._playback = playback
         self._follower = follower
         self._cell = cell
@@ -108,24 +75,26 @@ class _Driving:
         self._passed_s = 0.0
         self._published_s = 0.0  # time of the newest published joint state
         self._following = False
+        self._was_guided = False
         self._refused = 0
 
     def step(self, stop: threading.Event) -> bool:
         """Drive the arm for one period; True once it stands after `stop`. Raises DriveError and
         UnreachableError.
         """
-        drive = self._drive
+        arm = self._arm
         playback = self._playback
-        measured = drive.read()
-        self._passed_s += measured.elapsed_s
-        self._publish(measured)
+        elapsed_s = arm.wait()
+        position, velocity = arm.measured()
+        self._passed_s += elapsed_s
+        self._publish(position, velocity)
         stopping = stop.is_set()
         moved = playback.step(
             () if stopping else self._follower.commands(),
-            measured=measured.position if drive.takes_velocity else None,
-            elapsed_s=measured.elapsed_s,
+            measured=position if arm.takes_velocity else None,
+            elapsed_s=elapsed_s,
         )
-        drive.write(moved.position, moved.velocity)
+        arm.lead(moved)
 
         stands = not moved.velocity.any()
         if stopping and stands and not playback.following:
@@ -139,12 +108,14 @@ class _Driving:
         self._check_heard()
         return False
 
-    def _publish(self, measured: Measured) -> None:
-        """Publish the joints about once a tick."""
+    def _publish(self, position: Vector, velocity: Vector) -> None:
+        """Publish the joints about once a tick, and whether the arm is led by hand."""
         interval_s = 0.9 * max(self._playback.tick_s, SHORTEST_TICK_S)
         if self._passed_s - self._published_s >= interval_s:
-            position = self._playback.in_turn(measured.position).tolist()
-            self._follower.tell(position, measured.velocity.tolist())
+            self._follower.tell(self._playback.in_turn(position).tolist(), velocity.tolist())
+            if self._arm.guided or self._was_guided:
+                self._follower.guided(self._arm.guided)
+            self._was_guided = self._arm.guided
             self._published_s = self._passed_s
 
     def _report_following(self) -> None:

@@ -11,12 +11,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from thirdhand.arms.drive import DriveError, Measured
+from thirdhand.arms import DriveError
+from thirdhand.arms.arm import Arm
 from thirdhand.arms.playback import SpeedLimits
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import JointSettings, Settings
 
 FRANKA_PERIOD_S = 0.001
+ADDRESS = "172.16.0.2"  # of a control box as it is delivered
 # [rad/s², rad/s³] The robot allows 10 and 5000, but extrapolates over lost packets by itself.
 ACCELERATION = 9.0
 JERK = 4000.0
@@ -78,15 +80,15 @@ def limits_of(joints: JointSettings) -> JointSettings:
     )
 
 
-class FrankaArm:
-    """The drive of the Franka at an address; see `Drive`. Raises DriveError if it does not
-    answer.
-    """
+class FrankaArm(Arm):
+    """The Franka at an address. Raises DriveError if it does not answer."""
 
-    period_s: float = FRANKA_PERIOD_S
-    takes_velocity: bool = True
+    period_s = FRANKA_PERIOD_S
+    takes_velocity = True
 
-    def __init__(self, settings: Settings, address: str) -> None:
+    def __init__(self, settings: Settings, address: str = "") -> None:
+        address = address or ADDRESS
+        super().__init__(settings, address)
         self.limits = limits_of(settings.joints)
         self.speed_limits = ROBOT_SPEED_LIMITS
         try:
@@ -97,7 +99,6 @@ class FrankaArm:
                 "Python 3.11 or 3.12"
             ) from None
         self._library = pylibfranka
-        self._address = address
         self._control: Any = None
         try:  # the caller requests real-time scheduling for the loop
             self._robot = pylibfranka.Robot(address, pylibfranka.RealtimeConfig.kIgnore)
@@ -120,15 +121,14 @@ class FrankaArm:
             self._do(lambda: self._control.writeOnce(at_rest))
         self._control = None  # after an exception the robot stops by itself
 
-    def stands_at(self) -> Vector:
-        """The joints (J,) [rad] before the arm is controlled."""
-        return np.array(self._state.q)
+    def wait(self) -> float:
+        self._state, passed = self._do(self._control.readOnce)
+        return float(passed.to_sec())
 
-    def read(self) -> Measured:
-        state, passed = self._do(self._control.readOnce)
-        return Measured(np.array(state.q), np.array(state.dq), passed.to_sec())
+    def read(self) -> tuple[Vector, Vector]:
+        return np.array(self._state.q), np.array(self._state.dq)
 
-    def write(self, position: Vector, velocity: Vector) -> None:
+    def write(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
         self._do(lambda: self._control.writeOnce(self._library.JointVelocities(velocity.tolist())))
 
     def _do(self, what: Any) -> Any:
@@ -136,6 +136,6 @@ class FrankaArm:
             return what()
         except RuntimeError as error:
             raise DriveError(
-                f"the Franka at {self._address} stopped: {error}. Look at Desk, free and unlock "
+                f"the Franka at {self.address} stopped: {error}. Look at Desk, free and unlock "
                 "it, then restart"
             ) from None

@@ -6,35 +6,27 @@ import argparse
 import signal
 import threading
 
+from thirdhand.arms import DriveError, place_of
 from thirdhand.cli.usage import reaching
 from thirdhand.client import Client
 from thirdhand.client.session import tried
 from thirdhand.process.progress import say
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings
-from thirdhand.settings.file_content import UnreadableError
-
-DRIVES = ("franka", "simulated")
 
 
 def follow(args: argparse.Namespace) -> int:
     """Drive the arm until Ctrl-C; exit code 0 with the arm at rest. Raises DriveError,
     UnreachableError.
     """
-    if args.arm not in DRIVES:
-        raise UnreadableError(
-            f"no arm {args.arm!r}; {' or '.join(DRIVES)} accepted. For another arm, begin with "
-            "examples/own_arm.py"
-        )
+    place = place_of(args.arm)
     settings = cell_of(str(args.config)) if args.config else Settings()
     reach = reaching(args, settings)
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
         # slow imports: a missing daemon is reported before
-        from thirdhand.arms.drive import Drive, DriveError
+        from thirdhand.arms.arm import arm_class
         from thirdhand.arms.drive import follow as driven
-        from thirdhand.arms.franka import FrankaArm
-        from thirdhand.arms.simulated import SimulatedArm
         from thirdhand.daemon.clock import ask_for_real_time
 
         status = Client(session, cell).wait_until_ready(timeout_s=args.wait, silent=False)
@@ -44,15 +36,15 @@ def follow(args: argparse.Namespace) -> int:
                 f"{', '.join(status.joints)}; the settings here have {len(settings.joints.names)}, "
                 f"{', '.join(settings.joints.names)}: give the daemon's settings by --config"
             )
-        drive: Drive = (
-            FrankaArm(settings, args.robot) if args.arm == "franka" else SimulatedArm(settings)
-        )
+        arm = arm_class(place)(settings, args.robot)
+        arm.lag_s = arm.lag_s if args.lag is None else args.lag
+        arm.gain = arm.gain if args.gain is None else args.gain
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         ask_for_real_time()
         say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
-        playback = driven(drive, session, cell, stop=stop, wait_s=args.wait)
+        playback = driven(arm, session, cell, stop=stop, wait_s=args.wait)
     say(
         f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were "
         "refused"

@@ -26,17 +26,26 @@ def follow(add: AddCommand) -> None:
         "end.",
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
-    c.add_argument(
-        "arm", metavar="ARM", help="the arm to drive: franka, or simulated, which is an ideal arm"
+    arm = (
+        "the arm to drive: franka, ur, or simulated, which is an ideal arm; or one of your own, "
+        "MODULE:CLASS or FILE.py:CLASS"
     )
+    c.add_argument("arm", metavar="ARM", help=arm)
     option(c, "--config", "CELL", f"the settings that the daemon runs with: {ARM_HELP}")
     option(
         c,
         "--robot",
         "ADDRESS",
-        "the host name or IP address of a Franka's control box",
-        "172.16.0.2",
+        "the host name or IP address of the arm's control box",
+        "",
     )
+    lag = "what is written leads by this delay of the servo [s] (default: that of the arm's class)"
+    option(c, "--lag", "S", lag, type=within(float, 0.0, 0.5, " s"))
+    gain = (
+        "and by the acceleration / this stiffness of the servo [1/s²] (default: that of the arm's "
+        "class)"
+    )
+    option(c, "--gain", "K", gain, type=within(float, 1.0, 1e6, " 1/s²"))
     option(
         c,
         "--wait",

@@ -358,7 +358,9 @@ class Follower(_Received):
         self, session: zenoh.Session, names: Sequence[str], cell: str = "thirdhand"
     ) -> None:
         self._names = tuple(names)
-        self._state = Publisher(session, cell, "joints/state")
+        self._state, self._guided = (
+            Publisher(session, cell, f"joints/{name}") for name in ("state", "guided")
+        )
         super().__init__(session, cell, "joints/command")
 
     def command(self, timeout_s: float = BRAKE_AFTER_S) -> Command | None:
@@ -387,10 +389,15 @@ class Follower(_Received):
         now_ns = time.time_ns() if stamp_ns is None else checked_stamp(stamp_ns)
         self._state.put(encoded_joints(now_ns, self._names, position, velocity))
 
+    def guided(self, led: bool) -> None:
+        """Publish whether the arm is led by hand; while it is, with each state."""
+        self._guided.put(cdr.encode_bool(led))
+
     def close(self) -> None:
-        """End the subscription and the publisher."""
+        """End the subscription and the publishers."""
         super().close()
         self._state.close()
+        self._guided.close()
 
     def _decoded(self, sample: zenoh.Sample) -> Command:
         message = cdr.decode_joints(sample.payload.to_bytes())

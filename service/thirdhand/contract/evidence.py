@@ -91,6 +91,7 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Exceeded | None = None  # largest joint error at the fault
+    late_s: float = 0.0  # by which the arm followed its commands; 0: it did not follow them late
     # the joint that is farthest from its command now, with unit
     worst_joint: tuple[str, float, str] | None = None
     measured_speed: Exceeded | None = None  # of the tool [m/s]
@@ -155,6 +156,9 @@ def _reason(reason: Reason, seen: Evidence) -> tuple[str, str]:  # noqa: C901, P
                     f"{contradiction}; {finding or what_happened(word(reason), seen.settings)}"
                 )
                 closer = what_to_do(Condition.TWO_DRIVERS) + THEN_RESET
+            elif seen.late_s:
+                finding = f"the arm is about {lasting(1000.0 * seen.late_s)} late; {finding}"
+                closer = what_to_do(Condition.ARM_LATE) + THEN_RESET
         case Reason.ARM_SILENT:
             finding = _silence(seen)
             if _rate_too_low(seen, "arm"):

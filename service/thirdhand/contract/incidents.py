@@ -183,8 +183,8 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
             None,
             "arm late",
             "the arm follows its commands late",
-            "let the arm's driver lead by the lag: write position + lag * velocity, as "
-            "examples/own_arm.py does by its lag_s; then measure again",
+            "let the arm's driver lead by the lag: set lag_s of its class, or `thirdhand follow "
+            "--lag`; then measure again",
         ),
         Incident(
             Condition.NO_ARM,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from thirdhand.contract.requests import Source, Status
 from thirdhand.core.arm.stage import Arm
 from thirdhand.core.codes import READY, RETURNING
 from thirdhand.core.controller import Controller
-from thirdhand.core.frame import Frame, Record
+from thirdhand.core.frame import Frame, Record, Vector
 from thirdhand.core.geometry import off_target
 from thirdhand.core.separation.clearance import NEAR_ITSELF
 from thirdhand.core.separation.stage import Separation
@@ -32,6 +32,9 @@ from thirdhand.settings.config import Settings
 from thirdhand.skills.corrections import offer_of
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
+LAG_STATUSES = 10  # of the last second
+LEAST_LAG_S = 0.01
+UNEXPLAINED_SHARE = 0.2  # of the squared errors, beyond which another cause is as likely
 AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
 
 
@@ -49,6 +52,7 @@ class CellStatus(NamedTuple):
     inside: Inside | None = None  # what an arm that is not ready is inside of
     busy: str = ""  # signs of a busy machine when the arm stopped
     clutch: str = ""  # the problem with the clutch's messages
+    late_s: float = 0.0  # see `ArmLag`
     streams: Mapping[str, Source] = MappingProxyType({})  # other input, by key
 
     def status(self, **more: Any) -> Status:
@@ -217,6 +221,7 @@ class CellStatus(NamedTuple):
             inside=self.inside,
             stuck=self._stuck() if self.state["stuck"] else None,
             error_rad=(error_rad, settings.arm.fault_error_rad),
+            late_s=self.late_s,
             worst_joint=(
                 settings.joints.names[worst],
                 float(errors[worst]),
@@ -265,6 +270,35 @@ class CellStatus(NamedTuple):
         off_m = float(np.linalg.norm(self.frame["tool"] - self.frame["target"]))
         count = int(state["way_count"])
         return Stuck(off_m, tuple(at_limits), min(int(state["way_next"]) + 1, count), count)
+
+
+class ArmLag:
+    """How late an arm follows its commands, while it does: the lag τ of least squares of e - τ u
+    over the joints at the last statuses. A joint that is late by τ is off by e, the mean commanded
+    velocity of that time times τ; u is the mean of the velocities at its ends, the commanded and
+    the measured one.
+    """
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[Vector, Vector]] = deque(maxlen=LAG_STATUSES)
+
+    def note(self, frame: Frame, state: Record) -> None:
+        """Note the joints, as commanded and as measured."""
+        if frame["mode"] == Mode.FOLLOW and state["arm_tick"] >= 0:
+            error = frame["joints"] - state["measured"]
+            mean = 0.5 * (frame["joint_velocities"] + state["measured_velocities"])
+            self._rows.append((error, mean))
+
+    @property
+    def late_s(self) -> float:
+        """The lag [s]; 0 if it explains the errors badly."""
+        if not self._rows:
+            return 0.0
+        errors, velocities = map(np.array, zip(*self._rows, strict=True))
+        late_s = float((errors * velocities).sum() / max((velocities**2).sum(), 1e-12))
+        rest = ((errors - late_s * velocities) ** 2).sum()
+        is_late = late_s > LEAST_LAG_S and rest < UNEXPLAINED_SHARE * (errors**2).sum()
+        return late_s if is_late else 0.0
 
 
 class MeasuredArm:

@@ -21,7 +21,7 @@ from thirdhand.daemon.own_answers import OwnAnswers
 from thirdhand.daemon.saved_segment import SavedSegment
 from thirdhand.daemon.side_streams import side_streams
 from thirdhand.daemon.skill_work import SkillWork
-from thirdhand.daemon.status import CellStatus, MeasuredArm, outcome
+from thirdhand.daemon.status import ArmLag, CellStatus, MeasuredArm, outcome
 from thirdhand.settings.config import robot_description
 
 log = logging.getLogger("thirdhand")
@@ -37,6 +37,7 @@ class StatusThread:
         self._cell = cell
 
         # What the status reports beside the newest frame.
+        self._arm_lag = ArmLag()
         self._measured_arm = MeasuredArm(settings, robot_description(settings))
         self._machine = Machine()
         self._version = version("thirdhand")
@@ -162,6 +163,7 @@ class StatusThread:
         streams = cell.inputs.streams(now_s)
         clock.between_ticks()
         inside = self._measured_arm.inside(state)
+        self._arm_lag.note(frame, state)
         self._update_machine(frame, now_s)
 
         moment = CellStatus(
@@ -174,6 +176,7 @@ class StatusThread:
             inside=inside,
             busy=self._machine.at_stop,
             clutch=cell.inputs.clutch(state),
+            late_s=self._arm_lag.late_s,
             streams=streams,
         )
         return moment.status(
