@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib.util
 import threading
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import thirdhand
 from support.cell import serving
 from support.paths import ROOT
 
@@ -39,7 +41,8 @@ def test_tracker_follower_teacher_and_watcher_work_together(
     with serving(tmp_path) as daemon:
         options = ["--connect", daemon.endpoint]
         example("teach").main(options)
-        modules = {name: example(name) for name in ("watch", "follower", "tracker")}
+        modules = {name: example(name) for name in ("watch", "follower")}
+        hands: thirdhand.Hands = example("tracker").SwayingHands()
         for seconds in (2, 4, 8, 16):
             daemon.client.reset()
 
@@ -52,6 +55,12 @@ def test_tracker_follower_teacher_and_watcher_work_together(
             ]
             for thread in running:
                 thread.start()
+            ended_s = time.monotonic() + seconds
+
+            def is_over(ended_s: float = ended_s) -> bool:
+                return time.monotonic() > ended_s
+
+            hands.publish(daemon.session, is_over=is_over)
             for thread in running:
                 thread.join(60)
             output += capsys.readouterr().out

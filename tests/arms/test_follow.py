@@ -22,13 +22,15 @@ from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
-from thirdhand.arms import DriveError, place_of
-from thirdhand.arms.arm import arm_class
+from thirdhand.arms import place_of
+from thirdhand.arms.arm import Arm
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import UnreachableError, endpoints, open_session
 from thirdhand.contract import cdr
+from thirdhand.contract.explain import ExplainedError
 from thirdhand.daemon.launch import free_port
+from thirdhand.process.own_class import own_class
 from thirdhand.settings.config import Settings
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
@@ -254,10 +256,10 @@ def test_what_is_wrong_with_an_arm_of_ones_own_is_said(
 
     def run() -> None:
         with open_session() as session:
-            arm = arm_class(place_of(f"{file}:A"))(Settings())
+            arm = own_class(place_of(f"{file}:A"), Arm)(Settings())
             follow(arm, session, "thirdhand", stop=threading.Event())
 
-    with pytest.raises(DriveError, match=re.escape(message)):
+    with pytest.raises(ExplainedError, match=re.escape(message)):
         run()
 
 
@@ -270,7 +272,7 @@ def test_an_arm_of_another_distribution_is_found_by_its_name(
     (info / "entry_points.txt").write_text("[thirdhand.arms]\ntheirs = their_arm:Their\n")
     (tmp_path / "their_arm.py").write_text("import thirdhand\nclass Their(thirdhand.Arm): pass\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert arm_class(place_of("theirs")).__name__ == "Their"
+    assert own_class(place_of("theirs"), Arm).__name__ == "Their"
 
 
 def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import math
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -96,27 +93,3 @@ class Arm(AbstractContextManager["Arm"]):
         position = moved.position + self.lag_s * moved.velocity + moved.acceleration / self.gain
         inside = np.clip(position, self.limits.lower, self.limits.upper)
         self.write(inside, moved.velocity, moved.acceleration)
-
-
-def arm_class(place: str) -> type[Arm]:
-    """The class at a place, see `place_of`. Raises DriveError."""
-    module, _, name = place.rpartition(":")
-    try:
-        found = getattr(_module(module), name)
-    except (ImportError, OSError, SyntaxError, AttributeError) as error:
-        raise DriveError(f"{place}: {error}") from None
-    if not (isinstance(found, type) and issubclass(found, Arm)):
-        raise DriveError(f"{place} is no class of thirdhand.Arm")
-    return found
-
-
-def _module(place: str) -> Any:
-    """The module of this name, or in this file."""
-    if not place.endswith(".py"):
-        return importlib.import_module(place)
-    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{place} is no Python file")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -10,6 +10,7 @@ from thirdhand.arms import DriveError, place_of
 from thirdhand.cli.usage import reaching
 from thirdhand.client import Client
 from thirdhand.client.session import tried
+from thirdhand.process.own_class import own_class
 from thirdhand.process.progress import say
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings
@@ -25,7 +26,7 @@ def follow(args: argparse.Namespace) -> int:
     cell = settings.cell if args.config and not args.cell else reach.cell
     with tried(lambda: reach.session(at_once=True), args.wait, silent=False) as session:
         # slow imports: a missing daemon is reported before
-        from thirdhand.arms.arm import arm_class
+        from thirdhand.arms.arm import Arm
         from thirdhand.arms.drive import follow as driven
         from thirdhand.daemon.clock import ask_for_real_time
 
@@ -36,7 +37,7 @@ def follow(args: argparse.Namespace) -> int:
                 f"{', '.join(status.joints)}; the settings here have {len(settings.joints.names)}, "
                 f"{', '.join(settings.joints.names)}: give the daemon's settings by --config"
             )
-        arm = arm_class(place)(settings, args.robot)
+        arm = own_class(place, Arm)(settings, args.robot)
         arm.lag_s = arm.lag_s if args.lag is None else args.lag
         arm.gain = arm.gain if args.gain is None else args.gain
         stop = threading.Event()

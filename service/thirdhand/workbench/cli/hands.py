@@ -12,8 +12,9 @@ import webbrowser
 from pathlib import Path
 
 from thirdhand.cli.usage import UsageError, reached
-from thirdhand.client import Client, Tracker
+from thirdhand.client import Client, Hands, Tracker
 from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand.process.own_class import own_class
 from thirdhand.process.progress import say
 from thirdhand.settings.file_content import begin_of
 from thirdhand.settings.network import is_local
@@ -34,7 +35,17 @@ TOKEN_LENGTH = 12  # 62 bits, and few enough to type on a headset
 
 def hands(args: argparse.Namespace) -> int:
     """Publish hands until Ctrl-C; exit code 0 if a video file or SIGTERM ends it."""
+    if args.own:
+        return _own(args)
     return _camera(args) if args.camera is not None else _web(args)
+
+
+def _own(args: argparse.Namespace) -> int:
+    tracker = own_class(args.own, Hands)()
+    with reached(args, None) as session:
+        say(f"publishing the hands of {args.own}; Ctrl-C ends it")
+        tracker.publish(session, args.cell, is_over=lambda: False)
+    return 0
 
 
 def _camera(args: argparse.Namespace) -> int:

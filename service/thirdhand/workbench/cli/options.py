@@ -99,8 +99,8 @@ def hands(add: AddCommand) -> None:
     """Options of `hands`."""
     c = add(
         "hands",
-        "Publishes your hands, as a headset's browser or a camera of this machine tracks them, or "
-        "as you drag them with a mouse or a finger. Open the address that it prints.",
+        "Publishes your hands, as a headset's browser, a camera or your own tracker sees them, or as "
+        "you drag them with a mouse or a finger. Open the address that it prints.",
         "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https "
         "192.168.1.20\n"
         "  thirdhand hands --camera --hand-length 0.19",
@@ -117,6 +117,8 @@ def hands(add: AddCommand) -> None:
         "thirdhand[camera]"
     )
     option(kinds, "--camera", "NUMBER", camera, nargs="?", const="0")
+    own = "the hands of your own tracker: MODULE:CLASS or FILE.py:CLASS of a thirdhand.Hands"
+    option(kinds, "--own", "CLASS", own)
     address = (
         "serve the page at this address; port 0: any free one; for other machines with --https"
     )
