@@ -18,7 +18,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.geometry import place, rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings import palette
@@ -70,7 +70,7 @@ def tool_frame(
     name: str, settings: Settings, label_m: tuple[float, float, float]
 ) -> CoordinateFrame:
     """The frame of the tool in the posture of the settings."""
-    here = Arm(settings, robot_description(settings)).at(np.array(settings.arm.posture))
+    here = ArmStage(settings, robot_description(settings)).at(np.array(settings.arm.posture))
     return CoordinateFrame(
         name, np.array(here.position), np.array(here.record["rotation"][0]), label_m
     )

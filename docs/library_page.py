@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import kmp
+import thirdhand
 from kmp import estimator, orientation
-from thirdhand import client
 from thirdhand.contract import requests
 
 HERE = Path(__file__).parent
@@ -76,6 +76,7 @@ KMP_GROUPS = {
 CLIENT_GROUPS = {
     "Connect": ("connect", "Connection", "Watch", "SceneObject"),
     "Requests": ("Client",),
+    "A driver or a tracker of one's own": ("Arm", "Hands"),
     "Hands and joints": ("Tracker", "Follower", "Command", "Publisher"),
     "Sessions": ("client_settings", "ClientSettings", "open_session", "endpoints"),
     "Cells on a network": ("cells", "Cell", "living", "why_silent", "Overheard"),
@@ -126,7 +127,7 @@ def _library() -> str:
 
 def _client() -> str:
     """The page on `thirdhand.client`."""
-    parts = [CLIENT, *_groups(CLIENT_GROUPS, client), "## Values, `thirdhand.contract.requests`"]
+    parts = [CLIENT, *_groups(CLIENT_GROUPS, thirdhand), "## Values, `thirdhand.contract.requests`"]
     parts += [part for name in VALUES for part in _described(name, getattr(requests, name))]
     return "\n\n".join(parts) + "\n"
 

@@ -21,7 +21,7 @@ from thirdhand.contract import incidents, requests, ros2
 from thirdhand.contract.channels import CHANNELS, Channel, topic
 from thirdhand.contract.messages import BASE
 from thirdhand.contract.roles import ROLES
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import FRAME, TIMING_FIELDS
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings, robot_description
@@ -80,7 +80,7 @@ def test_each_view_that_a_page_names_by_its_title_exists() -> None:
 
 def test_the_table_of_signs_is_that_of_the_shipped_arm() -> None:
     text = (ROOT / "docs" / "hardware.md").read_text(encoding="utf-8")
-    arm = Arm(Settings(), robot_description(Settings()))
+    arm = ArmStage(Settings(), robot_description(Settings()))
     names = Settings().joints.names
     begin = np.array([0.0, 0.5, 0.0, 1.5, 0.0, -1.0, 0.0])
     rows = re.findall(r"\| `(wam/\w+)` \| (-?\d+) \| (-?\d+) \| (-?\d+) \|", text)

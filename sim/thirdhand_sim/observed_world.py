@@ -12,7 +12,7 @@ import zenoh
 
 from thirdhand.contract import cdr, messages
 from thirdhand.contract.joint_states import JointStates, measured
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.geometry import between_segments, place, quaternion_of
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.config import Settings, robot_description
@@ -27,7 +27,7 @@ class ObservedWorld(World):
     def _build(self, settings: Settings, bodies: dict[str, WorldBody], posture: Floats) -> None:
         self._names = settings.joints.names
         description = robot_description(settings)
-        self._arm = Arm(settings, description)
+        self._arm = ArmStage(settings, description)
         self._body = body_of(settings, description)
         self._bodies = bodies
         self._newest: tuple[Floats, Floats] = posture, (0.0,) * len(posture)

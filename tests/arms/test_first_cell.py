@@ -15,7 +15,7 @@ import pytest
 
 from support.arms import published
 from support.paths import ROOT
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.separation.stage import Separation
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import load, robot_description
@@ -69,7 +69,7 @@ def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
     proposal = proposed(path, plate=plate)
     cell = load(in_folder(proposal, path, tmp_path))
     robot = robot_description(cell)
-    arm = Arm(cell, robot)
+    arm = ArmStage(cell, robot)
     posture = np.array(cell.arm.posture)
     pose = arm.at(posture)
     assert pose.rotation[2, 2] < -math.cos(math.radians(50.0))

@@ -16,7 +16,7 @@ from thirdhand.arms import franka
 from thirdhand.arms.drive import DriveError
 from thirdhand.arms.playback import Playback
 from thirdhand.client import Command
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.settings.config import JointSettings, Settings, robot_description
 
@@ -122,7 +122,7 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     )
     assert rms <= rms_rad
     assert late_s <= 0.010
-    kinematics = Arm(cell(), robot_description(cell()))
+    kinematics = ArmStage(cell(), robot_description(cell()))
     distance_m = max(
         math.dist(kinematics.at(q).position, kinematics.at(commanded[-1]).position)
         for q in where[-100:]

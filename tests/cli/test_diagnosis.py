@@ -318,9 +318,7 @@ def test_the_lag_of_the_arm_is_reported_with_what_to_do(
     diagnosis = diagnosed(more={"lag_ms": lag_ms})
     (lag_finding,) = (finding for finding in diagnosis if finding.what == "arm's lag")
     assert (lag_finding.level, lag_finding.found) == (level, words)
-    assert ("lead by the lag: write position + lag * velocity" in lag_finding.text()) == (
-        level == "note"
-    )
+    assert ("lead by the lag: set lag_s of its class" in lag_finding.text()) == (level == "note")
     assert "arm's lag" not in {
         finding.what for finding in diagnosed(sources={"left": GOOD, "right": GOOD})
     }

@@ -454,7 +454,7 @@ def test_events_keep_the_numbers_that_recordings_know_them_by() -> None:
         "way",
         "segment",
     ]
-    kinds += ["clutch", "gripper/wish", "joints/guided"]
+    kinds += ["clutch", "gripper/wish", "joints/guided", "begin"]
     assert dict(enumerate(kinds)) == channels.EVENT_KINDS
 
 

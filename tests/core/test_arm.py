@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from support.followed import changed
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.contract.messages import BASE
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.settings.config import ArmSettings, Settings
 
@@ -43,7 +43,7 @@ LOWER, UPPER, FASTEST = (
     np.array(getattr(CELL.joints, name)) for name in ("lower", "upper", "velocity")
 )
 STILL = np.zeros(3)
-ARM = Arm(CELL, URDF)
+ARM = ArmStage(CELL, URDF)
 
 
 def facing(direction: Vector) -> Vector:
@@ -135,7 +135,7 @@ def test_forward_kinematics_is_as_published() -> None:
 def test_tool_sits_on_the_plate() -> None:
     """The tool sits on the plate where the settings say."""
     half = math.sqrt(0.5)
-    arm = Arm(
+    arm = ArmStage(
         changed(CELL, tool={"plate_from_tool": (0.01, 0.02, 0.1, 0.0, half, 0.0, half)}), URDF
     )
     q = random_joints(1, seed=2)[0]
@@ -216,7 +216,7 @@ def test_fast_task_is_scaled() -> None:
     """A task that is too fast is scaled and keeps its direction."""
     q = np.array(POSTURE)
     position = ARM.at(q).position
-    arm = Arm(changed(CELL, joints={"velocity": (0.7,) * 7}), URDF)
+    arm = ArmStage(changed(CELL, joints={"velocity": (0.7,) * 7}), URDF)
     slow = arm.step(q, position, np.array([0.0, 0.1, 0.0]), AHEAD)
     fast = arm.step(q, position + np.array([0, 0.018, 0]), np.array([0.0, 9.0, 0.0]), AHEAD)
     assert not slow.speed_limited

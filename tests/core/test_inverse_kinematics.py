@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear, minimize
 
 from thirdhand.core.arm.least_squares import keep_under, least_squares
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.decision.step import measured_error
 from thirdhand.core.frame import Vector, parameters
 from thirdhand.core.kinematics import tool_speed_after, tool_speeds
@@ -65,7 +65,7 @@ def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
     """The tool's speed after a joint displacement is that of Pinocchio."""
     random = np.random.default_rng(3)
     settings = cell_of(name)
-    arm = Arm(settings, robot_description(settings))
+    arm = ArmStage(settings, robot_description(settings))
     joints = len(settings.joints.names)
     for _ in range(20):
         q, step_rad, dq = random.uniform(-1, 1, (3, joints))

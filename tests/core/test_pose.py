@@ -16,7 +16,7 @@ from support.followed import changed, followed
 from support.in_process import ticks_of
 from support.wam import FRAME, URDF
 from thirdhand.contract import cdr
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import outgoing
 from thirdhand.core.frame import blank, state_layout
 from thirdhand.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
@@ -119,7 +119,7 @@ def test_turn_keeps_speed_and_acceleration(about: bool) -> None:
 def test_full_orientation_costs_no_position() -> None:
     """The arm follows the full orientation if the settings require it."""
     settings = changed(Settings(), tool={"orientation": "full"})
-    arm = Arm(settings, URDF)
+    arm = ArmStage(settings, URDF)
     limiter = Limiter(settings.joints, PERIOD_S)
     q = np.array(settings.arm.posture)
     dq = np.zeros(7)

@@ -20,7 +20,7 @@ from support.followed import changed, followed
 from support.in_process import ASSUMED, LEFT, RIGHT, seen
 from support.wam import STATE, URDF
 from thirdhand.contract.records import Flag, Mode
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import start_state
 from thirdhand.core.frame import Record, Tick, Vector, blank, frame_layout
 from thirdhand.core.geometry import between_segments, nearest_to_box, place, quaternion_of, to_box
@@ -44,7 +44,7 @@ SLIP_SPEED_MPS = TUNING.separation.slip_speed_mps
 RETREAT_SPEED_MPS = 2.0 * SLIP_SPEED_MPS
 
 
-ARM = Arm(ASSUMED, URDF)
+ARM = ArmStage(ASSUMED, URDF)
 BODY = body_of(ASSUMED, URDF)
 LOWER = np.array(ASSUMED.joints.lower)
 UPPER = np.array(ASSUMED.joints.upper)
@@ -307,7 +307,7 @@ def test_near_parts_move_apart(arm: str) -> None:
     cell = cell_of(arm)
     urdf = robot_description(cell)
     separation = Separation(cell, urdf)
-    kinematics = Arm(cell, urdf)
+    kinematics = ArmStage(cell, urdf)
     random = np.random.default_rng(3)
     planned = []
     for q in random.uniform(cell.joints.lower, cell.joints.upper, (4000, len(cell.joints.names))):
@@ -433,7 +433,7 @@ def test_braking_joints_do_not_take_turns() -> None:
     """
     cell = cell_of("panda")
     urdf = robot_description(cell)
-    arm = Arm(cell, urdf)
+    arm = ArmStage(cell, urdf)
     separation = Separation(cell, urdf)
     state = blank(STATE)
     frame = blank(frame_layout(7))

@@ -13,7 +13,7 @@ import pytest
 from support.in_process import Loop, assert_limits_hold, assert_replays, script_hands
 from support.turning import ARMS, BEYOND, cell_in, sliding_cell
 from thirdhand.contract.records import Cause, Mode, Reason
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.geometry import place
 from thirdhand.core.separation.body import body_of
 from thirdhand.core.skill.skill import Skill
@@ -112,7 +112,7 @@ def test_joints_beyond_plate_change_nothing(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         cells.append(cell_in(tmp_path / name, urdf))
     assert cells[0].joints == cells[1].joints
-    arms = [Arm(variant, robot_description(variant)) for variant in cells]
+    arms = [ArmStage(variant, robot_description(variant)) for variant in cells]
     q = np.array(cells[0].arm.posture) + 0.1
     np.testing.assert_array_equal(arms[0].at(q).jacobian, arms[1].at(q).jacobian)
     assert len(body_of(cells[1], robot_description(cells[1])).capsules) > 5

@@ -20,7 +20,7 @@ from support.in_process import ASSUMED, Loop, assert_limits_hold, assert_replays
 from support.starts import free_postures
 from support.wam import URDF
 from thirdhand.contract.records import Flag, Mode, Reason
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import Controller, start_state
 from thirdhand.core.decision import WAY
 from thirdhand.core.frame import Event, Frame, Tick, Vector, order
@@ -210,7 +210,7 @@ def test_arm_in_the_table_leaves_it_first(skill: Skill, seed: int) -> None:
     cell = replace(ASSUMED, arm=replace(ASSUMED.arm, source="state"))
     random = np.random.default_rng(seed)
     separation = Separation(cell, URDF)
-    kinematics = Arm(cell, URDF)
+    kinematics = ArmStage(cell, URDF)
     while True:
         q = random.uniform(cell.joints.lower, cell.joints.upper)
         depth, _, thing = separation.intrusion(q)

@@ -9,7 +9,7 @@ import pytest
 
 from support.followed import changed
 from thirdhand.contract.records import Flag, Mode
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import blank, frame_layout
 from thirdhand.core.tool_limits import binding, tool_limits
 from thirdhand.core.tuning import TUNING
@@ -23,7 +23,7 @@ PLANNED_LIMIT_SHARES = TUNING.arm.planned_limit_shares
 def test_limit_uses_all_that_is_planned(name: str) -> None:
     """At the tool's limit, the named joint uses all of its planned speed."""
     settings = cell_of(name)
-    arm = Arm(settings, robot_description(settings))
+    arm = ArmStage(settings, robot_description(settings))
     random = np.random.default_rng(0)
     never_binding = {"max_speed": 100.0, "max_acceleration": 1000.0, "fault_speed": 200.0}
     quick = changed(settings, tool=never_binding)

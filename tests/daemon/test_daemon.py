@@ -24,7 +24,7 @@ from support.paths import ROOT
 from support.wam import JOINT_NAMES
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, messages, requests
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Tick
 from thirdhand.core.skill.skill import Skill
@@ -256,7 +256,7 @@ def test_position_of_the_tool_comes_from_the_joints(skill: Skill) -> None:
     controller = Controller(settings, skill, urdf=urdf)
     joints = settings.arm.posture
     tool = MeasuredArm(settings, urdf)
-    expected_m = Arm(settings, urdf).at(np.array(joints)).position
+    expected_m = ArmStage(settings, urdf).at(np.array(joints)).position
     controller.step(Tick(0))
     assert tool.position(controller.state) is None
     controller.step(Tick(1, (arm(joints, 1),)))

@@ -13,7 +13,7 @@ from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
-from thirdhand.skills.start_place import BESIDE_M, FARTHEST_M, StartPlace
+from thirdhand.skills.via_points import BESIDE_START_M, FROM_START_M, StartPlace
 from thirdhand_sim.lab.open_loop import controller
 from thirdhand_sim.lab.people.comparison import PEOPLE_METHODS
 from thirdhand_sim.lab.people.trials import judge, seen
@@ -43,12 +43,12 @@ def test_the_daemon_begins_where_hands_rest(tmp_path: Path) -> None:
         np.testing.assert_allclose(moved["start"].left, LEFT + BESIDE, atol=0.005)
         assert "the task begins where the hands rest: start, handover" in daemon.log.read_text()
         hands.left = tuple(LEFT)
-        until(lambda: np.linalg.norm(starts(client)["start"].left - LEFT) < BESIDE_M)
+        until(lambda: np.linalg.norm(starts(client)["start"].left - LEFT) < BESIDE_START_M)
 
 
 @pytest.mark.parametrize(
     ("off_m", "is_moved"),
-    [(0.0, False), (BESIDE_M - 0.02, False), (0.15, True), (FARTHEST_M + 0.02, False)],
+    [(0.0, False), (BESIDE_START_M - 0.02, False), (0.15, True), (FROM_START_M + 0.02, False)],
 )
 def test_only_hands_beside_the_start_move_it(off_m: float, is_moved: bool) -> None:
     settings = Settings()

@@ -9,7 +9,7 @@ import pytest
 
 from support.followed import changed
 from support.turning import sliding_cell
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.skill.skill import is_reachable
 from thirdhand.recordings.shipped import ARMS, cell_of, shipped_skill
 from thirdhand.settings.config import Reach, Settings, robot_description
@@ -31,7 +31,7 @@ def test_reachable_places_are_within_reach(arm: str, tmp_path: Path) -> None:
     lower = np.array(cell.joints.lower)
     upper = np.array(cell.joints.upper)
     random = np.random.default_rng(7)
-    forward = Arm(cell, robot_description(cell))
+    forward = ArmStage(cell, robot_description(cell))
     shares = random.uniform(size=(1500, len(lower)))
     shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)  # half of the joints are at a limit
     places = np.array([forward.at(q).position for q in lower + shares * (upper - lower)])

@@ -22,7 +22,7 @@ from support.wicked import wicked_skill
 from thirdhand.command_line import main
 from thirdhand.contract.records import Flag, Mode, Reason
 from thirdhand.contract.requests import Percentiles, Status, ViaPoint, encode_json
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import STAGES, Event, Tick, order, timed
 from thirdhand.core.skill.skill import Skill
@@ -166,7 +166,7 @@ def test_stop_distance_is_compared_with_people(golden: Path) -> None:
     end[1] = 0.1
     columns.stops = {tick: [begin, end]}
     columns.frames["setpoint_velocity"][columns.frames["tick"] == tick] = (0.0, 0.8, 0.0)
-    arm = Arm(SETTINGS, URDF)
+    arm = ArmStage(SETTINGS, URDF)
     distance_mm = 1000 * float(np.linalg.norm(arm.at(end).position - arm.at(begin).position))
     assumed_mm = 0.8 * SETTINGS.people.reaction_ms + 1000 * 0.8**2 / (2 * SETTINGS.people.brake)
     (prompt,) = (table for table in tables(Report(columns)) if table.name == "times")

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.ur5_cell import UR5, cell_in
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import Settings, robot_description
@@ -67,7 +67,7 @@ def tried(folder: Path, text: str | bytes) -> Settings:
     finally:
         assert time.process_time() - start < BOUND_S
     robot = robot_description(cell)
-    arm = Arm(cell, robot)
+    arm = ArmStage(cell, robot)
     body = body_of(cell, robot)
     pose = arm.at(np.array(cell.arm.posture))
     for numbers in (pose.position, pose.jacobian, body.frames, body.axes, body.capsules["ends"]):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from support.turning import sliding_cell
 from support.ur5_cell import UR5, cell_in
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.file_content import SettingsError
@@ -42,7 +42,7 @@ def reached(cell: Settings, points: NDArray[np.float64]) -> float:
     """The share of points (N, 3) [m] that the arm reaches within 1 cm, by damped least squares from
     several postures.
     """
-    arm = Arm(cell, robot_description(cell))
+    arm = ArmStage(cell, robot_description(cell))
     lower = np.maximum(cell.joints.lower, -math.pi)
     upper = np.minimum(cell.joints.upper, math.pi)
     random = np.random.default_rng(3)

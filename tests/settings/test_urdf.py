@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.arms import MODELS, cell_of, published, toml_of
 from support.turning import continuous_urdf, sliding_urdf
 from support.wam import JOINT_NAMES, URDF
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.settings.arm_description import completed
 from thirdhand.settings.config import load, parse, robot_description
 from thirdhand.settings.file_content import SettingsError
@@ -166,7 +166,7 @@ def test_what_cannot_be_used_is_refused_in_words(text: str, message: str) -> Non
 @pytest.mark.parametrize("name", MODELS)
 def test_names_limits_and_reach_come_from_the_description(name: str) -> None:
     cell = cell_of(name)
-    arm = Arm(cell, robot_description(cell))
+    arm = ArmStage(cell, robot_description(cell))
     pose = arm.at(np.array(cell.arm.posture))
     position = pose.position
     rotation = pose.rotation

@@ -94,7 +94,7 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
         if i % 100 == 50:
             inbox += [
                 Event(kind, cdr.encode_string("{}"), None)
-                for kind in ("fault", "reset", "hold", "resume", "hold", "way", "segment")
+                for kind in ("fault", "reset", "hold", "resume", "hold", "way", "segment", "begin")
             ]
             inbox.insert(1, Event("skill", random.bytes(2000), None))
         yield Tick(i, tuple(inbox)), frame, timing

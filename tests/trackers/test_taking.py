@@ -22,7 +22,7 @@ from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.requests import Add, encode_json
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.daemon.launch import free_port
 from thirdhand.recordings.mcap_file import RecordingError
 from thirdhand.settings.config import HandSettings, Settings, ToolSettings, robot_description
@@ -110,7 +110,7 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     assert list(tmp_path.iterdir()) == [path]
     assert sorted(cdr.encode_pose(pose) for *_, pose in hand_samples(path)) == sorted(sent)
     got = read_demonstration(path)
-    arm = Arm(SETTINGS, robot_description(SETTINGS))
+    arm = ArmStage(SETTINGS, robot_description(SETTINGS))
     assert got.left[0, :3].tolist() == [1.0, -0.3, 0.0]
     np.testing.assert_allclose(got.tool[-1, :3], arm.at(joints + 0.29).position, atol=1e-12)
     assert PoseRecording(path).settings == SETTINGS

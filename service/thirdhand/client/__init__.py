@@ -5,7 +5,6 @@ the cells on a network. `import thirdhand` has the same names.
 from thirdhand.client.calls import Client
 from thirdhand.client.client_settings import CLIENT_FILE, ClientSettings, client_settings
 from thirdhand.client.connection import Connection, connect
-from thirdhand.client.hands import Hands, Pose
 from thirdhand.client.presence import Cell, Overheard, cells, living, why_silent
 from thirdhand.client.replies import decoded
 from thirdhand.client.session import (
@@ -46,9 +45,7 @@ __all__ = [
     "Command",
     "Connection",
     "Follower",
-    "Hands",
     "Overheard",
-    "Pose",
     "Publisher",
     "RefusedError",
     "SceneObject",

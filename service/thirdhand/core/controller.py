@@ -18,7 +18,7 @@ from thirdhand.contract import cdr
 from thirdhand.contract.channels import CHANNELS, STREAMS
 from thirdhand.contract.messages import BASE, GRIPPER, PoseStamped, PoseWithCovarianceStamped
 from thirdhand.contract.records import GONE_S, Flag, Reason
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.codes import (
     ARM_INSIDE,
     BROKEN,
@@ -118,7 +118,7 @@ class Controller:
         self.decision = Decision(settings, tuning=tuning)
         self._separation = Separation(settings, urdf, tuning=tuning)
         self._separation.set_contacts(skill.via_points)
-        self._arm = Arm(settings, urdf, tuning=tuning)
+        self._arm = ArmStage(settings, urdf, tuning=tuning)
         self._setpoint = SetpointStage(settings, self._arm, tuning=tuning)
         self._limiter = LimiterStage(settings, self._arm, tuning=tuning)
         # capsules exceed the meshes in them by about this: an arm that is less deep in a thing, by

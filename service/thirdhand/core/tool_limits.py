@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from thirdhand.contract.records import Flag, Mode
 from thirdhand.contract.requests import ALONG_TASK, ANY_DIRECTION, ToolLimits
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
@@ -33,7 +33,7 @@ MOST_PATH_POINTS = 40  # points of a path without an order
 
 
 def tool_limits(
-    arm: Arm, settings: Settings, postures: Vector, directions: Vector | None = None
+    arm: ArmStage, settings: Settings, postures: Vector, directions: Vector | None = None
 ) -> ToolLimits:
     """Limits of the tool at the postures (N, J) [rad, m] where they are least.
 
@@ -61,7 +61,7 @@ def limits_of_task(
     """Limits of the tool on a path through `positions` (M, 3) [m] in an orientation (4,), one named
     ANY_DIRECTION and one named ALONG_TASK; empty if the arm reaches none of the positions.
     """
-    arm = Arm(settings, urdf)
+    arm = ArmStage(settings, urdf)
     postures, directions = _along(arm, settings, positions, orientation)
     if not len(postures):
         return {}
@@ -87,7 +87,7 @@ def path_of(skill: Skill) -> Vector:
 
 
 def _along(
-    arm: Arm, settings: Settings, positions: Vector, orientation: Vector
+    arm: ArmStage, settings: Settings, positions: Vector, orientation: Vector
 ) -> tuple[Vector, Vector]:
     """Postures (N, J) along straight lines between positions (M, 3) [m], from the configured one
     on, by the arm's own inverse kinematics, and the directions of motion there (N, 3).

@@ -12,7 +12,7 @@ import numpy as np
 from kmp import KMP, GaussianKernel, Gaussians
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import SIDES
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import (
     Event,
@@ -91,7 +91,7 @@ def rehearse_motion(settings: Settings, urdf: str) -> None:
     They run only near the tool's largest speed, on a way out, and with a skill that depends on the
     past or whose teacher was late.
     """
-    arm = Arm(settings, urdf)
+    arm = ArmStage(settings, urdf)
     separation = Separation(settings, urdf)
     setpoint = SetpointStage(settings, arm)
     limiter = LimiterStage(settings, arm)

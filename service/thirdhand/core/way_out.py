@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.decision import WAY
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import axis_of, quaternion_of, swing, turn_between
@@ -50,7 +50,7 @@ class WayOut:
     """Planner of ways out for the arm of one cell; equal arguments give equal paths."""
 
     def __init__(self, settings: Settings, urdf: str) -> None:
-        self._arm = Arm(settings, urdf)
+        self._arm = ArmStage(settings, urdf)
         self._separation = Separation(settings, urdf)
         limits = settings.joints
         lower = np.array(limits.lower)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thirdhand.contract.requests import Correct, Orientation, RequestError, ViaPoint
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.codes import FAULT, HELD_SEEN, HOLD
 from thirdhand.core.frame import Frame, Record, Vector
 from thirdhand.core.geometry import quaternion_of
@@ -59,7 +59,7 @@ class Corrections:
 
     def __init__(self, cell: CellState) -> None:
         self._cell = cell
-        self._arm: Arm | None = None
+        self._arm: ArmStage | None = None
         self.replaced: dict[ViaPoint, tuple[ViaPoint, ...]] = {}
 
     def led(self, request: Correct) -> LedTool:
@@ -90,7 +90,7 @@ class Corrections:
             raise RequestError(
                 f"the arm moves at {speed:.2f} rad/s; {MAX_LED_RADPS} rad/s accepted: hold it still"
             )
-        self._arm = self._arm or Arm(settings, robot_description(settings))
+        self._arm = self._arm or ArmStage(settings, robot_description(settings))
         kinematics = self._arm.at(np.array(state["measured"]))
         quaternion = np.empty(4)
         quaternion_of(kinematics.rotation, quaternion)

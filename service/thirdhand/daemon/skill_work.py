@@ -15,7 +15,7 @@ from thirdhand.daemon.answers import Answers
 from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.skill_worker import tool_limits_of, way_out_of
 from thirdhand.skills.skill_file import SkillError, StoredSkill
-from thirdhand.skills.start_place import StartPlace
+from thirdhand.skills.via_points import StartPlace
 
 AGAIN_S = 2.0  # a search is repeated after this time, because obstacles may have moved
 

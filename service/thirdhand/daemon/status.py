@@ -14,7 +14,7 @@ from thirdhand.contract.incidents import MALFORMED, word
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.records import GONE_S, SIDES, Flag, Mode, Reason
 from thirdhand.contract.requests import Source, Status
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.codes import READY, RETURNING
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Frame, Record, Vector
@@ -308,7 +308,7 @@ class MeasuredArm:
         self._period_s = settings.period_s
         self._names = settings.joints.names
         # Own copies, because the loop uses its arm and separation at the same time.
-        self._arm = Arm(settings, urdf)
+        self._arm = ArmStage(settings, urdf)
         self._separation = Separation(settings, urdf)
 
     def inside(self, state: Record) -> Inside | None:

@@ -30,7 +30,7 @@ REMEDY = (
 )
 
 
-class _About(msgspec.Struct, frozen=True, kw_only=True):
+class _About(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A demonstration but for its samples."""
 
     name: str

@@ -65,7 +65,7 @@ RECORDED = {  # prefixes of the files' names
 }
 GROUPED_BY_PERSON = ("give",)  # tasks whose groups are persons
 NAMES_PLACES = ("give",)  # tasks whose takes begin and end at via-points
-REQUESTED = ("screw, begun by a request",)  # tasks whose takes a request begins
+BEGUN_BY_REQUEST = ("screw, begun by a request",)  # tasks whose takes a request begins
 TAKES_OF_BLOCK = 9  # takes of `walk` that are left out together
 PARTNER_SEEDS = EXPERIMENTS["partners"].seeds
 EACH = 2  # takes of a person
@@ -149,7 +149,7 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
             group,
             read(path, named=task in NAMES_PLACES)._replace(
                 person=group * (task in GROUPED_BY_PERSON),
-                begun_s=0.0 if task in REQUESTED else None,
+                begun_s=0.0 if task in BEGUN_BY_REQUEST else None,
             ),
         )
         for path, group in ((path, _group(task, i, path.stem)) for i, path in enumerate(files))
@@ -316,10 +316,11 @@ def numbers_of(found: Sequence[Found]) -> dict[str, Any]:
 
 def _accepted(folds: Sequence[SkillFold]) -> dict[str, Any]:
     """The numbers of all rounds of accepted takes, and the error [mm] by round."""
-    takes = [take for fold in folds for take in fold.accepted if take]
-    rounds = [summary(takes_of_round).get("rms_mm") for takes_of_round in zip(*takes, strict=True)]
-    numbers = summary([one for take in takes for one in take])
-    return numbers | {"takes": len(takes), "rounds_mm": rounds}
+    every = itertools.chain.from_iterable(fold.accepted for fold in folds)
+    takes = [rounds for rounds in every if rounds]
+    numbers = summary(list(itertools.chain.from_iterable(takes)))
+    rounds_mm = [summary(one_round)["rms_mm"] for one_round in zip(*takes, strict=True)]
+    return numbers | {"takes": len(takes), "rounds_mm": rounds_mm}
 
 
 def _service_numbers(found: Sequence[Found], name: str) -> dict[str, Any]:

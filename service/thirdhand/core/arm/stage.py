@@ -49,7 +49,7 @@ class Closing(NamedTuple):
     far_damping: float
 
 
-class Arm:
+class ArmStage:
     """The arm that a URDF describes, with a tool on its plate.
 
     It has no state: every result depends on the arguments only. J joints, in the order of the

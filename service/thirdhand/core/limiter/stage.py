@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import ruckig
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import Record, Vector, as_array, parameters
 from thirdhand.core.joint_limits import LIMIT_MARGIN_RAD, approach_gain
 from thirdhand.core.kinematics import Kinematics, tool_speeds
@@ -205,7 +205,7 @@ class Moved(NamedTuple):
 class LimiterStage:
     """Joints of the state (3, J): position, velocity, acceleration [rad, rad/s, rad/s²]."""
 
-    def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
+    def __init__(self, settings: Settings, arm: ArmStage, *, tuning: Tuning = TUNING) -> None:
         self._arm = arm
         self._max_speed = settings.tool.max_speed
         # Speed above which the joints stop: midway between that of closing in and max_speed.

@@ -26,7 +26,7 @@ import math
 
 import numpy as np
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.codes import SetpointBound
 from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
 from thirdhand.core.kinematics import Kinematics
@@ -155,7 +155,7 @@ class SetpointGenerator:
 class SetpointStage:
     """Position and orientation setpoints and gripper, in the box (2, 3) [m] of the active skill."""
 
-    def __init__(self, settings: Settings, arm: Arm, *, tuning: Tuning = TUNING) -> None:
+    def __init__(self, settings: Settings, arm: ArmStage, *, tuning: Tuning = TUNING) -> None:
         self._arm = arm
         self._period_s = settings.period_s
         self._gap_waiting_m = tuning.setpoint.gap_waiting_m

@@ -12,7 +12,8 @@ import webbrowser
 from pathlib import Path
 
 from thirdhand.cli.usage import UsageError, reached
-from thirdhand.client import Client, Hands, Tracker
+from thirdhand.client import Client, Tracker
+from thirdhand.client.hands import Hands
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand.process.own_class import own_class
 from thirdhand.process.progress import say

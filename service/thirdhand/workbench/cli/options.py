@@ -99,8 +99,8 @@ def hands(add: AddCommand) -> None:
     """Options of `hands`."""
     c = add(
         "hands",
-        "Publishes your hands, as a headset's browser, a camera or your own tracker sees them, or as "
-        "you drag them with a mouse or a finger. Open the address that it prints.",
+        "Publishes your hands, as a headset's browser, a camera or your own tracker sees them, or "
+        "as you drag them with a mouse or a finger. Open the address that it prints.",
         "thirdhand hands --mouse --open\n  thirdhand hands --web --listen 0.0.0.0:8443 --https "
         "192.168.1.20\n"
         "  thirdhand hands --camera --hand-length 0.19",

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from thirdhand.contract.requests import ANY_DIRECTION, ToolLimits
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.geometry import quaternion_of
 from thirdhand.core.separation.body import Body, body_of
 from thirdhand.core.separation.clearance import NEAR_ITSELF
@@ -145,7 +145,7 @@ def proposed(
 
 def _limits(settings: Settings, robot: str, *, is_demo: bool) -> dict[str, ToolLimits]:
     """Limits of the tool on the way through DEMO_TOOL_M, or in the posture alone."""
-    arm = Arm(settings, robot)
+    arm = ArmStage(settings, robot)
     posture = np.array(settings.arm.posture)
     orientation = np.empty(4)
     quaternion_of(arm.at(posture).rotation, orientation)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.optimize import least_squares
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import Vector
 from thirdhand.core.separation.stage import Separation
 from thirdhand.settings.config import Point, Settings
@@ -57,7 +57,7 @@ def first_posture(
     of the inverse kinematics the best is taken, by margin to the limits, clearance from the table
     and itself, manipulability, and distance from the middle of the joints' ranges.
     """
-    arm = Arm(settings, robot)
+    arm = ArmStage(settings, robot)
     separation = Separation(settings, robot)
     place = _over_the_table(settings, shell, start)
     lower = np.array(settings.joints.lower)

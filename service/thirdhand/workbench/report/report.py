@@ -361,7 +361,7 @@ def _binding(columns: Columns) -> Iterator[Limit]:
 
 def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
     """Limits of the tool at the postures in which the arm followed, and along its motion there."""
-    from thirdhand.core.arm.stage import Arm
+    from thirdhand.core.arm.stage import ArmStage
     from thirdhand.core.tool_limits import tool_limits
 
     speed = np.linalg.norm(following["setpoint_velocity"], axis=1)
@@ -371,7 +371,7 @@ def _tool_limits(columns: Columns, following: Records) -> dict[str, ToolLimits]:
         return {}
     settings = columns.recording.settings
     velocities = moving["setpoint_velocity"]
-    arm = Arm(settings, columns.recording.urdf)
+    arm = ArmStage(settings, columns.recording.urdf)
     directions = velocities / np.linalg.norm(velocities, axis=1)[:, None]
     return {
         ANY_DIRECTION: tool_limits(arm, settings, moving["joints"]),

@@ -17,11 +17,11 @@ LEAST_STOP_SPEED_MPS = 0.05
 
 def measured_stops(columns: Columns) -> Vector:
     """Tool speed [m/s] before each stop and distance [m] of the stop, (N, 2)."""
-    from thirdhand.core.arm.stage import Arm
+    from thirdhand.core.arm.stage import ArmStage
 
     stops: list[tuple[float, float]] = []
     if columns.recording.urdf:
-        arm = Arm(columns.recording.settings, columns.recording.urdf)
+        arm = ArmStage(columns.recording.settings, columns.recording.urdf)
         for tick, joints in columns.stops.items():
             tool_m = np.array([arm.at(np.array(q)).position for q in joints])
             before = columns.frames["setpoint_velocity"][columns.frames["tick"] == tick]

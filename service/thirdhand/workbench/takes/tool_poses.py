@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import Settings
 
@@ -22,7 +22,7 @@ def tool_poses(
     lasts_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
     step = max(1, int(len(stamps_ns) / lasts_s / MOST_HZ + 0.01)) if lasts_s else 1
     rows = np.arange(0, len(stamps_ns), step)
-    arm = Arm(settings, urdf)
+    arm = ArmStage(settings, urdf)
     poses = [arm.at(q) for q in joints[rows]]
     quaternions = Rotation.from_matrix([pose.rotation for pose in poses]).as_quat()
     return np.hstack([[pose.position for pose in poses], quaternions]), rows

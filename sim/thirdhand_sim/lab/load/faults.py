@@ -26,7 +26,7 @@ import numpy as np
 from thirdhand.client import RefusedError
 from thirdhand.contract import cdr
 from thirdhand.contract.records import Mode, Reason
-from thirdhand.core.arm.stage import Arm
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings, robot_description
@@ -257,7 +257,7 @@ def _commanded(told: list[Command], settings: Settings) -> float:
     """Path of the tool by the commands [m]."""
     if len(told) < 2:
         return 0.0
-    arm = Arm(settings, robot_description(settings))
+    arm = ArmStage(settings, robot_description(settings))
     places = np.array(
         [arm.at(np.array(cdr.decode_joints(payload).position)).position for _, _, payload in told]
     )

@@ -22,8 +22,7 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand.skills.start_place import StartPlace
-from thirdhand.skills.via_points import adapted
+from thirdhand.skills.via_points import StartPlace, adapted
 from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.open_loop import controller, frames
 from thirdhand_sim.lab.results import Array
