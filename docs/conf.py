@@ -41,6 +41,7 @@ GROUPS = {
         "own-arm",
         "franka",
         "universal-robots",
+        "wam",
         "ros2-control",
         "near-people",
         "rate",

@@ -184,7 +184,7 @@ def refused(*arguments: str) -> str:
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
-    assert "no arm 'frankia'; franka, simulated, ur accepted, or one of your own" in refused(
+    assert "no arm 'frankia'; franka, simulated, ur, wam accepted, or your own" in refused(
         "frankia"
     )
     assert "is a daemon or a router running" in refused(

@@ -11,6 +11,7 @@ SHIPPED = {
     "franka": "thirdhand.arms.franka:FrankaArm",
     "simulated": "thirdhand.arms.simulated:SimulatedArm",
     "ur": "thirdhand.arms.universal_robots:UniversalRobotsArm",
+    "wam": "thirdhand.arms.barrett_wam:BarrettWAM",
 }
 
 
