@@ -76,7 +76,7 @@ def test_it_follows_and_brakes_when_commands_end(address: str) -> None:
         while time.monotonic() < until_s:
             arm.wait()
             speeds.append(float(np.abs(arm.read()[1]).max()))
-    assert max(speeds) > 0.3
+    assert min(speeds[1:8]) > 0.3
     assert speeds[-1] == 0.0
     assert np.diff(speeds).min() > -2.0 * BRAKE_RADPS2 * 0.05  # never at once
 

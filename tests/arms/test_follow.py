@@ -19,7 +19,7 @@ import pytest
 import zenoh
 
 from support.arms import MODELS, toml_of
-from support.cell import LEFT, Tracker, serving, thirdhand, told
+from support.cell import LEFT, Tracker, serving, thirdhand, told, until
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms import place_of
@@ -29,6 +29,8 @@ from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import UnreachableError, endpoints, open_session
 from thirdhand.contract import cdr
 from thirdhand.contract.explain import ExplainedError
+from thirdhand.core.frame import Vector
+from thirdhand.core.limiter.stage import Limited
 from thirdhand.daemon.launch import free_port
 from thirdhand.process.own_class import own_class
 from thirdhand.settings.config import Settings
@@ -184,9 +186,7 @@ def refused(*arguments: str) -> str:
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
-    assert "no arm 'frankia'; franka, simulated, ur, wam accepted, or your own" in refused(
-        "frankia"
-    )
+    assert "no arm 'frankia'; franka, simulated, ur, wam accepted, or one" in refused("frankia")
     assert "is a daemon or a router running" in refused(
         "simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2"
     )
@@ -239,7 +239,9 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
     ("text", "message"),
     [
         ("class A: pass", "is no class of thirdhand.Arm"),
-        ("import nothing_like_this", "No module named 'nothing_like_this'"),
+        ("import nothing_like_this", "ModuleNotFoundError: No module named 'nothing_like_this'"),
+        ("x = 1 + ''", "TypeError: unsupported operand"),
+        ("from dataclasses import dataclass\n@dataclass\nclass A:\n  x: int", "is no class of"),
         ("class B: pass", "has no attribute 'A'"),
         ("return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; 7 of each needed"),
         ("return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
@@ -261,6 +263,46 @@ def test_what_is_wrong_with_an_arm_of_ones_own_is_said(
 
     with pytest.raises(ExplainedError, match=re.escape(message)):
         run()
+
+
+class Led(SimulatedArm):
+    """An arm led by positions, which keeps what was written last."""
+
+    def write(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
+        self.written = position
+        if not self.guided:
+            self.position = position
+
+
+def test_an_arm_that_was_led_stays_where_it_was_led_to() -> None:
+    """So does one that stands elsewhere for another reason, after a moment."""
+    arm = Led(Settings())
+    begin = arm.position.copy()
+    stop = threading.Event()
+    with open_session() as session:
+        driver = threading.Thread(
+            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
+        )
+        driver.start()
+        until(lambda: hasattr(arm, "written"))
+        arm.guided = True
+        for step in range(20):
+            arm.position = begin + 0.02 * step
+            time.sleep(0.01)
+        until(lambda: np.abs(arm.written - arm.position).max() < 1e-9)
+        arm.guided = False
+        time.sleep(0.1)
+        assert np.abs(arm.position - begin - 0.38).max() < 1e-6
+        stop.set()
+        driver.join(10)
+
+
+def test_an_arm_outside_its_limits_does_not_jump() -> None:
+    arm = Led(Settings())
+    outside = np.array(arm.limits.lower) - 0.1
+    still = np.zeros(7)
+    arm.lead(Limited(outside, still, still, limited=False))
+    np.testing.assert_array_equal(arm.written, outside)
 
 
 def test_an_arm_of_another_distribution_is_found_by_its_name(

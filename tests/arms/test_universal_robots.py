@@ -90,6 +90,7 @@ def test_it_leads_by_what_the_servo_lags_and_names_its_stop(box: Box) -> None:
     arm_error = sway(arm, 4.0)
     assert arm_error < 0.005
     box.stop()
+    arm = UniversalRobotsArm(UR5, ADDRESS)
     with pytest.raises(DriveError, match=r"is in a protective stop: .* Then start again"):
         sway(arm, 1.0)
     box.stop()
@@ -110,7 +111,9 @@ def test_a_cell_moves_it(kind: type[UniversalRobotsArm], box: Box, tmp_path: Pat
     """An arm that is merely late is a fault that says how late, and what to set."""
     config = tmp_path / "ur.toml"
     shipped = (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml").read_text()
-    urdf = f"urdf = {json.dumps(UR5.arm.urdf)}\nfault_error_rad = 0.06"
+    # a busy machine makes any arm late
+    most_rad = 0.06 if kind is LateArm else 0.3
+    urdf = f"urdf = {json.dumps(UR5.arm.urdf)}\nfault_error_rad = {most_rad}"
     config.write_text(f"{LISTENING}{shipped}".replace('urdf = "ur5.urdf"', urdf))
     stop = threading.Event()
     with (

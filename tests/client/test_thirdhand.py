@@ -5,6 +5,7 @@ the calls of a connection.
 from __future__ import annotations
 
 import ast
+import asyncio
 import itertools
 import math
 import re
@@ -20,6 +21,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from support.cell import until
 from support.installed import isolated, unpacked, wheel_of
 from support.paths import ROOT
 from thirdhand.client import (
@@ -33,8 +35,8 @@ from thirdhand.client import (
     endpoints,
     open_session,
 )
-from thirdhand.client.streams import Publisher, wait_until_heard
-from thirdhand.contract import channels
+from thirdhand.client.streams import UNTURNED, Publisher, wait_until_heard
+from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.process.foreign_modules import EXTRAS
 
@@ -381,6 +383,33 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
                 UnreachableError, match="the connection was closed in this program: open a new one"
             ):
                 call()
+
+
+def test_an_asynchronous_program_watches_too(listener: zenoh.Session) -> None:
+    """Messages arrive in order while others work, silence is None, and closing ends the loop."""
+
+    async def watched(sender: zenoh.Session) -> list[object]:
+        seen: list[object] = []
+        with Connection(listener, "async").watch("tool/setpoint", timeout_s=0.3) as watch:
+            publisher = Publisher(sender, "async", "tool/setpoint")
+            await asyncio.to_thread(until, lambda: publisher.is_heard)
+            task = asyncio.create_task(anext(watch))
+            await asyncio.sleep(0.05)
+            assert not task.done()
+            for number in range(3):
+                publisher.put(
+                    cdr.encode_pose(PoseStamped(number, "base", (0.1, 0.2, 0.3), UNTURNED))
+                )
+            seen.append((await task).stamp_ns)
+            async for message in watch:
+                seen.append(message and message.stamp_ns)
+                if message is None:
+                    watch.close()
+            publisher.close()
+        return seen
+
+    with open_session(connect=endpoints(listener)) as sender:
+        assert asyncio.run(watched(sender)) == [0, 1, 2, None]
 
 
 def test_watch_yields_in_order_and_none_in_silence(

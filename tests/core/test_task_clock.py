@@ -220,6 +220,14 @@ def test_a_request_alone_starts_a_requested_clock() -> None:
     assert counts[1.5][-1] == pytest.approx(5.1, abs=0.06)  # the longest demonstration
 
 
+def test_a_requested_clock_ends_with_the_longest_take() -> None:
+    """Also after hands that were unseen for long, in one step."""
+    state = np.zeros(CLOCK_SIZE)
+    state[task_clock.PROGRESS] = task_clock.GONE
+    count(HOME, 0.0, 1.0, 25.0, 0, REQUESTED.numbers[None], state)
+    assert state[CLOCK_S] == pytest.approx(REQUESTED.longest_s, abs=0.11)
+
+
 def requested_takes() -> list[Demonstration]:
     """Takes of a timetable that the teacher's request begins, up to 3 s before the hands move."""
     random = np.random.default_rng(1)

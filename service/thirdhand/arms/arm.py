@@ -91,5 +91,7 @@ class Arm(AbstractContextManager["Arm"]):
     def lead(self, moved: Limited) -> None:
         """Write a motion, ahead by what its servo lags."""
         position = moved.position + self.lag_s * moved.velocity + moved.acceleration / self.gain
-        inside = np.clip(position, self.limits.lower, self.limits.upper)
-        self.write(inside, moved.velocity, moved.acceleration)
+        # an arm that stands outside its limits does not jump into them
+        lower = np.minimum(self.limits.lower, moved.position)
+        upper = np.maximum(self.limits.upper, moved.position)
+        self.write(np.clip(position, lower, upper), moved.velocity, moved.acceleration)

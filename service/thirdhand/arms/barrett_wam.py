@@ -37,7 +37,7 @@ class BarrettWAM(Arm):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.connect((host, int(port or PORT)))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, OverflowError) as error:
             self._socket.close()
             raise DriveError(f"--robot {self.address}: {error}; HOST or HOST:PORT needed") from None
         self._joints = np.zeros((2, count))
@@ -50,7 +50,7 @@ class BarrettWAM(Arm):
                     f"nothing answers at {self.address}: does thirdhand_wam run on the arm's "
                     f"computer, for an arm of {count} joints, and is the arm Shift-activated?"
                 )
-            self._send(0, *self._joints)
+            self._send(0, np.array(self.limits.lower), np.array(self.limits.upper))
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._socket.close()

@@ -6,11 +6,12 @@ import sys
 import threading
 from collections.abc import Callable
 
+import numpy as np
 import zenoh
 
 from thirdhand.arms import DriveError
 from thirdhand.arms.arm import Arm
-from thirdhand.arms.playback import Playback
+from thirdhand.arms.playback import REJOIN_RAD, Playback
 from thirdhand.client import Follower, UnreachableError
 from thirdhand.contract.channels import key
 from thirdhand.contract.explain import ExplainedError
@@ -18,6 +19,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.settings.config import RATES_HZ
 
 SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
+SETTLED_S = 0.5  # a servo that is late has come to rest
 
 
 def say(line: str) -> None:
@@ -76,6 +78,8 @@ class _Driving:
         self._published_s = 0.0  # time of the newest published joint state
         self._following = False
         self._was_guided = False
+        self._stood_s = 0.0  # without commands, at rest
+        self._written = arm.measured()[0]
         self._refused = 0
 
     def step(self, stop: threading.Event) -> bool:
@@ -91,12 +95,14 @@ class _Driving:
         stopping = stop.is_set()
         moved = playback.step(
             () if stopping else self._follower.commands(),
-            measured=position if arm.takes_velocity else None,
+            measured=position if arm.takes_velocity or self._stands_elsewhere(position) else None,
             elapsed_s=elapsed_s,
         )
         arm.lead(moved)
 
         stands = not moved.velocity.any()
+        self._stood_s = self._stood_s + elapsed_s if stands and not playback.following else 0.0
+        self._written = moved.position
         if stopping and stands and not playback.following:
             return True
         self._report_following()
@@ -107,6 +113,15 @@ class _Driving:
         self._refused = playback.refused
         self._check_heard()
         return False
+
+    def _stands_elsewhere(self, position: Vector) -> bool:
+        """True for an arm that is led by hand, or has stood for SETTLED_S away from where it was
+        written: the motion then goes on from where it is.
+        """
+        away_rad = np.abs(self._playback.in_turn(position) - self._written)
+        per_rad = np.array(self._arm.limits.per_rad)
+        is_away = bool((away_rad > REJOIN_RAD * per_rad).any())
+        return self._arm.guided or (self._stood_s > SETTLED_S and is_away)
 
     def _publish(self, position: Vector, velocity: Vector) -> None:
         """Publish the joints about once a tick, and whether the arm is led by hand."""

@@ -1,4 +1,4 @@
-"""An arm of Universal Robots, led by `servoJ` through ur_rtde at 500 Hz.
+"""An arm of Universal Robots' e-Series, led by `servoJ` through ur_rtde at 500 Hz.
 
 It was tested against a simulated controller, never on hardware. It needs `pip install
 'thirdhand[ur]'`.
@@ -63,9 +63,12 @@ class UniversalRobotsArm(Arm):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         control = self._control
-        if kind is None:
-            self._do(lambda: (control.servoStop(), control.stopScript()))
-        control.disconnect()
+        try:
+            if kind is None:
+                self._do(lambda: (control.servoStop(), control.stopScript()))
+        finally:
+            control.disconnect()
+            self._receive.disconnect()
 
     def read(self) -> tuple[Vector, Vector]:
         self._check()

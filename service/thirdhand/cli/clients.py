@@ -12,11 +12,11 @@ import msgspec
 
 from thirdhand.cli.here import still
 from thirdhand.cli.usage import UsageError, added_in, reached
-from thirdhand.client import Client
+from thirdhand.client import Client, RefusedError, UnreachableError
 from thirdhand.contract.incidents import in_brief, what_to_do
 from thirdhand.contract.records import SIDES
 from thirdhand.contract.requests import Correction
-from thirdhand.process.progress import progress
+from thirdhand.process.progress import progress, say
 
 WAITING = "waiting for the daemon's answer"
 
@@ -97,8 +97,16 @@ def begin(args: argparse.Namespace) -> int:
     """Begin the task, once or at each Enter; exit code 0."""
     with reached(args) as session:
         client = Client(session, args.cell)
+        if args.key:
+            say("each Enter begins the task; Ctrl-C ends this")
         for _ in sys.stdin if args.key else ("once",):
-            reply = client.begin()
+            try:
+                reply = client.begin()
+            except (UnreachableError, RefusedError) as error:
+                if not args.key:
+                    raise
+                say(f"not begun: {error}")
+                continue
             note = f"; {reply.note}" if reply.note else ""
             print(
                 f"begun at tick {reply.tick}: {in_brief(reply.mode, reply.reason)}{note}",

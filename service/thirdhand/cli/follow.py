@@ -10,7 +10,7 @@ from thirdhand.arms import DriveError, place_of
 from thirdhand.cli.usage import reaching
 from thirdhand.client import Client
 from thirdhand.client.session import tried
-from thirdhand.process.own_class import own_class
+from thirdhand.process.own_class import explained, own_class
 from thirdhand.process.progress import say
 from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings
@@ -37,7 +37,11 @@ def follow(args: argparse.Namespace) -> int:
                 f"{', '.join(status.joints)}; the settings here have {len(settings.joints.names)}, "
                 f"{', '.join(settings.joints.names)}: give the daemon's settings by --config"
             )
-        arm = own_class(place, Arm)(settings, args.robot)
+        kind = own_class(place, Arm)
+        with explained(args.arm):
+            arm = kind(settings, args.robot or "")
+        if arm.takes_velocity and (args.lag is not None or args.gain is not None):
+            raise DriveError(f"{args.arm} follows velocities, which need neither --lag nor --gain")
         arm.lag_s = arm.lag_s if args.lag is None else args.lag
         arm.gain = arm.gain if args.gain is None else args.gain
         stop = threading.Event()

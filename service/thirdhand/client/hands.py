@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -14,6 +15,7 @@ from thirdhand.contract.records import SIDES
 
 Pose: TypeAlias = Sequence[float] | None
 """Numbers of a pose, see `Hands`."""
+MAX_BEHIND_S = 0.05  # after a longer pause, what was missed is not made up
 
 
 class Hands:
@@ -40,13 +42,15 @@ class Hands:
         with Tracker(session, cell, timeout_s=None) as tracker:
             due_s = time.monotonic()
             while not is_over():
-                seen_ns = time.time_ns()
-                for side, pose in zip(SIDES, self.read(), strict=True):
+                asked_ns = time.time_ns()
+                poses = self.read()
+                seen_ns = time.time_ns() if self.rate_hz == math.inf else asked_ns
+                for side, pose in zip(SIDES, poses, strict=True):
                     if pose is not None:
                         x, y, z, *turned = (float(value) for value in pose)
                         i, j, k, w = turned or UNTURNED
                         tracker.publish(
                             side, (x, y, z), (i, j, k, w), stamp_ns=seen_ns, frame_id=self.frame_id
                         )
-                due_s += 1.0 / self.rate_hz
+                due_s = max(due_s + 1.0 / self.rate_hz, time.monotonic() - MAX_BEHIND_S)
                 time.sleep(max(due_s - time.monotonic(), 0.0))

@@ -4,6 +4,7 @@ a Watch yields the messages of any channel.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import operator
@@ -13,9 +14,9 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import zenoh
 
@@ -241,12 +242,15 @@ class _Received(AbstractContextManager[Any]):
         self._session = session
         self._came = threading.Condition()  # guards the queue and the flag
         self._is_closed = False
+        self._wake: Callable[[], object] = bool  # wakes a program that waits asynchronously
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
         self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
 
     def close(self) -> None:
-        """End the subscription."""
+        """End the subscription, if that has not been done."""
+        if self._is_closed:
+            return
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         with self._came:
             self._is_closed = True
@@ -285,13 +289,16 @@ class _Received(AbstractContextManager[Any]):
         with self._came:
             self._queue.append(value)
             self._came.notify()
+        with contextlib.suppress(RuntimeError):  # the program's event loop has ended
+            self._wake()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
 class Watch(_Received, Iterator[Any]):
-    """An iterator over the messages of one channel, in the order of arrival; a context manager.
+    """An iterator over the messages of one channel, in the order of arrival, also for `async for`;
+    a context manager.
 
     Poses have `stamp_ns`, `frame_id`, `position` [m] and `orientation`, and `tool/target` also its
     `covariance` (36 numbers); joints have `names`, `position` and `velocity`; `objects` is a tuple
@@ -325,6 +332,28 @@ class Watch(_Received, Iterator[Any]):
                     return None
                 self._came.wait(min(left_s, CTRL_C_S))
             return self._queue.popleft()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Any:
+        import asyncio  # its import is slow, and most programs do without
+
+        loop = asyncio.get_running_loop()
+        came = asyncio.Event()
+        self._wake = functools.partial(loop.call_soon_threadsafe, came.set)
+        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        while True:
+            came.clear()
+            with self._came:
+                if self._queue:
+                    return self._queue.popleft()
+            if self._is_closed or self._session.is_closed():
+                raise StopAsyncIteration
+            if (left_s := end_s - time.monotonic()) <= 0:
+                return None
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(came.wait(), min(left_s, CTRL_C_S))
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
         return self._decode(sample.payload.to_bytes())

@@ -151,7 +151,7 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
         controller.step(Tick(index, (*adopted, *hands, measured)))
     # runs only for a hand out of sight
     deviation_m(as_array(controller.state), SkillStage(settings, skill).rules, 0)
-    controller.step(Tick(count, (order("hold"),)))
+    controller.step(Tick(count, (order("begin"), order("hold"))))
 
 
 def _flat(skill: Skill, outputs: int) -> KMP:

@@ -30,10 +30,11 @@ from thirdhand.contract.requests import (
     UndoCorrection,
     ViaPoint,
 )
-from thirdhand.core.frame import Event, Frame, order
+from thirdhand.core.frame import Event, Frame, Record, order
 from thirdhand.core.skill.task_clock import is_requested
 from thirdhand.daemon.cell_state import CellState
 from thirdhand.daemon.correcting import Corrections, check_same_hold, held_since
+from thirdhand.daemon.request_inbox import Check
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.skill_worker import SkillWorker, has_posture_of
 from thirdhand.daemon.status import outcome
@@ -47,7 +48,7 @@ from thirdhand.skills.corrections import (
 )
 from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand.skills.via_points import in_force, points_made_of, warnings_of
+from thirdhand.skills.via_points import are_still, in_force, points_made_of, warnings_of
 
 # limit of via-points that are not the task's, with the points of their neighbourhoods
 MAX_VIA_POINTS = 400
@@ -108,17 +109,17 @@ class Answers:
             return self._answered_by[type(request)](request)
 
     def begin_at(self, skill: StoredSkill, points: Sequence[ViaPoint]) -> None:
-        """Begin the task with these via-points of it, unless another skill than the given one is in
-        force by now. Raises RequestError, SkillError.
+        """Begin the task with these via-points of it, which are not kept over a restart. Raises
+        RequestError, also if the hands move or another skill is in force by now, and SkillError.
         """
         with self._teaching:
-            if self._cell.skill is skill:
-                self._check(points)
-                named = {point.name: point for point in (*skill.via_points, *points)}
-                after = self.skill_worker.adapt(
-                    skill, tuple(named.values()), tolerance=skill.tolerance
-                )
-                self._adopt(after, order("begin"))
+            if self._cell.skill is not skill:
+                raise RequestError("another skill is in force")
+            self._check(points)
+            named = {point.name: point for point in (*skill.via_points, *points)}
+            after = self.skill_worker.adapt(skill, tuple(named.values()), tolerance=skill.tolerance)
+            check = functools.partial(_check_still, skill)
+            self._adopt(after, order("begin"), check=check, is_saved=False)
 
     def _status(self, request: StatusRequest) -> bytes:
         return self._cell.newest_status.requested(published=request.published)
@@ -294,7 +295,9 @@ class Answers:
         skill: StoredSkill,
         *events: Event,
         held_tick: int | None = None,
+        check: Check | None = None,
         is_loaded: bool = False,
+        is_saved: bool = True,
         remark: str = "",
     ) -> Reply:
         """Have the loop adopt a skill and take `events` in one tick, and save its via-points; if
@@ -311,11 +314,11 @@ class Answers:
         before = cell.skill
         points = self._in_force(skill)
         cell.adoptable = {before.digest: before, skill.digest: skill}
-        check = functools.partial(check_same_hold, held_tick)
+        check = check or functools.partial(check_same_hold, held_tick)
         adoption = Event("skill", skill.file, skill.for_loop())
         try:
             # written first, because via-points that cannot be saved are not adopted
-            with self._saved.replacing(skill):
+            with self._saved.replacing(skill) if is_saved else contextlib.nullcontext():
                 frame = cell.inbox.send(adoption, *events, check=check).wait()
         except OSError as error:  # the skill is in force already
             unsaved = f"the via-points end at a restart: they cannot be saved ({in_words(error)})"
@@ -323,6 +326,12 @@ class Answers:
         risk = f"residual risk {skill.residual_risk}" if is_loaded and skill.residual_risk else ""
         remarks = filter(None, (remark, risk, finding.text))
         return Reply(int(frame["tick"]), points, (*remarks, *warnings_of(before, skill)))
+
+
+def _check_still(skill: StoredSkill, state: Record) -> None:
+    """Raise RequestError if the hands move."""
+    if not are_still(skill, state):
+        raise RequestError("the hands have moved meanwhile")
 
 
 def _check_segment(skill: StoredSkill, segment: str | None, path: str) -> None:

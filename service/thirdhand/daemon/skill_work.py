@@ -75,9 +75,9 @@ class SkillWork:
         """Move the start of the task to hands that rest beside it. Never waits."""
         skill = self._cell.skill
         state = self._cell.controller.state
-        if self._beginning.is_alive() or state["skill"].tobytes() != skill.digest:
-            return
-        if points := self._start.moved(skill, state):
+        points = self._start.moved(skill, state)
+        is_in_force = state["skill"].tobytes() == skill.digest
+        if points and is_in_force and not self._beginning.is_alive():
             self._beginning = threading.Thread(
                 target=self._begin, args=(skill, points), name="start of the task", daemon=True
             )
@@ -87,8 +87,10 @@ class SkillWork:
         try:
             self._answers.begin_at(skill, points)
         except (RequestError, SkillError) as error:
+            self._start.refused()
             self._cell.note_beside(f"the task's start stays where it was: {error}")
         else:
+            self._start.taken()
             names = ", ".join(point.name for point in points)
             self._cell.note_beside(f"the task begins where the hands rest: {names} moved there")
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from thirdhand.contract.explain import ExplainedError, in_words
+from thirdhand.process.child import end_with_parent
 
 CLUSTER_TIMEOUT_S = 3.0
 Item = TypeVar("Item")
@@ -48,9 +50,19 @@ def workers_of(workers: str = "1") -> Iterator[Workers]:
                 for future in client.map(functools.partial(_alone, work), items, pure=False)
             )
     else:
-        processes = multiprocessing.get_context("forkserver")
-        with ProcessPoolExecutor(int(workers), mp_context=processes) as pool, _explained(option):
+        processes = ProcessPoolExecutor(
+            int(workers),
+            mp_context=multiprocessing.get_context("forkserver"),
+            initializer=_serve_until_the_command_ends,
+        )
+        with processes as pool, _explained(option):
             yield lambda work, items: pool.map(functools.partial(_alone, work), items)
+
+
+def _serve_until_the_command_ends() -> None:
+    """Leave Ctrl-C to the command, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def spread(

@@ -177,41 +177,69 @@ def points_made_of(via_points: Sequence[ViaPoint]) -> int:
     return sum(1 + NEIGHBOURS * bool(point.radius) for point in via_points)
 
 
+def are_still(skill: Skill, state: Record) -> bool:
+    """True if the hands that matter to a skill rest in this state."""
+    return bool(state["hand_stillness"][_sides(skill)].min() > 0.5)
+
+
+def _sides(skill: Skill) -> list[int]:
+    return [0, 1] if skill.conductor is None else [skill.conductor] * 2
+
+
 class StartPlace:
     """Whether the hands rest beside the start of a skill's task. If so, the task begins there; it
-    does where it was once they rest there again.
+    does at its usual place once they rest there again.
     """
 
     def __init__(self, period_s: float) -> None:
         self._rest_ticks = round(RESTING_S / period_s)
         self._since = 0  # the last tick at which the hands moved
-        self._usual = np.full((2, 3), np.inf)  # the hands' positions [m] before they were replaced
+        self._is_refused = False  # True until they move again
+        self._usual = np.zeros((2, 3))  # where hands begin if nothing is moved [m]
+        self._placed: Vector | None = None  # where they begin because of this
+        self._proposed = np.zeros((2, 3))
 
     def moved(self, skill: Skill, state: Record) -> list[ViaPoint]:
         """The via-points by which the task begins where the hands rest in the state; empty if it
-        does.
+        does. `taken` or `refused` is called with what came of them.
         """
         model = skill.model
-        sides = [0, 1] if skill.conductor is None else [skill.conductor] * 2
         tick = int(state["tick"])
-        if state["hand_stillness"][sides].min() <= 0.5:
+        if not are_still(skill, state):
             self._since = tick
-        if not isinstance(model, SegmentedKMP) or tick - self._since < self._rest_ticks:
+            self._is_refused = False
+        rests = tick - self._since >= self._rest_ticks and not self._is_refused
+        if not isinstance(model, SegmentedKMP) or model.clock is None or not rests:
             return []
-        hands = np.array(state["hands"][sides, 0])
+
         segments = model.placed.segments
         begins = segments["begins"]
-        ends = segments["begins"] + segments["way"]
+        if self._placed is None or _away_m(begins[0], self._placed) > NEAR_M:
+            self._usual = begins[0].copy()  # another skill, or taught anew
+            self._placed = None
+        hands = np.array(state["hands"][_sides(skill), 0])
         away_m = _away_m(hands, begins[0])
-        if _away_m(hands, self._usual) < BESIDE_START_M < away_m:
+        if self._placed is not None and _away_m(hands, self._usual) < BESIDE_START_M < away_m:
+            self._proposed = self._usual
             return _at_start(skill, self._usual)
-        others_m = min(_away_m(hands, end) for end in (*begins[1:], ends[-1]))
-        if state["task_clock"][PROGRESS] != NOT_BEGUN or not BESIDE_START_M < away_m < min(
-            FROM_START_M, others_m
-        ):
+
+        first = model.task.names[0]
+        taught = [(point.left, point.right) for point in skill.via_points if point.name != first]
+        others = [*begins[1:], begins[-1] + segments["way"][-1], *map(np.array, taught)]
+        is_nearest = all(away_m <= _away_m(hands, other) for other in others)
+        is_beside = BESIDE_START_M < away_m < FROM_START_M
+        if not (is_nearest and is_beside and state["task_clock"][PROGRESS] == NOT_BEGUN):
             return []
-        self._usual = begins[0].copy()
+        self._proposed = hands
         return _at_start(skill, hands)
+
+    def taken(self) -> None:
+        """The via-points that `moved` gave are in force."""
+        self._placed = self._proposed
+
+    def refused(self) -> None:
+        """They are not: nothing is moved until the hands have."""
+        self._is_refused = True
 
 
 def _away_m(hands: Vector, place: Vector) -> float:
@@ -220,8 +248,8 @@ def _away_m(hands: Vector, place: Vector) -> float:
 
 
 def _at_start(skill: Skill, hands: Vector) -> list[ViaPoint]:
-    """The via-points of the skill's task at which a hand is where it begins, with that hand at its
-    position in `hands` (2, 3) [m].
+    """The first via-point of the skill's task, and those in force at which a hand is where it
+    begins, with that hand at its position in `hands` (2, 3) [m].
     """
     model = skill.model
     assert isinstance(model, SegmentedKMP)
@@ -231,7 +259,11 @@ def _at_start(skill: Skill, hands: Vector) -> list[ViaPoint]:
         model.task.names, model.task.corners, model.nominal.at.reshape(-1, 3, 3), strict=True
     ):
         left, right, tool = map(_point, nominal)
-        point = in_force.get(name) or ViaPoint(name, left, right, tool)
+        point = in_force.get(name)
+        if point is None:
+            if name != model.task.names[0]:
+                continue
+            point = ViaPoint(name, left, right, tool)
         for side, key in enumerate(("left", "right")):
             if corners[side] == model.task.corners[0, side]:
                 point = msgspec.structs.replace(point, **{key: _point(hands[side])})

@@ -7,9 +7,10 @@
 // It was compiled against a stand-in for libbarrett, and never run on a WAM. A binary that is linked
 // with libbarrett is under the GPL, version 3; this source is under thirdhand's licence.
 //
-// Packets are little endian. A command: "THWC", a number that grows (uint32; 0 asks for states
-// alone), positions [rad] and velocities [rad/s] (doubles, one of each for a joint). A state: "THWS",
-// a number that grows (uint32), the time [s] (double), positions and velocities.
+// Packets are little endian. A command: "THWC", a number that grows (uint32), positions [rad] and
+// velocities [rad/s] (doubles, one of each for a joint); with the number 0 it asks for states alone,
+// and holds the joints' lower and upper limits. A state: "THWS", a number that grows (uint32), the
+// time [s] (double), positions and velocities.
 
 #include <barrett/units.h>
 #include <barrett/systems.h>
@@ -17,6 +18,7 @@
 #include <barrett/standard_main_function.h>
 
 #include <arpa/inet.h>
+#include <cerrno>
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
@@ -49,6 +51,7 @@ public:
           reference(stands) {
         for (size_t i = 0; i < DOF; ++i) {
             velocity[i] = 0.0;
+            lower[i] = upper[i] = stands[i];
         }
         server = socket(AF_INET, SOCK_DGRAM, 0);
         sockaddr_in here = sockaddr_in();
@@ -74,7 +77,9 @@ protected:
         receive(measured);
         if (++silent > SILENT_CYCLES) {
             follows = false;
-            brake();
+            move(BRAKE_RADPS2 * PERIOD_S);
+        } else if (silent > 1) {  // late, or lost: the motion goes on
+            move(0.0);
         }
         send(measured, jvInput.getValue());
         outputValue->setData(&reference);
@@ -105,9 +110,11 @@ private:
             if (std::memcmp(command.name, "THWC", 4) != 0) {
                 continue;
             }
-            if (command.number == 0) {  // another client begins
+            if (command.number == 0) {  // another client begins, and tells the limits
                 client = from;
                 heard = 0;
+                std::memcpy(lower, command.position, sizeof lower);
+                std::memcpy(upper, command.velocity, sizeof upper);
             } else if (command.number > heard && follow(command, measured)) {
                 heard = command.number;
                 silent = 0;
@@ -138,12 +145,17 @@ private:
         return true;
     }
 
-    void brake() {
+    // Move the reference on for a cycle, slower by `less` [rad/s], and not beyond the limits.
+    void move(double less) {
         for (size_t i = 0; i < DOF; ++i) {
-            const double less = BRAKE_RADPS2 * PERIOD_S;
             const double speed = std::fabs(velocity[i]);
             velocity[i] = speed > less ? velocity[i] * (speed - less) / speed : 0.0;
-            reference[i] += PERIOD_S * velocity[i];
+            const double next = reference[i] + PERIOD_S * velocity[i];
+            if ((next > upper[i] && velocity[i] > 0.0) || (next < lower[i] && velocity[i] < 0.0)) {
+                velocity[i] = 0.0;
+            } else {
+                reference[i] = next;
+            }
         }
     }
 
@@ -166,6 +178,8 @@ private:
     sockaddr_in client = sockaddr_in();
     jp_type reference;
     double velocity[DOF];
+    double lower[DOF];
+    double upper[DOF];
     uint32_t heard = 0;
     uint32_t cycle = 0;
     int silent = SILENT_CYCLES;

@@ -12,7 +12,7 @@ from thirdhand.core.skill.model import Seen, Target, Wanted
 from thirdhand.core.skill.pose import NO_GRIPPER
 from thirdhand.core.skill.skill import NEVER, Skill, clamp, reach_of
 from thirdhand.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_segment
-from thirdhand.core.skill.task_clock import GONE, NOT_BEGUN, PROGRESS, forget, is_requested, move
+from thirdhand.core.skill.task_clock import BEGUN_TICK, GONE, PROGRESS, forget, is_requested, move
 from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
 from thirdhand.core.skill.unseen import deviation_m, off_m
 from thirdhand.core.tuning import TUNING, Tuning
@@ -177,6 +177,8 @@ class SkillStage:
         if self._clock is None:
             return
         before = int(state["memory_ticks"].max())
+        if self._is_requested:
+            before = max(before, int(state["task_clock"][BEGUN_TICK]))
         passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
         if not self._is_requested:
             passed_s = min(passed_s, MEMORY_LONGEST_STEP_S)
@@ -188,7 +190,9 @@ class SkillStage:
         """
         forget(as_array(state))
         state["task_clock"] = 0.0
-        state["task_clock"][PROGRESS] = GONE if self._is_requested else NOT_BEGUN
+        if self._is_requested:
+            state["task_clock"][BEGUN_TICK] = state["tick"]
+            state["task_clock"][PROGRESS] = GONE
 
     def set_segment(self, state: Record, name: str) -> None:
         """Set the belief to the segment that begins at the via-point of this name (at the last

@@ -44,6 +44,7 @@ from thirdhand.core.vectors import norm, squared_distance
 # entries of `task_clock` in the state
 CLOCK_S, CLOCK_RATE, CLOCK_CHANGE, REST_LEFT_S, CLOCK_SEGMENT, PROGRESS, OWN_BEGIN = range(7)
 CLOCK_SIZE = OWN_BEGIN + 6  # their number
+BEGUN_TICK = CLOCK_SEGMENT  # of a requested clock, which knows no segments: when it was
 # values of `TaskClock.pace`: the clock runs on while the hands rest, waits for them, or is started
 # by a request
 RUNS = 0
@@ -173,6 +174,8 @@ def count(
             goal = 1.0 - still if numbers[PACE_AT] == WAITS else 1.0
     clock[CLOCK_RATE] += (1.0 - exp(-period_s / CLOCK_LAG_S)) * (goal - clock[CLOCK_RATE])
     clock[CLOCK_S] += period_s * clock[CLOCK_RATE]
+    if numbers[PACE_AT] == REQUESTED:  # after hands that were not seen for long
+        clock[CLOCK_S] = min(clock[CLOCK_S], numbers[LONGEST_AT] + CLOCK_LAG_S)
     clock[CLOCK_CHANGE] = (goal - clock[CLOCK_RATE]) / CLOCK_LAG_S
     return begins_again
 

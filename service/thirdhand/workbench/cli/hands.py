@@ -15,7 +15,7 @@ from thirdhand.cli.usage import UsageError, reached
 from thirdhand.client import Client, Tracker
 from thirdhand.client.hands import Hands
 from thirdhand.contract.explain import ExplainedError, in_words
-from thirdhand.process.own_class import own_class
+from thirdhand.process.own_class import explained, own_class
 from thirdhand.process.progress import say
 from thirdhand.settings.file_content import begin_of
 from thirdhand.settings.network import is_local
@@ -42,10 +42,10 @@ def hands(args: argparse.Namespace) -> int:
 
 
 def _own(args: argparse.Namespace) -> int:
-    tracker = own_class(args.own, Hands)()
-    with reached(args, None) as session:
+    kind = own_class(args.own, Hands)
+    with reached(args, None) as session, explained(args.own):
         say(f"publishing the hands of {args.own}; Ctrl-C ends it")
-        tracker.publish(session, args.cell, is_over=lambda: False)
+        kind().publish(session, args.cell, is_over=lambda: False)
     return 0
 
 

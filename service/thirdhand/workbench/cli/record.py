@@ -130,6 +130,8 @@ def _capture(args: argparse.Namespace, settings: Settings) -> None:
     via_points = via_points_in(args.via_points) if args.via_points else ()
     cell = args.cell or settings.cell
     ended = EnterPressed()
+    if args.begin and not ended.listens:
+        raise UsageError("--begin: a terminal needed, as Enter begins the take")
     with inputs_session(args, CONNECT_TIMEOUT_S, settings) as session:
         if args.until == "key" and not args.begin:
             say("Enter or Ctrl-C ends it")

@@ -41,6 +41,7 @@ from thirdhand.workbench.takes.track_clocks import by_one_clock
 
 _STREAMS = tuple(TAKE_KEYS.values())
 MIN_USABLE_SHARE = 0.5  # takes with a smaller usable share are refused
+REQUEST_TOLERANCE_S = 0.1  # a take begins with the samples just before the request
 MIN_SEEN_SHARE = 0.1  # a hand that is seen for a smaller share of the time does not lead the tool
 MAX_NAMED_STRETCHES = 10  # a message names at most this many bad stretches
 # a tool with a low rate is out of sight after this many of its usual intervals
@@ -183,10 +184,10 @@ def _begun_s(recorded: PoseRecording, tracks: Sequence[Track], first_ns: int) ->
     """The time [s] from the request that began the task to the stamp `first_ns`; None without one.
     A request has a time of recording only, from which stamps may differ by a constant.
     """
-    if recorded.begun_ns is None:
-        return None
     ahead_ns = np.median([np.median(track.stamps_ns - track.logged_ns) for track in tracks])
-    return max(0.0, (first_ns - recorded.begun_ns - float(ahead_ns)) / 1e9)
+    since_s = [(first_ns - begun_ns - float(ahead_ns)) / 1e9 for begun_ns in recorded.begun_ns]
+    before_s = [lasts_s for lasts_s in since_s if lasts_s > -REQUEST_TOLERANCE_S]
+    return max(0.0, min(before_s)) if before_s else None
 
 
 def _settings_of(recorded: PoseRecording, cell: Settings | None) -> Settings:

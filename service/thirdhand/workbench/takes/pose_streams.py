@@ -143,7 +143,7 @@ class PoseRecording:
         self.via_points: tuple[ViaPoint, ...] = ()  # recorded via-points of the task
         self.conducts: Hands = "both"  # the hands that lead the tool in a take
         self.person = ""  # the person who demonstrates in a take
-        self.begun_ns: int | None = None  # when a request began the take
+        self.begun_ns: list[int] = []  # when requests began the task
         self._raw: dict[
             str, list[tuple[int, bytes]]
         ] = {}  # time of recording [ns] and bytes of messages by topic
@@ -188,7 +188,7 @@ class PoseRecording:
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{VIA_POINTS_TOPIC}"):
                 self._read_via_points(message.data)
             elif kind == STRING.type and f"/{channel.topic}".endswith(f"/{BEGIN_TOPIC}"):
-                self.begun_ns = message.log_time
+                self.begun_ns.append(message.log_time)
         self.faults = messages.faults
         about = messages.metadata.get("thirdhand", {})
         self.conducts = next(

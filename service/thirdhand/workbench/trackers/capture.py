@@ -404,17 +404,22 @@ def capture(
         others.close()
         captured.check()
         if is_begun is not None:
-            say("hands and tool arrive: Enter begins the take")
+            say("hands and tool arrive: Enter begins the take, and another one or Ctrl-C ends it")
             while not is_begun():
                 time.sleep(CAPTURE_POLL_S)
                 captured.collect()
+                if captured.silent_s > CAPTURE_SILENCE_S:
+                    raise CaptureError(
+                        f"no message arrived for {CAPTURE_SILENCE_S:g} s, before the take began. "
+                        "Nothing was recorded"
+                    )
             captured.begun_ns = time.time_ns()
         captured.begin()
         say(f"recording{f'; it ends once {end.at_rest} after a motion' if until == 'rest' else ''}")
         if reason := _collect(captured, is_ended, end, progress):
             say(reason)
     except KeyboardInterrupt:
-        if captured.missing:
+        if captured.missing or (is_begun is not None and captured.begun_ns is None):
             raise
     finally:
         others.close()

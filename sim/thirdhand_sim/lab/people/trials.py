@@ -226,6 +226,7 @@ def _of_service(skill: StoredSkill, one: SeenSession) -> NDArray[np.void]:
         if points := start.moved(skill, core.state):
             named = {point.name: point for point in (*skill.via_points, *points)}
             skill = adapted(skill, tuple(named.values()), tolerance=skill.tolerance)
+            start.taken()
             events = Event("skill", skill.file, skill.for_loop()), order("begin")
     return np.array(out)
 
