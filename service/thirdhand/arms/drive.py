@@ -19,7 +19,7 @@ from thirdhand.core.frame import Vector
 from thirdhand.settings.config import RATES_HZ
 
 SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
-SETTLED_S = 0.5  # a servo that is late has come to rest
+STOOD_S = 0.5  # a servo that is late has come to rest
 
 
 def say(line: str) -> None:
@@ -115,13 +115,13 @@ class _Driving:
         return False
 
     def _stands_elsewhere(self, position: Vector) -> bool:
-        """True for an arm that is led by hand, or has stood for SETTLED_S away from where it was
+        """True for an arm that is led by hand, or has stood for STOOD_S away from where it was
         written: the motion then goes on from where it is.
         """
         away_rad = np.abs(self._playback.in_turn(position) - self._written)
         per_rad = np.array(self._arm.limits.per_rad)
         is_away = bool((away_rad > REJOIN_RAD * per_rad).any())
-        return self._arm.guided or (self._stood_s > SETTLED_S and is_away)
+        return self._arm.guided or (self._stood_s > STOOD_S and is_away)
 
     def _publish(self, position: Vector, velocity: Vector) -> None:
         """Publish the joints about once a tick, and whether the arm is led by hand."""

@@ -15,7 +15,7 @@ from thirdhand.contract.records import SIDES
 
 Pose: TypeAlias = Sequence[float] | None
 """Numbers of a pose, see `Hands`."""
-MAX_BEHIND_S = 0.05  # after a longer pause, what was missed is not made up
+MAX_PAUSE_S = 0.05  # after a longer pause, what was missed is not made up
 
 
 class Hands:
@@ -52,5 +52,5 @@ class Hands:
                         tracker.publish(
                             side, (x, y, z), (i, j, k, w), stamp_ns=seen_ns, frame_id=self.frame_id
                         )
-                due_s = max(due_s + 1.0 / self.rate_hz, time.monotonic() - MAX_BEHIND_S)
+                due_s = max(due_s + 1.0 / self.rate_hz, time.monotonic() - MAX_PAUSE_S)
                 time.sleep(max(due_s - time.monotonic(), 0.0))
