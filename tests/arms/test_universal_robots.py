@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from thirdhand.recordings.shipped import cell_of
 from thirdhand.settings.config import Settings
 
 pytest.importorskip("rtde_control")
-ADDRESS = "127.0.0.41"
+ADDRESS = f"127.77.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"  # its ports are fixed
 UR5 = cell_of("ur5")
 NEAR_LEFT = (0.85, -0.30, 0.10)
 
@@ -113,7 +114,7 @@ def test_a_cell_moves_it(kind: type[UniversalRobotsArm], box: Box, tmp_path: Pat
     shipped = (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml").read_text()
     # a busy machine makes any arm late
     most_rad = 0.06 if kind is LateArm else 0.3
-    urdf = f"urdf = {json.dumps(UR5.arm.urdf)}\nfault_error_rad = {most_rad}"
+    urdf = f"urdf = {json.dumps(UR5.arm.urdf)}\nsilent_ms = 1000\nfault_error_rad = {most_rad}"
     config.write_text(f"{LISTENING}{shipped}".replace('urdf = "ur5.urdf"', urdf))
     stop = threading.Event()
     with (
@@ -128,7 +129,7 @@ def test_a_cell_moves_it(kind: type[UniversalRobotsArm], box: Box, tmp_path: Pat
         driver.start()
         try:
             status = daemon.until(lambda status: status["mode"] == "follow", 30.0)
-            for number in range(12):
+            for number in range(12 if kind is LateArm else 4):
                 tracker.left = LEFT if number % 2 else NEAR_LEFT
                 time.sleep(1.0)
                 status = daemon.client.ask("status")
@@ -142,10 +143,10 @@ def test_a_cell_moves_it(kind: type[UniversalRobotsArm], box: Box, tmp_path: Pat
         assert status["reason"] == "arm_error"
         late = re.search(r"the arm is about (\d+) ms late; a joint was", status["because"])
         assert late is not None, status["because"]
-        assert 20 < int(late[1]) < 140
+        assert 40 < int(late[1]) < 180  # a busy machine is late too
         assert "set lag_s" in status["remedy"]
     else:
-        assert status["mode"] != "fault"
+        assert status["mode"] != "fault", status["because"]
 
 
 def test_what_it_lacks_is_named() -> None:
@@ -153,5 +154,5 @@ def test_what_it_lacks_is_named() -> None:
         UniversalRobotsArm(Settings(), ADDRESS)
     with pytest.raises(DriveError, match="--robot is missing"):
         UniversalRobotsArm(UR5)
-    with pytest.raises(DriveError, match=r"no arm of Universal Robots at 127\.0\.0\.42: "):
-        UniversalRobotsArm(UR5, "127.0.0.42")
+    with pytest.raises(DriveError, match=r"no arm of Universal Robots at 127\.78\.0\.1: "):
+        UniversalRobotsArm(UR5, "127.78.0.1")

@@ -36,7 +36,8 @@ def follow(add: AddCommand) -> None:
         c,
         "--robot",
         "ADDRESS",
-        "the host name or IP address of the arm's control box (default: the maker's own)",
+        "the host name or IP address of the arm's control box (default of franka: 172.16.0.2; of "
+        "wam: this machine)",
     )
     lag = "what is written leads by this delay of the servo [s] (default: that of the arm's class)"
     option(c, "--lag", "S", lag, type=within(float, 0.0, 0.5, " s"))

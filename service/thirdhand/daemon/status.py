@@ -33,8 +33,10 @@ from thirdhand.skills.corrections import offer_of
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
 LAG_STATUSES = 10  # of the last second
+LEAST_LAG_STATUSES = 3
+LAGS_S = np.arange(0.0, 0.4, 0.002)  # that are tried
 LEAST_LAG_S = 0.01
-UNEXPLAINED_SHARE = 0.2  # of the squared errors, beyond which another cause is as likely
+UNEXPLAINED_SHARE = 0.1  # of the squared errors, beyond which another cause is as likely
 AT_LIMIT_RAD = 0.02  # a joint nearer to a limit than this is at the limit
 
 
@@ -52,7 +54,7 @@ class CellStatus(NamedTuple):
     inside: Inside | None = None  # what an arm that is not ready is inside of
     busy: str = ""  # signs of a busy machine when the arm stopped
     clutch: str = ""  # the problem with the clutch's messages
-    late_s: float = 0.0  # see `ArmLag`
+    late_s: float = 0.0  # see `ArmLag`; 0 unless the arm is at fault
     streams: Mapping[str, Source] = MappingProxyType({})  # other input, by key
 
     def status(self, **more: Any) -> Status:
@@ -273,32 +275,50 @@ class CellStatus(NamedTuple):
 
 
 class ArmLag:
-    """How late an arm follows its commands, while it does: the lag τ of least squares of e - τ u
-    over the joints at the last statuses. A joint that is late by τ is off by e, the mean commanded
-    velocity of that time times τ; u is the mean of the velocities at its ends, the commanded and
-    the measured one.
+    """How late an arm follows its commands: the lag with which the measured joints at the last
+    statuses fit the commanded path best, by least squares. Between statuses, the path is the cubic
+    through commanded positions and velocities; before the first one, the arm stands.
     """
 
-    def __init__(self) -> None:
-        self._rows: deque[tuple[Vector, Vector]] = deque(maxlen=LAG_STATUSES)
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._rows: deque[tuple[Vector, ...]] = deque(maxlen=LAG_STATUSES)
 
     def note(self, frame: Frame, state: Record) -> None:
-        """Note the joints, as commanded and as measured."""
-        if frame["mode"] == Mode.FOLLOW and state["arm_tick"] >= 0:
-            error = frame["joints"] - state["measured"]
-            mean = 0.5 * (frame["joint_velocities"] + state["measured_velocities"])
-            self._rows.append((error, mean))
+        """Note the joints, as commanded and as measured, unless the arm is at fault."""
+        if frame["mode"] != Mode.FAULT and frame["commanded"] and state["arm_tick"] >= 0:
+            times_s = self._period_s * np.array([frame["tick"], state["arm_tick"]])
+            commanded = frame["joints"], frame["joint_velocities"]
+            self._rows.append((times_s, *commanded, state["measured"].copy()))
 
-    @property
     def late_s(self) -> float:
         """The lag [s]; 0 if it explains the errors badly."""
-        if not self._rows:
+        if len(self._rows) < LEAST_LAG_STATUSES:
             return 0.0
-        errors, velocities = map(np.array, zip(*self._rows, strict=True))
-        late_s = float((errors * velocities).sum() / max((velocities**2).sum(), 1e-12))
-        rest = ((errors - late_s * velocities) ** 2).sum()
-        is_late = late_s > LEAST_LAG_S and rest < UNEXPLAINED_SHARE * (errors**2).sum()
-        return late_s if is_late else 0.0
+        times_s, positions, velocities, measured = (
+            np.array(part) for part in zip(*self._rows, strict=True)
+        )
+        squares = []
+        for lag_s in LAGS_S:
+            wanted = _path_at(times_s[:, 1] - lag_s, times_s[:, 0], positions, velocities)
+            squares.append(float(((measured - wanted) ** 2).sum()))
+        best = int(np.argmin(squares))
+        is_explained = squares[best] < UNEXPLAINED_SHARE * squares[0]
+        return float(LAGS_S[best]) if is_explained and LAGS_S[best] > LEAST_LAG_S else 0.0
+
+
+def _path_at(at_s: Vector, times_s: Vector, positions: Vector, velocities: Vector) -> Vector:
+    """The cubic path (N, J) through positions and velocities (M, J) at `times_s` (M,)."""
+    begin = np.clip(np.searchsorted(times_s, at_s, side="right") - 1, 0, len(times_s) - 2)
+    lasts_s = (times_s[begin + 1] - times_s[begin])[:, None]
+    u = np.clip((at_s - times_s[begin])[:, None] / lasts_s, 0.0, 1.0)
+    first = lasts_s * velocities[begin]
+    second = lasts_s * velocities[begin + 1]
+    way = positions[begin + 1] - positions[begin]
+    bend = 3.0 * way - 2.0 * first - second
+    return np.asarray(
+        positions[begin] + u * (first + u * (bend + u * (first + second - 2.0 * way)))
+    )
 
 
 class MeasuredArm:

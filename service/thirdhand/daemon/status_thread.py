@@ -11,6 +11,7 @@ from typing import Any
 
 from thirdhand.contract.explain import in_words
 from thirdhand.contract.incidents import Condition, in_brief, in_full, what_to_do
+from thirdhand.contract.records import Reason
 from thirdhand.contract.requests import Percentiles, Source, Status, encode_json
 from thirdhand.core.frame import Frame, Record, order
 from thirdhand.daemon.answers import Answers
@@ -37,7 +38,7 @@ class StatusThread:
         self._cell = cell
 
         # What the status reports beside the newest frame.
-        self._arm_lag = ArmLag()
+        self._arm_lag = ArmLag(settings.period_s)
         self._measured_arm = MeasuredArm(settings, robot_description(settings))
         self._machine = Machine()
         self._version = version("thirdhand")
@@ -176,7 +177,7 @@ class StatusThread:
             inside=inside,
             busy=self._machine.at_stop,
             clutch=cell.inputs.clutch(state),
-            late_s=self._arm_lag.late_s,
+            late_s=self._arm_lag.late_s() if frame["reason"] == Reason.ARM_ERROR else 0.0,
             streams=streams,
         )
         return moment.status(
