@@ -14,7 +14,13 @@ from thirdhand.core.skill.segmented import SegmentedKMP
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand.skills.via_points import BESIDE_START_M, FROM_START_M, StartPlace, adapted
+from thirdhand.skills.via_points import (
+    BESIDE_START_M,
+    FROM_START_M,
+    StartPlace,
+    adapted,
+    with_points,
+)
 from thirdhand_sim.lab.open_loop import controller
 from thirdhand_sim.lab.people.comparison import PEOPLE_METHODS
 from thirdhand_sim.lab.people.trials import judge, seen
@@ -89,8 +95,7 @@ def test_the_usual_start_is_not_forgotten() -> None:
         return points
 
     def taught(points: list[ViaPoint]) -> StoredSkill:
-        named = {point.name: point for point in (*skill.via_points, *points)}
-        return adapted(skill, tuple(named.values()), tolerance=skill.tolerance)
+        return adapted(skill, with_points(skill, points), tolerance=skill.tolerance)
 
     assert isinstance(skill.model, SegmentedKMP)
     usual = skill.model.placed.segments["begins"][0].copy()

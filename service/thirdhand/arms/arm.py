@@ -76,7 +76,9 @@ class Arm(AbstractContextManager["Arm"]):
         """End the control; the arm stands, or has failed."""
 
     def measured(self) -> tuple[Vector, Vector]:
-        """What `read` says, checked. Raises DriveError."""
+        """The joints (n,) that `read` gives: position [rad or m] and velocity [rad/s or m/s].
+        Raises DriveError.
+        """
         position, velocity = (np.array(part, np.float64) for part in self.read())
         count = len(self.limits.names)
         if position.shape != (count,) or velocity.shape != (count,):

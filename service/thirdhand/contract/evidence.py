@@ -91,7 +91,7 @@ class Evidence(NamedTuple):
     inside: Inside | None = None
     stuck: Stuck | None = None
     error_rad: Exceeded | None = None  # largest joint error at the fault
-    late_s: float = 0.0  # by which the arm followed its commands; 0: it did not follow them late
+    late_s: float = 0.0  # delay of the arm behind its commands; 0: none was found
     # the joint that is farthest from its command now, with unit
     worst_joint: tuple[str, float, str] | None = None
     measured_speed: Exceeded | None = None  # of the tool [m/s]

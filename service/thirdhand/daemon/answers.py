@@ -48,7 +48,13 @@ from thirdhand.skills.corrections import (
 )
 from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand.skills.via_points import are_still, in_force, points_made_of, warnings_of
+from thirdhand.skills.via_points import (
+    are_still,
+    in_force,
+    points_made_of,
+    warnings_of,
+    with_points,
+)
 
 # limit of via-points that are not the task's, with the points of their neighbourhoods
 MAX_VIA_POINTS = 400
@@ -116,8 +122,9 @@ class Answers:
             if self._cell.skill is not skill:
                 raise RequestError("another skill is in force")
             self._check(points)
-            named = {point.name: point for point in (*skill.via_points, *points)}
-            after = self.skill_worker.adapt(skill, tuple(named.values()), tolerance=skill.tolerance)
+            after = self.skill_worker.adapt(
+                skill, with_points(skill, points), tolerance=skill.tolerance
+            )
             check = functools.partial(_check_still, skill)
             self._adopt(after, order("begin"), check=check, is_saved=False)
 
@@ -160,8 +167,7 @@ class Answers:
 
     def _add(self, request: Add) -> Reply:
         self._check(request.points)
-        points = {point.name: point for point in (*self._cell.skill.via_points, *request.points)}
-        return self._teach(points.values(), request.tolerance)
+        return self._teach(with_points(self._cell.skill, request.points), request.tolerance)
 
     def _remove(self, request: Remove) -> Reply:
         points = {point.name: point for point in self._cell.skill.via_points}
@@ -272,8 +278,8 @@ class Answers:
         for segments that the skill does not have. `at` is the position of the tool in the request.
         """
         skill = self._cell.skill
-        points = {point.name: point for point in (*skill.via_points, *added)}
-        total = points_made_of([points[name] for name in points.keys() - set(skill.model.names)])
+        points = with_points(skill, added)
+        total = points_made_of([point for point in points if point.name not in skill.model.names])
         if total > MAX_VIA_POINTS:
             raise RequestError(
                 f"$.points: {total} via-points beside the task's, where one with a radius counts "

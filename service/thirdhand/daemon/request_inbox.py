@@ -101,9 +101,7 @@ class RequestInbox:
         return pending
 
     def order(self, kind: str, by: str = "", holds: int = 0) -> PendingRequest:
-        """An order for the next tick, `by` the one of this name. `holds` is the
-        number of holds that were received before it.
-        """
+        """An order for the next tick, `by` the one of this name, received after so many `holds`."""
         return self.send(order(kind), check=functools.partial(self._check, kind, by, holds))
 
     def take(self, state: Record) -> list[Event]:

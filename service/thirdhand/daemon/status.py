@@ -275,9 +275,9 @@ class CellStatus(NamedTuple):
 
 
 class ArmLag:
-    """How late an arm follows its commands: the lag with which the measured joints at the last
-    statuses fit the commanded path best, by least squares. Between statuses, the path is the cubic
-    through commanded positions and velocities; before the first one, the arm stands.
+    """The delay [s] of an arm behind its commands: the one at which the commanded path fits the
+    joints measured at the last statuses best, by least squares. Between statuses, the path is the
+    cubic through commanded positions and velocities; before the first one, the arm stands.
     """
 
     def __init__(self, period_s: float) -> None:

@@ -82,6 +82,12 @@ def adapted(skill: StoredSkill, via_points: Sequence[ViaPoint], *, tolerance: fl
     return with_file(replace(skill, turn=turn, gripper=gripper))
 
 
+def with_points(skill: Skill, points: Sequence[ViaPoint]) -> tuple[ViaPoint, ...]:
+    """The skill's via-points with these, of which one replaces that of the same name."""
+    named = {point.name: point for point in (*skill.via_points, *points)}
+    return tuple(named.values())
+
+
 def of_one(point: ViaPoint, conductor: int) -> ViaPoint:
     """The via-point with both hands at the position of the conducting one."""
     hand = (point.left, point.right)[conductor]
@@ -187,8 +193,8 @@ def _sides(skill: Skill) -> list[int]:
 
 
 class StartPlace:
-    """Whether the hands rest beside the start of a skill's task. If so, the task begins there; it
-    does at its usual place once they rest there again.
+    """Tells when hands rest beside the start of a skill's task, and where the task then begins: at
+    the hands, until they rest at its usual place again.
     """
 
     def __init__(self, period_s: float) -> None:

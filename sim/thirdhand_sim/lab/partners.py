@@ -395,8 +395,8 @@ def summary(takes: Sequence[Judged]) -> dict[str, Any]:
 
 
 def _detection(takes: Sequence[Judged]) -> dict[str, Any]:
-    """How probabilities of an error tell right and wrong samples apart: the shares of right and of
-    wrong ones above each of PROBABILITIES, the area under this curve, and the mean squared
+    """How well the predicted probabilities of an error separate right samples from wrong ones: the
+    shares of both above each of PROBABILITIES, the area under this curve, and the mean squared
     difference of the probabilities from the truth, beside that of a constant probability.
     """
     counts = [take.by_probability for take in takes if take.by_probability is not None]
@@ -575,10 +575,7 @@ def _draw_reliability(results: Results, numbers: dict[str, Any]) -> None:
             name = [name for name in task["methods"] if name.startswith(SERVICE)][-1]
             scores = task["methods"][name]
             if scores["takes"] and scores["coverage"]:
-                levels, shares = (
-                    100 * np.array(scores_or)
-                    for scores_or in (numbers["levels"], scores["coverage"])
-                )
+                levels, shares = 100 * np.array([numbers["levels"], scores["coverage"]])
                 inside.plot(levels, shares, ".-", color=colour, lw=0.8)
             if "roc" in scores:
                 warned.plot(*(100 * np.array(scores["roc"])), color=colour, lw=0.8)

@@ -286,7 +286,7 @@ def conclusion(s: Subject) -> str:
 
 
 def _what_helps(s: Subject) -> str:
-    """What probably reduces the error most, by the figures."""
+    """The advice that should reduce the error most, judged by the skill's figures."""
     spread = s.figures.spread
     if len(s.figures.demonstrations) < ADVISED:
         return f"record at least {ADVISED} demonstrations"

@@ -22,7 +22,7 @@ from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import StoredSkill
-from thirdhand.skills.via_points import StartPlace, adapted
+from thirdhand.skills.via_points import StartPlace, adapted, with_points
 from thirdhand_sim.closed_loop import START_NS, hand_event
 from thirdhand_sim.lab.open_loop import controller, frames
 from thirdhand_sim.lab.results import Array
@@ -224,8 +224,7 @@ def _of_service(skill: StoredSkill, one: SeenSession) -> NDArray[np.void]:
         out.append(core.step(Tick(tick.index, (*events, *tick.inbox))))
         events = ()
         if points := start.moved(skill, core.state):
-            named = {point.name: point for point in (*skill.via_points, *points)}
-            skill = adapted(skill, tuple(named.values()), tolerance=skill.tolerance)
+            skill = adapted(skill, with_points(skill, points), tolerance=skill.tolerance)
             start.taken()
             events = Event("skill", skill.file, skill.for_loop()), order("begin")
     return np.array(out)
