@@ -188,6 +188,8 @@ def _scheduling(now: Status) -> str:
 def _target(now: Status) -> str:
     """Target, its uncertainty, and the distance of the tool from it."""
     if now.tool_m is None or now.target_m is None:
+        if now.hands == "neither":
+            return "none: no wish is followed"
         hands = "both hands" if now.needed == SIDES else f"the {now.hands} hand"
         return f"none: the skill needs {hands}"
     off_mm = 1000 * math.dist(now.tool_m, now.target_m)

@@ -31,6 +31,7 @@ from thirdhand.contract.messages import (
     GRIPPER,
     JointState,
     PoseStamped,
+    PoseWithCovarianceStamped,
     Quaternion,
     SceneObject,
     Vector3,
@@ -41,6 +42,7 @@ from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
 FORMS = {  # by the largest count of numbers
     1: "0 (open) to 1 (closed)",
+    2: "a deviation [m] and one [rad]",
     3: "x y z [m]",
     7: "x y z [m], or x y z and a quaternion x y z w,",
 }
@@ -163,6 +165,41 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Publish how far a person wants the gripper closed, 0 (open) to 1 (closed)."""
         self._publish_closure("gripper/wish", closure, stamp_ns)
 
+    def wish(
+        self,
+        pose: Sequence[float],
+        *,
+        stamp_ns: int | None = None,
+        std: tuple[float, float] | None = None,
+        frame_id: str = BASE,
+    ) -> None:
+        """Publish where a policy wants the tool at the time `stamp_ns`; None: now. `std` is the
+        deviation of each axis [m] and of each small rotation [rad]; None: not known.
+        """
+        self._publish({"tool/wish": _wish(pose, std, frame_id)}, stamp_ns)
+
+    def wish_chunk(
+        self,
+        poses: Iterable[Sequence[float]],
+        *,
+        step_s: float,
+        stamp_ns: int | None = None,
+        std: tuple[float, float] | None = None,
+        frame_id: str = BASE,
+    ) -> None:
+        """Publish a policy's answer: the poses of the tool from the time `stamp_ns` on, `step_s`
+        [s] apart; None: from now on. For a policy that answers late, that is the time of its
+        observation. It replaces what was wished for later than its begin.
+        """
+        chunk = [_wish(pose, std, frame_id) for pose in poses]
+        if not 0.0 < step_s < math.inf:
+            raise ValueError(f"step_s: {step_s!r} given; a duration above 0 s needed")
+        if stamp_ns is None:
+            self._heard("tool/wish")
+            stamp_ns = time.time_ns()
+        for i, encode in enumerate(chunk):
+            self._publish({"tool/wish": encode}, stamp_ns + round(i * step_s * 1e9))
+
     def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
         """Publish all objects on the bench, for viewers and recordings."""
         try:
@@ -265,6 +302,22 @@ def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Calla
     """The encoding of a pose for a stamp [ns]. Raises ValueError for an invalid frame."""
     checked_frame(frame_id)
     return lambda stamp_ns: cdr.encode_pose(PoseStamped(stamp_ns, frame_id, position, orientation))
+
+
+def _wish(
+    pose: Sequence[float], std: tuple[float, float] | None, frame_id: str
+) -> Callable[[int], bytes]:
+    """The encoding of a wish for a stamp [ns]. Raises ValueError."""
+    position, orientation = _pose("wish", pose)
+    if std is None:
+        return _encoded(frame_id, position, orientation)
+    checked_frame(frame_id)
+    std_m, std_rad = _numbers("std", std, 2)
+    variances = 3 * [std_m**2] + 3 * [std_rad**2]
+    covariance = tuple(variances[i] * (i == j) for i in range(6) for j in range(6))
+    return lambda ns: cdr.encode_pose_with_covariance(
+        PoseWithCovarianceStamped(ns, frame_id, position, orientation, covariance)
+    )
 
 
 def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:

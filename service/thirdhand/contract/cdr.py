@@ -376,6 +376,15 @@ def decode_pose_with_covariance(data: bytes) -> PoseWithCovarianceStamped:
     return PoseWithCovarianceStamped(*_read_pose(data, _POSE, _COVARIANCE))
 
 
+def decode_wish(data: bytes) -> PoseStamped | PoseWithCovarianceStamped:
+    """The PoseWithCovarianceStamped or PoseStamped in CDR bytes; one of a frame with a long name is
+    taken as the former. Raises WireError.
+    """
+    if len(data) > _POSE.size + _COVARIANCE.size:
+        return decode_pose_with_covariance(data)
+    return decode_pose(data)
+
+
 class _JointLayout(NamedTuple):
     """The common part of messages of one length from one source."""
 

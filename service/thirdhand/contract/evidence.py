@@ -271,6 +271,36 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
     return finding, closer
 
 
+def refused_wish(cause: Cause, wish: Any, now_ns: int, frames: tuple[str, ...]) -> Explanation:
+    """A wish that was rejected at the time `now_ns` [ns], in words."""
+    off_ms = (wish.stamp_ns - now_ns) * 1e-6
+    clock = "stamp wishes by the clock of the daemon's machine, or with 0 for now"
+    match cause:
+        case Cause.OLDER:
+            return Explanation(
+                f"due {lasting(-off_ms)} ago; up to 1 s accepted",
+                f"drop what a policy answers too late; {clock}",
+            )
+        case Cause.AHEAD:
+            return Explanation(
+                f"due in {lasting(off_ms)}; up to 1 s, and at most 128 poses, accepted",
+                f"send the end of a long chunk later; {clock}",
+            )
+        case Cause.OUT_OF_RANGE:
+            return Explanation(
+                f"at {figures(wish.position)}; up to 10 m from the base plate accepted",
+                "publish wishes in metres",
+            )
+        case Cause.NOT_FINITE:
+            return Explanation(
+                f"at {figures(wish.position)}, orientation {figures(wish.orientation)}; finite "
+                "numbers, and variances of at least 0, needed",
+                "publish nothing while the policy has no answer",
+            )
+    facts = Evidence(sample=wish, newest_ns=now_ns, frames=frames)
+    return Explanation(_rejection(cause, facts)[0], what_to_do(word(cause)))
+
+
 def _unseen(seen: Evidence) -> str:
     """The hands that are not seen, since when, and what of them is rejected."""
     clauses = []

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from thirdhand.contract.records import Cause, Flag, Mode, Reason
 
-SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm"}
+SOURCE_NAMES = {"left": "left hand", "right": "right hand", "arm": "arm", "wish": "wish"}
 ORDERS = {
     "hold": "the operator stopped the arm, which holds until it is resumed",
     "resume": "the operator ended the hold",
@@ -85,6 +85,13 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
             "no hands yet",
             "a hand has not been seen since the start",
             "start the tracker; `hand_age_ms` in the status names the hands that have been seen",
+        ),
+        Incident(
+            Reason.NO_WISH,
+            Mode.HOLD,
+            "no wish yet",
+            "no wish has come on tool/wish since the start",
+            "start the policy, connected to the daemon; `rejected` counts what is not taken",
         ),
         Incident(
             Reason.OPERATOR,
@@ -211,6 +218,28 @@ INCIDENTS: Mapping[str, tuple[Incident, ...]] = {
             "hands far from the demonstrations",
             "the hands are farther from the demonstrations than the skill accepts",
             "move the hands back to where the task was demonstrated, or demonstrate this too",
+        ),
+        Incident(
+            Reason.STALE_WISH,
+            Mode.HOLD,
+            "policy silent",
+            "no wish is due, and none came for {skill.silent_ms ms}",
+            "let the policy answer sooner, or in longer chunks; the arm goes on with its next wish",
+        ),
+        Incident(
+            Reason.JUMPED_WISH,
+            Mode.HOLD,
+            "wish jumped",
+            "a wish was more than 0.25 m from the ones before it, in the last 0.5 s",
+            "wait: the tool then moves there slowly; if it goes on, look for two policies in one "
+            "program, or for mixed frames and units",
+        ),
+        Incident(
+            Reason.UNREACHABLE_WISH,
+            Mode.HOLD,
+            "wish out of reach",
+            "the wished pose is outside of `[reach]`",
+            "wish for poses within the arm's reach; the arm goes on with the first of them",
         ),
         Incident(
             Reason.TWO_SOURCES,

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 SIDES = ("left", "right")
 # a hand that the skill does not need has disappeared after this time; occlusions are shorter
 GONE_S = 5.0
-SOURCES = (*SIDES, "arm")
+SOURCES = (*SIDES, "arm", "wish")
 
 
 class Mode(enum.IntEnum):
@@ -43,6 +43,10 @@ class Reason(enum.IntEnum):
     AMBIGUOUS = 13
     CLUTCH = 14
     GUIDED = 15
+    NO_WISH = 16
+    STALE_WISH = 17
+    JUMPED_WISH = 18
+    UNREACHABLE_WISH = 19
 
 
 class Flag(enum.IntFlag):

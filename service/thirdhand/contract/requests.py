@@ -24,7 +24,7 @@ Metre = Annotated[float, msgspec.Meta(ge=-10, le=10, extra={"accepted": "-10 to 
 Point = tuple[Metre, Metre, Metre]
 Turned = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001, extra={"accepted": "-1 to 1"})]
 Orientation = tuple[Turned, Turned, Turned, Turned]  # quaternion x y z w
-Hands: TypeAlias = Literal["both", "left", "right"]
+Hands: TypeAlias = Literal["both", "left", "right", "neither"]
 Name = Annotated[
     str, msgspec.Meta(min_length=1, max_length=64, pattern=r"\A[\w .-]+\Z", extra=_NAMES)
 ]
@@ -308,7 +308,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     realtime: bool
     memory_locked: bool
     skill: str
-    hands: Hands = "both"  # hands that the skill follows
+    hands: Hands = "both"  # hands that the skill follows; `neither`: wishes lead
     via_points: tuple[str, ...]
     rejected: dict[str, int]
     received: dict[str, int] = {}  # messages that arrived, by channel of each input
@@ -326,7 +326,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     because: str = ""  # the reason in words, with its figures
     remedy: str = ""  # what to do about it
     time_ns: int = 0  # time of the status by the daemon's clock
-    sources: dict[str, Source] = {}  # by `left`, `right` and, if joints are measured, `arm`
+    sources: dict[str, Source] = {}  # by `left`, `right`, and `arm` and `wish` where they are heard
     streams: dict[str, Source] = {}  # all other streams that the cell receives, by key
     # accepted names of a hand's frame; the empty name stands for the tracker's
     frames: tuple[str, ...] = ()

@@ -22,6 +22,11 @@ class Condition(enum.IntFlag):
     UNSEEN_HAND_NEEDED = 512  # the target depends on a hand that is out of sight
     CLUTCH_RELEASED = 1024  # a clutch is configured, and is not pressed
     ARM_GUIDED = 2048  # the arm's driver reports that the arm is led by hand
+    WISH_LEADS = 4096  # the tool follows wishes, so the rules for hands do not apply
+    WISH_UNKNOWN = 8192  # no wish has come yet
+    WISH_SILENT = 16384  # no wish is due, and none came lately
+    WISH_JUMPED = 32768  # a wish was far from the path a moment ago
+    WISH_OUTSIDE = 65536  # the wished pose is out of the arm's reach
 
 
 class Start(enum.IntEnum):
@@ -86,12 +91,18 @@ ARM_HEARD = int(Condition.ARM_HEARD)
 ARM_STILL = int(Condition.ARM_STILL)
 CONTESTED = int(Condition.CONTESTED)
 UNSEEN = (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
+EITHER_UNSEEN = sum(UNSEEN)
 ARM_INSIDE = int(Condition.ARM_INSIDE)
 ONE_HAND = int(Condition.ONE_HAND)
 SEGMENT_AMBIGUOUS = int(Condition.SEGMENT_AMBIGUOUS)
 UNSEEN_HAND_NEEDED = int(Condition.UNSEEN_HAND_NEEDED)
 CLUTCH_RELEASED = int(Condition.CLUTCH_RELEASED)
 ARM_GUIDED = int(Condition.ARM_GUIDED)
+WISH_LEADS = int(Condition.WISH_LEADS)
+WISH_UNKNOWN = int(Condition.WISH_UNKNOWN)
+WISH_SILENT = int(Condition.WISH_SILENT)
+WISH_JUMPED = int(Condition.WISH_JUMPED)
+WISH_OUTSIDE = int(Condition.WISH_OUTSIDE)
 STARTS_ASSUMED = int(Start.ASSUMED)
 STARTS_MEASURED = int(Start.MEASURED)
 READY = int(ArmReady.READY)
@@ -129,3 +140,7 @@ CLUTCH = int(Reason.CLUTCH)
 ARM_ERROR = int(Reason.ARM_ERROR)
 ARM_SILENT = int(Reason.ARM_SILENT)
 GUIDED = int(Reason.GUIDED)
+NO_WISH = int(Reason.NO_WISH)
+STALE_WISH = int(Reason.STALE_WISH)
+JUMPED_WISH = int(Reason.JUMPED_WISH)
+UNREACHABLE_WISH = int(Reason.UNREACHABLE_WISH)

@@ -26,15 +26,13 @@ from thirdhand.core.codes import (
     HANDS_KNOWN,
     ONE_HAND,
     READY,
-    SEGMENT_AMBIGUOUS,
     STARTS_MEASURED,
-    UNSEEN,
-    UNSEEN_HAND_NEEDED,
 )
 from thirdhand.core.decision.stage import Decision
 from thirdhand.core.frame import (
     RECORDS,
     STAGES,
+    WISHES,
     Event,
     Frame,
     Lap,
@@ -44,7 +42,9 @@ from thirdhand.core.frame import (
     as_array,
     blank,
     copied,
+    dtype_of,
     frame_layout,
+    part_of,
     state_layout,
 )
 from thirdhand.core.intake.stage import Intake
@@ -57,6 +57,7 @@ from thirdhand.core.skill.pose import CLOSED, NO_GRIPPER, UNKNOWN
 from thirdhand.core.skill.skill import NEVER, Skill
 from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.tuning import TUNING, Tuning
+from thirdhand.core.wish.stage import WishStage
 from thirdhand.settings.config import Settings
 
 # Plain integers, because combining the members of an enumeration takes a microsecond.
@@ -67,8 +68,8 @@ SEPARATED = int(Flag.SEPARATION)
 STUCK = int(Flag.STUCK)
 UNSURE = int(Flag.UNSURE)
 ENGAGING = int(Flag.ENGAGING)
-EITHER_UNSEEN = sum(UNSEEN)
 SAMPLES = {channel.key for channel in CHANNELS if channel.direction == "in" and channel.event}
+SAMPLES.remove("tool/wish")  # which the skill's stage takes
 
 Tap: TypeAlias = Callable[[Tick, Frame], None]
 
@@ -79,7 +80,13 @@ def no_lap(stage: str) -> None:
 
 def start_state(settings: Settings, skill: Skill, tuning: Tuning = TUNING) -> Record:
     """State before the first tick."""
-    state = blank(state_layout(len(settings.joints.names)))
+    joints = len(settings.joints.names)
+    has_wishes = settings.skill.has_wishes
+    state = blank(state_layout(joints, has_wishes=has_wishes))
+    if has_wishes:
+        state["wish_tick"] = -1
+        for field in ("wish_leap_tick", "wish_told_tick"):
+            state[field] = NEVER
     Intake(settings, tuning=tuning).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture
@@ -108,13 +115,21 @@ class Controller:
         urdf: str,
         tuning: Tuning = TUNING,
     ) -> None:
-        self._state = copied(start_state(settings, skill, tuning) if state is None else state)
+        self._whole = copied(start_state(settings, skill, tuning) if state is None else state)
+        self._bytes = as_array(self._whole).view(np.uint8)
+        joints = len(settings.joints.names)
+        layout = state_layout(joints)
+        # its compiled functions are those of all cells, so the stages share one layout
+        self._state = part_of(self._whole, layout, 0)
         # the same memory as an array: a number is read from it in a third of the time
         self._memory = as_array(self._state)
-        self._bytes = self._memory.view(np.uint8)
-        self._layout = frame_layout(len(settings.joints.names))
+        self._layout = frame_layout(joints)
         self.intake = Intake(settings, tuning=tuning)
         self._skill = SkillStage(settings, skill, tuning=tuning)
+        self._wishes: WishStage | None = None
+        if settings.skill.has_wishes:
+            wishes = part_of(self._whole, dtype_of(WISHES, joints), layout.itemsize)
+            self._skill = self._wishes = WishStage(settings, skill, wishes, tuning=tuning)
         self.decision = Decision(settings, tuning=tuning)
         self._separation = Separation(settings, urdf, tuning=tuning)
         self._separation.set_contacts(skill.via_points)
@@ -142,7 +157,7 @@ class Controller:
     @property
     def state(self) -> Record:
         """Copy of all that the next frame depends on, except settings and skill."""
-        return copied(self._state)
+        return copied(self._whole)
 
     @property
     def skill(self) -> Skill:
@@ -172,13 +187,8 @@ class Controller:
         lap("intake")
 
         conditions |= self._alone(frame)
-        unseen = UNSEEN.index(flag) if (flag := conditions & EITHER_UNSEEN) else None
-        request = self._skill.step(state, frame, unseen) if conditions & HANDS_KNOWN else None
-        if request is not None:
-            conditions |= (
-                SEGMENT_AMBIGUOUS * request.is_ambiguous
-                | UNSEEN_HAND_NEEDED * request.needs_unseen_hand
-            )
+        request, flags = self._skill.request(state, frame, conditions)
+        conditions |= flags
         lap("skill")
 
         kinematics = self._decide(
@@ -213,15 +223,26 @@ class Controller:
         for event in tick.inbox:
             if event.kind in SAMPLES:
                 samples.append(event)
-            elif event.kind == "skill":
-                self._adopt(event.value)
-            elif event.kind == "segment":
-                self._skill.set_segment(state, cdr.decode_string(event.payload))
-            elif event.kind == "begin":
-                self._skill.begin(state)
             else:
-                self.decision.take(state, event)
+                self._apply(tick, event)
         return self.intake.step(state, frame, tick.index - before, samples)
+
+    def _apply(self, tick: Tick, event: Event) -> None:
+        """Apply an event that is no sample of a hand or the arm."""
+        state = self._state
+        match event.kind:
+            case "tool/wish" if self._wishes is not None:
+                cause = self._wishes.take(tick.index, tick.time_ns, event.value)
+                if cause is not None:
+                    self.intake.reject(state, "wish", cause, event.value, newest_ns=tick.time_ns)
+            case "skill":
+                self._adopt(event.value)
+            case "segment":
+                self._skill.set_segment(state, cdr.decode_string(event.payload))
+            case "begin":
+                self._skill.begin(state)
+            case _:
+                self.decision.take(state, event)
 
     def _alone(self, frame: Frame) -> int:
         """Flags ONE_HAND and HANDS_KNOWN if one hand leads the skill and the other one has never
@@ -272,7 +293,7 @@ class Controller:
         state = self._state
         separation = self._separation
         limitation = self._setpoint.step(
-            state, frame, wanted, kinematics, self.skill.workspace, separation.setpoint_share
+            state, frame, wanted, kinematics, self._skill.workspace, separation.setpoint_share
         )
         if limitation == BROKEN:
             self.decision.fail(state, frame, Reason.SETPOINT)

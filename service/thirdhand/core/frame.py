@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from kmp.compiled import PLAIN
 from thirdhand.contract import cdr
 from thirdhand.contract.records import Field, Layout, assembled, definition
-from thirdhand.core import arm, decision, intake, limiter, separation, setpoint, skill
+from thirdhand.core import arm, decision, intake, limiter, separation, setpoint, skill, wish
 
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
@@ -91,6 +91,12 @@ def copied(record: Record) -> Record:
     return copy
 
 
+def part_of(record: Record, layout: DType, offset: int) -> Record:
+    """The part of a record with this layout and offset [bytes], in the same memory."""
+    part: Record = RECORDS(1, layout, as_array(record).view(np.uint8), offset)[0]
+    return part
+
+
 def frozen(record: Record) -> Record:
     """Read-only copy of a record."""
     copy: Record = np.frombuffer(record.tobytes(), record.dtype)[0]
@@ -106,6 +112,8 @@ STAGES = tuple(package.__name__.rsplit(".", 1)[1] for package in _PACKAGES)
 _TICK = (Field("tick", "int64"),)
 FRAME = assembled(_TICK, *(package.FRAME for package in _PACKAGES))
 STATE = assembled(_TICK, *(package.STATE for package in _PACKAGES))
+# after these, where a policy leads
+WISHES = assembled(wish.STATE)
 TIMING_FIELDS = (
     Field("tick", "int64"),
     Field("time_ns", "int64"),  # the tick's deadline on the wall clock
@@ -142,6 +150,8 @@ class Tick:
 
     index: int
     inbox: tuple[Event, ...] = ()
+    # of the deadline: the stamp of its messages, with which the stamps of wishes are compared
+    time_ns: int = 0
 
 
 def frame_layout(joints: int) -> DType:
@@ -149,14 +159,17 @@ def frame_layout(joints: int) -> DType:
     return dtype_of(FRAME, joints)
 
 
-def state_layout(joints: int) -> DType:
-    """Layout of a State for an arm with this number of joints."""
-    return dtype_of(STATE, joints)
+def state_layout(joints: int, *, has_wishes: bool = False) -> DType:
+    """Layout of a State for an arm with this number of joints; where a policy leads, it
+    `has_wishes`.
+    """
+    return dtype_of(STATE + WISHES if has_wishes else STATE, joints)
 
 
-def definitions(joints: int) -> dict[str, str]:
+def definitions(joints: int, *, has_wishes: bool = False) -> dict[str, str]:
     """ROS 2 definitions of Frame, State and Timing for an arm with this number of joints."""
-    layouts = {"Frame": FRAME, "State": STATE, "Timing": TIMING_FIELDS}
+    state = STATE + WISHES if has_wishes else STATE
+    layouts = {"Frame": FRAME, "State": state, "Timing": TIMING_FIELDS}
     return {f"thirdhand/{name}": definition(layout, joints) for name, layout in layouts.items()}
 
 

@@ -13,6 +13,7 @@ from thirdhand.core.decision.tuning import DecisionTuning
 from thirdhand.core.intake.tuning import IntakeTuning
 from thirdhand.core.separation.tuning import SeparationTuning
 from thirdhand.core.setpoint.tuning import SetpointTuning
+from thirdhand.core.wish.tuning import WishTuning
 
 
 class Tuning(NamedTuple):
@@ -23,6 +24,7 @@ class Tuning(NamedTuple):
     separation: SeparationTuning = SeparationTuning()
     setpoint: SetpointTuning = SetpointTuning()
     arm: ArmTuning = ArmTuning()
+    wish: WishTuning = WishTuning()
 
 
 TUNING = Tuning()

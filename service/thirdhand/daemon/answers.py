@@ -46,6 +46,7 @@ from thirdhand.skills.corrections import (
     offer_of,
     segment_of,
 )
+from thirdhand.skills.no_skill import leads_alone
 from thirdhand.skills.reach import accepted, beyond_m, out_of_reach
 from thirdhand.skills.skill_file import StoredSkill
 from thirdhand.skills.via_points import (
@@ -111,6 +112,11 @@ class Answers:
         """The reply to a request; a status is in bytes. The error of an order is returned, that of
         other requests raised: RequestError or SkillError.
         """
+        if isinstance(request, (*TEACHING, SegmentRequest)) and leads_alone(self._cell.settings):
+            raise RequestError(
+                "this cell has no skill: it follows the wishes on tool/wish, by `[skill] source`; "
+                "with `[skill] blend = true` a skill leads too"
+            )
         with self._teaching if isinstance(request, TEACHING) else contextlib.nullcontext():
             return self._answered_by[type(request)](request)
 
@@ -146,6 +152,8 @@ class Answers:
             note = "there was no hold to end"
         elif request.kind == "resume" and reply.mode == word(Mode.FAULT):
             note = "resume does not end a fault, reset does"
+        elif request.kind == "begin" and leads_alone(self._cell.settings):
+            note = "the cell has no skill whose task could begin: it follows wishes"
         elif request.kind == "begin" and not is_requested(self._cell.skill.model.clock):
             note = "the skill needs no request: its task begins as the hands move"
         return msgspec.structs.replace(reply, note=note)

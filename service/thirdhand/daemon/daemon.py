@@ -40,6 +40,7 @@ from thirdhand.process.priority import ahead_of_others
 from thirdhand.scribe.protocol import pack
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings, robot_description
+from thirdhand.skills.no_skill import leads_alone, no_skill
 from thirdhand.skills.reach import beyond_m, out_of_reach
 from thirdhand.skills.skill_file import SkillError, StoredSkill
 
@@ -209,7 +210,7 @@ class Daemon:
                 inbox.append(cell.own.popleft())
             if stop_by is not None:
                 inbox.append(order("hold"))  # last, so that no other request overrides it
-            yield Tick(index, tuple(inbox))
+            yield Tick(index, tuple(inbox), cell.clock.stamp_ns)
             requests.answer(cell.frame)  # the frame of this tick
 
     def _warm_up(self) -> None:
@@ -221,7 +222,7 @@ class Daemon:
         for event in newest:
             channels.BY_KEY[event.kind].codec.decode(event.payload)
         self._twin.copy_from(cell.controller)
-        tick = Tick(self._newest + 1, newest)
+        tick = Tick(self._newest + 1, newest, cell.clock.stamp_ns)
         frame = self._twin.step(tick)
         _, outputs = self._messages(frame)
         timing = timed(tick.index, 0, 0, 0.0, 0.0, 0.0, [0.0] * len(STAGES))
@@ -273,11 +274,14 @@ class Daemon:
 
 
 def load_skill(path: Path, settings: Settings) -> StoredSkill:
-    """The skill in a file, with the via-points that were taught to it before.
+    """The skill in a file, with the via-points that were taught to it before; a stand-in where
+    wishes lead alone.
 
     Raises SkillError, also if the arm does not reach most of the skill's tool positions, or if
     nobody accepted the skill's residual risk.
     """
+    if leads_alone(settings):
+        return no_skill()
     skill = skill_of(path)
     saved = SavedViaPoints(settings)
     skill.check_accepted()

@@ -21,6 +21,7 @@ from thirdhand.contract.evidence import (
     Jump,
     Outside,
     explained,
+    refused_wish,
 )
 from thirdhand.contract.incidents import (
     FROZEN,
@@ -32,7 +33,12 @@ from thirdhand.contract.incidents import (
     word,
 )
 from thirdhand.contract.joint_states import measured
-from thirdhand.contract.messages import JointState, PoseStamped, WireError
+from thirdhand.contract.messages import (
+    JointState,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    WireError,
+)
 from thirdhand.contract.records import SOURCES, Cause
 from thirdhand.contract.requests import Source
 from thirdhand.core.controller import Controller
@@ -41,13 +47,16 @@ from thirdhand.core.intake.far_away import too_far, unit_meant
 from thirdhand.core.intake.late_samples import lateness_ms
 from thirdhand.core.intake.stage import Intake, Refused
 from thirdhand.core.tuning import TUNING
+from thirdhand.core.wish.path import newest_due
 from thirdhand.daemon.cell_streams import Arrivals, heard
 from thirdhand.daemon.side_streams import side_keys
 from thirdhand.settings.config import JointSettings, Settings
 
 RATE_WINDOW_S = 1.0  # rates and clocks are taken over this time
 COUNTS_EVERY_S = 10.0  # interval of the log lines that count further rejections
-KEY_OF_SOURCE = dict(zip(SOURCES, ("hands/left", "hands/right", "joints/state"), strict=True))
+KEY_OF_SOURCE = dict(
+    zip(SOURCES, ("hands/left", "hands/right", "joints/state", "tool/wish"), strict=True)
+)
 
 
 class _History:
@@ -151,29 +160,34 @@ class InputMonitor:
         if cause == MALFORMED or intake is None:
             return explained(Condition.MALFORMED, Evidence(mistake=str(arrivals.refusal)))
         refused = intake.refused[name, Cause[cause.upper()]]
+        if name == "wish":
+            return refused_wish(
+                refused.cause, refused.sample, refused.newest_ns, self._settings.tracker_frames
+            )
         return explained(refused.cause, evidence(refused, self._settings, arrivals))
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
-        """Hand or arm at this moment: its stream, its age [ms], and what only its kind has."""
-        settings = self._settings
-        is_arm = source == "arm"
-        index = SOURCES.index(source)
-        sample_tick = int(state["arm_tick"] if is_arm else state["hand_ticks"][index])
-        age_ms = (
-            None
-            if sample_tick < 0
-            else round((int(state["tick"]) - sample_tick) * settings.period_s * 1e3, 1)
-        )
-        silent_ms = settings.arm.silent_ms if is_arm else self._stale_ms(state, index)
-        of_its_kind: dict[str, Any] = (
-            {"contested": round(float(state["arm_contested"]), 3)}
-            if is_arm
-            else self._hand(source, state)
-        )
+        """A hand, the arm or the wish: its stream, its age [ms], and what only its kind has."""
+        period_ms = 1e3 * self._settings.period_s
+        tick = int(state["tick"])
+        of_its_kind: dict[str, Any] = {}
+        if source == "arm":
+            sample_tick = due_tick = int(state["arm_tick"])
+            silent_ms = self._settings.arm.silent_ms
+            of_its_kind = {"contested": round(float(state["arm_contested"]), 3)}
+        elif source == "wish":
+            sample_tick = int(state["wish_tick"])
+            due_tick = newest_due(state)
+            silent_ms = self._settings.skill.silent_ms
+        else:
+            index = SOURCES.index(source)
+            sample_tick = due_tick = int(state["hand_ticks"][index])
+            silent_ms = self._stale_ms(state, index)
+            of_its_kind = self._hand(source, state)
         return msgspec.structs.replace(
             self._stream(source, now_s, controller.intake),
-            age_ms=age_ms,
-            fresh=age_ms is not None and age_ms < silent_ms,
+            age_ms=None if sample_tick < 0 else round((tick - sample_tick) * period_ms, 1),
+            fresh=sample_tick >= 0 and (tick - due_tick) * period_ms < silent_ms,
             unit=self._unit_of(self.arrivals[self._keys[source]].newest),
             **of_its_kind,
         )
@@ -271,6 +285,7 @@ def _too_far(sample: PoseStamped, settings: Settings) -> str:
 def evidence(refused: Refused, settings: Settings, arrivals: Arrivals) -> Evidence:
     """A rejected sample, and the other samples of its source that arrived with it."""
     cause, sample, newest_ns, _ = refused
+    assert not isinstance(sample, PoseWithCovarianceStamped)  # those are wishes
     held_up_s = arrivals.held_up_s(newest_ns, sample.stamp_ns) if cause is Cause.AHEAD else None
     is_set_back = cause is Cause.OLDER and arrivals.is_set_back(newest_ns)
     facts = Evidence(

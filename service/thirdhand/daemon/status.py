@@ -30,6 +30,7 @@ from thirdhand.core.tuning import TUNING
 from thirdhand.daemon.input_monitor import KEY_OF_SOURCE
 from thirdhand.settings.config import Settings
 from thirdhand.skills.corrections import offer_of
+from thirdhand.skills.no_skill import leads_alone
 
 MAX_MEASURED_AGE_S = 0.2  # the tool is measured by joint states up to this age
 LAG_STATUSES = 10  # of the last second
@@ -139,6 +140,8 @@ class CellStatus(NamedTuple):
 
     def _demonstrated(self) -> dict[str, Any]:
         """The fields on the hands as demonstrated: needed ones, their boxes and via-points [m]."""
+        if leads_alone(self.settings):
+            return {"hands": "neither"}
         skill = self.controller.skill
         low, high = skill.demonstrated
         return {

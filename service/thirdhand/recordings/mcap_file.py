@@ -119,9 +119,16 @@ class McapFile:
     """
 
     def __init__(
-        self, path: Path, *, joints: int, attached: bool = True, compressed: bool = True
+        self,
+        path: Path,
+        *,
+        joints: int,
+        attached: bool = True,
+        compressed: bool = True,
+        has_wishes: bool = False,
     ) -> None:
-        """`joints` is the arm's number of joints, on which the schemas depend.
+        """`joints` is the arm's number of joints, and a State `has_wishes` where a policy leads, on
+        which the schemas depend.
 
         A file without attachments and metadata (`attached` False) has no index of them, because its
         summary would list empty groups.
@@ -131,7 +138,7 @@ class McapFile:
         kinds = IndexType.ALL if attached else IndexType.CHUNK | IndexType.MESSAGE
         compression = CompressionType.ZSTD if compressed else CompressionType.NONE
         self.writer = Writer(self._stream, 1 << 62, compression, kinds, enable_data_crcs=True)  # type: ignore[arg-type]
-        self._definitions = definitions(joints)
+        self._definitions = definitions(joints, has_wishes=has_wishes)
         self._unflushed = 0  # bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}

@@ -98,7 +98,12 @@ class Recorder(McapFile):
             for channel in channels.CHANNELS
             if channel.recorded
         }
-        super().__init__(Path(path), joints=len(settings.joints.names), compressed=not checksums)
+        super().__init__(
+            Path(path),
+            joints=len(settings.joints.names),
+            compressed=not checksums,
+            has_wishes=settings.skill.has_wishes,
+        )
         about = {
             "format": FORMAT,
             "cell": settings.cell,

@@ -298,7 +298,7 @@ class _Comparison:
                 return
             events = self._skills.events(step)
             self.last = step
-            yield Tick(step.tick, events)
+            yield Tick(step.tick, events, step.time_ns)
 
     def compare(self, tick: Tick, frame: Frame) -> None:
         """Compare the newest tick's frame, and the state after it, with the recorded ones."""
@@ -346,7 +346,7 @@ def ticks(recording: Recording) -> Iterator[Tick]:
     """The ticks of a recording as input of the core."""
     skills = _Skills(recording)
     for step in recording.steps(outputs=False):
-        yield Tick(step.tick, skills.events(step))
+        yield Tick(step.tick, skills.events(step), step.time_ns)
 
 
 def _named(metadata: dict[str, str]) -> str:

@@ -113,7 +113,7 @@ class _Assembly:
         self._layouts = {
             "frame": frame_layout(joints),
             "timing": TIMING,
-            "state": state_layout(joints),
+            "state": state_layout(joints, has_wishes=settings.skill.has_wishes),
         }
         replayed = REPLAYED if outputs else REPLAYED.difference(_RECORDS)
         self._names = channels.keys_by_topic(settings.cell, replayed)

@@ -168,6 +168,7 @@ class ScribeProcess:
     def __init__(self, setup: ScribeSetup, skill: bytes | None, source: socket.socket) -> None:
         self._source = source
         self._joints = len(setup.settings.joints.names)
+        self._has_wishes = setup.settings.skill.has_wishes
         self._errors: list[str] = []
         self._live: LiveView | None = None
         self._reported_left_out = 0
@@ -186,7 +187,9 @@ class ScribeProcess:
         state = (
             None
             if setup.state is None
-            else np.frombuffer(setup.state, state_layout(self._joints))[0]
+            else np.frombuffer(
+                setup.state, state_layout(self._joints, has_wishes=self._has_wishes)
+            )[0]
         )
         self._segments.begin(skill, state)
         self.report()
@@ -224,7 +227,7 @@ class ScribeProcess:
         """Write one message, and pass it to the live view. Ticks that are on disk with it are
         reported at once, because unreported ones count as lost if this process dies.
         """
-        received = unpack(message, skills, joints=self._joints)
+        received = unpack(message, skills, joints=self._joints, has_wishes=self._has_wishes)
         live = self._live
         if isinstance(received, Note):
             key = received.key

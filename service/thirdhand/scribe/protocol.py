@@ -82,10 +82,10 @@ def pack(
 
 
 def unpack(
-    message: bytes, skills: list[bytes], *, joints: int
+    message: bytes, skills: list[bytes], *, joints: int, has_wishes: bool = False
 ) -> TickMessage | Note | ImageArrival:
-    """The tick, note or image in a message. `joints` is the arm's number of joints; `skills` are
-    the files sent with the message, in order.
+    """The tick, note or image in a message. `joints` is the arm's number of joints, whose state
+    `has_wishes` where a policy leads; `skills` are the files sent with the message, in order.
     """
     sent = _MESSAGES.decode(message)
     files = iter(skills)
@@ -99,7 +99,9 @@ def unpack(
     frame: Record = np.frombuffer(sent.frame, frame_layout(joints))[0]
     timing: Record = np.frombuffer(sent.timing, TIMING)[0]
     state: Record | None = (
-        None if sent.state is None else np.frombuffer(sent.state, state_layout(joints))[0]
+        None
+        if sent.state is None
+        else np.frombuffer(sent.state, state_layout(joints, has_wishes=has_wishes))[0]
     )
     skill = next(files) if sent.with_skill else None
     return TickMessage(

@@ -325,10 +325,21 @@ class TableTop(Section, frozen=True):
 
 
 class SkillSettings(Section, frozen=True):
-    """The timing with which the skill is followed."""
+    """What the tool follows, and the timing with which a skill is followed."""
 
     # the tool is this far ahead of the teacher's timing
     lead_s: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
+    # "tool/wish": the poses that a policy wishes there, instead of a learned skill
+    source: Literal["hands", "tool/wish"] = "hands"
+    # the skill leads too: both are weighed by their covariances
+    blend: bool = False
+    # the arm holds after this time without a wish that is due
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=5000)] = 500.0
+
+    @property
+    def has_wishes(self) -> bool:
+        """True if a policy leads."""
+        return self.source == "tool/wish"
 
 
 class Files(Section, frozen=True):

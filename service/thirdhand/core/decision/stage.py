@@ -16,6 +16,7 @@ from thirdhand.core.codes import (
     NOT_READY,
     RETURNING,
     STALE_HAND,
+    STALE_WISH,
 )
 from thirdhand.core.decision.leave import WayOut, speeds_of_ways
 from thirdhand.core.decision.step import step
@@ -23,7 +24,7 @@ from thirdhand.core.frame import Event, Record, Records, Vector, as_array, param
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings
 
-BY_THE_HANDS = (STALE_HAND, FAR, AMBIGUOUS)
+BRIEF = (STALE_HAND, STALE_WISH, FAR, AMBIGUOUS)
 
 
 class Decision:
@@ -102,11 +103,11 @@ class Decision:
         return self._way_out.velocity(state, tasks) if state["reason"] == BLOCKED else None
 
     def is_brief(self, state: Record) -> bool:
-        """True in the first tracker_memory_s of a hold that the hands have caused. The arm then
-        resumes its motion without engaging anew.
+        """True in the first tracker_memory_s of a hold that hands or wishes have caused. The arm
+        then resumes its motion without engaging anew.
         """
         held = int(state["tick"] - state["followed_tick"])
-        return int(state["reason"]) in BY_THE_HANDS and held <= self._brief_ticks
+        return int(state["reason"]) in BRIEF and held <= self._brief_ticks
 
     def take(self, state: Record, event: Event) -> None:
         """Apply an event of the kind hold, resume, reset, fault or way (a way out). Raises

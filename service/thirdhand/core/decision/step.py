@@ -26,7 +26,9 @@ from thirdhand.core.codes import (
     HELD_SEEN,
     HELD_UNSEEN,
     HOLD,
+    JUMPED_WISH,
     NO_HANDS,
+    NO_WISH,
     NONE,
     NOT_READY,
     NOTICED,
@@ -36,12 +38,19 @@ from thirdhand.core.codes import (
     RETURNING,
     SEGMENT_AMBIGUOUS,
     STALE_HAND,
+    STALE_WISH,
     STARTS_ASSUMED,
     STARTS_MEASURED,
     TOOL_SPEED,
     TWO_SOURCES,
+    UNREACHABLE_WISH,
     UNSEEN,
     UNSEEN_HAND_NEEDED,
+    WISH_JUMPED,
+    WISH_LEADS,
+    WISH_OUTSIDE,
+    WISH_SILENT,
+    WISH_UNKNOWN,
 )
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.vectors import distance
@@ -103,6 +112,8 @@ def _why_hold(
       itself holds for a later reason.
     * OPERATOR: the operator holds it.
     * CLUTCH: the clutch is released.
+    * NO_WISH, STALE_WISH, JUMPED_WISH, UNREACHABLE_WISH where wishes lead; none of the rules below
+      applies then.
     * FAR: the arm does not follow, and a hand has jumped within the last jumpy_s.
     * NO_HANDS, STALE_HAND: the skill predicts nothing (`gate_m` is NaN), because a hand has never
       been seen or is not seen now.
@@ -124,6 +135,8 @@ def _why_hold(
         return OPERATOR
     if conditions & CLUTCH_RELEASED:
         return CLUTCH
+    if conditions & (WISH_LEADS | WISH_SILENT | WISH_UNKNOWN):
+        return _wish_reason(conditions)
     jump_tick = max(state.jump_newest_tick[0], state.jump_newest_tick[1])
     jumped_s = (state.tick - jump_tick) * config.period_s
     if state.mode != FOLLOW and jump_tick > 0 and jumped_s < config.jumpy_s:
@@ -135,6 +148,18 @@ def _why_hold(
     if reason == NONE and conditions & SEGMENT_AMBIGUOUS:
         return AMBIGUOUS
     return reason
+
+
+@compiled
+def _wish_reason(conditions: int) -> int:
+    """The reason for a hold where wishes lead, or NONE."""
+    if conditions & WISH_UNKNOWN:
+        return NO_WISH
+    if conditions & WISH_SILENT:
+        return STALE_WISH
+    if conditions & WISH_JUMPED:
+        return JUMPED_WISH
+    return UNREACHABLE_WISH if conditions & WISH_OUTSIDE else NONE
 
 
 @compiled

@@ -7,14 +7,20 @@ at the tick. The clutch, the wish for the gripper and reports of hand guiding ar
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thirdhand.contract.channels import BY_KEY
 from thirdhand.contract.joint_states import measured
-from thirdhand.contract.messages import BASE, JointState, PoseStamped, WireError
+from thirdhand.contract.messages import (
+    BASE,
+    JointState,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    WireError,
+)
 from thirdhand.contract.records import SIDES, SOURCES, Cause
 from thirdhand.core.frame import Event, Record, as_array, parameters
 from thirdhand.core.geometry import rotation
@@ -50,13 +56,16 @@ def _stale_ticks(key: str, settings: Settings) -> int:
     return max(1, settings.ticks_in(duration_ms / 1000))
 
 
+Sample: TypeAlias = PoseStamped | PoseWithCovarianceStamped | JointState
+
+
 class Refused(NamedTuple):
-    """A rejected sample, with the stamp [ns] of the newest accepted sample; for the arm, also with
-    the joint positions of that one.
+    """A rejected sample, with the stamp [ns] of the newest accepted sample, or for a wish the time
+    of its arrival; for the arm, also with the joint positions of that one.
     """
 
     cause: Cause
-    sample: PoseStamped | JointState
+    sample: Sample
     newest_ns: int
     joints: tuple[float, ...] = ()
 
@@ -214,9 +223,15 @@ class Intake:
         if cause >= 0:
             self._note(state, ARM, cause, sample)
 
-    def _note(
-        self, state: Record, source: int, cause: int, sample: PoseStamped | JointState
+    def reject(
+        self, state: Record, source: str, cause: Cause, sample: Sample, *, newest_ns: int
     ) -> None:
+        """Count a sample that another stage rejects, and retain it for reports."""
+        state["rejected"][cause] += 1
+        self.refused[source, cause] = Refused(cause, sample, newest_ns)
+        self.rejected[SOURCES.index(source), cause] += 1
+
+    def _note(self, state: Record, source: int, cause: int, sample: Sample) -> None:
         """Count a rejected sample, and retain it for reports."""
         newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
         joints = tuple(state["measured"].tolist()) if source == ARM else ()

@@ -190,7 +190,7 @@ def _judge_arm(
 
 
 @compiled
-def _malformed(
+def malformed(
     parameters: Records,
     position: tuple[float, float, float],
     turn: tuple[float, float, float, float],
@@ -252,7 +252,7 @@ def _in_time(
 
 
 @compiled
-def _in_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
+def to_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
     """Position (3,) [m] in frame base of a tracker's position, by its axes times its unit, and its
     origin: `mapping` (3, 4).
     """
@@ -339,7 +339,7 @@ def take_hand(
     `mapping` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
     state = states[0]
-    in_base = _in_base(position, mapping)
+    in_base = to_base(position, mapping)
     fresh = (
         state.hand_ticks[side] >= 0
         and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
@@ -350,7 +350,7 @@ def take_hand(
     made_tick = state.tick
     jumped = False
     wrong = 0
-    cause = _malformed(parameters, position, turn, in_base)
+    cause = malformed(parameters, position, turn, in_base)
     if cause < 0:
         cause, order, made_tick, jumped, wrong = _judge_hand(
             states, parameters, models, side, stamp_ns, in_base, fresh

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from thirdhand.core.frame import Record, as_array, parameters
+from thirdhand.core.codes import (
+    EITHER_UNSEEN,
+    HANDS_KNOWN,
+    SEGMENT_AMBIGUOUS,
+    UNSEEN,
+    UNSEEN_HAND_NEEDED,
+)
+from thirdhand.core.frame import Record, Vector, as_array, parameters
 from thirdhand.core.numerics import UNPRIMED_DECIDED
 from thirdhand.core.skill import ORDER, TURNS
 from thirdhand.core.skill.memory import recall, turn_lag_s
@@ -73,6 +80,11 @@ class SkillStage:
             alarm=regions.alarm,
         )
 
+    @property
+    def workspace(self) -> Vector:
+        """Lower and upper corner of the box for targets (2, 3) [m]."""
+        return self.skill.workspace
+
     def adopt(self, state: Record, skill: Skill) -> None:
         """Replace the skill. The belief is kept if the new skill has the same via-points, the
         memory of the hands if it has the same filters, and the clock if it has the same clock.
@@ -95,6 +107,18 @@ class SkillStage:
         state["closure"] = NO_GRIPPER
         state["sure_tick"] = state["tick"]
         state["trail_tick"] = NEVER
+
+    def request(self, state: Record, frame: Record, conditions: int) -> tuple[Wanted | None, int]:
+        """Request of the skill for the hands, None if they are not known, and flags of
+        `codes.Condition`. `conditions` are those that the intake determines.
+        """
+        if not conditions & HANDS_KNOWN:
+            return None, 0
+        flag = conditions & EITHER_UNSEEN
+        wanted = self.step(state, frame, UNSEEN.index(flag) if flag else None)
+        return wanted, (
+            SEGMENT_AMBIGUOUS * wanted.is_ambiguous | UNSEEN_HAND_NEEDED * wanted.needs_unseen_hand
+        )
 
     def step(self, state: Record, frame: Record, unseen: int | None = None) -> Wanted:
         """Request of the skill for the hands in the state, which must be known; `unseen` is the

@@ -1,0 +1,25 @@
+"""Tuned numbers of the wishes. docs/policies.md has what each of them changes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class WishTuning(NamedTuple):
+    """Tuned numbers of stage 2 where a policy leads."""
+
+    fade_rate: float = 20.0  # [1/s] at which the offset between two chunks fades out
+    fade_mps: float = 0.3  # [m/s] at most
+    steady_s: float = 0.1  # the last poses, over this time, give the velocity at the path's end
+
+
+NEAREST_S = 0.01  # of wishes due closer together than this only the newest is kept
+LEAP_M = 0.25  # a wish farther from the path than this is another task's, or a mistake
+LEAP_HOLD_S = 0.5  # the arm holds for so long after such a wish
+GOES_ON_S = 0.2  # after a longer gap, a target does not go on from the one before
+RAD_AS_M = 0.2  # [m/rad] an offset of orientation fades out as one of position of this size
+UNKNOWN_STD = (0.01, 0.05)  # [m, rad] deviation of a wish without a covariance
+FARTHEST_S = (
+    1.05  # a pose may be due a second after it arrives; clocks differ by less than the rest
+)
+LATEST_S = 1.0  # a pose that was due earlier is not taken
