@@ -334,7 +334,7 @@ class SkillSettings(Section, frozen=True):
     # the skill leads too: both are weighed by their covariances
     blend: bool = False
     # the arm holds after this time without a wish that is due
-    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=5000)] = 500.0
+    silent_ms: Annotated[float, msgspec.Meta(gt=0, le=5000)] = 1000.0
 
     @property
     def has_wishes(self) -> bool:

@@ -156,6 +156,14 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     ),
     "motion-of-others": Experiment("motion", ALL, _OTHERS, ("arm", "hands")),
     "separation": Experiment("separation", CORE, Seeds(_scenes(100), tuning=TUNED_SCENES)),
+    "seams": Experiment(
+        "seams",
+        ("core", "wishes"),
+        Seeds(
+            {"policies": Stream("policy", 0, range(100, 103))},
+            tuning={"policies": Stream("policy", 0, range(2))},
+        ),
+    ),
     "faults": Experiment("load.faults", CORE, Seeds(_hands(Scene().seed)), ("arm",)),
     "letters": Experiment("reproduction.letters", KMP, _WRITTEN, ("letters",)),
     "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),

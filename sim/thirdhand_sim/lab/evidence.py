@@ -1,8 +1,8 @@
 """The origin of each experiment's result, and its staleness against this source tree.
 
-A result depends on up to three digests: `core`, of the frames of the golden session; `learning`, of
-the numbers of the shipped skill, which `learn` makes of the shipped takes; `kmp`, of the library's
-results for two small problems. A result is stale if its digests are not those of the tree.
+A result depends on up to four digests: `core`, of the frames of the golden session; `wishes`, of a
+tool that a policy leads; `learning`, of the numbers of the shipped skill, which `learn` makes of
+the shipped takes; `kmp`, of the library's results for two small problems. A result is stale if its digests are not those of the tree.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ def tree() -> dict[str, str]:
         "core": core_digest(recordings() / "golden.mcap"),
         "learning": _skill_digest(),
         "kmp": kmp_digest(),
+        "wishes": _wishes_digest(),
     }
 
 
@@ -81,6 +82,17 @@ def _skill_digest() -> str:
     with np.load(recordings() / SHIPPED_SKILL, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files if name != DEMONSTRATIONS}
     return checksum({name: array for name, array in arrays.items() if array.dtype.kind != "U"})
+
+
+def _wishes_digest() -> str:
+    """The digest of a tool's path that a policy leads."""
+    from thirdhand_sim.lab.seams import STEADY_POLICY, OurArm, cell, led
+
+    arm = OurArm(cell())
+    path = np.linspace(arm.tool, arm.tool + 0.05, 1000)
+    return hashlib.blake2b(
+        led(arm, path, STEADY_POLICY, (1,)).tool.tobytes(), digest_size=16
+    ).hexdigest()
 
 
 @functools.cache

@@ -74,7 +74,7 @@ def take(
     normalise(pose[3:])
     turn_on(pose[3:], mapping[3, :3])
     due = tick + ahead_s / rule.period_s
-    if not _append(wishes, rules, tick, due, pose):
+    if not _insert(wishes, rules, tick, due, pose):
         return AHEAD
     _carry(covariance[:3, :3], mapping, 1.0, rule.unknown_std_m**2, wish.wish_covariances[:3])
     unit = math.sqrt(dot(mapping[0, :3], mapping[0, :3]))
@@ -103,36 +103,76 @@ def _carry(covariance: Vector, mapping: Vector, scale: float, unknown: float, ou
 
 
 @compiled
-def _append(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> bool:
-    """Let the path end with a pose (7,) that is due at the tick `due`. False if too many poses are
-    ahead already.
+def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> bool:
+    """Put a pose (7,) that is due at the tick `due` into the path. False if there is no room.
 
-    It replaces all poses that were due then or later: a new chunk begins. Of poses that follow each
-    other within nearest_ticks only the newest is kept. A pose farther than leap_m from the path is
-    noted as a leap.
+    Where an earlier chunk has the path x already, the pose p becomes x + a (p - x), a = max(1 / n,
+    least_share), as the n-th one for that time. Poses of earlier chunks between two of one chunk
+    are dropped, and so are those nearer than nearest_ticks; those after its end stay. A pose
+    farther than leap_m from the path is noted as a leap; where the path has ended, leap_mps is
+    added for the time since.
     """
     wish = wishes[0]
     rule = rules[0]
-    if wish.wish_count:
+    count = _forget_passed(wishes, wish.wish_count, tick)
+    wish.wish_count = count
+    times = 1
+    if count:
         motion = np.empty((3, 6))
         quaternion = np.empty(4)
         at(wishes, rules, due, motion, quaternion)
-        if squared_distance(pose[:3], motion[0, :3]) > rule.leap_m**2:
+        silent_s = max(due - wish.wish_due[count - 1], 0.0) * rule.period_s
+        leap_m = rule.leap_m + rule.leap_mps * silent_s
+        if squared_distance(pose[:3], motion[0, :3]) > leap_m * leap_m:
             wish.wish_leap_tick = tick
+        elif wish.wish_due[0] <= due <= wish.wish_due[count - 1]:
+            times = 1 + wish.wish_times[_first_after(wishes, due)]
+            share = max(1.0 / times, rule.least_share)
+            turn = np.empty(3)
+            turn_between(quaternion, pose[3:], turn)
+            for axis in range(3):
+                pose[axis] = motion[0, axis] + share * (pose[axis] - motion[0, axis])
+                turn[axis] *= share
+            turn_on(quaternion, turn)
+            pose[3:] = quaternion
 
-    count = wish.wish_count
-    while count and wish.wish_due[count - 1] >= due:
-        count -= 1
-    if count > 1 and due - wish.wish_due[count - 2] < rule.nearest_ticks:
-        count -= 1
-    count = _forget_passed(wishes, count, tick)
+    begin = min(wish.wish_newest_due, due - rule.nearest_ticks)
+    if due < wish.wish_newest_due:
+        begin = due - rule.nearest_ticks
+    wish.wish_newest_due = due
+    place = 0
+    for i in range(count):
+        if not begin < wish.wish_due[i] < due + rule.nearest_ticks:
+            wish.wish_due[place] = wish.wish_due[i]
+            wish.wish_poses[place] = wish.wish_poses[i]
+            wish.wish_times[place] = wish.wish_times[i]
+            place += 1
+    count = place
+    wish.wish_count = count
     if count == MOST_WISHES:
         return False
-    wish.wish_due[count] = due
-    wish.wish_poses[count] = pose
+
+    place = count
+    while place and wish.wish_due[place - 1] > due:
+        wish.wish_due[place] = wish.wish_due[place - 1]
+        wish.wish_poses[place] = wish.wish_poses[place - 1]
+        wish.wish_times[place] = wish.wish_times[place - 1]
+        place -= 1
+    wish.wish_due[place] = due
+    wish.wish_poses[place] = pose
+    wish.wish_times[place] = times
     wish.wish_count = count + 1
     wish.wish_is_new = 1
     return True
+
+
+@compiled
+def _first_after(wishes: Records, due: float) -> int:
+    """The number of the first pose that is due at this tick or later."""
+    i = 0
+    while wishes[0].wish_due[i] < due:
+        i += 1
+    return i
 
 
 @compiled
@@ -146,6 +186,7 @@ def _forget_passed(wishes: Records, count: int, tick: int) -> int:
         for i in range(first, count):
             wish.wish_due[i - first] = wish.wish_due[i]
             wish.wish_poses[i - first] = wish.wish_poses[i]
+            wish.wish_times[i - first] = wish.wish_times[i]
     return count - first
 
 
@@ -193,8 +234,8 @@ def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: 
 
         p_i (2s³ - 3s² + 1) + p_(i+1) (3s² - 2s³) + h m_i (s³ - 2s² + s) + h m_(i+1) (s³ - s²)
 
-    and the orientation turns evenly. After the last pose it goes on for the last interval h, as the
-    next pose may be late, and comes to rest evenly during another one.
+    and the orientation turns evenly. After the last pose it goes on for steady_ticks, as the next
+    pose may be late, and comes to rest evenly within as long.
     """
     wish = wishes[0]
     rule = rules[0]
@@ -240,7 +281,7 @@ def _beyond(wishes: Records, rules: Records, passed: float, motion: Vector) -> N
     wish = wishes[0]
     rule = rules[0]
     last = wish.wish_count - 1
-    h = min(wish.wish_due[last] - wish.wish_due[last - 1], rule.steady_ticks)
+    h = rule.steady_ticks
     slowing = min(max(passed - h, 0.0), h)
     gone = min(passed, h) + slowing - 0.5 * slowing * slowing / h
     share = 1.0 - slowing / h

@@ -1,4 +1,4 @@
-"""Tuned numbers of the wishes. docs/policies.md has what each of them changes."""
+"""Numbers of the wishes. docs/policies.md has what each tuned one changes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from typing import NamedTuple
 class WishTuning(NamedTuple):
     """Tuned numbers of stage 2 where a policy leads."""
 
+    # 10 to 40. More: chunks are joined sooner, and a policy is answered sooner. Less: less jerk.
     fade_rate: float = 20.0  # [1/s] at which the offset between two chunks fades out
-    fade_mps: float = 0.3  # [m/s] at most
-    steady_s: float = 0.1  # the last poses, over this time, give the velocity at the path's end
+    # 0.15 to 1. More: changes are taken up sooner. Less: chunks that differ are averaged.
+    least_share: float = 0.3  # weight of the newest chunk where several overlap, at least
+    # 0 to 0.3. More: a late chunk is bridged. Less: the tool rests sooner where none comes.
+    steady_s: float = 0.1  # time over which the path goes on after its end, at its velocity there
 
 
 NEAREST_S = 0.01  # of wishes due closer together than this only the newest is kept
 LEAP_M = 0.25  # a wish farther from the path than this is another task's, or a mistake
+LEAP_MPS = 0.5  # and by this for each second in which no wish was due
 LEAP_HOLD_S = 0.5  # the arm holds for so long after such a wish
 GOES_ON_S = 0.2  # after a longer gap, a target does not go on from the one before
 RAD_AS_M = 0.2  # [m/rad] an offset of orientation fades out as one of position of this size
