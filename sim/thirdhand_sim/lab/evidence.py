@@ -2,7 +2,8 @@
 
 A result depends on up to four digests: `core`, of the frames of the golden session; `wishes`, of a
 tool that a policy leads; `learning`, of the numbers of the shipped skill, which `learn` makes of
-the shipped takes; `kmp`, of the library's results for two small problems. A result is stale if its digests are not those of the tree.
+the shipped takes; `kmp`, of the library's results for two small problems. A result is stale if its
+digests are not those of the tree.
 """
 
 from __future__ import annotations

@@ -331,7 +331,7 @@ def _draw(
     plt = pyplot()
     shown = {OURS: TOOL_COLOUR, "temporal ensemble": OTHER, "replaced": ADAPTED}
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(9, 5), sharex=True)
-    habits = Seam(30, 16, 0.35, 0.1, 0.07)
+    habits = Seam(30, 24, 0.35, 0.1, 0.07)
     begin = round((REST_S + 1.0) / PERIOD_S)
     end = begin + round(4.0 / PERIOD_S)
     times_s = np.arange(begin, end) * PERIOD_S - REST_S
