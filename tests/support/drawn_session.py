@@ -18,6 +18,7 @@ from support.bounds import Session
 from support.drawn_arms import KINDS, ODD_STAMPS_NS, WELL, DrawnArm
 from support.drawn_cells import changes, drawn_cell, engaging_cell
 from support.drawn_hands import MOTIONS, REPORTS, Report, Surroundings, both, come_to_rest
+from support.drawn_policy import DrawnPolicy
 from support.explained import explained_controller
 from support.in_process import clutch
 from support.paths import RECORDINGS
@@ -29,8 +30,9 @@ from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Frame, Record, Tick, Vector, order
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.way_out import WayOut
+from thirdhand.core.wish.stage import WHOLE_REACH
 from thirdhand.recordings.shipped import shipped_skill
-from thirdhand.settings.config import Settings, robot_description
+from thirdhand.settings.config import Settings, SkillSettings, robot_description
 from thirdhand.skills.skill_file import SkillError, decoded
 from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.learning.learn import learn
@@ -152,14 +154,18 @@ def play(
     quiet_s: float,
     most_quiet_ticks: int,
     engages: bool = False,
+    skill: SkillSettings | None = None,
 ) -> Played:
     """The session of a seed: ticks in which anything may happen, then hands that come to rest. In a
-    cell that `engages`, the setpoint begins slowly, and a clutch is pressed and released.
+    cell that `engages`, the setpoint begins slowly, and a clutch is pressed and released. Settings
+    of the `skill` that let wishes lead bring a policy.
     """
     random = np.random.default_rng(seed)
     settings = drawn_cell(random, arm)
     if engages:
         settings = engaging_cell(random, settings)
+    if skill is not None:
+        settings = msgspec.structs.replace(settings, skill=skill)
     urdf = robot_description(settings)
     hz = settings.rate_hz
     player = _Player(random, settings, urdf, wild_ticks)
@@ -220,6 +226,7 @@ class _Player:
         ]
         self.kept_at = set(random.integers(1, wild_ticks, STATES).tolist())
         self.controller = explained_controller(settings, self.skill, urdf=urdf)
+        self.policy = DrawnPolicy.of(random, settings, self.skill.orientation)
         self.motion = iter(())
         self.report = both
         self.index = self.asked = self.searches = 0
@@ -254,11 +261,14 @@ class _Player:
             inbox += self.arm.events(number, self._stamp_ns())
         inbox += self._requests_at_rest(number) if is_quiet else self._requests(number)
         inbox += self._clutch(is_quiet) if self._has_clutch else []
+        if self.policy is not None:
+            now_s = self.index * self.settings.period_s
+            inbox += self.policy.events(now_s, self._stamp_ns(), is_quiet=is_quiet)
         if not is_quiet and random.random() < 0.3:
             random.shuffle(inbox)
         inbox += [event for due, event in self.later if due <= number]
         self.later = [(due, event) for due, event in self.later if due > number]
-        self.ticks.append(Tick(self.index, tuple(inbox)))
+        self.ticks.append(Tick(self.index, tuple(inbox), self._stamp_ns()))
         frame = self.controller.step(self.ticks[-1])
         self._remember(number, frame)
         self.around.tool = frame["tool"]
@@ -401,7 +411,9 @@ class _Player:
             geometry=self.geometry,
             frames=np.array(self.frames),
             measured=np.array(self.measured),
-            boxes=np.array([skill.workspace for skill in self.skills]),
+            boxes=np.array(
+                [WHOLE_REACH if self.policy else skill.workspace for skill in self.skills]
+            ),
             receiving=np.array([receiving[skill.digest] for skill in self.skills]),
             hands=np.array(self.hands),
             still_s=np.array(self.still_s),

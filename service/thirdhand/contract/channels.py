@@ -65,7 +65,7 @@ POSE_WITH_COVARIANCE = Codec(
     cdr.encode_pose_with_covariance,
     cdr.decode_pose_with_covariance,
 )
-WISH = POSE_WITH_COVARIANCE._replace(decode=cdr.decode_wish)
+WISHED_POSE = POSE_WITH_COVARIANCE._replace(decode=cdr.decode_wish)
 JOINTS = Codec("sensor_msgs/msg/JointState", "cdr", cdr.encode_joints, cdr.decode_joints)
 CLOSURE = Codec(JOINTS.type, "cdr", cdr.encode_joints, cdr.decode_closure)
 BOOL = Codec("std_msgs/msg/Bool", "cdr", cdr.encode_bool, cdr.decode_bool)
@@ -194,12 +194,12 @@ CHANNELS = (
     ),
     Channel(
         "tool/wish",
-        WISH,
+        WISHED_POSE,
         "in",
         "where a policy wants the tool at the time of the stamp, up to 1 s ahead; also "
         'PoseStamped; heard with `[skill] source = "tool/wish"`',
         rate="10 - 1000 Hz, or in chunks",
-        event=EventKind(14, WISH),
+        event=EventKind(14, WISHED_POSE),
         stale_after=("skill", "silent_ms"),
     ),
     Channel(

@@ -14,6 +14,7 @@ ROUTER = "router"
 HEADSET = "headset"
 HANDS = ("hands/left", "hands/right")
 WISHES = ("clutch", "gripper/wish")
+POLICY_WISHES = ("tool/wish", "gripper/wish")
 ARM = ("joints/state", "joints/guided", "gripper/state")
 TOOL = ("tool/pose",)
 OBJECTS = ("objects",)
@@ -44,18 +45,24 @@ ROLES = {
         (*HANDS, *WISHES, *TOOL, *OBJECTS),
     ),
     HEADSET: Role(
-        "may publish hands, clutch and gripper, send requests, receive all outputs, and serve a "
+        "may publish hands, clutch and wishes, send requests, receive all outputs, and serve a "
         "page to browsers",
-        (*HANDS, *WISHES),
+        (*HANDS, *WISHES, *POLICY_WISHES[:1]),
         hears=True,
         asks=True,
+    ),
+    "policy": Role(
+        "may publish wishes for the tool and the gripper, and receive everything that is published",
+        POLICY_WISHES,
+        hears=True,
+        hears_inputs=True,
     ),
     "arm": Role(
         "may publish joint states and the tool, and receive all outputs", (*ARM, *TOOL), hears=True
     ),
     "bench": Role(
         "may do what tracker and arm may, like the simulated bench",
-        (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
+        (*HANDS, *WISHES, *POLICY_WISHES[:1], *ARM, *TOOL, *OBJECTS),
         hears=True,
     ),
     "operator": Role("may send requests, and receive all outputs", hears=True, asks=True),
@@ -65,7 +72,7 @@ ROLES = {
     ),
     ROUTER: Role(
         "may forward everything, and must enforce the roles itself",
-        (*HANDS, *WISHES, *ARM, *TOOL, *OBJECTS),
+        (*HANDS, *WISHES, *POLICY_WISHES[:1], *ARM, *TOOL, *OBJECTS),
         hears=True,
         asks=True,
         hears_inputs=True,

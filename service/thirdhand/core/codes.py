@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-from thirdhand.contract.records import Mode, Reason
+from thirdhand.contract.records import Cause, Mode, Reason
 
 
 class Condition(enum.IntFlag):
@@ -144,3 +144,10 @@ NO_WISH = int(Reason.NO_WISH)
 STALE_WISH = int(Reason.STALE_WISH)
 JUMPED_WISH = int(Reason.JUMPED_WISH)
 UNREACHABLE_WISH = int(Reason.UNREACHABLE_WISH)
+NOT_FINITE = int(Cause.NOT_FINITE)
+NOT_A_ROTATION = int(Cause.NOT_A_ROTATION)
+OUT_OF_RANGE = int(Cause.OUT_OF_RANGE)
+REPEATED = int(Cause.REPEATED)
+OLDER = int(Cause.OLDER)
+AHEAD = int(Cause.AHEAD)
+JUMPED = int(Cause.JUMPED)

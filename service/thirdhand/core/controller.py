@@ -32,7 +32,7 @@ from thirdhand.core.decision.stage import Decision
 from thirdhand.core.frame import (
     RECORDS,
     STAGES,
-    WISHES,
+    WISH_STATE,
     Event,
     Frame,
     Lap,
@@ -128,7 +128,7 @@ class Controller:
         self._skill = SkillStage(settings, skill, tuning=tuning)
         self._wishes: WishStage | None = None
         if settings.skill.has_wishes:
-            wishes = part_of(self._whole, dtype_of(WISHES, joints), layout.itemsize)
+            wishes = part_of(self._whole, dtype_of(WISH_STATE, joints), layout.itemsize)
             self._skill = self._wishes = WishStage(settings, skill, wishes, tuning=tuning)
         self.decision = Decision(settings, tuning=tuning)
         self._separation = Separation(settings, urdf, tuning=tuning)

@@ -113,7 +113,7 @@ _TICK = (Field("tick", "int64"),)
 FRAME = assembled(_TICK, *(package.FRAME for package in _PACKAGES))
 STATE = assembled(_TICK, *(package.STATE for package in _PACKAGES))
 # after these, where a policy leads
-WISHES = assembled(wish.STATE)
+WISH_STATE = assembled(wish.STATE)
 TIMING_FIELDS = (
     Field("tick", "int64"),
     Field("time_ns", "int64"),  # the tick's deadline on the wall clock
@@ -163,12 +163,12 @@ def state_layout(joints: int, *, has_wishes: bool = False) -> DType:
     """Layout of a State for an arm with this number of joints; where a policy leads, it
     `has_wishes`.
     """
-    return dtype_of(STATE + WISHES if has_wishes else STATE, joints)
+    return dtype_of(STATE + WISH_STATE if has_wishes else STATE, joints)
 
 
 def definitions(joints: int, *, has_wishes: bool = False) -> dict[str, str]:
     """ROS 2 definitions of Frame, State and Timing for an arm with this number of joints."""
-    state = STATE + WISHES if has_wishes else STATE
+    state = STATE + WISH_STATE if has_wishes else STATE
     layouts = {"Frame": FRAME, "State": state, "Timing": TIMING_FIELDS}
     return {f"thirdhand/{name}": definition(layout, joints) for name, layout in layouts.items()}
 

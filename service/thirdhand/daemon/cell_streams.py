@@ -45,14 +45,14 @@ SMOOTH_SHARE = 0.05  # a smooth step / the median step: noise makes one in 10 00
 UNMEASURED_SHARE = 1e-6
 LEAST_BATCHES = 3  # with fewer pauses than this, a hand was out of sight
 ARM_STATE = "joints/state"
-WISH = "tool/wish"
+TOOL_WISH = "tool/wish"
 # channels that are heard with some settings only
 CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {
     ARM_STATE: lambda settings: settings.arm.source == "state",
     "joints/guided": lambda settings: settings.arm.source == "state",
     "clutch": lambda settings: settings.hands.clutch == "key",
     "gripper/wish": lambda settings: settings.hands.gripper == "key",
-    WISH: lambda settings: settings.skill.has_wishes,
+    TOOL_WISH: lambda settings: settings.skill.has_wishes,
 }
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
@@ -228,7 +228,7 @@ class CellStreams:
         self._arrivals = arrivals
         self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
-        self._sole = {key: SolePublisher() for key in (*self._frozen, WISH)}
+        self._sole = {key: SolePublisher() for key in (*self._frozen, TOOL_WISH)}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
 
         inputs = [channel.key for channel in heard(settings)]
@@ -245,7 +245,7 @@ class CellStreams:
             (
                 suffix,
                 session.declare_subscriber(
-                    key, RingChannel(MAX_WISHES if suffix == WISH else _most(suffix))
+                    key, RingChannel(MAX_WISHES if suffix == TOOL_WISH else _most(suffix))
                 ),
             )
             for suffix, key in keys
@@ -406,7 +406,7 @@ def heard(settings: Settings) -> list[channels.Channel]:
 
 def _most(suffix: str) -> int:
     """Largest number of messages of a channel that are read in one tick."""
-    most = {ARM_STATE: MAX_JOINT_STATES, WISH: MAX_WISHES_READ}
+    most = {ARM_STATE: MAX_JOINT_STATES, TOOL_WISH: MAX_WISHES_READ}
     return most.get(suffix, MAX_ARRIVALS)
 
 

@@ -47,7 +47,7 @@ from thirdhand.core.intake.far_away import too_far, unit_meant
 from thirdhand.core.intake.late_samples import lateness_ms
 from thirdhand.core.intake.stage import Intake, Refused
 from thirdhand.core.tuning import TUNING
-from thirdhand.core.wish.path import newest_due
+from thirdhand.core.wish.step import newest_due
 from thirdhand.daemon.cell_streams import Arrivals, heard
 from thirdhand.daemon.side_streams import side_keys
 from thirdhand.settings.config import JointSettings, Settings

@@ -12,7 +12,7 @@ from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import HIGHEST_GATE_M, StoredSkill, with_file
 
-NAME = "none, wishes lead"
+NO_SKILL = "none, wishes lead"
 
 
 def leads_alone(settings: Settings) -> bool:
@@ -27,7 +27,7 @@ def no_skill() -> StoredSkill:
     primitive = KMP.fit(np.zeros((1, 6)), tool, kernel=GaussianKernel(1.0), lambda_mean=1.0)
     box = MAX_SKILL_DISTANCE_M * np.array([[-1.0] * 3, [1.0] * 3])
     skill = StoredSkill(
-        name=NAME,
+        name=NO_SKILL,
         model=HandsKMP(primitive),
         orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         workspace=box,

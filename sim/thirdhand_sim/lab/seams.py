@@ -28,6 +28,7 @@ from thirdhand.recordings.shipped import recordings
 from thirdhand.settings.config import Settings, SkillSettings, robot_description
 from thirdhand.skills.no_skill import no_skill
 from thirdhand.workbench.takes.demonstration_reader import read_demonstration
+from thirdhand_sim.closed_loop import START_NS
 from thirdhand_sim.lab.catalogue import EXPERIMENTS
 from thirdhand_sim.lab.people.moving_hands import PERIOD_S
 from thirdhand_sim.lab.results import (
@@ -44,18 +45,17 @@ from thirdhand_sim.lab.results import (
 from thirdhand_sim.lab.rivals.chunk_queues import QUEUES, Chunk, Queue, QueuedArm
 
 OURS = "wishes"
-REST_S = 5.0  # the path begins after this time, in which the arm moves to its begin
-RATES_HZ = (15, 30, 50)
-STEPS = (8, 50)  # of a chunk, least and most
+BEFORE_PATH_S = 5.0  # the path begins after this time, in which the arm moves to its begin
+POLICY_RATES_HZ = (15, 30, 50)
+CHUNK_STEPS = (8, 50)  # of a chunk, least and most
 ANSWERS_S = (0.05, 0.8)  # mean time of an answer
 ARM_LAGS_S = (0.03, 0.15)  # of what the policy sees behind the command
 APART_M = (0.0, 0.02, 0.07)  # largest distance between two chunks at their seam
 EARLY = 0.2  # share of the chunks that end early
 COVERED = {True: "chunks overlap", False: "answers come later than chunks end"}
 NEARS_S = 0.3  # time constant with which an answer nears the path
-SLOW_MPS = 0.05  # below this speed of the path a tool that rests has not stopped
-LAGS_S = np.arange(-0.1, 0.5, 0.01)
-START_NS = 10**18
+STOPPING_MPS = 0.05  # below this speed of the path a tool that rests has not stopped
+SEAM_LAGS_S = np.arange(-0.1, 0.5, 0.01)
 
 
 class Seam(NamedTuple):
@@ -72,14 +72,16 @@ class Seam(NamedTuple):
         """Habits drawn evenly; the time of an answer on a logarithmic scale."""
         answer_s = np.exp(rng.uniform(*np.log(ANSWERS_S)))
         lag_s = rng.uniform(*ARM_LAGS_S)
-        steps = rng.integers(STEPS[0], STEPS[1] + 1)
-        return cls(int(rng.choice(RATES_HZ)), int(steps), float(answer_s), float(lag_s), apart_m)
+        steps = rng.integers(CHUNK_STEPS[0], CHUNK_STEPS[1] + 1)
+        return cls(
+            int(rng.choice(POLICY_RATES_HZ)), int(steps), float(answer_s), float(lag_s), apart_m
+        )
 
 
 STEADY_POLICY = Seam(30, 30, 0.2, 0.05, 0.0)
 
 
-class Led(Protocol):
+class PolicyArm(Protocol):
     """An arm that a policy leads."""
 
     @property
@@ -173,7 +175,7 @@ class OurArm:
         )
 
 
-class Run(NamedTuple):
+class PolicyRun(NamedTuple):
     """The tool's path (N, 3) [m] of a run, its joints' motion (N, 3, J), and times of answers."""
 
     tool: Array
@@ -181,7 +183,7 @@ class Run(NamedTuple):
     answers_s: list[float]
 
 
-def led(arm: Led, path: Array, habits: Seam, seed: tuple[int, ...]) -> Run:
+def led(arm: PolicyArm, path: Array, habits: Seam, seed: tuple[int, ...]) -> PolicyRun:
     """The motion of an arm that a policy leads along a path."""
     policy = LatePolicy(path, habits, default_rng(seed))
     lag = round(habits.arm_lag_s / PERIOD_S)
@@ -196,19 +198,19 @@ def led(arm: Led, path: Array, habits: Seam, seed: tuple[int, ...]) -> Run:
             answers_s.append(now_s)
         joints.append(arm.step(now_s))
         tools.append(arm.tool)
-    return Run(np.array(tools[1:]), np.array(joints), answers_s)
+    return PolicyRun(np.array(tools[1:]), np.array(joints), answers_s)
 
 
-def figures(run: Run, path: Array, settings: Settings) -> dict[str, float]:
+def figures(run: PolicyRun, path: Array, settings: Settings) -> dict[str, float]:
     """What is judged of a run, from the path's begin on."""
-    begin = round((REST_S - 0.5) / PERIOD_S)
+    begin = round((BEFORE_PATH_S - 0.5) / PERIOD_S)
     tool = run.tool[begin:]
     meant = path[1:][begin:]
     velocity = np.diff(tool, axis=0) / PERIOD_S
     wanted = np.diff(meant, axis=0) / PERIOD_S
     speed = np.linalg.norm(wanted, axis=1)
     along = (velocity * wanted).sum(axis=1) / np.maximum(speed, 1e-9)
-    moving = speed > SLOW_MPS
+    moving = speed > STOPPING_MPS
     errors = np.linalg.norm(tool - meant, axis=1)
     limits = settings.joints
     acceleration = run.joints[begin:, 2] / limits.acceleration
@@ -231,10 +233,10 @@ def _lag_s(tool: Array, meant: Array) -> float:
     """The lag with which the tool is nearest to the path."""
     ticks = np.arange(len(meant))
     squares = []
-    for lag_s in LAGS_S:
+    for lag_s in SEAM_LAGS_S:
         shifted = meant_at(meant, (ticks * PERIOD_S) - lag_s)
         squares.append(float(((tool - shifted) ** 2).sum()))
-    return float(LAGS_S[int(np.argmin(squares))])
+    return float(SEAM_LAGS_S[int(np.argmin(squares))])
 
 
 def tool_paths(folder: Path) -> dict[str, Array]:
@@ -245,7 +247,7 @@ def tool_paths(folder: Path) -> dict[str, Array]:
         times_s = (take.stamps_ns - take.stamps_ns[0]) / 1e9
         even_s = np.arange(0.0, times_s[-1], PERIOD_S)
         path = CubicSpline(times_s, take.tool[:, :3])(even_s)
-        rest = np.tile(path[0], (round(REST_S / PERIOD_S), 1))
+        rest = np.tile(path[0], (round(BEFORE_PATH_S / PERIOD_S), 1))
         paths[file.stem] = np.vstack([rest, path])
     return paths
 
@@ -269,7 +271,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     settings = cell()
     seeds = EXPERIMENTS["seams"].seeds
     orientation = OurArm(settings).orientation
-    arms: dict[str, Callable[[], Led]] = {OURS: lambda: OurArm(settings)}
+    arms: dict[str, Callable[[], PolicyArm]] = {OURS: lambda: OurArm(settings)}
     tried: dict[str, dict[float, float]] = {}
     paths = tool_paths(recordings())
     draws = seeds.tuning["policies"].share(options.share)
@@ -305,7 +307,7 @@ def _queued(
 
 
 def _all_runs(
-    made: Callable[[], Led], paths: Mapping[str, Array], draws: range, settings: Settings
+    made: Callable[[], PolicyArm], paths: Mapping[str, Array], draws: range, settings: Settings
 ) -> list[dict[str, float]]:
     """The figures of each path with each policy."""
     rows = []
@@ -325,16 +327,16 @@ def _mean(rows: list[dict[str, float]], key: str) -> float:
 
 
 def _draw(
-    results: Results, arms: Mapping[str, Callable[[], Led]], path: Array, settings: Settings
+    results: Results, arms: Mapping[str, Callable[[], PolicyArm]], path: Array, settings: Settings
 ) -> None:
     """One coordinate of a tool that each follower leads, with the same policy."""
     plt = pyplot()
     shown = {OURS: TOOL_COLOUR, "temporal ensemble": OTHER, "replaced": ADAPTED}
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(9, 5), sharex=True)
     habits = Seam(30, 24, 0.35, 0.1, 0.07)
-    begin = round((REST_S + 1.0) / PERIOD_S)
+    begin = round((BEFORE_PATH_S + 1.0) / PERIOD_S)
     end = begin + round(4.0 / PERIOD_S)
-    times_s = np.arange(begin, end) * PERIOD_S - REST_S
+    times_s = np.arange(begin, end) * PERIOD_S - BEFORE_PATH_S
     axis = int(np.ptp(path[begin:end], axis=0).argmax())
     for name, colour in shown.items():
         made = led(arms[name](), path, habits, (7,))
@@ -343,8 +345,8 @@ def _draw(
         lower.plot(times_s, speed[begin:end], color=colour, lw=1.0)
     upper.plot(times_s, 1e3 * path[begin:end, axis], "--", color=REFERENCE, label="meant")
     for answer_s in made.answers_s:
-        if times_s[0] < answer_s - REST_S < times_s[-1]:
-            lower.axvline(answer_s - REST_S, color=REFERENCE, lw=0.4)
+        if times_s[0] < answer_s - BEFORE_PATH_S < times_s[-1]:
+            lower.axvline(answer_s - BEFORE_PATH_S, color=REFERENCE, lw=0.4)
     upper.set_ylabel(f"{'xyz'[axis]} of the tool [mm]")
     lower.set(ylabel="its speed [m/s]", xlabel="time [s]; lines: a chunk arrives")
     upper.legend(frameon=False, ncols=4)

@@ -8,8 +8,8 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.contract.records import Cause
 from thirdhand.core.codes import (
+    AHEAD,
     ARM_GUIDED,
     ARM_HEARD,
     ARM_STILL,
@@ -17,6 +17,12 @@ from thirdhand.core.codes import (
     CONTESTED,
     FAULT,
     HANDS_KNOWN,
+    JUMPED,
+    NOT_A_ROTATION,
+    NOT_FINITE,
+    OLDER,
+    OUT_OF_RANGE,
+    REPEATED,
     TWO_SOURCES,
     UNSEEN,
 )
@@ -35,14 +41,6 @@ from thirdhand.core.intake.hand_estimator import (
 from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
 from thirdhand.core.intake.plausibility import is_confirmed
 from thirdhand.core.vectors import distance, squared_distance
-
-NOT_FINITE = int(Cause.NOT_FINITE)
-NOT_A_ROTATION = int(Cause.NOT_A_ROTATION)
-OUT_OF_RANGE = int(Cause.OUT_OF_RANGE)
-REPEATED = int(Cause.REPEATED)
-OLDER = int(Cause.OLDER)
-AHEAD = int(Cause.AHEAD)
-JUMPED = int(Cause.JUMPED)
 
 
 @compiled
@@ -190,7 +188,7 @@ def _judge_arm(
 
 
 @compiled
-def malformed(
+def _malformed(
     parameters: Records,
     position: tuple[float, float, float],
     turn: tuple[float, float, float, float],
@@ -252,7 +250,7 @@ def _in_time(
 
 
 @compiled
-def to_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
+def _in_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
     """Position (3,) [m] in frame base of a tracker's position, by its axes times its unit, and its
     origin: `mapping` (3, 4).
     """
@@ -339,7 +337,7 @@ def take_hand(
     `mapping` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
     state = states[0]
-    in_base = to_base(position, mapping)
+    in_base = _in_base(position, mapping)
     fresh = (
         state.hand_ticks[side] >= 0
         and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
@@ -350,7 +348,7 @@ def take_hand(
     made_tick = state.tick
     jumped = False
     wrong = 0
-    cause = malformed(parameters, position, turn, in_base)
+    cause = _malformed(parameters, position, turn, in_base)
     if cause < 0:
         cause, order, made_tick, jumped, wrong = _judge_hand(
             states, parameters, models, side, stamp_ns, in_base, fresh

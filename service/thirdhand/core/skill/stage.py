@@ -11,7 +11,7 @@ from thirdhand.core.codes import (
     UNSEEN,
     UNSEEN_HAND_NEEDED,
 )
-from thirdhand.core.frame import Record, Vector, as_array, parameters
+from thirdhand.core.frame import Record, as_array, parameters
 from thirdhand.core.numerics import UNPRIMED_DECIDED
 from thirdhand.core.skill import ORDER, TURNS
 from thirdhand.core.skill.memory import recall, turn_lag_s
@@ -39,6 +39,7 @@ class SkillStage:
     def _take(self, skill: Skill) -> None:
         """Put a skill into force, with the time constant of the hands' memory that it needs."""
         self.skill = skill
+        self.workspace = skill.workspace
         late_s = skill.model.delay_s - self._lead_s
         delay_s = max(late_s, 0.0)
         memory = np.empty((ORDER, 6))
@@ -79,11 +80,6 @@ class SkillStage:
             weights=regions.weights,
             alarm=regions.alarm,
         )
-
-    @property
-    def workspace(self) -> Vector:
-        """Lower and upper corner of the box for targets (2, 3) [m]."""
-        return self.skill.workspace
 
     def adopt(self, state: Record, skill: Skill) -> None:
         """Replace the skill. The belief is kept if the new skill has the same via-points, the

@@ -17,7 +17,6 @@ STATE = (
     Field("wish_rate", "float64"),  # at which the offset fades out [1/s]
     Field("wish_due", "float64", (MOST_WISHES,)),  # when each pose is due [ticks]
     Field("wish_poses", "float64", (MOST_WISHES, 7)),  # x y z [m], quaternion x y z w
-    Field("wish_times", "int64", (MOST_WISHES,)),  # chunks that had a pose for this time
     Field("wish_newest_due", "float64"),  # when the newest wish is due [ticks]
     # of the newest wish: of the position [m²], of the orientation [rad²]
     Field("wish_covariances", "float64", (6, 3)),

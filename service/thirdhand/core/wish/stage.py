@@ -24,13 +24,13 @@ from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.skill.step import NO_SEGMENT
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.wish import tuning as fixed
-from thirdhand.core.wish.path import BY_SKILL, BY_WISHES, lead, newest_due, take
+from thirdhand.core.wish.step import BY_SKILL, BY_WISHES, lead, newest_due, take
 from thirdhand.settings.config import Settings
 
-UNLIMITED = np.array([[-MAX_SKILL_DISTANCE_M] * 3, [MAX_SKILL_DISTANCE_M] * 3])
-UNLIMITED.setflags(write=False)
+WHOLE_REACH = np.array([[-MAX_SKILL_DISTANCE_M] * 3, [MAX_SKILL_DISTANCE_M] * 3])
+WHOLE_REACH.setflags(write=False)
 NO_COVARIANCE = np.zeros((6, 6))
-UNTURNED = np.array([0.0, 0.0, 0.0, 1.0])
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class WishStage(SkillStage):
@@ -49,12 +49,12 @@ class WishStage(SkillStage):
         period_s = settings.period_s
         self.wish_rules = parameters(
             period_s=period_s,
-            max_hand_distance_m=MAX_SKILL_DISTANCE_M,
+            farthest_m=MAX_SKILL_DISTANCE_M,
+            norm_tolerance=fixed.WISH_NORM_TOLERANCE,
             nearest_ticks=fixed.NEAREST_S / period_s,
             steady_ticks=tuning.wish.steady_s / period_s,
             leap_m=fixed.LEAP_M,
             leap_mps=fixed.LEAP_MPS,
-            least_share=tuning.wish.least_share,
             fade_rate=tuning.wish.fade_rate,
             fade_mps=settings.tool.max_speed,
             rad_as_m=fixed.RAD_AS_M,
@@ -68,10 +68,9 @@ class WishStage(SkillStage):
         self._silent_ticks = settings.skill.silent_ms / 1e3 / period_s
         self._mappings = _mappings(settings)
 
-    @property
-    def workspace(self) -> Vector:
-        """Only the arm's reach limits wishes."""
-        return UNLIMITED
+    def _take(self, skill: Skill) -> None:
+        super()._take(skill)
+        self.workspace = WHOLE_REACH  # wishes are limited by the arm's reach only
 
     def take(
         self, tick: int, time_ns: int, wish: PoseStamped | PoseWithCovarianceStamped
@@ -113,7 +112,7 @@ class WishStage(SkillStage):
         sources = BY_WISHES if wanted is None else BY_WISHES | BY_SKILL
         wanted = self._led(state, frame, wanted, sources)
         leapt = 0 <= state["tick"] - self._wishes[0]["wish_leap_tick"] < self._leap_ticks
-        inside = is_inside(wanted.target.position, UNLIMITED, reach_of(self._reach))
+        inside = is_inside(wanted.target.position, WHOLE_REACH, reach_of(self._reach))
         return wanted, WISH_LEADS | WISH_JUMPED * bool(leapt) | WISH_OUTSIDE * (not inside)
 
     def _led(self, state: Record, frame: Record, by_skill: Wanted | None, sources: int) -> Wanted:
@@ -147,6 +146,6 @@ def _mappings(settings: Settings) -> dict[str, Vector]:
         if frame not in ("", BASE) and of_frame.axes == "right-handed":
             mapping = np.zeros((4, 4))
             mapping[:3] = base_from(of_frame)
-            turn_between(UNTURNED, np.array(of_frame.base_from_tracker[3:]), mapping[3, :3])
+            turn_between(IDENTITY, np.array(of_frame.base_from_tracker[3:]), mapping[3, :3])
             mappings[frame] = mapping
     return {"": mappings[BASE], **mappings}

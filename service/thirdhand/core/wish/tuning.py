@@ -10,8 +10,6 @@ class WishTuning(NamedTuple):
 
     # 10 to 40. More: chunks are joined sooner, and a policy is answered sooner. Less: less jerk.
     fade_rate: float = 20.0  # [1/s] at which the offset between two chunks fades out
-    # 0.15 to 1. More: changes are taken up sooner. Less: chunks that differ are averaged.
-    least_share: float = 0.3  # weight of the newest chunk where several overlap, at least
     # 0 to 0.3. More: a late chunk is bridged. Less: the tool rests sooner where none comes.
     steady_s: float = 0.1  # time over which the path goes on after its end, at its velocity there
 
@@ -26,4 +24,5 @@ UNKNOWN_STD = (0.01, 0.05)  # [m, rad] deviation of a wish without a covariance
 FARTHEST_S = (
     1.05  # a pose may be due a second after it arrives; clocks differ by less than the rest
 )
+WISH_NORM_TOLERANCE = 0.01  # a quaternion whose norm is farther from 1 is no rotation
 LATEST_S = 1.0  # a pose that was due earlier is not taken

@@ -21,7 +21,7 @@ from thirdhand_sim.lab.results import Array
 
 # of the inverse kinematics
 MOST_STEPS = 40
-NEAR_M = 1e-4
+SOLVED_M = 1e-4
 
 
 class Chunk(NamedTuple):
@@ -160,7 +160,7 @@ class QueuedArm:
     def _solve(self, wanted: Array) -> None:
         """Solve the inverse kinematics for a position, without the limits of joints' speeds."""
         for _ in range(MOST_STEPS):
-            if np.linalg.norm(self._arm.at(self._reference).position - wanted) < NEAR_M:
+            if np.linalg.norm(self._arm.at(self._reference).position - wanted) < SOLVED_M:
                 return
             solution = self._arm.step(self._reference, wanted, np.zeros(3), self._orientation)
             self._reference = self._reference + PERIOD_S * solution.velocity

@@ -10,19 +10,15 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.contract.records import Cause
+from thirdhand.core.codes import AHEAD, NOT_A_ROTATION, NOT_FINITE, OLDER, OUT_OF_RANGE
 from thirdhand.core.frame import Record, Records, Vector
 from thirdhand.core.geometry import normalise, turn_between, turn_on
-from thirdhand.core.intake.step import malformed, to_base
 from thirdhand.core.vectors import dot, squared_distance
 from thirdhand.core.wish import MOST_WISHES
 
 RETAINED = 12  # poses before now, from which a velocity is estimated
 # largest speed of an offset d that fades out at the rate w from rest is this times |d| w: 2 / e²
 FADING_SHARE = 0.2706705664732254
-AHEAD = int(Cause.AHEAD)
-OLDER = int(Cause.OLDER)
-NOT_FINITE = int(Cause.NOT_FINITE)
 # what leads a target, added
 BY_SKILL = 1
 BY_WISHES = 2
@@ -57,20 +53,15 @@ def take(
     wish = wishes[0]
     rule = rules[0]
     pose = np.empty(7)
-    pose[:3] = to_base(position, mapping[:3])
-    cause = malformed(rules, position, orientation, pose[:3])
-    if cause >= 0:
-        return cause
-    if ahead_s > rule.farthest_s:
-        return AHEAD
-    if ahead_s < -rule.latest_s:
-        return OLDER
-    for i in range(6):
-        if not (np.isfinite(covariance[i]).all() and covariance[i, i] >= 0.0):
-            return NOT_FINITE
-
+    for i in range(3):
+        pose[i] = mapping[i, 3]
+        for k in range(3):
+            pose[i] += mapping[i, k] * position[k]
     for k in range(4):
         pose[3 + k] = orientation[k]
+    cause = _fault(rules, pose, ahead_s, covariance)
+    if cause >= 0:
+        return cause
     normalise(pose[3:])
     turn_on(pose[3:], mapping[3, :3])
     due = tick + ahead_s / rule.period_s
@@ -83,6 +74,25 @@ def take(
     )
     wish.wish_tick = tick
     return -1
+
+
+@compiled
+def _fault(rules: Records, pose: Vector, ahead_s: float, covariance: Vector) -> int:
+    """Cause for which a pose (7,) in frame base is rejected, or -1."""
+    rule = rules[0]
+    if not (np.isfinite(pose).all() and np.isfinite(covariance).all()):
+        return NOT_FINITE
+    for i in range(6):
+        if covariance[i, i] < 0.0:
+            return NOT_FINITE
+    norm = math.sqrt(dot(pose[3:6], pose[3:6]) + pose[6] * pose[6])
+    if abs(norm - 1.0) > rule.norm_tolerance:
+        return NOT_A_ROTATION
+    if dot(pose[:3], pose[:3]) > rule.farthest_m**2:
+        return OUT_OF_RANGE
+    if ahead_s > rule.farthest_s:
+        return AHEAD
+    return OLDER if ahead_s < -rule.latest_s else -1
 
 
 @compiled
@@ -106,9 +116,9 @@ def _carry(covariance: Vector, mapping: Vector, scale: float, unknown: float, ou
 def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> bool:
     """Put a pose (7,) that is due at the tick `due` into the path. False if there is no room.
 
-    Where an earlier chunk has the path x already, the pose p becomes x + a (p - x), a = max(1 / n,
-    least_share), as the n-th one for that time. Poses of earlier chunks between two of one chunk
-    are dropped, and so are those nearer than nearest_ticks; those after its end stay. A pose
+    Where an earlier chunk has the path x already, until a time u after the tick, the pose p that is
+    due after t becomes (1 - t/u) (x + p) / 2 + t/u p. Poses of earlier chunks between two of one
+    chunk are dropped, and so are those nearer than nearest_ticks; those after its end stay. A pose
     farther than leap_m from the path is noted as a leap; where the path has ended, leap_mps is
     added for the time since.
     """
@@ -116,7 +126,6 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     rule = rules[0]
     count = _forget_passed(wishes, wish.wish_count, tick)
     wish.wish_count = count
-    times = 1
     if count:
         motion = np.empty((3, 6))
         quaternion = np.empty(4)
@@ -126,8 +135,8 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
         if squared_distance(pose[:3], motion[0, :3]) > leap_m * leap_m:
             wish.wish_leap_tick = tick
         elif wish.wish_due[0] <= due <= wish.wish_due[count - 1]:
-            times = 1 + wish.wish_times[_first_after(wishes, due)]
-            share = max(1.0 / times, rule.least_share)
+            ahead = max(due - tick, 0.0) / max(wish.wish_due[count - 1] - tick, 1.0)
+            share = 0.5 * (1.0 + min(ahead, 1.0))
             turn = np.empty(3)
             turn_between(quaternion, pose[3:], turn)
             for axis in range(3):
@@ -145,7 +154,6 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
         if not begin < wish.wish_due[i] < due + rule.nearest_ticks:
             wish.wish_due[place] = wish.wish_due[i]
             wish.wish_poses[place] = wish.wish_poses[i]
-            wish.wish_times[place] = wish.wish_times[i]
             place += 1
     count = place
     wish.wish_count = count
@@ -156,23 +164,12 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     while place and wish.wish_due[place - 1] > due:
         wish.wish_due[place] = wish.wish_due[place - 1]
         wish.wish_poses[place] = wish.wish_poses[place - 1]
-        wish.wish_times[place] = wish.wish_times[place - 1]
         place -= 1
     wish.wish_due[place] = due
     wish.wish_poses[place] = pose
-    wish.wish_times[place] = times
     wish.wish_count = count + 1
     wish.wish_is_new = 1
     return True
-
-
-@compiled
-def _first_after(wishes: Records, due: float) -> int:
-    """The number of the first pose that is due at this tick or later."""
-    i = 0
-    while wishes[0].wish_due[i] < due:
-        i += 1
-    return i
 
 
 @compiled
@@ -186,7 +183,6 @@ def _forget_passed(wishes: Records, count: int, tick: int) -> int:
         for i in range(first, count):
             wish.wish_due[i - first] = wish.wish_due[i]
             wish.wish_poses[i - first] = wish.wish_poses[i]
-            wish.wish_times[i - first] = wish.wish_times[i]
     return count - first
 
 
