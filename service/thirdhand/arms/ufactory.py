@@ -19,9 +19,9 @@ from thirdhand.arms.arm import Arm
 from thirdhand.core.frame import Vector
 from thirdhand.settings.config import Settings
 
-SERVO_MOTION = 1  # mode in which positions are not planned
-READY = 0  # state to set
-STOPPED = 4  # state to set, and reported after a stop
+MODE_SERVO = 1  # mode in which positions are not planned
+STATE_READY = 0  # state to set
+STATE_STOPPED = 4  # state to set, and reported after a stop
 SWITCH_S = 0.1  # the maker's examples wait this long after a change of mode
 REPLY_TIMEOUT_S = 0.25  # users report replies that take 0.19 s
 
@@ -78,14 +78,14 @@ class UfactoryArm(Arm):
         if arm.error_code:
             self._raise_stop()
         # also after an error that was cleared: it leaves the motors off, and the arm stopped
-        for code in (arm.motion_enable(True), arm.set_mode(SERVO_MOTION), arm.set_state(READY)):
+        for code in (arm.motion_enable(True), arm.set_mode(MODE_SERVO), arm.set_state(STATE_READY)):
             self._check(code)
         time.sleep(SWITCH_S)
         arm.set_timeout(REPLY_TIMEOUT_S)
         return super().__enter__()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._arm.set_state(STOPPED)
+        self._arm.set_state(STATE_STOPPED)
         self._arm.disconnect()
 
     def read(self) -> tuple[Vector, Vector]:
@@ -113,7 +113,7 @@ class UfactoryArm(Arm):
                 f"is stopped by error {errors[0]} ({title}): remove the cause, and clear the error "
                 "in UFACTORY Studio"
             )
-        elif self._arm.state == STOPPED:
+        elif self._arm.state == STATE_STOPPED:
             stop = "was stopped in UFACTORY Studio, or by another program"
         else:
             stop = other
