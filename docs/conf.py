@@ -41,6 +41,7 @@ GROUPS = {
         "own-arm",
         "franka",
         "universal-robots",
+        "ufactory",
         "wam",
         "ros2-control",
         "near-people",

@@ -186,7 +186,9 @@ def refused(*arguments: str) -> str:
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
-    assert "no arm 'frankia'; franka, simulated, ur, wam accepted, or one" in refused("frankia")
+    assert "no arm 'frankia'; franka, simulated, ur, wam, xarm accepted, or one" in refused(
+        "frankia"
+    )
     assert "is a daemon or a router running" in refused(
         "simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2"
     )

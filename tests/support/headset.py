@@ -35,10 +35,11 @@ EMULATED = """
 ;(() => {
   const has = feature => !LACKING.includes(feature), quest = IWER.metaQuest3;
   const config = {...quest, supportedFeatures: quest.supportedFeatures.filter(has)};
+  if (PHONE) config.interactionMode = "screen-space";
   if (!has("immersive-ar")) config.supportedSessionModes = ["inline", "immersive-vr"];
   const device = window.device = new IWER.XRDevice(config, {stereoEnabled: STEREO});
   device.installRuntime({forceInstall: true});
-  device.primaryInputMode = "hand";
+  device.primaryInputMode = PHONE ? "controller" : "hand";
   Object.assign(window, {truth: [], path: null, begun: 0});
   for (const side of ["left", "right"]) {
     const hand = device.hands[side], onFrameStart = hand.onFrameStart.bind(hand);
@@ -108,20 +109,30 @@ def _fetch() -> None:
     partial.replace(_script())
 
 
-def emulation(*, without: tuple[str, ...] = (), stereo: bool = False) -> str:
-    """The script that emulates a headset, `without` some features or `immersive-ar`."""
-    constants = f"const LACKING = {list(without)}, STEREO = {str(stereo).lower()};"
+def emulation(
+    *, without: tuple[str, ...] = (), stereo: bool = False, is_phone: bool = False
+) -> str:
+    """The script that emulates a headset, `without` some features or `immersive-ar`, or a phone."""
+    flags = f"STEREO = {str(stereo).lower()}, PHONE = {str(is_phone).lower()}"
+    constants = f"const LACKING = {list(without)}, {flags};"
     return f"{_script().read_text(encoding='utf-8')};{constants}{EMULATED}"
 
 
 @contextlib.contextmanager
-def worn(url: str, folder: Path, **more: Any) -> Iterator[chromium.Tab]:
-    """The page in the browser of a headset, with its session started."""
+def shown(url: str, folder: Path, **more: Any) -> Iterator[chromium.Tab]:
+    """The page in the browser of a headset, its button for a session pressed."""
     with chromium.opened(
         url, folder, size=(320, 240), timeout_s=250, before=emulation(**more)
     ) as tab:
         tab.until("document.getElementById('start')?.disabled === false")
         tab.ask("document.getElementById('start').click()")
+        yield tab
+
+
+@contextlib.contextmanager
+def worn(url: str, folder: Path, **more: Any) -> Iterator[chromium.Tab]:
+    """The page in the browser of a headset, with its session started."""
+    with shown(url, folder, **more) as tab:
         tab.until("session !== null")
         yield tab
 

@@ -158,6 +158,53 @@ def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
         until(lambda: len(heard.poses["left"]) > before["left"], within_s=TIMEOUT_S)
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_phone_is_one_hand_and_a_touch_its_pinch(
+    side: str, hearing: tuple[zenoh.Session, str], tmp_path: Path
+) -> None:
+    session, endpoint = hearing
+    heard = Heard(session)
+    clutch: list[bool] = []
+    subscriber = session.declare_subscriber(
+        "thirdhand/clutch", lambda sample: clutch.append(bool(sample.payload.to_bytes()[-1]))
+    )
+    phone = {"without": ("hand-tracking",), "is_phone": True}
+    with (
+        headset.serving_hands(endpoint, tmp_path, "--pinch-clutch", side) as served,
+        headset.worn(f"{served.url}&hand={side}", tmp_path, **phone) as tab,
+    ):
+        tab.ask("device.position.set(.1, 1.2, -.3), device.quaternion.set(0, .6, 0, .8)")
+        position = (0.1, 1.2, -0.3)
+        until(
+            lambda: heard.poses[side] and np.allclose(heard.poses[side][-1].position, position),
+            within_s=TIMEOUT_S,
+        )
+        assert np.allclose(heard.poses[side][-1].orientation, (0.0, 0.6, 0.0, 0.8))
+        assert heard.poses["left" if side == "right" else "right"] == []
+        tab.until(f"document.getElementById('sent').textContent.includes('{side} seen')")
+        assert clutch[-1] is False
+        tab.ask("device.controllers.right.updateButtonValue('trigger', 1)")
+        until(lambda: clutch[-1], within_s=TIMEOUT_S)
+        tab.ask("device.controllers.right.updateButtonValue('trigger', 0)")
+        until(lambda: not clutch[-1], within_s=TIMEOUT_S)
+    subscriber.undeclare()
+
+
+def test_a_headset_without_hand_tracking_does_not_start(
+    hearing: tuple[zenoh.Session, str], tmp_path: Path
+) -> None:
+    """Its own pose is no hand."""
+    session, endpoint = hearing
+    heard = Heard(session)
+    with (
+        headset.serving_hands(endpoint, tmp_path) as served,
+        headset.shown(served.url, tmp_path, without=("hand-tracking",)) as tab,
+    ):
+        tab.until("note.includes('hand tracking is missing')")
+        assert tab.ask("session === null")
+    assert heard.poses == {"left": [], "right": []}
+
+
 class Stalling:
     """A connection to a server that can be stalled: data sent meanwhile arrives later."""
 

@@ -12,6 +12,7 @@ SHIPPED = {
     "simulated": "thirdhand.arms.simulated:SimulatedArm",
     "ur": "thirdhand.arms.universal_robots:UniversalRobotsArm",
     "wam": "thirdhand.arms.barrett_wam:BarrettWAM",
+    "xarm": "thirdhand.arms.ufactory:UfactoryArm",
 }
 
 

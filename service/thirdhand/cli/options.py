@@ -27,7 +27,7 @@ def follow(add: AddCommand) -> None:
         "thirdhand follow franka --config cell.toml --robot 172.16.0.2",
     )
     arm = (
-        "the arm to drive: franka, ur, wam, or simulated, an ideal arm; or one of your own, "
+        "the arm to drive: franka, ur, wam, xarm, or simulated, an ideal arm; or one of your own, "
         "MODULE:CLASS or FILE.py:CLASS"
     )
     c.add_argument("arm", metavar="ARM", help=arm)
