@@ -17,7 +17,7 @@ from thirdhand_sim.lab.evidence import RESULTS, result_of, staleness, tree
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tuning.md"
 # the limiter has no tuned number
-STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision")
+STAGES = ("intake", "skill", "setpoint", "arm", "separation", "decision", "wish")
 RECORD = re.compile(r"(\S+) to (\S+)\. More: (.+?)\. Less: (.+?)\.(?= |$)(.*)")
 HEAD = """# Tuned numbers
 
@@ -32,7 +32,8 @@ and at twice the number (×2). A change of 0 is left out.
 * *Largest other*: the figure of another session that changes most, if that is more than its noise,
   the standard deviation over other seeds; in brackets as a multiple of the noise.
 
-The numbers of the skill are not measured, because skills are learned with them.
+The numbers of the skill are not measured, because skills are learned with them. Those of wishes are
+measured in [an experiment of their own](experiments.md#seams-between-chunks).
 {state}
 A number without effect here may matter in a rare situation: look for its tests before you remove
 it.
@@ -91,7 +92,7 @@ def page() -> str:
 def _section(stage: str, numbers: list[Number], measured: Mapping[str, Any]) -> Iterator[str]:
     """The heading and the table of a stage."""
     titles = ("number", "value", "range", "meaning", "more", "less")
-    titles += () if stage == "skill" else ("motion", "stops", "largest other")
+    titles += () if stage in ("skill", "wish") else ("motion", "stops", "largest other")
     yield f"\n## {stage.capitalize()}\n\n| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n"
     for number in numbers:
         effects = measured.get(f"{stage}.{number.name}", {"effects": {}})["effects"]

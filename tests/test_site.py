@@ -211,7 +211,7 @@ def test_figure_without_a_result_is_an_error() -> None:
 
     def written(text: str) -> str:
         return str(
-            page.templates(results, dict.fromkeys(("core", "learning", "kmp"), "a"))
+            page.templates(results, dict.fromkeys(("core", "learning", "kmp", "wishes"), "a"))
             .from_string(text)
             .render()
         )

@@ -44,18 +44,18 @@ ROLES = {
         "may publish hands, clutch, gripper, objects, and the tool in demonstrations",
         (*HANDS, *WISHES, *TOOL, *OBJECTS),
     ),
+    "policy": Role(
+        "may publish wishes for the tool and the gripper, and receive everything that is published",
+        POLICY_WISHES,
+        hears=True,
+        hears_inputs=True,
+    ),
     HEADSET: Role(
         "may publish hands, clutch and wishes, send requests, receive all outputs, and serve a "
         "page to browsers",
         (*HANDS, *WISHES, *POLICY_WISHES[:1]),
         hears=True,
         asks=True,
-    ),
-    "policy": Role(
-        "may publish wishes for the tool and the gripper, and receive everything that is published",
-        POLICY_WISHES,
-        hears=True,
-        hears_inputs=True,
     ),
     "arm": Role(
         "may publish joint states and the tool, and receive all outputs", (*ARM, *TOOL), hears=True

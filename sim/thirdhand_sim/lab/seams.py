@@ -297,7 +297,27 @@ def run(results: Results, options: Options) -> dict[str, Any]:
             judged[name]["error_mm, " + COVERED[covered]] = _mean(part, "error_mm")
         results.say(f"{name}: {brief(judged[name])}")
     _draw(results, arms, next(iter(paths.values())), settings)
-    return {"followers": judged, "tuning": tried, "runs": len(paths) * len(draws)}
+    changed = {
+        f"{name}, x{factor:g}": _mean(
+            _all_runs(partial(_with, settings, name, factor), paths, draws[:1], settings),
+            "error_mm",
+        )
+        for name in TUNING.wish._fields
+        for factor in (0.5, 1.0, 2.0)
+    }
+    results.say(brief(changed))
+    return {
+        "followers": judged,
+        "tuning": tried,
+        "sensitivity": changed,
+        "runs": len(paths) * len(draws),
+    }
+
+
+def _with(settings: Settings, name: str, factor: float) -> OurArm:
+    """Our arm with one tuned number multiplied by a factor."""
+    wish = TUNING.wish._replace(**{name: factor * getattr(TUNING.wish, name)})
+    return OurArm(settings, TUNING._replace(wish=wish))
 
 
 def _queued(
