@@ -148,7 +148,8 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
         )
         measured = Event("joints/state", b"", JointState(stamp_ns, names, settings.arm.posture, ()))
         adopted = [Event("skill", b"", other)] if index == change else []
-        controller.step(Tick(index, (*adopted, *hands, measured)))
+        wishes = [Event("tool/wish", b"", sample)] if settings.skill.has_wishes else []
+        controller.step(Tick(index, (*adopted, *wishes, *hands, measured), stamp_ns))
     # runs only for a hand out of sight
     deviation_m(as_array(controller.state), SkillStage(settings, skill).rules, 0)
     controller.step(Tick(count, (order("begin"), order("hold"))))
