@@ -26,10 +26,12 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     variance of X). `noise` is the deviation of a sample of y over the deviation of y. With
     `components` None, each sample is a reference point of that noise; with a number, the reference
     is the regression of a mixture of that many components at each sample (the paper, section II-A),
-    with the seed `random_state`. `lambda_mean` and `lambda_covariance` are those of `KMP.fit` for a
-    variance of y of 1. Far from the samples, the mean returns to the mean of y.
+    with the seed `random_state`. `lambda_mean` and `lambda_covariance` are those of `KMP.fit`. Far
+    from the samples, the mean returns to the mean of y.
 
-    After `fit`: the `KMP` as `primitive_`, and `n_features_in_`.
+    Each output is standardised, so that none depends on the unit of another: its prior covariance
+    is K times its variance. After `fit`: the `KMP` of the standardised outputs as `primitive_`,
+    their means `y_mean_` (O,) and deviations `y_deviation_` (O,), and `n_features_in_`.
     """
 
     def __init__(
@@ -64,9 +66,11 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         )
         self._one_output = outputs.ndim == 1
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
-        spread = outputs.var(axis=0)
-        spread = np.where(spread > 0, spread, 1.0)  # a constant output
-        variance = squared("noise", self.noise) * np.diag(spread)
+        deviation = outputs.std(axis=0)
+        self.y_mean_ = outputs.mean(axis=0)
+        self.y_deviation_ = np.where(deviation > 0, deviation, 1.0)  # of a constant output
+        outputs = (outputs - self.y_mean_) / self.y_deviation_
+        variance = squared("noise", self.noise) * np.eye(outputs.shape[1])
         if self.components is None:
             reference = Gaussians(outputs, np.tile(variance, (len(inputs), 1, 1)))
         else:
@@ -74,16 +78,14 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             seed = whole("random_state", self.random_state, least=0, most=2**32 - 1)
             mixture = GaussianMixture.fit(samples, components=self.components, seed=seed)
             reference = mixture.regress(inputs)
-        unit = float(spread.mean())
         self.primitive_ = KMP.fit(
             inputs,
             reference,
             kernel=GaussianKernel(self._ell(inputs)),
-            lambda_mean=positive("lambda_mean", self.lambda_mean) / unit,
+            lambda_mean=positive("lambda_mean", self.lambda_mean),
             lambda_covariance=None
             if self.lambda_covariance is None
-            else positive("lambda_covariance", self.lambda_covariance) / unit,
-            prior_mean=outputs.mean(axis=0),
+            else positive("lambda_covariance", self.lambda_covariance),
         )
         return self
 
@@ -95,10 +97,14 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self)
         inputs = validate_data(self, X, reset=False, dtype=np.float64)
         if not return_std:
-            return self._shaped(self.primitive_.mean(inputs))
+            return self._in_units_of_y(self.primitive_.mean(inputs))
         prediction = self.primitive_.predict(inputs)
         deviations = np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2))
-        return self._shaped(prediction.mean), self._shaped(deviations)
+        mean = self._in_units_of_y(prediction.mean)
+        return mean, self._shaped(deviations * self.y_deviation_)
+
+    def _in_units_of_y(self, standardised: Array) -> Array:
+        return self._shaped(self.y_mean_ + self.y_deviation_ * standardised)
 
     def _shaped(self, outputs: Array) -> Array:
         return outputs[:, 0] if self._one_output else outputs

@@ -140,9 +140,10 @@ class KMP(Predictor, Plotted):
         The paper, Algorithm 1. A desired point nearer than `tolerance` [unit of the inputs] to a
         point of the *base's* reference replaces the nearest one (all of them, if several are
         equally near); any other is inserted. None is `base.spacing / 2`: evenly spaced points are
-        then replaced one by one. The order of the desired points does not matter. Earlier
-        via-points remain; to remove them, adapt `base` again. N of the covariance remains that of
-        the base, so that the covariance far away does not change.
+        then replaced one by one. The order of the desired points does not matter. An earlier
+        via-point nearer than `tolerance`, or at the same input, is replaced too, so that a goal can
+        be moved again and again; others remain, see `without_via_points`. N of the covariance
+        remains that of the base, so that the covariance far away does not change.
 
         Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows.
 
@@ -167,6 +168,33 @@ class KMP(Predictor, Plotted):
         adapted = self._through(points, desired, tolerance)
         warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
         return adapted
+
+    def without_via_points(self, inputs: ArrayLike, *, tolerance: float | None = None) -> KMP:
+        """A new primitive without the via-points at these inputs (V, I), all of them there.
+
+        Those that remain replace points of the base as in `adapt` with this tolerance.
+
+        Raises ValueError if there is none at an input, and as `adapt` does.
+        """
+        gone = numbers("inputs", inputs, "V", self._dimensions)
+        changes = self.inner.changes
+        same = (changes.inputs[:, None] == gone).all(axis=2)  # (via-points, V)
+        for row in np.flatnonzero(~same.any(axis=0)):
+            raise ValueError(
+                f"inputs[{row}]: {brief(gone[row])} given, the input of a via-point needed; they are "
+                f"at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
+            )
+        remaining = ~same.any(axis=1)
+        if tolerance is None:
+            tolerance = self.base.spacing / 2
+        before: Solution = self.inner.solution
+        base = self.base
+        if isinstance(before, Constrained):
+            base = base.constrained(before.constraints)
+        points = changes.functionals.take(remaining)
+        return base._through(  # noqa: SLF001 (of its own kind)
+            points, changes.points.take(remaining), not_negative("tolerance", tolerance)
+        )
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
         """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
@@ -271,10 +299,11 @@ class KMP(Predictor, Plotted):
             return self
         before = self.inner.changes
         nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
+        remaining = ~before.near(points, tolerance, self.kernel.period)
         changes = Changes(
             frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
-            Functionals.concatenated([before.functionals, points]),
-            Gaussians.concatenated([before.points, desired]),
+            Functionals.concatenated([before.functionals.take(remaining), points]),
+            Gaussians.concatenated([before.points.take(remaining), desired]),
         )
         return self._changed(self.inner.solution.adapted(changes), changes, self.base)
 

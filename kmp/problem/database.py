@@ -40,6 +40,19 @@ class Changes(NamedTuple):
         """The inputs (V, I) of the via-points."""
         return self.functionals.inputs
 
+    def near(
+        self, points: Functionals, tolerance: float, period: float | None
+    ) -> NDArray[np.bool_]:
+        """Whether each via-point (V,) is a value nearer than `tolerance` [unit of the inputs] to
+        one of the points that is a value, or is one of the points.
+        """
+        distance = _distances(self.inputs, points.inputs, period)  # (V, P)
+        along = self.functionals.along[:, None] == points.along
+        same = (distance == 0) & along.all(axis=2)
+        both = self.functionals.values[:, None] & points.values
+        near: NDArray[np.bool_] = (same | (both & (distance < tolerance))).any(axis=1)
+        return near
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Database(Immutable):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
-from kmp import KMP, Gaussians, ViaPointMissed, named_arrays
+from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed, named_arrays
 from support.primitives import (
     database,
     kernel,
@@ -50,7 +51,9 @@ def test_tolerance_is_exclusive_and_takes_nearest():
 @properties
 @given(seeds, st.floats(0, 3), representations)
 def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
-    """The order of via-points does not matter, nor whether they are inserted one by one."""
+    """The order of via-points does not matter, nor whether they are inserted one by one, unless a
+    later one replaces an earlier one.
+    """
     primitive = skill(seed, representation=representation)
     inputs, points = via(seed, 5, std=0.01)
     inputs[4] = inputs[3] + 0.05
@@ -66,8 +69,43 @@ def test_order_of_via_points_does_not_matter(seed, tolerance, representation):
     covariance = shuffled.predict(queries).covariance
     expected = together.predict(queries).covariance
     np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-7)
-    assert same_bits(singly, together, queries)
+    assert same_bits(singly, together, queries) == (pdist(inputs).min() >= tolerance)
     assert primitive.adapt(*via(0, 0), tolerance=1) is together.base is primitive
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_a_goal_can_be_moved_a_thousand_times(representation):
+    """Each move replaces the one before: it is met, and the primitive does not grow."""
+    times = np.linspace(0.0, 2.0, 100)[:, None]
+    reference = Gaussians.of(np.hstack([np.sin(3 * times), np.cos(2 * times)]), deviation=0.05)
+    first = KMP.fit(
+        times,
+        reference,
+        kernel=GaussianKernel(8.0),
+        lambda_mean=1.0,
+        representation=representation,
+    )
+    beside = first.adapt([[0.5]], Gaussians.of([0.9, 0.1], deviation=1e-5))
+    moved = beside
+    for k in range(1000):
+        goal = np.array([0.3 + 0.001 * k, -0.4])
+        at = [[2.0 - 1e-5 * (k % 7)]]
+        moved = moved.adapt(at, Gaussians.of(goal, deviation=1e-5))
+    np.testing.assert_allclose(moved.mean(at)[0], goal, atol=1e-5)
+    np.testing.assert_allclose(moved.mean([[0.5]])[0], [0.9, 0.1], atol=1e-5)
+    assert len(moved.via_inputs) == 2
+    assert len(moved.inputs) == 100
+    back = moved.without_via_points(at)
+    assert same_bits(back, beside, times[::9])
+    assert same_bits(back.without_via_points([[0.5]]), first, times[::9])
+
+
+def test_via_points_that_are_not_there_are_named():
+    adapted = skill(0).adapt(*via(0, 2, std=0.01), tolerance=0.1)
+    with pytest.raises(ValueError, match=r"inputs\[0\]: .* given, the input of a via-point"):
+        adapted.without_via_points([np.zeros(4)])
+    with pytest.raises(ValueError, match="they are at no input"):
+        skill(0).without_via_points([np.zeros(4)])
 
 
 @properties

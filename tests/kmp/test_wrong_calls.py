@@ -33,6 +33,7 @@ S = np.random.default_rng(0).normal(size=(6, 2))
 R = Gaussians(S, np.tile(0.01 * np.eye(2), (6, 1, 1)))
 K = GaussianKernel(1.0)
 ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
+TAUGHT = ONE.adapt(S[:1] + 9, R[:1])
 LOW = KMP.fit(S, R, kernel=K, lambda_mean=1.0, representation="low_rank").adapt(
     S[:1], R[:1], tolerance=0.1
 )
@@ -103,6 +104,7 @@ RIGHT = {
         "tolerance": 0.1,
         "directions": np.zeros((2, 2)),
     },
+    TAUGHT.without_via_points: {"inputs": S[:1] + 9, "tolerance": 0.1},
     ONE.adapt_many: {"points": [(S[:2], R[:2]), (S[2:3], R[2:3])], "tolerance": 0.1},
     ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
     ONE.via_point_reach: {"query": S[0], "share": 0.5},
