@@ -181,8 +181,8 @@ class KMP(Predictor, Plotted):
         same = (changes.inputs[:, None] == gone).all(axis=2)  # (via-points, V)
         for row in np.flatnonzero(~same.any(axis=0)):
             raise ValueError(
-                f"inputs[{row}]: {brief(gone[row])} given, the input of a via-point needed; they are "
-                f"at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
+                f"inputs[{row}]: {brief(gone[row])} given, the input of a via-point needed; they "
+                f"are at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
             )
         remaining = ~same.any(axis=1)
         if tolerance is None:
