@@ -37,10 +37,11 @@ from thirdhand.daemon.start import Startup
 from thirdhand.daemon.status_thread import StatusThread
 from thirdhand.process.pages import release_start_memory
 from thirdhand.process.priority import ahead_of_others
+from thirdhand.recordings.shipped import SHIPPED_SKILL, recordings
 from thirdhand.scribe.protocol import pack
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings, robot_description
-from thirdhand.skills.no_skill import leads_alone, no_skill
+from thirdhand.skills.no_skill import leads_alone, no_skill, stand_in
 from thirdhand.skills.reach import beyond_m, out_of_reach
 from thirdhand.skills.skill_file import SkillError, StoredSkill
 
@@ -281,7 +282,7 @@ def load_skill(path: Path, settings: Settings) -> StoredSkill:
     nobody accepted the skill's residual risk.
     """
     if leads_alone(settings):
-        return no_skill()
+        return no_skill() if path == recordings() / SHIPPED_SKILL else stand_in(path)
     skill = skill_of(path)
     saved = SavedViaPoints(settings)
     skill.check_accepted()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -10,9 +11,27 @@ from kmp import KMP, GaussianKernel, Gaussians
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.settings.config import Settings
-from thirdhand.skills.skill_file import HIGHEST_GATE_M, StoredSkill, with_file
+from thirdhand.skills.skill_file import (
+    HIGHEST_GATE_M,
+    SkillError,
+    StoredSkill,
+    skill_in,
+    with_file,
+)
 
 NO_SKILL = "none, wishes lead"
+OF_WISHES = "wishes"  # instead of the hash of demonstrations
+
+
+def stand_in(path: Path) -> StoredSkill:
+    """The stand-in in a file that `learn --wishes` has written. Raises SkillError."""
+    skill = skill_in(path)
+    if skill.learned_from != OF_WISHES:
+        raise SkillError(
+            f"{path}: a skill that was learned from demonstrations, and the tool follows wishes "
+            "alone: leave `[files] skill` out, or set `[skill] blend = true`"
+        )
+    return skill
 
 
 def leads_alone(settings: Settings) -> bool:
@@ -32,6 +51,6 @@ def no_skill() -> StoredSkill:
         orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         workspace=box,
         threshold=HIGHEST_GATE_M,
-        learned_from="",
+        learned_from=OF_WISHES,
     )
     return with_file(skill)

@@ -17,11 +17,11 @@ from thirdhand.core.frame import Record, Vector, as_array, parameters
 from thirdhand.core.geometry import turn_between
 from thirdhand.core.intake.stage import base_from
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
-from thirdhand.core.skill.model import Target, Wanted
-from thirdhand.core.skill.pose import NO_GRIPPER
-from thirdhand.core.skill.skill import Skill, is_inside, reach_of
+from thirdhand.core.skill.model import KNOWN_SIGNS, Target, Wanted
+from thirdhand.core.skill.pose import NO_GRIPPER, Turn
+from thirdhand.core.skill.skill import Skill, is_inside
 from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.step import NO_SEGMENT
+from thirdhand.core.skill.step import NO_SEGMENT, conclude
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.wish import tuning as fixed
 from thirdhand.core.wish.step import BY_SKILL, BY_WISHES, lead, newest_due, take
@@ -112,7 +112,7 @@ class WishStage(SkillStage):
         sources = BY_WISHES if wanted is None else BY_WISHES | BY_SKILL
         wanted = self._led(state, frame, wanted, sources)
         leapt = 0 <= state["tick"] - self._wishes[0]["wish_leap_tick"] < self._leap_ticks
-        inside = is_inside(wanted.target.position, WHOLE_REACH, reach_of(self._reach))
+        inside = is_inside(wanted.target.position, WHOLE_REACH, self.rules[0]["reach"])
         return wanted, WISH_LEADS | WISH_JUMPED * bool(leapt) | WISH_OUTSIDE * (not inside)
 
     def _led(self, state: Record, frame: Record, by_skill: Wanted | None, sources: int) -> Wanted:
@@ -121,6 +121,8 @@ class WishStage(SkillStage):
         if by_skill is None:
             frame["closure"] = NO_GRIPPER
             frame["segment"] = NO_SEGMENT
+            if not self._blends:
+                self._calibrate(state, frame)
         target = Target(
             frame["target"].copy(),
             frame["target_velocity"].copy(),
@@ -134,6 +136,23 @@ class WishStage(SkillStage):
             0.0 if by_skill is None else by_skill.gate_m,
             is_ambiguous=False,
             needs_unseen_hand=False,
+        )
+
+    def _calibrate(self, state: Record, frame: Record) -> None:
+        """Replace the covariance by the calibrated one, and judge whether the policy is unsure."""
+        motion = [
+            frame[name].copy() for name in ("target", "target_velocity", "target_acceleration")
+        ]
+        turn = [frame[name].copy() for name in ("orientation", "turning", "orientation_covariance")]
+        conclude(
+            as_array(state),
+            as_array(frame),
+            self.rules,
+            (*motion, frame["covariance"].copy(), 0.0, 0.0, KNOWN_SIGNS),
+            Turn(*turn),
+            NO_GRIPPER,
+            0.0,
+            0.0,
         )
 
 

@@ -257,6 +257,11 @@ def learn(add: AddCommand) -> None:
         "when they move"
     )
     option(c, "--via-points", "FILE", via_points)
+    wishes = (
+        "calibrate a policy instead: each DEMO is a recording of a cell whose tool wishes lead, in "
+        "which somebody leads the arm through the task"
+    )
+    c.add_argument("--wishes", action="store_true", help=wishes)
     accept = (
         "accept the residual risk of the skill, if it has one, in the name of this person, who "
         "takes responsibility for it; skill, daemon and status name both"

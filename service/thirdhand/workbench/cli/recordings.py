@@ -18,6 +18,7 @@ from thirdhand.client import Client, Tracker
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.printable import printable, printable_lines
 from thirdhand.contract.requests import Status
+from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.process.progress import progress, say, steps
 from thirdhand.recordings.mcap_file import ends_early
 from thirdhand.recordings.recording import Recording
@@ -35,9 +36,19 @@ from thirdhand.workbench.learning.picture import draw
 from thirdhand.workbench.learning.records import Evidence, Figures
 from thirdhand.workbench.learning.table import table
 from thirdhand.workbench.learning.takes import check_count
+from thirdhand.workbench.learning.wishes import calibrated_wishes
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
 from thirdhand.workbench.takes.pose_streams import TRACK_NAMES, PoseTopic
 
+# options of `learn` that wishes have no use for
+OF_SKILLS = {
+    "refined": "--from",
+    "plot": "--plot",
+    "delay": "--delay",
+    "via_points": "--via-points",
+    "config": "--config",
+    "accept_residual_risk": OPTION,
+}
 COUNTED_WITHIN_S = 1.0  # the daemon's status must show the last poses within this time
 
 
@@ -134,6 +145,8 @@ def learn(args: argparse.Namespace) -> int:
     accepted_by = (args.accept_residual_risk or "").strip()
     name = args.output.stem if args.name is None else args.name
     _check_outputs(args, name, accepted_by)
+    if args.wishes:
+        return _learn_wishes(args, name)
     names = [path.stem for path in args.demonstrations]
     if args.demonstrations[0].exists():  # else its reader reports the missing file
         check_count(names)
@@ -165,6 +178,25 @@ def learn(args: argparse.Namespace) -> int:
     with whole(args.output) as part:
         part.write_bytes(skill.file)
     _report_written(args.output, skill, figures)
+    return 0
+
+
+def _learn_wishes(args: argparse.Namespace, name: str) -> int:
+    """Calibrate a policy's wishes; exit code 0 once the stand-in skill is written."""
+    given = [option for option in OF_SKILLS if getattr(args, option) is not None]
+    if given:
+        raise UsageError(f"--wishes: without {', '.join(OF_SKILLS[option] for option in given)}")
+    found = calibrated_wishes(args.demonstrations, name)
+    with whole(args.output) as part:
+        part.write_bytes(found.skill.file)
+    print(
+        f"the wishes are {1000 * found.rms_m:.1f} mm (rms) from the tool as it was led, in "
+        f"{100 * found.wrong:.1f} % of the frames more than {1000 * UNSURE_M:.0f} mm\n"
+        f"of the errors, {100 * found.held_before:.0f} % are within the policy's own 95 % region, "
+        f"and {100 * found.held:.0f} % within the one that the other recordings lead to\n"
+        f"{args.output}: name it as `[files] skill` of a cell with `[skill] source = "
+        '"tool/wish"`'
+    )
     return 0
 
 
