@@ -82,6 +82,21 @@ def test_rows_are_what_was_seen_and_commanded_at_their_times(data_set: Path, gol
     )
 
 
+def test_a_closure_that_never_changes_is_left_out(
+    golden: Path, skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That of a changing one is kept, also in the episodes where it is constant."""
+    still = recorded(tmp_path / "still.mcap", skill, resting(0, 600))
+    for files, is_left_out in (([still], True), ([still, golden], False)):
+        folder = tmp_path / f"{len(files)}"
+        assert main(["report", *map(str, files), "--lerobot", str(folder)]) == 0
+        says = "rows, without action.gripper, which is always " in capsys.readouterr().out
+        columns = parquet.read_table(folder / "data" / FIRST).column_names
+        features = json.loads((folder / "meta" / "info.json").read_text())["features"]
+        assert says == is_left_out == ("action.gripper" not in columns)
+        assert [*features] == columns
+
+
 def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
     table, about = (
         parquet.read_table(data_set / part / FIRST) for part in ("data", "meta/episodes")
