@@ -82,7 +82,8 @@ class CellDevice:
         self._cell = None
 
     def recent(self, channel: str) -> Any:
-        """The newest message of a channel; None if it is silent."""
+        """The newest message of a channel; None if it is silent. Raises DeviceNotConnectedError."""
+        _ = self.cell
         now_s = time.monotonic()
         for message in iter(self._watches[channel].__next__, None):
             self._newest[channel] = now_s, message
@@ -91,7 +92,6 @@ class CellDevice:
 
     def newest(self, channel: str) -> Any:
         """The newest message of a channel. Raises DeviceNotConnectedError if it is silent."""
-        _ = self.cell
         if (message := self.recent(channel)) is None:
             raise DeviceNotConnectedError(f"{channel} is silent: do the daemon and the arm run?")
         return message
