@@ -1,7 +1,9 @@
 """A device of LeRobot that is a cell: its life cycle, and the newest messages of its channels."""
 
+import math
 import time
 from collections.abc import Sequence
+from threading import Thread
 from typing import Any
 
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
@@ -60,9 +62,10 @@ class CellDevice:
         self._cell = cell = thirdhand.connect(endpoint, cell=self.config.cell, timeout_s=CONNECT_S)
         try:
             cell.wait_until_ready(timeout_s=CONNECT_S)
-            channels = self.needed + self.optional
-            self._watches = {channel: cell.watch(channel, timeout_s=0.0) for channel in channels}
             self._newest: dict[str, tuple[float, Any]] = {}
+            for channel in self.needed + self.optional:
+                watch = cell.watch(channel)
+                Thread(target=self._keep, args=(channel, watch), daemon=True).start()
             end_s = time.monotonic() + CONNECT_S
             while time.monotonic() < end_s and not all(map(self.recent, self.needed)):
                 time.sleep(0.01)
@@ -84,11 +87,13 @@ class CellDevice:
     def recent(self, channel: str) -> Any:
         """The newest message of a channel; None if it is silent. Raises DeviceNotConnectedError."""
         _ = self.cell
-        now_s = time.monotonic()
-        for message in iter(self._watches[channel].__next__, None):
-            self._newest[channel] = now_s, message
-        arrival_s, message = self._newest.get(channel, (now_s, None))
-        return message if now_s - arrival_s <= SILENT_S else None
+        arrival_s, message = self._newest.get(channel, (-math.inf, None))
+        return message if time.monotonic() - arrival_s <= SILENT_S else None
+
+    def _keep(self, channel: str, watch: thirdhand.Watch) -> None:
+        """Keep the newest message, until the connection closes."""
+        for message in watch:
+            self._newest[channel] = time.monotonic(), message
 
     def newest(self, channel: str) -> Any:
         """The newest message of a channel. Raises DeviceNotConnectedError if it is silent."""
