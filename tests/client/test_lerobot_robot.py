@@ -67,7 +67,7 @@ def hands(plug_in: ModuleType, endpoint: str, folder: Path) -> Any:
     return plug_in.ThirdhandHands(config)
 
 
-def test_lerobot_finds_both_devices_by_the_name_of_the_distribution(site: Path) -> None:
+def test_lerobot_finds_both_devices_by_the_distribution(site: Path) -> None:
     (metadata,) = site.glob("*.dist-info/METADATA")
     assert "\nName: lerobot_robot_thirdhand\n" in metadata.read_text(encoding="utf-8")
     plugins = pytest.importorskip("lerobot.utils.import_utils", reason="needs lerobot and PyTorch")
