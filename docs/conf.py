@@ -31,6 +31,7 @@ GROUPS = {
         "calibrate",
         "clutch",
         "policies",
+        "lerobot",
         "record-takes",
         "other-recordings",
         "arrays",

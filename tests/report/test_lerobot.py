@@ -82,6 +82,23 @@ def test_rows_are_what_was_seen_and_commanded_at_their_times(data_set: Path, gol
     )
 
 
+def test_a_closure_that_never_changes_is_left_out(
+    skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A changing one is kept, also in the episodes where it is constant."""
+    still = recorded(tmp_path / "still.mcap", skill, resting(0, 600))
+    closing = recorded(tmp_path / "closing.mcap", skill, resting(0, 600), closing_at=300)
+    for files, left_out in (([still], True), ([still, closing], False)):
+        folder = tmp_path / f"{len(files)}"
+        assert main(["report", *map(str, files), "--lerobot", str(folder)]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        is_said = "rows, without action.gripper, which is always -1" in printed
+        columns = parquet.read_table(folder / "data" / FIRST).column_names
+        features = json.loads((folder / "meta" / "info.json").read_text())["features"]
+        assert is_said == left_out == ("action.gripper" not in columns)
+        assert [*features] == columns
+
+
 def test_episodes_end_at_gaps_and_follow_each_other(data_set: Path) -> None:
     table, about = (
         parquet.read_table(data_set / part / FIRST) for part in ("data", "meta/episodes")
@@ -246,14 +263,26 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
         assert loaded[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
-def recorded(path: Path, skill: StoredSkill, inputs: list[Tick], urdf: str = URDF) -> Path:
-    """A recording of an arm that does not report its joints."""
+def recorded(
+    path: Path,
+    skill: StoredSkill,
+    inputs: list[Tick],
+    urdf: str = URDF,
+    *,
+    closing_at: int | None = None,
+) -> Path:
+    """A recording of an arm that does not report its joints; from the tick `closing_at` on, with a
+    gripper that is to be closed.
+    """
     controller = Controller(ASSUMED, skill, urdf=URDF)
     with Recorder(
         path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
     ) as recorder:
 
         def keep(tick: Tick, frame: Frame) -> None:
+            if closing_at is not None and tick.index >= closing_at:
+                frame = frame.copy()
+                frame["closure"] = 1.0
             recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
 
         run(controller, inputs, [keep])

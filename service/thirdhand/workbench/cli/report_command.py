@@ -74,16 +74,15 @@ def _report_each(args: argparse.Namespace, reports: Sequence[Report]) -> None:
         write_csv(reports, args.csv)
         _print_line(console, f"tables in {args.csv}")
     if args.lerobot:
-        episodes, rows = _write_lerobot(args, [report.columns for report in reports])
-        _print_line(console, f"data set {args.lerobot}: {episodes} episodes, {rows} rows")
+        _print_line(console, _write_lerobot(args, [report.columns for report in reports]))
     if args.html:
         _write_page(args.html, reports)
         _print_line(console, f"page {args.html}")
 
 
-def _write_lerobot(args: argparse.Namespace, recordings: Sequence[Columns]) -> tuple[int, int]:
-    """Write the data set; return the numbers of episodes and rows. Its task is named after the
-    skills, unless the arguments name it.
+def _write_lerobot(args: argparse.Namespace, recordings: Sequence[Columns]) -> str:
+    """Write the data set; return a line with its size. Its task is named after the skills, unless
+    the arguments name it.
     """
     from thirdhand.workbench.report import lerobot
 
@@ -91,7 +90,11 @@ def _write_lerobot(args: argparse.Namespace, recordings: Sequence[Columns]) -> t
         change.skill.name for recording in recordings for change in recording.skills
     )
     with whole(args.lerobot) as part:
-        return lerobot.write(recordings, part, fps=args.fps, task=args.task or ", ".join(skills))
+        written = lerobot.write(recordings, part, fps=args.fps, task=args.task or ", ".join(skills))
+    line = f"data set {args.lerobot}: {written.episodes} episodes, {written.rows} rows"
+    if written.constant_closure is None:
+        return line
+    return f"{line}, without action.gripper, which is always {written.constant_closure:g}"
 
 
 def _write_page(path: Path, reports: Sequence[Report]) -> None:

@@ -26,6 +26,7 @@ FEATURES = ("observation.state", "observation.environment_state", "action")
 HAND_FEATURES = [f"{side}_{axis}" for side in ("left", "right") for axis in "xyz"]
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+CLOSURE = "action.gripper"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 Episode = dict[str, NDArray[np.float32 | np.int64]]
 
@@ -75,7 +76,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             part: Episode = {
                 name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)
             }
-            part["action.gripper"] = frames["closure"][rows].astype(np.float32)
+            part[CLOSURE] = frames["closure"][rows].astype(np.float32)
             part["observation.segment"] = np.where(
                 frames["segment_belief"][rows] > 0, frames["segment"][rows], -1
             )
@@ -150,8 +151,17 @@ class _DataSet(NamedTuple):
         return _statistics(columns) | _video_statistics(self.videos, episodes)
 
 
-def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> tuple[int, int]:
-    """Write a data set of one task to a new folder; return the numbers of episodes and rows.
+class Written(NamedTuple):
+    """The size of a data set."""
+
+    episodes: int
+    rows: int
+    constant_closure: float | None  # value of `action.gripper`, which is left out; None: it is kept
+
+
+def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -> Written:
+    """Write a data set of one task to a new folder; return its size. A closure that never changes
+    is left out: policies divide by its deviation.
 
     Raises ExplainedError if arms differ, or if there is no episode.
     """
@@ -163,12 +173,23 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
             camera_rows.append(CameraRows(columns.recording, times_ns))
             parts.append(part)
     arm, joints = _arm_of(recordings, parts)
+    constant_closure = _take_constant_closure(parts)
     ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
     for i, part in enumerate(parts):
         part.update(_indices(i, ends, fps))
     data_set = _DataSet(arm, joints, parts, ends, _videos(camera_rows, folder, fps), fps)
     _write_data_set(data_set, folder, task)
-    return len(parts), ends[-1]
+    return Written(len(parts), ends[-1], constant_closure)
+
+
+def _take_constant_closure(parts: Sequence[Episode]) -> float | None:
+    """Remove the closure from all episodes if it is one value; that value, None if it changes."""
+    values = np.unique(np.concatenate([part[CLOSURE] for part in parts]))
+    if len(values) > 1:
+        return None
+    for part in parts:
+        del part[CLOSURE]
+    return float(values[0])
 
 
 def _arm_of(
