@@ -219,12 +219,12 @@ def test_lines_that_break_a_contract_are_found_and_named(
     [
         (
             "thirdhand.daemon.daemon",
-            196,
+            203,
             ("thirdhand.workbench", "thirdhand_sim", "rerun", "mcap", "sklearn", "rich"),
         ),
         (
             "thirdhand.scribe.process, thirdhand.viewer.stream",
-            80,
+            82,
             (
                 "thirdhand.workbench",
                 "thirdhand.daemon",
@@ -287,9 +287,8 @@ def test_a_module_begins_with_what_it_is() -> None:
 
 
 def test_no_module_has_a_name_that_says_nothing() -> None:
-    assert [
-        named(path) for path in MODULES if path.stem in VAGUE or path.parent.name in VAGUE
-    ] == []
+    ours = [path for path in MODULES if "stand_in" not in path.parts]
+    assert [named(path) for path in ours if path.stem in VAGUE or path.parent.name in VAGUE] == []
 
 
 def defined(path: Path) -> set[str]:
@@ -369,7 +368,7 @@ def test_a_stage_keeps_its_numbers_apart_and_its_step_to_itself() -> None:
     """
     core = ROOT / "service" / "thirdhand" / "core"
     stages = sorted(path.parent for path in core.glob("*/stage.py"))
-    assert len(stages) == 7
+    assert len(stages) == 8
     for stage in stages:
         assert {"step.py", "stage.py"} <= {path.name for path in stage.glob("*.py")}
         for path in stage.glob("*.py"):

@@ -454,7 +454,7 @@ def test_events_keep_the_numbers_that_recordings_know_them_by() -> None:
         "way",
         "segment",
     ]
-    kinds += ["clutch", "gripper/wish", "joints/guided", "begin"]
+    kinds += ["clutch", "gripper/wish", "joints/guided", "begin", "tool/wish"]
     assert dict(enumerate(kinds)) == channels.EVENT_KINDS
 
 

@@ -105,8 +105,9 @@ def test_newer_urdfs_are_read_as_by_every_reader(quaternion: tuple[float, ...]) 
     assert "quat_xyzw" not in text
     (joint,) = Urdf(text).movable("tool_plate")
     assert abs(np.dot(joint.rotation, turn)) == pytest.approx(1.0, abs=1e-12)
+    # at a pitch of 90 degrees, roll and yaw have half of the digits
     placed = pin.buildModelFromXML(Urdf(text).kinematics(["a"])).jointPlacements[1].rotation
-    np.testing.assert_allclose(placed, Rotation.from_quat(turn).as_matrix(), atol=1e-8)
+    np.testing.assert_allclose(placed, Rotation.from_quat(turn).as_matrix(), atol=1e-6)
     assert (joint.lower, joint.upper, joint.acceleration, joint.jerk) == (-1.0, 1.5, 5.0, 9.0)
     assert rates(text, [joint])[:2] == ([5.0], [9.0])
     joints = completed({"arm": {"plate": "tool_plate", "posture": [0.0]}}, Urdf(text))["joints"]

@@ -115,7 +115,8 @@ def test_result_names_its_origin(tmp_path: Path) -> None:
     assert set(result["options"]) == {"share", "data"}  # this experiment has no option for hands
     assert set(result["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
     assert result["seeds"] == EXPERIMENTS["partners"].seeds.named()
-    assert result["depends_on"] == tree()
+    names = EXPERIMENTS["partners"].depends_on
+    assert result["depends_on"] == {name: tree()[name] for name in names}
     before = result["options"]["data"]
     assert before["files"] == 1
     np.savez(tmp_path / "a.npz", t=np.arange(3) + 1)

@@ -91,6 +91,10 @@ def ticks(count: int, *, first: int = 0) -> Iterator[tuple[Tick, Record, Record]
             inbox.append(Event("joints/guided", cdr.encode_bool(i % 8 == 0), None))
             wish = messages.JointState(at_ns(i), (messages.GRIPPER,), (0.5,), ())
             inbox.append(Event("gripper/wish", cdr.encode_joints(wish), None))
+            wished = messages.PoseWithCovarianceStamped(
+                at_ns(i), messages.BASE, (0.5, 0.0, 0.4), (0.0, 0.0, 0.0, 1.0), (0.0,) * 36
+            )
+            inbox.append(Event("tool/wish", cdr.encode_pose_with_covariance(wished), None))
         if i % 100 == 50:
             inbox += [
                 Event(kind, cdr.encode_string("{}"), None)

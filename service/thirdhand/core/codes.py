@@ -29,6 +29,13 @@ class Condition(enum.IntFlag):
     WISH_OUTSIDE = 65536  # the wished pose is out of the arm's reach
 
 
+class LedBy(enum.IntFlag):
+    """What leads the tool where wishes may."""
+
+    SKILL = 1
+    WISHES = 2
+
+
 class Start(enum.IntEnum):
     """Posture at which the arm's motion starts."""
 
@@ -103,6 +110,8 @@ WISH_UNKNOWN = int(Condition.WISH_UNKNOWN)
 WISH_SILENT = int(Condition.WISH_SILENT)
 WISH_JUMPED = int(Condition.WISH_JUMPED)
 WISH_OUTSIDE = int(Condition.WISH_OUTSIDE)
+BY_SKILL = int(LedBy.SKILL)
+BY_WISHES = int(LedBy.WISHES)
 STARTS_ASSUMED = int(Start.ASSUMED)
 STARTS_MEASURED = int(Start.MEASURED)
 READY = int(ArmReady.READY)

@@ -231,7 +231,9 @@ class Controller:
         """Apply an event that is no sample of a hand or the arm."""
         state = self._state
         match event.kind:
-            case "tool/wish" if self._wishes is not None:
+            case "tool/wish":
+                if self._wishes is None:
+                    return  # of a program that is not asked
                 cause = self._wishes.take(tick.index, tick.time_ns, event.value)
                 if cause is not None:
                     self.intake.reject(state, "wish", cause, event.value, newest_ns=tick.time_ns)

@@ -91,11 +91,10 @@ class Number(NamedTuple):
 
 def numbers() -> dict[str, Number]:
     """The tuned numbers of all stages by key."""
+    stages = TUNING._asdict()
+    del stages["wish"]  # the experiment `seams` measures those
     all_numbers = [
-        Number(stage, *item)
-        for stage, tuned in TUNING._asdict().items()
-        if stage != "wish"  # the experiment `seams` measures those
-        for item in tuned._asdict().items()
+        Number(stage, *item) for stage, tuned in stages.items() for item in tuned._asdict().items()
     ]
     return {number.key: number for number in all_numbers}
 

@@ -7,6 +7,8 @@ import numpy as np
 from thirdhand.contract.messages import BASE, PoseStamped, PoseWithCovarianceStamped
 from thirdhand.contract.records import Cause
 from thirdhand.core.codes import (
+    BY_SKILL,
+    BY_WISHES,
     WISH_JUMPED,
     WISH_LEADS,
     WISH_OUTSIDE,
@@ -24,7 +26,7 @@ from thirdhand.core.skill.stage import SkillStage
 from thirdhand.core.skill.step import NO_SEGMENT, conclude
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.wish import tuning as fixed
-from thirdhand.core.wish.step import BY_SKILL, BY_WISHES, lead, newest_due, take
+from thirdhand.core.wish.step import lead, newest_due, take
 from thirdhand.settings.config import Settings
 
 WHOLE_REACH = np.array([[-MAX_SKILL_DISTANCE_M] * 3, [MAX_SKILL_DISTANCE_M] * 3])
@@ -55,7 +57,7 @@ class WishStage(SkillStage):
             steady_ticks=tuning.wish.steady_s / period_s,
             leap_m=fixed.LEAP_M,
             leap_mps=fixed.LEAP_MPS,
-            fade_rate=tuning.wish.fade_rate,
+            fade_rate_per_s=tuning.wish.fade_rate_per_s,
             fade_mps=settings.tool.max_speed,
             rad_as_m=fixed.RAD_AS_M,
             goes_on_s=fixed.GOES_ON_S,

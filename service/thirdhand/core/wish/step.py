@@ -10,18 +10,20 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.core.codes import AHEAD, NOT_A_ROTATION, NOT_FINITE, OLDER, OUT_OF_RANGE
+from thirdhand.core.codes import (
+    AHEAD,
+    BY_SKILL,
+    BY_WISHES,
+    NOT_A_ROTATION,
+    NOT_FINITE,
+    OLDER,
+    OUT_OF_RANGE,
+)
 from thirdhand.core.frame import Record, Records, Vector
 from thirdhand.core.geometry import normalise, turn_between, turn_on
 from thirdhand.core.vectors import dot, squared_distance
 from thirdhand.core.wish import MOST_WISHES
-
-RETAINED = 12  # poses before now, from which a velocity is estimated
-# largest speed of an offset d that fades out at the rate w from rest is this times |d| w: 2 / e²
-FADING_SHARE = 0.2706705664732254
-# what leads a target, added
-BY_SKILL = 1
-BY_WISHES = 2
+from thirdhand.core.wish.tuning import FADING_SHARE, RETAINED
 
 
 def newest_due(state: Record) -> int:
@@ -404,7 +406,7 @@ def _join(
     missed, d is set so that the target goes on from the one before, position, velocity and
     acceleration. Then it obeys
 
-        d''' = -w³ d - 3 w² d' - 3 w d'',   w = min(fade_rate, fade_mps / (2 / e² |d|))
+        d''' = -w³ d - 3 w² d' - 3 w d'',   w = min(fade_rate_per_s, fade_mps / (2 / e² |d|))
 
     whose largest speed from rest is fade_mps; rotations count with rad_as_m. Its solution is
 
@@ -442,7 +444,7 @@ def _begin_offset(
     offset = wish.wish_offset
     if passed_s > rule.goes_on_s:
         offset[:] = 0.0
-        wish.wish_rate = rule.fade_rate
+        wish.wish_rate = rule.fade_rate_per_s
         return
     told = wish.wish_told
     for axis in range(3):
@@ -459,8 +461,8 @@ def _begin_offset(
         offset[1, 3 + axis] = told[3, axis] - motion[1, 3 + axis]
     turn = offset[0, 3:]
     away_m = math.sqrt(dot(offset[0, :3], offset[0, :3]) + rule.rad_as_m**2 * dot(turn, turn))
-    wish.wish_rate = rule.fade_rate
-    if away_m * FADING_SHARE * rule.fade_rate > rule.fade_mps:
+    wish.wish_rate = rule.fade_rate_per_s
+    if away_m * FADING_SHARE * rule.fade_rate_per_s > rule.fade_mps:
         wish.wish_rate = rule.fade_mps / (FADING_SHARE * away_m)
 
 

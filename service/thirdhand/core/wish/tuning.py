@@ -9,11 +9,14 @@ class WishTuning(NamedTuple):
     """Tuned numbers of stage 2 where a policy leads."""
 
     # 10 to 40. More: chunks are joined sooner, and a policy is answered sooner. Less: less jerk.
-    fade_rate: float = 20.0  # [1/s] at which the offset between two chunks fades out
+    fade_rate_per_s: float = 20.0  # [1/s] at which the offset between two chunks fades out
     # 0 to 0.3. More: a late chunk is bridged. Less: the tool rests sooner where none comes.
     steady_s: float = 0.1  # time over which the path goes on after its end, at its velocity there
 
 
+RETAINED = 12  # poses before now, from which a velocity is estimated
+# largest speed of an offset d that fades out at the rate w from rest is this times |d| w: 2 / e²
+FADING_SHARE = 0.2706705664732254
 NEAREST_S = 0.01  # of wishes due closer together than this only the newest is kept
 LEAP_M = 0.25  # a wish farther from the path than this is another task's, or a mistake
 LEAP_MPS = 0.5  # and by this for each second in which no wish was due

@@ -36,8 +36,8 @@ from thirdhand.workbench.learning.picture import draw
 from thirdhand.workbench.learning.records import Evidence, Figures
 from thirdhand.workbench.learning.table import table
 from thirdhand.workbench.learning.takes import check_count
-from thirdhand.workbench.learning.wishes import calibrated_wishes
 from thirdhand.workbench.takes.demonstration_reader import hand_samples, read_demonstration
+from thirdhand.workbench.takes.led_wishes import calibrated_wishes
 from thirdhand.workbench.takes.pose_streams import TRACK_NAMES, PoseTopic
 
 # options of `learn` that wishes have no use for

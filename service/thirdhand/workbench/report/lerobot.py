@@ -26,7 +26,7 @@ FEATURES = ("observation.state", "observation.environment_state", "action")
 HAND_FEATURES = [f"{side}_{axis}" for side in ("left", "right") for axis in "xyz"]
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-CLOSURE = "action.gripper"
+CLOSURE_COLUMN = "action.gripper"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 Episode = dict[str, NDArray[np.float32 | np.int64]]
 
@@ -76,7 +76,7 @@ def episodes(found: Columns, *, fps: int) -> Iterator[Episode]:
             part: Episode = {
                 name: value.astype(np.float32) for name, value in zip(FEATURES, values, strict=True)
             }
-            part[CLOSURE] = frames["closure"][rows].astype(np.float32)
+            part[CLOSURE_COLUMN] = frames["closure"][rows].astype(np.float32)
             part["observation.segment"] = np.where(
                 frames["segment_belief"][rows] > 0, frames["segment"][rows], -1
             )
@@ -184,11 +184,11 @@ def write(recordings: Sequence[Columns], folder: Path, *, fps: int, task: str) -
 
 def _take_constant_closure(parts: Sequence[Episode]) -> float | None:
     """Remove the closure from all episodes if it is one value; that value, None if it changes."""
-    values = np.unique(np.concatenate([part[CLOSURE] for part in parts]))
+    values = np.unique(np.concatenate([part[CLOSURE_COLUMN] for part in parts]))
     if len(values) > 1:
         return None
     for part in parts:
-        del part[CLOSURE]
+        del part[CLOSURE_COLUMN]
     return float(values[0])
 
 
