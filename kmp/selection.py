@@ -19,6 +19,7 @@ from kmp.criteria.cross_validation import preferred, rms
 from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
 from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians
 from kmp.kernel import GaussianKernel, Kernel
 from kmp.mixture import GaussianMixture, mixture_of
 from kmp.primitive import KMP
@@ -64,6 +65,7 @@ class Learned(Immutable):
 
     primitive: KMP
     mixture: GaussianMixture
+    """Of inputs and outputs, each column over its deviation in the demonstrations."""
     scores: tuple[Score, ...]
     """The best first."""
     regression_rmse: float
@@ -119,25 +121,34 @@ class _Recipe:
     count: int
     regularization: float
     channels: int
+    unit: Array
+    """Of each column (I + O,) in the mixture: its deviation."""
 
     def mixture(
         self, data: Sequence[tuple[Array, Array]], start: GaussianMixture | None = None
     ) -> GaussianMixture:
         """The mixture of all samples; EM begins at `start`, the mixture of a few more samples, if
         given.
+
+        Its columns are over `unit`, so that the regularization is a share of each variance.
         """
-        try:
-            return mixture_of(
-                np.concatenate([np.hstack(pair) for pair in data]),
-                components=self.components,
-                seed=self.seed,
-                regularization=self.regularization,
-                start=start,
-            )
-        except ValueError as error:
-            if "singular" in str(error):
-                _check_scale(data, self.regularization, is_singular=True)
-            raise
+        return mixture_of(
+            np.concatenate([np.hstack(pair) for pair in data]) / self.unit,
+            components=self.components,
+            seed=self.seed,
+            regularization=self.regularization,
+            start=start,
+        )
+
+    def regressed(self, mixture: GaussianMixture, inputs: Array) -> Gaussians:
+        """The regression of a mixture at inputs (N, I), in the units of the outputs."""
+        dimensions = inputs.shape[1]
+        output_unit = self.unit[dimensions:]
+        found = mixture.regress(inputs / self.unit[:dimensions])
+        return Gaussians(
+            found.mean * output_unit,
+            found.covariance * np.multiply.outer(output_unit, output_unit),
+        )
 
     def reference(
         self, data: Sequence[tuple[Array, Array]], mixture: GaussianMixture, shown: bool
@@ -151,8 +162,10 @@ class _Recipe:
         elif samples.shape[1] == 1:
             inputs = np.linspace(samples.min(), samples.max(), self.count)[:, None]
         else:
-            inputs = mixture.sample_inputs(self.count, dimensions=samples.shape[1], seed=self.seed)
-        reference = mixture.regress(inputs)
+            dimensions = samples.shape[1]
+            drawn = mixture.sample_inputs(self.count, dimensions=dimensions, seed=self.seed)
+            inputs = drawn * self.unit[:dimensions]
+        reference = self.regressed(mixture, inputs)
         prior = reference.mean.mean(axis=0)
         prior[len(prior) // self.channels :] = 0
         nothing = np.empty((0, 0))
@@ -175,7 +188,9 @@ class _Recipe:
         indices = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
         inputs = data[h][0][indices]
         outputs = data[h][1][indices]
-        miss = (mixture.regress(inputs).mean - outputs)[:, : outputs.shape[1] // self.channels]
+        miss = (self.regressed(mixture, inputs).mean - outputs)[
+            :, : outputs.shape[1] // self.channels
+        ]
         return Fold(
             training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss)
         )
@@ -227,8 +242,8 @@ def learn(
     """The primitive of demonstrations, each inputs (T, I) and outputs (T, O), and its scores.
 
     The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs, and
-    the primitive, whose mean returns to the reference's. `regularization` [unit^2] is that of
-    `GaussianMixture.fit`.
+    the primitive, whose mean returns to the reference's. `regularization` is that of
+    `GaussianMixture.fit`, as a share of the variance of each input and output.
 
     `points`: the inputs are "drawn" from the marginal as in the paper (evenly spaced over time,
     where I is 1), or "shown", the demonstrations' own. "auto": drawn where I is 1; else those
@@ -249,8 +264,8 @@ def learn(
     follows the data's units.
 
     Raises ValueError if shapes do not agree, a number is not finite, a parameter is out of its
-    range, the unit or origin of the inputs does not suit the regularization, or there are too few
-    samples for the components, or demonstrations for a choice.
+    range, the inputs are too far from 0 for their deviation, or there are too few samples for the
+    components, or demonstrations for a choice.
     """
     data = checked_demonstrations(demonstrations)
     for name, value in (("lambda_mean", lambda_mean), ("lambda_covariance", lambda_covariance)):
@@ -265,9 +280,11 @@ def learn(
         checked_kernel(kernel).check(data[0][0].shape[1], data[0][1].shape[1])
     elif velocity:
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
-    recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1)
+    deviation = np.concatenate([np.hstack(pair) for pair in data]).std(axis=0)
+    unit = np.where(deviation > 0, deviation, 1.0)  # of a column that never changes
+    recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1, unit)
     mixture = recipe.mixture(data)
-    _check_scale(data, regularization)
+    _check_precision(data)
     is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
     plain = np.nan
@@ -310,31 +327,18 @@ def learn(
     )
 
 
-def _check_scale(
-    data: Sequence[tuple[Array, Array]], regularization: float, *, is_singular: bool = False
-) -> None:
-    """Raise ValueError for inputs that vary too little for the regularization [unit^2], or for the
-    precision of numbers of their size; and if a mixture is singular, for those that vary too much.
+def _check_precision(data: Sequence[tuple[Array, Array]]) -> None:
+    """Raise ValueError for inputs that vary too little for the precision of numbers of their
+    size.
     """
     inputs = np.concatenate([s for s, _ in data])
     widest = int(inputs.std(axis=0).argmax())
     deviation = float(inputs[:, widest].std())
     largest = float(np.abs(inputs[:, widest]).max())
-    coarse = float(np.spacing(largest)) / _COARSEST
-    least = float(np.sqrt(regularization))
-    varies = f"demonstrations: the inputs deviate by {deviation:.3g} from their mean"
-    if deviation < coarse and coarse > least:
+    if deviation < float(np.spacing(largest)) / _COARSEST:
         raise ValueError(
-            f"{varies}, which is too little at {largest:.3g}: subtract the begin of each "
-            "demonstration."
-        )
-    if 0.0 < deviation < least:
-        needed = f"at least {least:.3g}, the root of the regularization, needed"
-        raise ValueError(f"{varies}, {needed}: give them in a smaller unit.")
-    if is_singular and np.finfo(float).eps * deviation**2 > regularization:
-        raise ValueError(
-            f"{varies}, too much for a regularization of {regularization:g}: give seconds, not "
-            "nanoseconds."
+            f"demonstrations: the inputs deviate by {deviation:.3g} from their mean, which is too "
+            f"little at {largest:.3g}: subtract the begin of each demonstration."
         )
 
 
