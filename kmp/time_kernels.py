@@ -7,20 +7,22 @@ of two points: d/dx is d/dr, and d/dx' is -d/dr.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import ClassVar
 
 import numpy as np
 
 from kmp.arrays.checks import Array, positive
 from kmp.arrays.immutable import Immutable, frozen
+from kmp.composition import Composable
 from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
 
 
 @dataclass(frozen=True)
-class _OneInput(Immutable):
+class _OneInput(Composable, Immutable):
     """A kernel of one input, defined by its blocks' derivatives with respect to r = x - x'."""
 
     channels: ClassVar[int] = 1
@@ -210,3 +212,14 @@ class PeriodicKernel(_OneInput):
         else:
             factor = c * sine * (3 * c * cosine + 1 - c * c * sine * sine)
         return np.asarray((factor * values)[..., None, None])
+
+    def derivative(self, offsets: Array, directions: Sequence[Array]) -> Array:
+        """As `RadialKernel.derivative`."""
+        scale, stretch = self.coordinates(1)
+        r = offsets * stretch
+        blocks = self.blocks(r[:, 0], self.values(r, scale), scale, len(directions))
+        return np.asarray(
+            reduce(
+                np.multiply, [(along * stretch)[..., 0] for along in directions], blocks[:, 0, 0]
+            )
+        )
