@@ -1,78 +1,74 @@
-"""Sums and products of kernels. Rasmussen and Williams 2006, section 4.2.4.
-
-The product rule: D_u (k k') = D_u k k' + k D_u k', and so on for each further direction.
-"""
+"""Sums and products of kernels, which are kernels. Rasmussen and Williams 2006, section 4.2.4."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from itertools import compress, product
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from kmp.arrays.checks import Array, positive
 from kmp.arrays.immutable import Immutable, frozen
-from kmp.kernel import (
-    Kernel,
-    checked_kernel,
-    derivative,
-    directed,
-    missing_members,
-    unstretched,
-)
+from kmp.kernel import Kernel, checked_kernel, third_derivative
 
 
-class Composable:
-    """The operators of kernels: `a + b`, `a * b` and `0.5 * a`."""
+class Composable(Immutable):
+    """The operators of kernels: `a + b`, `a * b` and `0.5 * a`. The parts have one channel each."""
 
     __array_ufunc__ = None  # np.float64(0.5) * kernel is computed by __rmul__
 
-    def __add__(self: Kernel, other: Kernel) -> SumKernel:
-        if missing_members(other):
-            return NotImplemented
-        (parts, factors), (others, other_factors) = _terms(self), _terms(other)
-        return SumKernel(parts + others, factors + other_factors)
+    channels: ClassVar[int] = 1
 
-    def __mul__(self: Kernel, other: Kernel | float) -> SumKernel | ProductKernel:
-        if isinstance(other, (int, float, np.number)):
-            factor = positive("factor of a kernel", other)
-            parts, factors = _terms(self)
-            return SumKernel(parts, tuple(factor * each for each in factors))
-        return NotImplemented if missing_members(other) else ProductKernel((self, other))
+    def __add__(self: Any, other: Kernel) -> SumKernel:
+        return SumKernel(*zip(*_terms(self), *_terms(other), strict=True))
 
-    def __rmul__(self: Kernel, other: float) -> SumKernel | ProductKernel:
-        return Composable.__mul__(self, other)
+    def __mul__(self: Any, other: Kernel | float) -> SumKernel | ProductKernel:
+        if not isinstance(other, (int, float, np.number)):
+            return ProductKernel((self, other))
+        factor = positive("factor of a kernel", other)
+        return SumKernel(*zip(*((part, factor * c) for part, c in _terms(self)), strict=True))
+
+    __rmul__ = __mul__
+
+    @cached_property
+    def prior_variance(self: Any) -> Array:
+        """k(s, s) (1, 1)."""
+        origin = np.zeros((1, np.size(self.ell)))
+        return frozen(self(origin, origin))
+
+    def variances(self: Any, along: Array) -> Array:
+        """k (N, 1) of N functionals with themselves; zero for a value."""
+        axes = np.eye(along.shape[1])
+        across = self(0 * axes, 0 * axes, axes, axes)  # (I, I)
+        squares = np.vecdot(along @ across, along)[:, None]
+        return np.asarray(np.where(along.any(axis=1, keepdims=True), squares, self.prior_variance))
 
 
 @dataclass(frozen=True, repr=False)
-class _Composite(Composable, Immutable):
-    """A kernel made of others, each of one channel."""
+class _Composite(Composable):
+    """A kernel made of others."""
 
-    channels: ClassVar[int] = 1
     parts: tuple[Kernel, ...]
 
     def __post_init__(self) -> None:
         for part in self.parts:
             if checked_kernel(part).channels > 1:
                 raise ValueError(
-                    f"kernel: {part} has rates among its outputs, so it cannot be a part of a sum "
-                    "or product. Give kernels of values, and `directions` for rates."
+                    f"kernel: {part} has rates, and no sum or product: give kernels of values."
                 )
+
+    @property
+    def ell(self) -> float | Array:
+        """The sum of the parts': that of a product of Gaussian kernels, a bound for others."""
+        return reduce(np.add, [part.ell for part in self.parts])
 
     @property
     def period(self) -> float | None:
         """The period that all parts have; None if they differ."""
         periods = {part.period for part in self.parts}
         return periods.pop() if len(periods) == 1 else None
-
-    @property
-    @abstractmethod
-    def ell(self) -> float | Array:
-        """The parameter of the sharpest part of a sum, or the sum over a product's parts."""
 
     def check(self, inputs: int, outputs: int) -> None:
         """Raise ValueError unless the inputs and outputs fit each part."""
@@ -86,39 +82,20 @@ class SumKernel(_Composite):
 
     factors: tuple[float, ...]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for factor in self.factors:
-            positive("factor of a kernel", factor)
-
     def __repr__(self) -> str:
-        terms = zip(self.factors, self.parts, strict=True)
-        return " + ".join(
-            f"{factor!r} * {part}" if factor != 1 else f"{part}" for factor, part in terms
-        )
-
-    @property
-    def ell(self) -> float | Array:
-        return reduce(np.maximum, [part.ell for part in self.parts])
-
-    @cached_property
-    def prior_variance(self) -> Array:
-        return frozen(self._sum(part.prior_variance for part in self.parts))
+        return " + ".join(f"{part}" if c == 1 else f"{c!r} * {part}" for part, c in _terms(self))
 
     def __call__(
         self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
     ) -> Array:
         return self._sum(part(a, b, along_a, along_b) for part in self.parts)
 
-    def variances(self, along: Array) -> Array:
-        return self._sum(part.variances(along) for part in self.parts)
-
-    def derivative(self, offsets: Array, directions: tuple[Array, ...]) -> Array:
-        return self._sum(derivative(part, offsets, directions) for part in self.parts)
+    def third(self, offsets: Array, along: Array, direction: Array) -> Array:
+        """As `third_derivative`."""
+        return self._sum(third_derivative(part, offsets, along, direction) for part in self.parts)
 
     def _sum(self, values: Iterable[Array]) -> Array:
-        terms = (factor * value for factor, value in zip(self.factors, values, strict=True))
-        return reduce(np.add, terms)
+        return reduce(np.add, map(np.multiply, self.factors, values))
 
 
 @dataclass(frozen=True, repr=False)
@@ -126,57 +103,34 @@ class ProductKernel(_Composite):
     """The product of two kernels: k(s, s') k'(s, s')."""
 
     def __repr__(self) -> str:
-        return " * ".join(
-            f"({part})" if isinstance(part, SumKernel) else f"{part}" for part in self.parts
-        )
-
-    @property
-    def ell(self) -> float | Array:
-        first, second = self.parts
-        return first.ell + second.ell
-
-    @cached_property
-    def prior_variance(self) -> Array:
-        first, second = self.parts
-        return frozen(first.prior_variance * second.prior_variance)
+        return " * ".join(f"({part})" if "+" in f"{part}" else f"{part}" for part in self.parts)
 
     def __call__(
         self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
     ) -> Array:
-        first, second = (part(a, b) for part in self.parts)
-        k = first * second
+        (value, by_a, by_b, by_both), (value_2, by_a_2, by_b_2, by_both_2) = (
+            (
+                part(a, b),
+                part(a, b, along_a),
+                part(a, b, None, along_b),
+                part(a, b, along_a, along_b),
+            )
+            for part in self.parts
+        )
         if along_a is None and along_b is None:
-            return k
-        i, u = directed(along_a, unstretched(a.shape[1]))
-        j, v = directed(along_b, unstretched(a.shape[1]))
-        both = np.ix_(i, j)
-        by_a = [part(a[i], b, u) for part in self.parts]
-        by_b = [part(a, b[j], None, v) for part in self.parts]
-        by_both = [part(a[i], b[j], u, v) for part in self.parts]
-        mixed = by_both[0] * second[both] + first[both] * by_both[1]
-        mixed += by_a[0][:, j] * by_b[1][i] + by_b[0][i] * by_a[1][:, j]
-        k[i] = by_a[0] * second[i] + first[i] * by_a[1]
-        k[:, j] = by_b[0] * second[:, j] + first[:, j] * by_b[1]
-        k[both] = mixed
-        return k
-
-    def variances(self, along: Array) -> Array:
-        first, second = (part.variances(along) for part in self.parts)
-        first_value, second_value = (part.prior_variance[0] for part in self.parts)
-        of_derivatives = first * second_value + first_value * second
-        return np.where(along.any(axis=1, keepdims=True), of_derivatives, first * second)
-
-    def derivative(self, offsets: Array, directions: tuple[Array, ...]) -> Array:
-        """The sum over all ways to share the directions between the two kernels."""
-        first, second = self.parts
-        total = np.zeros(len(offsets))
-        for shares in product((True, False), repeat=len(directions)):
-            of_first = tuple(compress(directions, shares))
-            of_second = tuple(compress(directions, np.logical_not(shares)))
-            total += derivative(first, offsets, of_first) * derivative(second, offsets, of_second)
-        return total
+            return value * value_2
+        total = by_both * value_2 + by_a * by_b_2 + by_b * by_a_2 + value * by_both_2
+        # a point that is a value is derived nowhere: each term is there twice
+        return total / (_copies(along_a, a)[:, None] * _copies(along_b, b))
 
 
-def _terms(kernel: Kernel) -> tuple[tuple[Kernel, ...], tuple[float, ...]]:
+def _copies(along: Array | None, points: Array) -> Array:
+    """1 for each point (A,) that is a derivative, 2 for a value."""
+    return np.where(np.zeros(len(points)) if along is None else along.any(axis=1), 1.0, 2.0)
+
+
+def _terms(kernel: Kernel) -> list[tuple[Kernel, float]]:
     """The parts and factors of a sum; a kernel of another kind is its only part."""
-    return (kernel.parts, kernel.factors) if isinstance(kernel, SumKernel) else ((kernel,), (1.0,))
+    if isinstance(kernel, SumKernel):
+        return list(zip(kernel.parts, kernel.factors, strict=True))
+    return [(kernel, 1.0)]

@@ -9,21 +9,20 @@ derivative along a direction: its row is the kernel derived.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array, brief
 from kmp.arrays.immutable import frozen
-from kmp.functionals import Derivatives, Functionals
+from kmp.functionals import Functionals
 
 
 class Kernel(Protocol):
     """The members that a primitive uses, of a function of s - s'. I inputs, C channels.
 
-    `RadialKernel` has them all but f(u). A kernel that is not radial gives them itself; for a
-    curvature where derivatives are observed, it also needs `RadialKernel.derivative`.
+    `RadialKernel` has them all but f(u). A kernel that is not radial gives them itself.
     """
 
     @property
@@ -58,82 +57,31 @@ class Kernel(Protocol):
         """k (N, C) of N functionals with themselves, for directions (N, I); zero for a value."""
 
 
-class OneQueryKernel(Kernel, Protocol):
-    """A kernel with formulas of its own for one query s, where microseconds count.
-
-    They are functions of arrays in the coordinates x = stretch * s, in which one scale holds for
-    all inputs: the offsets x - x_r (R, I) from R centres, the values k (R,), and the centres that
-    are derivatives. The weights are of D outputs a channel.
-    """
-
-    def coordinates(self, inputs: int) -> tuple[float, Array]:
-        """The scale, and the stretch (I,) of the inputs."""
-
-    @staticmethod
-    def values(offsets: Array, scale: float) -> Array:
-        """k (R,) of the offsets, as if all centres were values."""
-
-    @staticmethod
-    def row(
-        offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None
-    ) -> Array:
-        """k(s, s_r): (R,) if C is 1, else (C, R C)."""
-
-    @staticmethod
-    def jacobian(
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weight_rows: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        """d/dx sum_r k(s, s_r) w_r (O, I), of weights w as rows (D, R C)."""
-
-    @staticmethod
-    def curvature(
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weights: Array,
-        direction: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        """d^2/dt^2 of that sum (O,) at x + t v for t = 0, of v (I,) and weights (R C, D)."""
-
-
 _MEMBERS = ("ell", "channels", "period", "prior_variance", "check", "__call__", "variances")
-
-
-def missing_members(kernel: object) -> list[str]:
-    """The members of `Kernel` that a value lacks."""
-    return [name for name in _MEMBERS if isinstance(kernel, type) or not hasattr(kernel, name)]
 
 
 def checked_kernel(kernel: Kernel) -> Kernel:
     """The kernel. Raises ValueError unless it is a `Kernel`."""
-    missing = missing_members(kernel)
-    if "prior_variance" in missing:
+    lacks = [name for name in _MEMBERS if isinstance(kernel, type) or not hasattr(kernel, name)]
+    if lacks:
         raise ValueError(
-            f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one."
-        )
-    if missing:
-        raise ValueError(
-            f"kernel: {brief(kernel)} lacks {', '.join(missing)}. Derive it from RadialKernel."
+            f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one. "
+            f"It lacks {', '.join(lacks)}, which RadialKernel has."
         )
     return kernel
 
 
-def derivative(kernel: Kernel, offsets: Array, directions: tuple[Array, ...]) -> Array:
-    """The derivative (R,) of k by s along up to three directions (R, I) or (I,).
+def third_derivative(kernel: Any, offsets: Array, along: Array, direction: Array) -> Array:
+    """The derivative (R,) of k by s, once along (R, I) and twice along one direction (I,).
 
-    `offsets` (R, I) are s - s'. Raises ValueError if the kernel has no such derivatives.
+    `offsets` (R, I) are s - s'. Raises ValueError if the kernel has no such derivative.
     """
-    if not hasattr(kernel, "derivative"):
+    if not hasattr(kernel, "third"):
         raise ValueError(
-            f"kernel: {brief(kernel)} has no method `derivative`, which curvatures need where "
+            f"kernel: {brief(kernel)} has no method `third`, which curvatures need where "
             "derivatives are observed."
         )
-    return np.asarray(cast(Any, kernel).derivative(offsets, directions))
+    return np.asarray(kernel.third(offsets, along, direction))
 
 
 def between(kernel: Kernel, a: Functionals, b: Functionals) -> Array:

@@ -21,7 +21,7 @@ from kmp.constraints import Constrained, LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
-from kmp.kernel import Kernel, missing_members
+from kmp.kernel import Kernel
 from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP
@@ -104,11 +104,7 @@ def from_arrays(
     is unknown, or the arrays do not belong together.
     """
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
-    if kernels is not None:
-        check_kind("kernels", kernels, Mapping, 'classes by their names, {"Cauchy": Cauchy}')
-        for name, kind in kernels.items():
-            if not (isinstance(kind, type) and is_dataclass(kind)):
-                raise ValueError(f"kernels: {brief(kind)} given for {name}, a dataclass needed.")
+    check_kind("kernels", kernels or {}, Mapping, '{"Cauchy": Cauchy}')
     kinds = {**(kernels or {}), **_KINDS}
     return _value(arrays, "", kinds) if KIND in arrays else _primitive(arrays, kinds)
 
@@ -265,10 +261,10 @@ def _kernel(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Ker
 
 def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
     kind = type(value).__name__
-    if _KINDS.get(kind) is not type(value) and not missing_members(value):
+    if _KINDS.get(kind) is not type(value):
+        if not hasattr(value, "prior_variance"):
+            raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
         _check_restorable(value)
-    elif _KINDS.get(kind) is not type(value):
-        raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
     arrays = {prefix + KIND: np.array(kind)}
     if isinstance(value, KMP):
         return arrays | {prefix + name: array for name, array in _of_primitive(value).items()}
@@ -280,14 +276,13 @@ def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
 def _check_restorable(kernel: object) -> None:
     """Raise ValueError unless a user's kernel can be made again of its name and fields."""
     kind = type(kernel)
-    names = _fields(kind) if is_dataclass(kind) else ()
+    names = _fields(kind)
     # a cached property is an attribute of the class, too
-    others = [name for name in vars(kernel) if name not in names and not hasattr(kind, name)]
-    if not names or others or kind.__name__ in _KINDS:
+    hidden = [name for name in vars(kernel) if name not in names and not hasattr(kind, name)]
+    if not names or hidden or kind.__name__ in _KINDS:
         raise ValueError(
-            f"kernel: {kind.__name__} given, which no file restores. Derive it from RadialKernel, "
-            "with a name that kmp has not, and a dataclass field for each parameter besides ell"
-            + (f": {', '.join(others)}." if others else ".")
+            f"kernel: no file restores {kind.__name__}. Derive it from RadialKernel, by a new name, "
+            f"with a dataclass field for each of {', '.join(hidden or names)}."
         )
 
 
@@ -303,18 +298,18 @@ def _value(arrays: Mapping[str, NDArray[Any]], prefix: str, kinds: Mapping[str, 
         return _primitive(
             {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}, kinds
         )
-    names = _fields(kind)
-    stored = {key.removeprefix(prefix).split(".")[0] for key in arrays if key.startswith(prefix)}
-    if prefix.startswith(_KERNEL) and stored != {KIND, *names}:
-        raise ValueError(
-            f"{prefix}{KIND}: the file has {', '.join(sorted(stored - {KIND}))} of {name:.60}, and "
-            f"the class needs {', '.join(names)}."
-        )
-    return kind(**{name: _field(arrays, prefix + name, kinds) for name in names})
+    names = set(_fields(kind))
+    if prefix.startswith(_KERNEL):  # all that is stored, so that no parameter is lost
+        names = {key[len(prefix) :].split(".")[0] for key in arrays if key.startswith(prefix)}
+    return kind(**{name: _field(arrays, prefix + name, kinds) for name in names - {KIND}})
 
 
 def _fields(kind: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else kind._fields
+    return (
+        tuple(field.name for field in fields(kind))
+        if is_dataclass(kind)
+        else getattr(kind, "_fields", ())
+    )
 
 
 def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:

@@ -19,7 +19,7 @@ from kmp.arrays.checks import Array
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Derivatives, Functionals
-from kmp.kernel import OneQueryKernel, between, derivative, unstretched
+from kmp.kernel import between, third_derivative, unstretched
 from kmp.radial import GaussianKernel
 from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
@@ -56,7 +56,7 @@ class Query(Immutable):
     """The arrays of a solution for one query: R centres, C channels, D outputs a channel."""
 
     solution: Solution
-    kernel: OneQueryKernel
+    kernel: GaussianKernel | VelocityKernel | PeriodicKernel
     scale: float
     stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
     centres: Array  # (R, I), there
@@ -74,16 +74,13 @@ class Query(Immutable):
         """
         parameters = solution.hyperparameters
         centres = solution.centres
-        kernel = cast(OneQueryKernel, parameters.kernel)
-        if type(kernel) in (GaussianKernel, VelocityKernel, PeriodicKernel):
-            kind = cls
-            scale, stretch = kernel.coordinates(centres.shape[1])
-        else:  # a subclass may have other formulas than those for one query
-            kind = _GeneralQuery
-            scale = 1.0
-            stretch = unstretched(centres.shape[1])
+        kernel = cast(GaussianKernel, parameters.kernel)
+        inputs = centres.shape[1]
+        # a subclass may have other formulas than those for one query
+        is_general = type(kernel) not in (GaussianKernel, VelocityKernel, PeriodicKernel)
+        scale, stretch = (1.0, unstretched(inputs)) if is_general else kernel.coordinates(inputs)
         weights = solution.weights.reshape(-1, parameters.channel_outputs)
-        return kind(
+        return (_GeneralQuery if is_general else cls)(
             solution,
             kernel,
             scale,
@@ -214,6 +211,6 @@ class _GeneralQuery(Query):
         bend = -self.kernel(row.query[None], self.centres, velocity[None], along)
         if self.derivatives is not None:
             rows, observed = self.derivatives
-            directions = observed, velocity, velocity
-            bend[0, rows] = -derivative(self.kernel, row.offsets[rows], directions)
+            offsets = row.offsets[rows]
+            bend[0, rows] = -third_derivative(self.kernel, offsets, observed, velocity)
         return np.asarray(bend @ self.weights).ravel()

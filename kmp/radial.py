@@ -1,24 +1,20 @@
 """Radial kernels k(s, s') = f(u) of u = sum_i ell_i (s_i - s'_i)^2: Gaussian, Matern, a user's own.
 
-By the chain rule, with the derivatives u_a of u along directions, D_a k = f' u_a, D_ab k = f'' u_a
-u_b + f' u_ab and D_abc k = f''' u_a u_b u_c + f'' (u_ab u_c + u_ac u_b + u_bc u_a). In the
-coordinates x = stretch * s with r = x - x', u is scale |r|^2.
+By the chain rule, with the derivatives u_a of u along directions: D_a k = f' u_a, D_ab k = f'' u_a
+u_b + f' u_ab, and D_abb k = f''' u_a u_b^2 + f'' (2 u_ab u_b + u_bb u_a). In the coordinates x =
+stretch * s, u is scale |x - x'|^2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
-from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from kmp.arrays.checks import Array, check_some, numbers, positive, real
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
 from kmp.composition import Composable
 from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
@@ -29,7 +25,7 @@ _LARGEST_ROOT = 1e3  # exp(-1000) is 0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RadialKernel(Composable, Immutable):
+class RadialKernel(Composable):
     """A kernel k(s, s') = f(u) of u = sum_i ell_i (s_i - s'_i)^2, given by f and its derivatives.
 
     A kernel of your own derives from this class, and gives f, f' and f'' of arrays of u:
@@ -58,7 +54,6 @@ class RadialKernel(Composable, Immutable):
     and above 0.
     """
 
-    channels: ClassVar[int] = 1
     period: ClassVar[None] = None
     ell: float | Array
 
@@ -85,30 +80,25 @@ class RadialKernel(Composable, Immutable):
 
     def profile(self, u: Array) -> Array:
         """f(u), of the shape of u."""
-        raise self._lacking("profile", "every prediction needs")
+        raise self._lacking("profile")
 
     def first_derivative(self, u: Array) -> Array:
         """df/du."""
-        raise self._lacking("first_derivative", "Jacobians and observed derivatives need")
+        raise self._lacking("first_derivative")
 
     def second_derivative(self, u: Array) -> Array:
         """d^2 f/du^2."""
-        raise self._lacking("second_derivative", "curvatures and observed derivatives need")
+        raise self._lacking("second_derivative")
 
     def third_derivative(self, u: Array) -> Array:
         """d^3 f/du^3."""
-        raise self._lacking("third_derivative", "curvatures need where derivatives are observed")
+        raise self._lacking("third_derivative")
 
-    def _lacking(self, name: str, use: str) -> ValueError:
+    def _lacking(self, name: str) -> ValueError:
         return ValueError(
-            f"kernel: {self} has no {name}, which {use}. Define it, or take a smoother kernel, "
-            "such as GaussianKernel."
+            f"kernel: {self} has no {name}, which this needs. Define it, or take a smoother "
+            "kernel, such as GaussianKernel."
         )
-
-    @cached_property
-    def prior_variance(self) -> Array:
-        origin = np.zeros((1, np.size(self.ell)))
-        return frozen(self(origin, origin))
 
     def check(self, inputs: int, outputs: int) -> None:
         """Raise ValueError unless there is one ell for each input, or one for all."""
@@ -127,81 +117,52 @@ class RadialKernel(Composable, Immutable):
         self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
     ) -> Array:
         scale, stretch = self.coordinates(a.shape[1])
-        u = frozen(scale * cdist(a * stretch, b * stretch, "sqeuclidean"))
+        x = a * stretch
+        y = b * stretch
+        u = frozen(scale * cdist(x, y, "sqeuclidean"))
         k = self.profile(u)
         if along_a is None and along_b is None:
             return k
-        i, j, left, right, across = self._slopes(a, b, along_a, along_b)
-        k[i] = self._chain(u[i], [-left])
-        k[:, j] = self._chain(u[:, j], [-right])
-        if len(i) and len(j):
-            both = np.ix_(i, j)
-            k[both] = self._chain(u[both], [left[:, j], right[i]], [-across])
-        return k
-
-    def _slopes(
-        self, a: Array, b: Array, along_a: Array | None, along_b: Array | None
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
-        """Indices (A',) and (B',) of the derivatives, and derivatives of -u.
-
-        These are by a (A', B), by b (A, B'), and by both (A', B').
-        """
-        scale, stretch = self.coordinates(a.shape[1])
-        x = a * stretch
-        y = b * stretch
-        i, along_x = directed(along_a, stretch)
-        j, along_y = directed(along_b, stretch)
+        i, v = directed(along_a, stretch)
+        j, w = directed(along_b, stretch)
         # a shift to the first point, as differences of small numbers round less
         origin = y[:1].sum(axis=0)
         x = x - origin
         y = y - origin
-        left = 2 * scale * (along_x @ y.T - np.vecdot(x[i], along_x)[:, None])
-        right = 2 * scale * (x @ along_y.T - np.vecdot(y[j], along_y))
-        return i, j, left, right, 2 * scale * (along_x @ along_y.T)
+        # the derivatives of -u by a (A', B), by b (A, B'), and by both
+        left = 2 * scale * (v @ y.T - np.vecdot(x[i], v)[:, None])
+        right = 2 * scale * (x @ w.T - np.vecdot(y[j], w))
+        both = np.ix_(i, j)
+        mixed = k[both]
+        if mixed.size:
+            across = 2 * scale * (v @ w.T)
+            mixed = self._derived(u[both], mixed, left[:, j] * right[i], across)
+        k[i] = self._derived(u[i], k[i], left)
+        k[:, j] = self._derived(u[:, j], k[:, j], right)
+        k[both] = mixed
+        return k
 
-    def variances(self, along: Array) -> Array:
-        inputs = along.shape[1]
-        axes = np.eye(inputs)
-        origin = np.zeros((inputs, inputs))
-        across = self(origin, origin, axes, axes)  # (I, I)
-        if not np.isfinite(across).all():
-            raise ValueError(
-                f"kernel: {self} has no finite first_derivative at 0, so that its functions have no "
-                "derivatives. Take a smoother kernel, such as Matern32."
-            )
-        squares = np.vecdot(along @ across, along)[:, None]
-        return np.where(along.any(axis=1, keepdims=True), squares, self.prior_variance)
-
-    def derivative(self, offsets: Array, directions: Sequence[Array]) -> Array:
-        """The derivative (R,) of k by s along up to three directions (R, I) or (I,).
-
-        `offsets` (R, I) are s - s'.
-        """
-        if type(self).__call__ not in (RadialKernel.__call__, GaussianKernel.__call__):
-            raise ValueError(f"kernel: {self} overrides __call__: override `derivative`, too.")
-        scale, stretch = self.coordinates(offsets.shape[1])
-        r = offsets * stretch
-        u = scale * np.vecdot(r, r)
-        if not directions:
-            return self.profile(u)
-        along = [direction * stretch for direction in directions]
-        slopes = [2 * scale * np.vecdot(r, direction) for direction in along]
-        bends = [2 * scale * np.vecdot(*pair) for pair in combinations(along, 2)]
-        return self._chain(u, slopes, bends)
-
-    def _chain(self, u: Array, slopes: Sequence[Array], bends: Sequence[Array] = ()) -> Array:
-        """The derivative of f(u), by the first derivatives of u and the second of each pair."""
+    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
+        """D_a k, by the slope -u_a; with -u_ab given, D_ab k by the slope u_a u_b. k is f(u)."""
         above_0 = np.maximum(u, _LEAST_U)
-        a, *more = slopes
-        if not more:
-            return self.first_derivative(above_0) * a
-        b, *more = more
-        second = self.second_derivative(above_0)
-        if not more:
-            return second * a * b + self.first_derivative(u) * bends[0]
-        [c] = more
-        ab, ac, bc = bends
-        return self.third_derivative(above_0) * a * b * c + second * (ab * c + ac * b + bc * a)
+        if across is None:
+            return -self.first_derivative(above_0) * slope
+        return self.second_derivative(above_0) * slope - self.first_derivative(u) * across
+
+    def third(self, offsets: Array, along: Array, direction: Array) -> Array:
+        """As `kmp.kernel.third_derivative`."""
+        if type(self).__call__ is not RadialKernel.__call__:
+            raise ValueError(f"kernel: {self} overrides __call__: override `third`, too.")
+        scale, stretch = self.coordinates(len(direction))
+        r = offsets * stretch
+        v = along * stretch
+        w = direction * stretch
+        u = np.maximum(scale * np.vecdot(r, r), _LEAST_U)
+        u_v, u_w, u_vw, u_ww = (
+            2 * scale * np.vecdot(*pair) for pair in ((r, v), (r, w), (v, w), (w, w))
+        )
+        second = self.second_derivative(u) * (2 * u_vw * u_w + u_ww * u_v)
+        return np.asarray(self.third_derivative(u) * u_v * u_w * u_w + second)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -213,33 +174,21 @@ class GaussianKernel(RadialKernel):
     """
 
     def profile(self, u: Array) -> Array:
-        return np.exp(-u)
+        minus = -u
+        return np.exp(minus, minus)
 
     def first_derivative(self, u: Array) -> Array:
-        return -np.exp(-u)
+        return -self.profile(u)
 
     def second_derivative(self, u: Array) -> Array:
-        return np.exp(-u)
+        return self.profile(u)
 
-    def third_derivative(self, u: Array) -> Array:
-        return -np.exp(-u)
+    third_derivative = first_derivative
 
-    def __call__(
-        self, a: Array, b: Array, along_a: Array | None = None, along_b: Array | None = None
-    ) -> Array:
-        if type(self) is not GaussianKernel:  # a subclass may have another profile
-            return super().__call__(a, b, along_a, along_b)
-        scale, stretch = self.coordinates(a.shape[1])
-        k = np.exp(-scale * cdist(a * stretch, b * stretch, "sqeuclidean"))
-        if along_a is None and along_b is None:
-            return k
-        i, j, left, right, across = self._slopes(a, b, along_a, along_b)
-        both = np.ix_(i, j)
-        mixed = k[both] * (left[:, j] * right[i] + across)
-        k[i] *= left
-        k[:, j] *= right
-        k[both] = mixed
-        return k
+    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
+        if type(self) is not GaussianKernel:
+            return super()._derived(u, k, slope, across)
+        return k * (slope if across is None else slope + across)
 
     def variances(self, along: Array) -> Array:
         if type(self) is not GaussianKernel:

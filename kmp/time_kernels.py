@@ -7,25 +7,23 @@ of two points: d/dx is d/dr, and d/dx' is -d/dr.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from kmp.arrays.checks import Array, positive
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
 from kmp.composition import Composable
 from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
 
 
 @dataclass(frozen=True)
-class _OneInput(Composable, Immutable):
+class _OneInput(Composable):
     """A kernel of one input, defined by its blocks' derivatives with respect to r = x - x'."""
 
-    channels: ClassVar[int] = 1
     ell: float
 
     @staticmethod
@@ -177,10 +175,6 @@ class PeriodicKernel(_OneInput):
     def __post_init__(self) -> None:
         self.__dict__.update(ell=positive("ell", self.ell), period=positive("period", self.period))
 
-    @cached_property
-    def prior_variance(self) -> Array:
-        return frozen(np.ones((1, 1)))
-
     def check(self, inputs: int, outputs: int) -> None:
         """Raise ValueError unless there is one input."""
         if inputs != 1:
@@ -212,14 +206,3 @@ class PeriodicKernel(_OneInput):
         else:
             factor = c * sine * (3 * c * cosine + 1 - c * c * sine * sine)
         return np.asarray((factor * values)[..., None, None])
-
-    def derivative(self, offsets: Array, directions: Sequence[Array]) -> Array:
-        """As `RadialKernel.derivative`."""
-        scale, stretch = self.coordinates(1)
-        r = offsets * stretch
-        blocks = self.blocks(r[:, 0], self.values(r, scale), scale, len(directions))
-        return np.asarray(
-            reduce(
-                np.multiply, [(along * stretch)[..., 0] for along in directions], blocks[:, 0, 0]
-            )
-        )
