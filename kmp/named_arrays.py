@@ -281,8 +281,8 @@ def _check_restorable(kernel: object) -> None:
     hidden = [name for name in vars(kernel) if name not in names and not hasattr(kind, name)]
     if not names or hidden or kind.__name__ in _KINDS:
         raise ValueError(
-            f"kernel: no file restores {kind.__name__}. Derive it from RadialKernel, by a new name, "
-            f"with a dataclass field for each of {', '.join(hidden or names)}."
+            f"kernel: no file restores {kind.__name__}. Derive it from RadialKernel, by a new "
+            f"name and with a dataclass field for each of {', '.join(hidden or names)}."
         )
 
 

@@ -159,7 +159,7 @@ def test_derivatives_equal_finite_differences(kernel, inputs):
     np.testing.assert_allclose(kernel(a, b, u)[0], by_a, atol=1e-4)
     np.testing.assert_allclose(kernel(b, a, None, u)[:, 0], by_a, atol=1e-4)
     across = differences(lambda x: kernel(x[None], b, None, v)[0], a[0]) @ u[0]
-    np.testing.assert_allclose(kernel(a, b, u, v)[0], across, atol=1e-3)
+    np.testing.assert_allclose(kernel(a, b, u, v)[0], across, atol=2e-3)
     at_a = kernel(a, a, u, u)
     np.testing.assert_allclose(kernel.variances(np.vstack([u, 0 * u]))[0], at_a[0])
     np.testing.assert_allclose(kernel.variances(0 * u), kernel.prior_variance)
@@ -173,9 +173,10 @@ def test_primitive_takes_any_kernel(kernel, inputs):
     """Each prediction is that of the kernel's matrix, and each derivative that of the mean."""
     skill = fitted(kernel, inputs)
     query = np.full(inputs, 0.41)
+    goal = query + 0.03  # elsewhere, as a Matern 3/2 has a kink there
     velocity = np.linspace(0.5, 1.0, inputs)
     through = skill.adapt(
-        [query, query + 0.1],
+        [goal, query + 0.1],
         Gaussians.of(np.zeros((2, 2)), deviation=0.01),
         directions=[velocity, 0 * velocity],
         tolerance=0.0,
@@ -196,7 +197,7 @@ def test_primitive_takes_any_kernel(kernel, inputs):
     motion = skill.predict_motion(query, velocity, velocity)
     np.testing.assert_allclose(skill.curvature(query, velocity), bend, atol=1e-4)
     np.testing.assert_allclose(motion.acceleration, motion.velocity + motion.curvature)
-    assert np.abs(through.jacobian(query) @ velocity).max() < 0.1
+    assert np.abs(through.jacobian(goal) @ velocity).max() < 0.1
     assert np.array_equal(skill.curvature(query, 0 * velocity), [0.0, 0.0])
     assert (np.linalg.eigvalsh(skill.uncertainty([query]).distance) > 0).all()
     assert skill.sample([query, query + 0.1], 2, seed=0).shape == (2, 2, 2)
