@@ -104,8 +104,9 @@ def from_arrays(
     is unknown, or the arrays do not belong together.
     """
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
-    check_kind("kernels", kernels or {}, Mapping, '{"Cauchy": Cauchy}')
-    kinds = {**(kernels or {}), **_KINDS}
+    kernels = {} if kernels is None else kernels
+    check_kind("kernels", kernels, Mapping, '{"Cauchy": Cauchy}')
+    kinds = {**kernels, **_KINDS}
     return _value(arrays, "", kinds) if KIND in arrays else _primitive(arrays, kinds)
 
 
