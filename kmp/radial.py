@@ -96,8 +96,8 @@ class RadialKernel(Composable):
 
     def _lacking(self, name: str) -> ValueError:
         return ValueError(
-            f"kernel: {self} has no {name}, which this needs. Define it, or take a smoother "
-            "kernel, such as GaussianKernel."
+            f"kernel: {self} has no {name}, needed here. Define it, or take a smoother kernel: "
+            "GaussianKernel."
         )
 
     def check(self, inputs: int, outputs: int) -> None:

@@ -378,7 +378,9 @@ def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
         return [value for value in objects if not isinstance(value, (str, bytes))], []
     if name == "value":
         return [*NO_NUMBERS, 1.0, True, S, [], [ONE], KMP], []
-    if name in {"arrays", "kernels"}:
+    if name == "kernels":
+        return [value for value in objects if not isinstance(value, dict)], []
+    if name == "arrays":
         return [*objects, [("ell", 1.0)]], []
     if name == "reward":
         bad = (None, "text", np.nan, np.inf, 1j, S, [1.0, 2.0], object())
