@@ -78,7 +78,7 @@ def third_derivative(kernel: Any, offsets: Array, along: Array, direction: Array
     """
     if not hasattr(kernel, "third"):
         raise ValueError(
-            f"kernel: {brief(kernel)} has no method `third`, which curvatures need where "
+            f"kernel: {brief(kernel)} has no `third`, which curvatures need where "
             "derivatives are observed."
         )
     return np.asarray(kernel.third(offsets, along, direction))

@@ -292,8 +292,8 @@ def _value(arrays: Mapping[str, NDArray[Any]], prefix: str, kinds: Mapping[str, 
     kind = kinds.get(name)
     if kind is None:
         raise ValueError(
-            f"{prefix}{KIND}: {name:.60} given, one of {', '.join(kinds)} needed. Load a kernel of "
-            f'your own with kernels={{"{name:.60}": its class}}.'
+            f"{prefix}{KIND}: {name:.60} given, one of {', '.join(kinds)} needed. Load your "
+            f'own kernel with kernels={{"{name:.60}": its class}}.'
         )
     if kind is KMP:
         return _primitive(

@@ -256,7 +256,7 @@ def test_what_a_kernel_lacks_is_refused_by_name():
         (Matern32(2.0), "Matern32.* has no third_derivative"),
         (RationalQuadratic(2.0), "RationalQuadratic.* has no third_derivative"),
         (Halved(2.0), "Halved.* overrides __call__: override `third`"),
-        (Matern52(2.0) * Matern52(1.0), "has no method `third`"),
+        (Matern52(2.0) * Matern52(1.0), "has no `third`"),
     ):
         skill = fitted(kernel, 2).adapt([[0.3, 0.3]], rest, **observed)
         with pytest.raises(ValueError, match=message):
