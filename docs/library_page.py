@@ -69,7 +69,16 @@ KMP_GROUPS = {
         "LocalKMP",
         "CoordinateFrame",
     ),
-    "Kernels and means": ("GaussianKernel", "PeriodicKernel", "VelocityKernel", "AffineMean"),
+    "Kernels and means": (
+        "GaussianKernel",
+        "Matern32",
+        "Matern52",
+        "PeriodicKernel",
+        "VelocityKernel",
+        "RadialKernel",
+        "Kernel",
+        "AffineMean",
+    ),
     "Beyond": ("LinearConstraints", "superposed", "Correlation", "improve", "Improvement"),
     "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
 }
@@ -89,7 +98,10 @@ CLIENT_GROUPS = {
     ),
 }
 VALUES = ("ViaPoint", "ViaPointInForce", "Reply")  # of thirdhand.contract.requests
-WITHOUT_METHODS = {"GaussianKernel", "PeriodicKernel", "VelocityKernel", "KMPRegressor"}
+WITHOUT_METHODS = {
+    *("GaussianKernel", "Matern32", "Matern52", "PeriodicKernel", "VelocityKernel"),
+    *("RadialKernel", "KMPRegressor"),
+}
 INSIDE = {"to_plot", "inner"}
 SAME = {"LocalKMP.plot": "KMP.plot"}  # members with the docstring of another one
 # errors of wrong shapes and of numbers that are not finite, or those of another member
@@ -101,7 +113,16 @@ PLAIN_ERROR = re.compile(
 )
 # values that a caller receives and does not construct
 RETURNED = {
-    *("KMP", "Learned", "Score", "MotionPrediction", "Uncertainty", "Improvement", "Stored"),
+    *(
+        "KMP",
+        "Kernel",
+        "Learned",
+        "Score",
+        "MotionPrediction",
+        "Uncertainty",
+        "Improvement",
+        "Stored",
+    ),
     *("Command", "Cell", "ViaPointInForce", "Reply"),
 }
 

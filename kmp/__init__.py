@@ -13,7 +13,8 @@ fitted weights.
 The method, in the order in which it computes:
 
 * `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
-* `kernel`, `time_kernels`: k between `functionals`, the values and derivatives of the output.
+* `kernel`: k between `functionals`, the values and derivatives of the output. `radial`,
+  `time_kernels`: the kernels; `composition`: sums and products of them.
 * `problem/`: the reference database with its via-points, and the hyper-parameters.
 * `solution`: the solved problem as a protocol. `dense` solves equation (9), `low_rank/` the cost
   (4) on features of the kernel; `representation` chooses between them.
@@ -33,13 +34,14 @@ if typing.TYPE_CHECKING:
     from kmp.constraints import LinearConstraints
     from kmp.estimator import KMPRegressor as KMPRegressor
     from kmp.gaussians import Gaussians
-    from kmp.kernel import GaussianKernel
+    from kmp.kernel import Kernel
     from kmp.mixture import GaussianMixture
     from kmp.orientation import OrientationKMP
     from kmp.predictor import Uncertainty
     from kmp.primitive import KMP
     from kmp.problem.hyperparameters import AffineMean
     from kmp.query import MotionPrediction
+    from kmp.radial import GaussianKernel, Matern32, Matern52, RadialKernel
     from kmp.references.correlation import Correlation, Improvement, improve
     from kmp.references.frames import CoordinateFrame, LocalKMP
     from kmp.references.gaussian_process import gaussian_process_reference
@@ -59,12 +61,16 @@ __all__ = [
     "GaussianMixture",
     "Gaussians",
     "Improvement",
+    "Kernel",
     "Learned",
     "LinearConstraints",
     "LocalKMP",
+    "Matern32",
+    "Matern52",
     "MotionPrediction",
     "OrientationKMP",
     "PeriodicKernel",
+    "RadialKernel",
     "RankReached",
     "Score",
     "Stored",
@@ -84,18 +90,22 @@ _MODULES = {
     "AffineMean": "kmp.problem.hyperparameters",
     "CoordinateFrame": "kmp.references.frames",
     "Correlation": "kmp.references.correlation",
-    "GaussianKernel": "kmp.kernel",
+    "GaussianKernel": "kmp.radial",
     "GaussianMixture": "kmp.mixture",
     "Gaussians": "kmp.gaussians",
     "Improvement": "kmp.references.correlation",
     "KMP": "kmp.primitive",
     "KMPRegressor": "kmp.estimator",
+    "Kernel": "kmp.kernel",
     "Learned": "kmp.selection",
     "LinearConstraints": "kmp.constraints",
     "LocalKMP": "kmp.references.frames",
+    "Matern32": "kmp.radial",
+    "Matern52": "kmp.radial",
     "MotionPrediction": "kmp.query",
     "OrientationKMP": "kmp.orientation",
     "PeriodicKernel": "kmp.time_kernels",
+    "RadialKernel": "kmp.radial",
     "RankReached": "kmp.arrays.checks",
     "Score": "kmp.selection",
     "Stored": "kmp.storage",

@@ -14,9 +14,9 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from kmp.arrays.checks import Array, brief, positive, squared, whole
 from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel
 from kmp.mixture import GaussianMixture
 from kmp.primitive import KMP
+from kmp.radial import GaussianKernel
 
 
 class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]

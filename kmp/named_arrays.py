@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
 from kmp.arrays.immutable import frozen
+from kmp.composition import ProductKernel, SumKernel
 from kmp.constraints import Constrained, LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
-from kmp.kernel import GaussianKernel, Kernel
+from kmp.kernel import Kernel
 from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP
@@ -29,6 +30,7 @@ from kmp.primitive import KMP
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.query import MotionPrediction
+from kmp.radial import GaussianKernel, Matern32, Matern52
 from kmp.references.correlation import Correlation, Improvement
 from kmp.references.frames import CoordinateFrame, LocalKMP
 from kmp.selection import Learned, Score
@@ -45,11 +47,11 @@ _NAMES = (
     "via_covariance",
     "replaced",
     "weights",
-    "ell",
     "lambda_mean",
     "lambda_covariance",
     "prior_mean",
 )
+_KERNEL = "kernel."  # begin of the names of a kernel's arrays, if `_BY_ELL` lacks it
 _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
 KIND = "kind"
@@ -67,6 +69,10 @@ _KINDS: dict[str, Any] = {
         GaussianKernel,
         VelocityKernel,
         PeriodicKernel,
+        Matern32,
+        Matern52,
+        SumKernel,
+        ProductKernel,
         Correlation,
         Improvement,
         Learned,
@@ -75,6 +81,7 @@ _KINDS: dict[str, Any] = {
         MotionPrediction,
     )
 }
+_BY_ELL = (GaussianKernel, VelocityKernel, PeriodicKernel)  # told apart by period and channels
 
 
 def to_arrays(value: object) -> dict[str, NDArray[Any]]:
@@ -86,15 +93,21 @@ def to_arrays(value: object) -> dict[str, NDArray[Any]]:
     return _of_primitive(value) if isinstance(value, KMP) else _of_value(value, "")
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
+def from_arrays(
+    arrays: Mapping[str, NDArray[Any]], kernels: Mapping[str, type] | None = None
+) -> Any:
     """The value of the arrays of `to_arrays`, a primitive with its stored weights.
 
-    Other names are ignored. `predict` and `adapt` of a primitive compute the factors when they
-    first need them, to the same bits with the same libraries and kind of processor. Raises
-    ValueError if an array is missing, or the arrays do not belong together.
+    `kernels` are the classes of kernels of your own, by name. Other arrays are ignored. `predict`
+    and `adapt` of a primitive compute the factors when they first need them, to the same bits with
+    the same libraries and kind of processor. Raises ValueError if an array is missing, the kernel
+    is unknown, or the arrays do not belong together.
     """
     check_kind("arrays", arrays, Mapping, "what `to_arrays` gives")
-    return _value(arrays, "") if KIND in arrays else _primitive(arrays)
+    kernels = {} if kernels is None else kernels
+    check_kind("kernels", kernels, Mapping, '{"Cauchy": Cauchy}')
+    kinds = {**kernels, **_KINDS}
+    return _value(arrays, "", kinds) if KIND in arrays else _primitive(arrays, kinds)
 
 
 def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
@@ -102,6 +115,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
     changes = primitive.inner.changes
     solution = primitive.inner.solution
     parameters = base.hyperparameters
+    kernel = parameters.kernel
+    by_ell = type(kernel) in _BY_ELL
+    kernel_arrays = {"ell": np.array(kernel.ell)} if by_ell else _of_value(kernel, _KERNEL)
     arrays = {
         "base_inputs": base.database.inputs,
         "base_mean": base.database.reference.mean,
@@ -112,17 +128,17 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
         "via_covariance": changes.points.covariance,
         "replaced": changes.replaced,
         "weights": solution.weights,
-        "ell": np.array(parameters.kernel.ell),
+        **kernel_arrays,
         "lambda_mean": np.array(parameters.lambda_mean),
         "lambda_covariance": np.array(parameters.lambda_covariance),
         "prior_mean": parameters.prior_offset
         if parameters.prior_matrix is None
         else parameters.prior_columns,
     }
-    if parameters.kernel.period is not None:
-        arrays["period"] = np.array(parameters.kernel.period)
-    if parameters.kernel.channels > 1:
-        arrays["channels"] = np.array(parameters.kernel.channels)
+    if by_ell and kernel.period is not None:
+        arrays["period"] = np.array(kernel.period)
+    if by_ell and kernel.channels > 1:
+        arrays["channels"] = np.array(kernel.channels)
     for name, functionals in (("base", base.database.functionals), ("via", changes.functionals)):
         if functionals.directions is not None:
             arrays[f"{name}_directions"] = functionals.directions
@@ -136,14 +152,15 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
     return arrays | base.to_arrays()
 
 
-def _primitive(arrays: Mapping[str, NDArray[Any]]) -> KMP:
-    names = _NAMES + (_OF_LOW_RANK if "pivots" in arrays else ())
+def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> KMP:
+    kernel_name = _KERNEL + KIND if _KERNEL + KIND in arrays else "ell"
+    names = (*_NAMES, kernel_name) + (_OF_LOW_RANK if "pivots" in arrays else ())
     if missing := [name for name in names if name not in arrays]:
         raise ValueError(
             f"The primitive's arrays lack {', '.join(missing)}. Needed are {', '.join(names)}: "
             "give all that `named_arrays.to_arrays` returned."
         )
-    base = _base(arrays)
+    base = _base(arrays, kinds)
     changes = _changes(arrays, base.database)
     solution = base.adapted(changes) if len(changes.inputs) else base
     if any(name in arrays for name in _OF_CONSTRAINTS):
@@ -172,7 +189,7 @@ def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Cons
     return Constrained(solution, constraints)
 
 
-def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
+def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
     reference = _normals("base", arrays)
     check_pairs("base_mean", inputs, reference, reference.outputs)
@@ -180,7 +197,7 @@ def _base(arrays: Mapping[str, NDArray[Any]]) -> Solution:
     if prior.ndim == 2:
         check_shape("prior_mean", prior, reference.outputs, 1 + inputs.shape[1])
     parameters = Hyperparameters.checked(
-        _kernel(arrays),
+        _kernel(arrays, kinds),
         float(numbers("lambda_mean", arrays["lambda_mean"])),
         float(numbers("lambda_covariance", arrays["lambda_covariance"])),
         AffineMean(prior[:, 1:], prior[:, 0]) if prior.ndim == 2 else prior,
@@ -229,7 +246,9 @@ def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]])
     )
 
 
-def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
+def _kernel(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Kernel:
+    if _KERNEL + KIND in arrays:
+        return cast(Kernel, _value(arrays, _KERNEL, kinds))
     if "period" in arrays:
         return PeriodicKernel(
             float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"]))
@@ -244,7 +263,9 @@ def _kernel(arrays: Mapping[str, NDArray[Any]]) -> Kernel:
 def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
     kind = type(value).__name__
     if _KINDS.get(kind) is not type(value):
-        raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
+        if not hasattr(value, "prior_variance"):
+            raise ValueError(f"value: {kind} given, one of {', '.join(_KINDS)} needed.")
+        _check_restorable(value)
     arrays = {prefix + KIND: np.array(kind)}
     if isinstance(value, KMP):
         return arrays | {prefix + name: array for name, array in _of_primitive(value).items()}
@@ -253,22 +274,43 @@ def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _value(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
-    kind = _KINDS.get(str(arrays[prefix + KIND]))
+def _check_restorable(kernel: object) -> None:
+    """Raise ValueError unless a user's kernel can be made again of its name and fields."""
+    kind = type(kernel)
+    names = _fields(kind)
+    # a cached property is an attribute of the class, too
+    hidden = [name for name in vars(kernel) if name not in names and not hasattr(kind, name)]
+    if not names or hidden or kind.__name__ in _KINDS:
+        raise ValueError(
+            f"kernel: no file restores {kind.__name__}. Derive it from RadialKernel, by a new "
+            f"name and with a dataclass field for each of {', '.join(hidden or names)}."
+        )
+
+
+def _value(arrays: Mapping[str, NDArray[Any]], prefix: str, kinds: Mapping[str, Any]) -> Any:
+    name = str(arrays[prefix + KIND])
+    kind = kinds.get(name)
     if kind is None:
         raise ValueError(
-            f"{prefix}{KIND}: {arrays[prefix + KIND]!s:.60} given, one of {', '.join(_KINDS)} "
-            "needed."
+            f"{prefix}{KIND}: {name:.60} given, one of {', '.join(kinds)} needed. Load your "
+            f'own kernel with kernels={{"{name:.60}": its class}}.'
         )
     if kind is KMP:
         return _primitive(
-            {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}
+            {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}, kinds
         )
-    return kind(**{name: _field(arrays, prefix + name) for name in _fields(kind)})
+    names = set(_fields(kind))
+    if prefix.startswith(_KERNEL):  # all that is stored, so that no parameter is lost
+        names = {key[len(prefix) :].split(".")[0] for key in arrays if key.startswith(prefix)}
+    return kind(**{name: _field(arrays, prefix + name, kinds) for name in names - {KIND}})
 
 
 def _fields(kind: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else kind._fields
+    return (
+        tuple(field.name for field in fields(kind))
+        if is_dataclass(kind)
+        else getattr(kind, "_fields", ())
+    )
 
 
 def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:
@@ -284,10 +326,11 @@ def _of_field(value: object, name: str) -> dict[str, NDArray[Any]]:
     return _of_value(value, f"{name}.")
 
 
-def _field(arrays: Mapping[str, NDArray[Any]], name: str) -> Any:
+def _field(arrays: Mapping[str, NDArray[Any]], name: str, kinds: Mapping[str, Any]) -> Any:
     if name in arrays:
         array = np.array(arrays[name])
         return frozen(array) if array.ndim else array.item()
     if f"{name}.count" in arrays:
-        return tuple(_field(arrays, f"{name}.{i}") for i in range(int(arrays[f"{name}.count"])))
-    return _value(arrays, f"{name}.") if f"{name}.{KIND}" in arrays else None
+        count = int(arrays[f"{name}.count"])
+        return tuple(_field(arrays, f"{name}.{i}", kinds) for i in range(count))
+    return _value(arrays, f"{name}.", kinds) if f"{name}.{KIND}" in arrays else None

@@ -7,7 +7,7 @@ The mean minimises sum_n (xi(s_n) - mu_n)^T Sigma_n^-1 (xi(s_n) - mu_n) + lambda
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,8 +40,10 @@ from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
 from kmp.problem.database import Changes, Database, warn_of_missed
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
+from kmp.radial import GaussianKernel
 from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
+from kmp.time_kernels import VelocityKernel
 
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
 _FREE = 1e6  # [unit of the outputs / unit of the inputs] deviation of a rate that is not prescribed
@@ -345,14 +347,14 @@ class KMP(Predictor, Plotted):
         save(path, self, input_unit=input_unit, output_unit=output_unit)
 
     @classmethod
-    def load(cls, path: str | Path) -> KMP:
-        """The primitive that `save` wrote; `kmp.load` gives its units too.
+    def load(cls, path: str | Path, *, kernels: Mapping[str, type] | None = None) -> KMP:
+        """The primitive that `save` wrote; `kmp.load` gives its units too, and explains `kernels`.
 
         Raises OSError if the file cannot be read, and ValueError if it holds no primitive.
         """
         from kmp.storage import load
 
-        return load(path).primitive
+        return load(path, kernels=kernels).primitive
 
     @staticmethod
     def _changed(solution: Solution, changes: Changes, base: KMP) -> KMP:
@@ -418,7 +420,7 @@ class KMP(Predictor, Plotted):
             point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0
         )
         reach = np.empty(len(s))
-        for i, farthest in enumerate(_kernel_lengths(self.kernel, len(s))):
+        for i, farthest in enumerate(self._farthest(s)):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
             path = np.tile(s, (2, len(r), 1))
             path[:, :, i] += [r, -r]
@@ -433,6 +435,15 @@ class KMP(Predictor, Plotted):
                 )
             reach[i] = r[matters.any(axis=0)].max(initial=0.0)
         return reach
+
+    def _farthest(self, query: Array) -> Array:
+        """Distances (I,) along each input, beyond which a via-point at the query has no effect."""
+        kernel = self.kernel
+        if kernel.period is not None:
+            return np.full(len(query), kernel.period / 2)
+        if type(kernel) in (GaussianKernel, VelocityKernel):  # the kernel is exp(-9)
+            return np.broadcast_to(3.0 / np.sqrt(kernel.ell), len(query))
+        return np.asarray(np.abs(self.inputs - query).max(axis=0))
 
     @cached_property
     def spacing(self) -> float:
@@ -471,14 +482,6 @@ class KMP(Predictor, Plotted):
     def via_points(self) -> Gaussians:
         """The V via-points."""
         return self.inner.changes.points
-
-
-def _kernel_lengths(kernel: Kernel, inputs: int) -> Array:
-    """Distances (I,) along each input at which the kernel is exp(-9); at most half a period."""
-    if kernel.period is not None:
-        return np.full(inputs, kernel.period / 2)
-    scale, stretch = kernel.coordinates(inputs)
-    return np.asarray(3.0 / (np.sqrt(scale) * stretch))
 
 
 def checked_primitive(value: object, name: str = "primitive") -> KMP:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -19,8 +19,10 @@ from kmp.arrays.checks import Array
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Derivatives, Functionals
-from kmp.kernel import GaussianKernel, Kernel, between
+from kmp.kernel import between, third_derivative, unstretched
+from kmp.radial import GaussianKernel
 from kmp.solution import Solution
+from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 
 class MotionPrediction(NamedTuple):
@@ -54,7 +56,7 @@ class Query(Immutable):
     """The arrays of a solution for one query: R centres, C channels, D outputs a channel."""
 
     solution: Solution
-    kernel: Kernel
+    kernel: GaussianKernel | VelocityKernel | PeriodicKernel
     scale: float
     stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
     centres: Array  # (R, I), there
@@ -72,11 +74,15 @@ class Query(Immutable):
         """
         parameters = solution.hyperparameters
         centres = solution.centres
-        scale, stretch = parameters.kernel.coordinates(centres.shape[1])
+        kernel = cast(GaussianKernel, parameters.kernel)
+        inputs = centres.shape[1]
+        # a subclass may have other formulas than those for one query
+        is_general = type(kernel) not in (GaussianKernel, VelocityKernel, PeriodicKernel)
+        scale, stretch = (1.0, unstretched(inputs)) if is_general else kernel.coordinates(inputs)
         weights = solution.weights.reshape(-1, parameters.channel_outputs)
-        return cls(
+        return (_GeneralQuery if is_general else cls)(
             solution,
-            parameters.kernel,
+            kernel,
             scale,
             stretch,
             frozen(centres * stretch),
@@ -131,7 +137,7 @@ class Query(Immutable):
         functionals = self.solution.functionals
         kernel = self.kernel
         i = len(self.stretch)
-        if isinstance(kernel, GaussianKernel) and self.derivatives is None:
+        if type(kernel) is GaussianKernel and self.derivatives is None:
             # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
             # at the mean of the centres, the differences lose few digits.
             products = between(kernel, Functionals(queries), functionals) @ self._moments
@@ -184,3 +190,27 @@ class Query(Immutable):
             jacobian,
             curvature,
         )
+
+
+class _GeneralQuery(Query):
+    """The same for any `Kernel`, by calls of it. Its coordinates are the inputs themselves."""
+
+    def row(self, query: Array) -> KernelRow:
+        k = between(self.kernel, Functionals(query[None]), self.solution.functionals)
+        k = k[0] if len(k) == 1 else k
+        return KernelRow(query, query - self.centres, k, k)
+
+    def jacobian(self, row: KernelRow) -> Array:
+        return np.asarray(self.jacobians(row.query[None])[0])
+
+    def curvature(self, row: KernelRow, velocity: Array) -> Array:
+        if not velocity.any():
+            return np.zeros(len(self.prior_mean))
+        # k is a function of s - s': minus its derivative by both along v is that by s, twice
+        along = np.broadcast_to(velocity, self.centres.shape)
+        bend = -self.kernel(row.query[None], self.centres, velocity[None], along)
+        if self.derivatives is not None:
+            rows, observed = self.derivatives
+            offsets = row.offsets[rows]
+            bend[0, rows] = -third_derivative(self.kernel, offsets, observed, velocity)
+        return np.asarray(bend @ self.weights).ravel()

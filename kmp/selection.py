@@ -20,11 +20,11 @@ from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel, Kernel
+from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture, mixture_of
 from kmp.primitive import KMP
 from kmp.problem.database import Database
-from kmp.problem.hyperparameters import checked_kernel
+from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
 
 _ELLS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # ell times twice the inputs' variance

@@ -71,8 +71,10 @@ def save(path: str | Path, value: object, *, input_unit: str = "", output_unit: 
         np.savez(file, allow_pickle=False, **arrays, checksum=np.array(checksum(arrays)))
 
 
-def load(path: str | Path) -> Stored:
+def load(path: str | Path, *, kernels: Mapping[str, type] | None = None) -> Stored:
     """The value that `save` wrote, and the units; a primitive predicts the same, bit for bit.
+
+    `kernels` are the classes of kernels of your own, by their names: {"Cauchy": Cauchy}.
 
     Raises OSError if the file cannot be read, and ValueError if `save` did not write it or it was
     changed since.
@@ -107,6 +109,7 @@ def load(path: str | Path) -> Stored:
             "or save it again."
         )
     try:
-        return Stored(from_arrays(arrays), str(arrays["input_unit"]), str(arrays["output_unit"]))
+        value = from_arrays(arrays, kernels)
+        return Stored(value, str(arrays["input_unit"]), str(arrays["output_unit"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

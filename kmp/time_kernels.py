@@ -14,16 +14,16 @@ from typing import ClassVar
 import numpy as np
 
 from kmp.arrays.checks import Array, positive
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import frozen
+from kmp.composition import Composable
 from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
 
 
 @dataclass(frozen=True)
-class _OneInput(Immutable):
+class _OneInput(Composable):
     """A kernel of one input, defined by its blocks' derivatives with respect to r = x - x'."""
 
-    channels: ClassVar[int] = 1
     ell: float
 
     @staticmethod
@@ -174,10 +174,6 @@ class PeriodicKernel(_OneInput):
 
     def __post_init__(self) -> None:
         self.__dict__.update(ell=positive("ell", self.ell), period=positive("period", self.period))
-
-    @cached_property
-    def prior_variance(self) -> Array:
-        return frozen(np.ones((1, 1)))
 
     def check(self, inputs: int, outputs: int) -> None:
         """Raise ValueError unless there is one input."""

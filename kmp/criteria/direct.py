@@ -42,9 +42,9 @@ from kmp.criteria.cross_validation import (
     squared_distances,
 )
 from kmp.gaussians import Gaussians
-from kmp.kernel import GaussianKernel
 from kmp.primitive import KMP
 from kmp.problem.hyperparameters import AffineMean
+from kmp.radial import GaussianKernel
 
 _NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # candidates for r
 _SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # candidates for q

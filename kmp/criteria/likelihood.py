@@ -15,8 +15,9 @@ from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity
-from kmp.kernel import GaussianKernel, Kernel, between
+from kmp.kernel import Kernel, between
 from kmp.problem.database import Database
+from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
 
 _STARTS = (0.1, 1.0, 10.0)  # factors on the initial ell, as the likelihood has several maxima
@@ -135,19 +136,17 @@ def negative_log_likelihood(
 
 def with_ell(kernel: Kernel, ell: Array) -> Kernel:
     """A kernel of the same class with other ell (I,), or (1,)."""
-    return (
-        VelocityKernel(float(ell[0])) if isinstance(kernel, VelocityKernel) else GaussianKernel(ell)
-    )
+    return VelocityKernel(float(ell[0])) if type(kernel) is VelocityKernel else GaussianKernel(ell)
 
 
 def _by_log_ell(kernel: Kernel, inputs: Array, k: Array) -> Iterator[Array]:
     """dK / d log ell (N C, N C) for each ell."""
     ell = np.atleast_1d(np.asarray(kernel.ell, dtype=np.float64))
-    if isinstance(kernel, GaussianKernel):
+    if type(kernel) is GaussianKernel:
         columns = inputs.T[:, :, None] if len(ell) > 1 or inputs.shape[1] == 1 else inputs[None]
         for value, column in zip(ell, columns, strict=True):
             yield -value * ((column[:, None] - column[None]) ** 2).sum(axis=2) * k
-    elif isinstance(kernel, VelocityKernel):
+    elif type(kernel) is VelocityKernel:
         r = inputs - inputs.T
         squares = ell[0] * r * r
         blocks = k.reshape(len(r), 2, len(r), 2).copy()

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from kmp.arrays.checks import Array, brief, check_shape, numbers, positive
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
-from kmp.kernel import Kernel
+from kmp.kernel import Kernel, checked_kernel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,12 +140,3 @@ class Hyperparameters(Immutable):
     def channel_outputs(self) -> int:
         """D, the outputs of each of the kernel's C channels: O = C D."""
         return len(self.prior_offset) // self.kernel.channels
-
-
-def checked_kernel(kernel: Kernel) -> Kernel:
-    """The kernel. Raises ValueError unless it is a `Kernel`."""
-    if isinstance(kernel, type) or not hasattr(kernel, "prior_variance"):
-        raise ValueError(
-            f"kernel: {brief(kernel)} given, a kernel needed: GaussianKernel(ell=8.0), for one."
-        )
-    return kernel

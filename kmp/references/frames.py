@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike
 from kmp.arrays.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of
 from kmp.arrays.immutable import Immutable
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
-from kmp.kernel import Kernel
+from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture
 from kmp.plot import Plotted, Points, Shown
 from kmp.primitive import KMP, checked_primitive
-from kmp.problem.hyperparameters import checked_kernel
 
 
 @dataclass(frozen=True, eq=False, repr=False)

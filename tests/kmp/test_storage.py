@@ -1,9 +1,12 @@
 """Files: exact to the bit, with units, without pickle."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 import kmp
+from kmp import KMP, GaussianKernel, Gaussians, Matern52, RadialKernel, named_arrays
 from kmp.storage import checksum
 from support.primitives import skill
 
@@ -80,3 +83,76 @@ def test_changed_numbers_are_refused(tmp_path):
         np.savez(part, **(arrays | {name: value}))
         with pytest.raises(ValueError, match=r"part\.npz: "):
             kmp.load(part)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rational(RadialKernel):
+    """(1 + u / alpha)^-alpha."""
+
+    alpha: float = 2.0
+
+    def profile(self, u):
+        return (1 + u / self.alpha) ** -self.alpha
+
+
+class Hidden(RadialKernel):
+    """A kernel with a parameter that is no field."""
+
+    def __init__(self, ell, power):
+        super().__init__(ell)
+        self.__dict__["power"] = power
+
+    def profile(self, u):
+        return np.exp(-(u**self.power))
+
+
+T = np.linspace(0, 1, 20)[:, None]
+
+
+def with_kernel(kernel):
+    return KMP.fit(T, Gaussians.of(np.sin(3 * T), deviation=0.1), kernel=kernel, lambda_mean=1.0)
+
+
+@pytest.mark.parametrize(
+    "kernel", [Rational(2.0, 3.0), 0.3 * Matern52(1.0) + Rational([2.0], 1.5) * GaussianKernel(3.0)]
+)
+def test_own_kernel_is_restored_by_its_class(tmp_path, kernel):
+    """Without the class it is refused, and so is another class of that name."""
+    skill = with_kernel(kernel)
+    path = tmp_path / "own.npz"
+    skill.save(path)
+    loaded = KMP.load(path, kernels={"Rational": Rational})
+    assert repr(loaded.kernel) == repr(kernel)
+    assert np.array_equal(loaded.mean(T + 0.1), skill.mean(T + 0.1))
+    with pytest.raises(
+        ValueError, match=r'own\.npz: kernel.*kind: Rational given.*"Rational": its'
+    ):
+        kmp.load(path)
+    with pytest.raises(ValueError, match=r"own\.npz: .*unexpected keyword argument"):
+        kmp.load(path, kernels={"Rational": Matern52})
+    with pytest.raises(ValueError, match="kernels: list given"):
+        kmp.load(path, kernels=[Rational])
+
+
+def test_kernel_that_no_file_restores_is_refused(tmp_path):
+    class Matern52(RadialKernel):
+        profile = Rational.profile
+        alpha = 2.0
+
+    for kernel, message in (
+        (Hidden(2.0, 0.4), "Hidden.*field for each of power"),
+        (Matern52(2.0), "restores Matern52.*by a new name"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            with_kernel(kernel).save(tmp_path / "own.npz")
+    assert not (tmp_path / "own.npz").exists()
+
+
+def test_gaussian_kernel_keeps_its_arrays():
+    """Files of earlier versions have these names, in this order."""
+    arrays = named_arrays.to_arrays(with_kernel(GaussianKernel(2.0)))
+    assert list(arrays)[-4:] == ["ell", "lambda_mean", "lambda_covariance", "prior_mean"]
+    assert not [name for name in arrays if name.startswith("kernel")]
+    others = named_arrays.to_arrays(with_kernel(Matern52(2.0)))
+    assert {str(others["kernel.kind"]), float(others["kernel.ell"])} == {"Matern52", 2.0}
+    assert "ell" not in others  # so that earlier versions refuse it

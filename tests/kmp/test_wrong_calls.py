@@ -22,6 +22,8 @@ from kmp import (
     Gaussians,
     LinearConstraints,
     LocalKMP,
+    Matern32,
+    Matern52,
     OrientationKMP,
     PeriodicKernel,
     VelocityKernel,
@@ -84,6 +86,8 @@ RIGHT = {
     MIXTURE.regress: {"inputs": S},
     MIXTURE.sample_inputs: {"count": 3, "dimensions": 2, "seed": 0},
     GaussianKernel: {"ell": np.ones(2)},
+    Matern32: {"ell": np.ones(2)},
+    Matern52: {"ell": np.ones(2)},
     PeriodicKernel: {"ell": 1.0, "period": 2.0},
     VelocityKernel: {"ell": 1.0},
     KMP.fit: {
@@ -109,12 +113,12 @@ RIGHT = {
     ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
     ONE.via_point_reach: {"query": S[0], "share": 0.5},
     ONE.save: {"path": "other.npz", "input_unit": "m", "output_unit": "m"},
-    KMP.load: {"path": "skill.npz"},
+    KMP.load: {"path": "skill.npz", "kernels": {}},
     ONE.adapt_jacobian: {"inputs": S[:1], "jacobians": np.eye(2)[None], "deviation": 0.1},
     ONE.constrained: {"constraints": LIMITS},
     ONE.extended: {"inputs": S[:2] + 1, "reference": R[:2], "directions": np.zeros((2, 2))},
     ONE.refitted: {"reference": R},
-    named_arrays.from_arrays: {"arrays": named_arrays.to_arrays(LOW)},
+    named_arrays.from_arrays: {"arrays": named_arrays.to_arrays(LOW), "kernels": {}},
     ONE.mean: {"queries": S},
     LOW.mean: {"queries": S[:1]},
     ONE.predict: {"queries": S},
@@ -192,7 +196,7 @@ RIGHT = {
         **LEARN,
     },
     kmp.save: {"path": "skill.npz", "value": ONE, "input_unit": "m", "output_unit": "m"},
-    kmp.load: {"path": "skill.npz"},
+    kmp.load: {"path": "skill.npz", "kernels": {}},
     LEARNED.report: {"count": 3},
     regressor: {
         "ell": np.ones(2),
@@ -227,8 +231,15 @@ MADE_BY_THE_PACKAGE = {
     "Stored",
     "Uncertainty",
     "KMP",
+    "Kernel",
+    "RadialKernel",
 }
 OF_THE_KERNEL = {
+    "profile",
+    "first_derivative",
+    "second_derivative",
+    "third_derivative",
+    "third",
     "check",
     "coordinates",
     "variances",
@@ -241,7 +252,9 @@ OF_THE_KERNEL = {
 
 OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "direction", "offset"}
 WRONG_COLUMNS = {0, 1}  # indices in the second list of `wrong_arrays`: one column more, none
+OF_ANY_SIZE = {GaussianKernel, Matern32, Matern52, Gaussians.of, regressor}
 OPTIONAL = {
+    "kernels",
     "lambda_covariance",
     "prior_mean",
     "directions",
@@ -367,6 +380,8 @@ def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
         return [value for value in objects if not isinstance(value, (str, bytes))], []
     if name == "value":
         return [*NO_NUMBERS, 1.0, True, S, [], [ONE], KMP], []
+    if name == "kernels":
+        return [value for value in objects if not isinstance(value, dict)], []
     if name == "arrays":
         return [*objects, [("ell", 1.0)]], []
     if name == "reward":
@@ -398,9 +413,7 @@ def calls():
             # CoordinateFrame names its matrix
             must_fail = name in OF_KNOWN_COLUMNS and function is not CoordinateFrame
             for candidate in wrong:
-                if function in {GaussianKernel, Gaussians.of, regressor} and isinstance(
-                    candidate, float
-                ):
+                if function in OF_ANY_SIZE and isinstance(candidate, float):
                     continue  # one number for all inputs is right
                 if function is regressor and name == "components" and candidate is None:
                     continue  # None: each sample is a reference point
@@ -469,7 +482,7 @@ def public():
                 yield name, name, inspect.signature(member).parameters
             for part, value in inspect.getmembers(member, callable):
                 if not part.startswith("_") and not (
-                    name.endswith("Kernel") and part in OF_THE_KERNEL
+                    ("Kernel" in name or "Matern" in name) and part in OF_THE_KERNEL
                 ):
                     yield name, part, inspect.signature(value).parameters
     for name, member in inspect.getmembers(orientation, inspect.isfunction):

@@ -7,12 +7,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp import KMP
+from kmp import KMP, GaussianKernel
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.loops.mean import table_of
 from kmp.named_arrays import from_arrays
@@ -109,7 +109,7 @@ class Placed(Immutable):
             scatters = np.where(np.isin(task.names, at.known)[:, None, None], 0.0, unknown.scatters)
             segments["scatter"] = np.stack([scatters[:-1], scatters[1:]], axis=1)
 
-        sizes["scale"], _ = primitive.kernel.coordinates(1)
+        sizes["scale"], _ = cast(GaussianKernel, primitive.kernel).coordinates(1)
         sizes["std"] = at.std
         sizes["prior"] = primitive.prior_offset
 

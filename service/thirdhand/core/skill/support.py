@@ -30,10 +30,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
-from kmp import KMP
+from kmp import KMP, GaussianKernel
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.compiled import compiled
 from kmp.elementary import exp, log
@@ -80,7 +81,7 @@ class LocalErrors(Immutable):
         """Errors (M, 3) [m] at inputs (M, I) of a primitive. Its kernel is made SUPPORT_SHARPNESS
         times as sharp.
         """
-        scale, stretch = primitive.kernel.coordinates(inputs.shape[1])
+        scale, stretch = cast(GaussianKernel, primitive.kernel).coordinates(inputs.shape[1])
         factors = math.sqrt(SUPPORT_SHARPNESS * scale) * np.asarray(stretch, np.float64)
         table = error_table(inputs * factors, errors)
         return cls(
