@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from thirdhand.core.codes import (
@@ -11,12 +13,12 @@ from thirdhand.core.codes import (
     UNSEEN,
     UNSEEN_HAND_NEEDED,
 )
-from thirdhand.core.frame import Record, as_array, parameters
+from thirdhand.core.frame import Record, Records, as_array, parameters
 from thirdhand.core.numerics import UNPRIMED_DECIDED
 from thirdhand.core.skill import ORDER, TURNS
 from thirdhand.core.skill.memory import recall, turn_lag_s
 from thirdhand.core.skill.model import Seen, Target, Wanted
-from thirdhand.core.skill.pose import NO_GRIPPER
+from thirdhand.core.skill.pose import NO_GRIPPER, Turn
 from thirdhand.core.skill.skill import NEVER, Skill, clamp, reach_of
 from thirdhand.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_segment
 from thirdhand.core.skill.task_clock import BEGUN_TICK, GONE, PROGRESS, forget, is_requested, move
@@ -166,15 +168,8 @@ class SkillStage:
                 motion.now, motion.stillness, self._period_s, motion.belief, unprimed
             )
 
-        outcome = conclude(
-            states,
-            frames,
-            rules,
-            prediction[:7],
-            prediction.turn,
-            prediction.closure,
-            error_m,
-            doubt,
+        outcome = self._conclude(
+            states, frames, prediction[:7], prediction.turn, prediction.closure, error_m, doubt
         )
         target = Target(*prediction[:3], clamped=False)
         if outcome & IS_OUTSIDE:
@@ -189,6 +184,19 @@ class SkillStage:
             is_ambiguous,
             error_m > UNSURE_M,
         )
+
+    def _conclude(
+        self,
+        states: Records,
+        frames: Records,
+        motion: tuple[Any, ...],
+        turn: Turn,
+        closure: float,
+        error_m: float,
+        doubt: float,
+    ) -> int:
+        """`step.conclude` by this skill's rules."""
+        return int(conclude(states, frames, self.rules, motion, turn, closure, error_m, doubt))
 
     def _count(self, state: Record) -> None:
         """Advance the clock of the task to this tick, if the skill has one. While a hand is not

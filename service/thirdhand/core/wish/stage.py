@@ -23,7 +23,6 @@ from thirdhand.core.skill.model import KNOWN_SIGNS, Target, Wanted
 from thirdhand.core.skill.pose import NO_GRIPPER, Turn
 from thirdhand.core.skill.skill import Skill, is_inside
 from thirdhand.core.skill.stage import SkillStage
-from thirdhand.core.skill.step import NO_SEGMENT, conclude
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.wish import tuning as fixed
 from thirdhand.core.wish.step import lead, newest_due, take
@@ -122,7 +121,7 @@ class WishStage(SkillStage):
         lead(self._wishes, self.wish_rules, as_array(frame), int(state["tick"]), sources)
         if by_skill is None:
             frame["closure"] = NO_GRIPPER
-            frame["segment"] = NO_SEGMENT
+            frame["segment"] = -1  # not known
             if not self._blends:
                 self._calibrate(state, frame)
         target = Target(
@@ -146,16 +145,8 @@ class WishStage(SkillStage):
             frame[name].copy() for name in ("target", "target_velocity", "target_acceleration")
         ]
         turn = [frame[name].copy() for name in ("orientation", "turning", "orientation_covariance")]
-        conclude(
-            as_array(state),
-            as_array(frame),
-            self.rules,
-            (*motion, frame["covariance"].copy(), 0.0, 0.0, KNOWN_SIGNS),
-            Turn(*turn),
-            NO_GRIPPER,
-            0.0,
-            0.0,
-        )
+        known = (*motion, frame["covariance"].copy(), 0.0, 0.0, KNOWN_SIGNS)
+        self._conclude(as_array(state), as_array(frame), known, Turn(*turn), NO_GRIPPER, 0.0, 0.0)
 
 
 def _mappings(settings: Settings) -> dict[str, Vector]:
