@@ -37,9 +37,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     records = folder / "records"
     arguments = ("--joints", "assumed", "--record", str(records))
     with serving(folder, *arguments) as daemon, Tracker(daemon.session):
-        daemon.until(
-            lambda status: status["mode"] == "follow" and status["scribe"].get("kept", 0) > 500
-        )
+        daemon.until(lambda status: status["mode"] == "follow" and status["tick"] > 2500)
         yield daemon.endpoint, str(next(records.glob("*.mcap")))
 
 

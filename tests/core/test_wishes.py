@@ -137,6 +137,54 @@ def test_single_poses_are_followed_smoothly() -> None:
     assert np.sqrt((jerk**2).sum(axis=1).mean()) < 60.0
 
 
+@pytest.mark.parametrize("rate_hz", [50, 100, 500])
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_wish_in_each_tick_is_followed(rate_hz: int, every: int) -> None:
+    """From rest, and to a stop from full motion."""
+    policy = Policy(msgspec.structs.replace(LED, rate_hz=rate_hz))
+    for _ in range(rate_hz // every):
+        policy.run(every, policy.pose(0.0 * AWAY_M))
+    frames = []
+    for k in range(3 * rate_hz // every):
+        off = AWAY_M * np.sin(1.5 * k * every / rate_hz)
+        frames.append(policy.run(every, policy.pose(off)))
+    tool = np.concatenate(frames)
+    seconds = np.arange(len(tool)) // every * every / rate_hz
+    errors = np.linalg.norm(
+        tool["tool"] - policy.start - np.outer(np.sin(1.5 * seconds), AWAY_M), axis=1
+    )
+    assert np.sqrt(np.mean(errors[rate_hz:] ** 2)) < 8e-3
+
+    stopped = tool["tool"][-1] - policy.start
+    for _ in range(rate_hz // every):
+        rest = policy.run(every, policy.pose(stopped))
+    assert np.linalg.norm(rest["tool"][-1] - policy.start - stopped) < 2e-3
+
+
+@pytest.mark.parametrize("step_s", [0.002, 0.008, 0.0101])
+def test_a_fine_chunk_is_followed_along_its_path(step_s: float) -> None:
+    policy = Policy()
+    policy.lead(0.0 * AWAY_M, 1.0)
+    times_s = np.arange(0.0, 0.9, step_s)
+    policy.run(1, *(policy.pose(AWAY_M * np.sin(3.0 * t), t) for t in times_s))
+    tool = policy.run(400)
+    truth = np.outer(np.sin(3.0 * 0.002 * np.arange(1, 401)), AWAY_M)
+    assert np.linalg.norm(tool["tool"] - policy.start - truth, axis=1)[300:].max() < 6e-3
+
+
+def test_a_leap_within_a_chunk_holds_when_it_is_due() -> None:
+    policy = Policy()
+    policy.lead(0.0 * AWAY_M, 1.0)
+    far = np.array([0.0, 0.4, 0.0])
+    chunk = [policy.pose(far * (k >= 20), k / 30) for k in range(30)]
+    frames = policy.run(2000, *chunk, *())
+    reasons = frames["reason"].tolist()
+    assert reasons[100] == Reason.NONE
+    assert reasons[325] == Reason.JUMPED_WISH
+    speed = np.linalg.norm(np.diff(frames["setpoint"], axis=0), axis=1) / 0.002
+    assert speed.max() < LED.tool.engage_speed + 0.1
+
+
 def test_arm_holds_without_a_wish_and_goes_on_with_the_next() -> None:
     policy = Policy()
     assert set(policy.run(100)["reason"]) == {Reason.NO_WISH}
@@ -197,6 +245,8 @@ WRONG = {
     "from the past": (Cause.OLDER, {"after_s": -1.2}),
     "from the future": (Cause.AHEAD, {"after_s": 1.2}),
     "in another frame": (Cause.WRONG_FRAME, {"frame": "camera"}),
+    "a huge variance": (Cause.NOT_FINITE, {"covariance": tuple((1e9 * np.eye(6)).ravel())}),
+    "no covariance": (Cause.NOT_FINITE, {"covariance": tuple((3.0 - np.eye(6)).ravel())}),
     "a negative variance": (Cause.NOT_FINITE, {"covariance": tuple((-np.eye(6)).ravel())}),
 }
 

@@ -141,7 +141,7 @@ def test_skill_and_policy_share_the_control(tmp_path: Path) -> None:
         wanted = np.add(alone["target_m"], [0.0, 0.05, 0.0])
         cell = Connection(daemon.session)
         for _ in range(60):
-            cell.wish(wanted.tolist(), std=(1e-4, 1e-2))
+            cell.wish([*wanted, 1.0, 0.0, 0.0, 0.0], std=(1e-4, 1e-2))
             time.sleep(0.02)
         both = daemon.until(is_following)
         assert np.linalg.norm(np.array(both["target_m"]) - wanted) < 0.01

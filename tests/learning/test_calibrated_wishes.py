@@ -93,7 +93,7 @@ def test_what_cannot_be_calibrated_is_refused(takes: list[Path], tmp_path: Path)
     assert (few.returncode, "recordings given; at least" in few.stderr) == (1, True)
     golden = [str(recordings() / "golden.mcap")] * 6
     other = told("learn", "--wishes", *golden, "--output", output)
-    assert (other.returncode, "whose tool wishes lead needed" in other.stderr) == (1, True)
+    assert (other.returncode, "whose tool wishes lead alone needed" in other.stderr) == (1, True)
     useless = told("learn", "--wishes", str(takes[0]), "--output", output, "--delay", "0.1")
     assert (useless.returncode, "--wishes: without --delay" in useless.stderr) == (2, True)
 

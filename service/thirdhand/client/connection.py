@@ -39,6 +39,7 @@ from thirdhand.contract.messages import (
 )
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply, ViaPoint
 
+LARGEST_STD = 1e3  # [m, rad]
 LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
 FORMS = {  # by the largest count of numbers
     1: "0 (open) to 1 (closed)",
@@ -173,7 +174,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
         std: tuple[float, float] | None = None,
         frame_id: str = BASE,
     ) -> None:
-        """Publish where a policy wants the tool at the time `stamp_ns`; None: now. `std` is the
+        """Publish where a policy wants the tool, x y z [m] and a quaternion x y z w, at the time
+        `stamp_ns`; None: now. `std` is the
         deviation of each axis [m] and of each small rotation [rad]; None: not known.
         """
         self._publish({"tool/wish": _wish(pose, std, frame_id)}, stamp_ns)
@@ -189,12 +191,13 @@ class Connection(Client, AbstractContextManager["Connection"]):
     ) -> None:
         """Publish a policy's answer: the poses of the tool from the time `stamp_ns` on, `step_s`
         [s] apart; None: from now on. For a policy that answers late, that is the time of its
-        observation. It replaces what was wished for later than its begin.
+        observation. It takes the place of an earlier chunk as long as it lasts; what that one has
+        for later stays.
         """
         chunk = [_wish(pose, std, frame_id) for pose in poses]
         if not 0.0 < step_s < math.inf:
             raise ValueError(f"step_s: {step_s!r} given; a duration above 0 s needed")
-        if stamp_ns is None:
+        if not stamp_ns:
             self._heard("tool/wish")
             stamp_ns = time.time_ns()
         for i, encode in enumerate(chunk):
@@ -308,11 +311,13 @@ def _wish(
     pose: Sequence[float], std: tuple[float, float] | None, frame_id: str
 ) -> Callable[[int], bytes]:
     """The encoding of a wish for a stamp [ns]. Raises ValueError."""
-    position, orientation = _pose("wish", pose)
+    position, orientation = _pose("wish", _numbers("wish", pose, 7))
     if std is None:
         return _encoded(frame_id, position, orientation)
     checked_frame(frame_id)
     std_m, std_rad = _numbers("std", std, 2)
+    if not (0.0 < std_m <= LARGEST_STD and 0.0 < std_rad <= LARGEST_STD):
+        raise ValueError(f"std: {std} given; deviations above 0, up to {LARGEST_STD:g}, needed")
     variances = 3 * [std_m**2] + 3 * [std_rad**2]
     covariance = tuple(variances[i] * (i == j) for i in range(6) for j in range(6))
     return lambda ns: cdr.encode_pose_with_covariance(

@@ -23,6 +23,7 @@ from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import SIDES, Cause, Flag, Reason
 from thirdhand.contract.requests import Source
 
+MOST_AHEAD_MS = 1050.0  # a wish that is due later is not taken
 LONGEST_NAME = 64  # characters of a frame's name
 # reasons that a busy machine causes too, unless the samples of these sources are rejected
 OF_A_BUSY_MACHINE = {
@@ -273,7 +274,7 @@ def _rejection(cause: Cause | Condition, seen: Evidence) -> tuple[str, str]:  # 
 
 def refused_wish(cause: Cause, wish: Any, now_ns: int, frames: tuple[str, ...]) -> Explanation:
     """A wish that was rejected at the time `now_ns` [ns], in words."""
-    off_ms = (wish.stamp_ns - now_ns) * 1e-6
+    off_ms = (wish.stamp_ns - now_ns) * 1e-6 if wish.stamp_ns else 0.0
     clock = "stamp wishes by the clock of the daemon's machine, or with 0 for now"
     match cause:
         case Cause.OLDER:
@@ -281,20 +282,23 @@ def refused_wish(cause: Cause, wish: Any, now_ns: int, frames: tuple[str, ...]) 
                 f"due {lasting(-off_ms)} ago; up to 1 s accepted",
                 f"drop what a policy answers too late; {clock}",
             )
+        case Cause.AHEAD if off_ms <= MOST_AHEAD_MS:
+            return Explanation("128 poses wait already", "send poses farther apart, or fewer")
         case Cause.AHEAD:
             return Explanation(
-                f"due in {lasting(off_ms)}; up to 1 s, and at most 128 poses, accepted",
+                f"due in {lasting(off_ms)}; up to 1 s accepted",
                 f"send the end of a long chunk later; {clock}",
             )
         case Cause.OUT_OF_RANGE:
             return Explanation(
-                f"at {figures(wish.position)}; up to 10 m from the base plate accepted",
-                "publish wishes in metres",
+                f"at {figures(wish.position)} in frame {wish.frame_id[:LONGEST_NAME]!r}; up to 10 "
+                "m from the base plate accepted",
+                "publish wishes in the unit of their frame, metres in `base`",
             )
         case Cause.NOT_FINITE:
             return Explanation(
                 f"at {figures(wish.position)}, orientation {figures(wish.orientation)}; finite "
-                "numbers, and variances of at least 0, needed",
+                "numbers, and a covariance from 0 to 1e6, needed",
                 "publish nothing while the policy has no answer",
             )
     facts = Evidence(sample=wish, newest_ns=now_ns, frames=frames)

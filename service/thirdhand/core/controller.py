@@ -85,8 +85,7 @@ def start_state(settings: Settings, skill: Skill, tuning: Tuning = TUNING) -> Re
     state = blank(state_layout(joints, has_wishes=has_wishes))
     if has_wishes:
         state["wish_tick"] = -1
-        for field in ("wish_leap_tick", "wish_told_tick"):
-            state[field] = NEVER
+        state["wish_told_tick"] = state["wish_leap"] = NEVER
     Intake(settings, tuning=tuning).begin(state)
     state["reason"] = Reason.ARM_NOT_READY
     state["joints"][0] = settings.arm.posture

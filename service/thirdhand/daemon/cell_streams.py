@@ -31,6 +31,7 @@ from thirdhand.settings.config import Settings
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
+LONGEST_CHUNK_S = 1.05  # a wish that is due later is not taken
 TAKEOVER_S = 0.5  # another publisher of a hand is heard after a silence of this time
 # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
 FROZEN_S = 0.5
@@ -152,8 +153,12 @@ class SolePublisher:
         if self._name is not None and name != self._name and now_s - self._heard_s < TAKEOVER_S:
             return True
         self._name = name
-        self._heard_s = now_s
+        self._heard_s = max(now_s, self._heard_s)
         return False
+
+    def lasts(self, until_s: float) -> None:
+        """Note that what was heard lasts until this time [s]."""
+        self._heard_s = max(self._heard_s, until_s)
 
 
 class FrozenHand:
@@ -331,7 +336,10 @@ class CellStreams:
             arrivals.others += 1
             arrivals.count += 1
             return None
-        arrivals.take(message, time.time_ns())
+        at_ns = time.time_ns()
+        if suffix == TOOL_WISH and sole is not None:  # a chunk leads until its end
+            sole.lasts(now_s + min((message.stamp_ns - at_ns) / 1e9, LONGEST_CHUNK_S))
+        arrivals.take(message, at_ns)
         hand = self._frozen.get(suffix)
         if hand is not None and hand.is_frozen(message):
             arrivals.frozen += 1

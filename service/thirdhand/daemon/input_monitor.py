@@ -34,6 +34,7 @@ from thirdhand.contract.incidents import (
 )
 from thirdhand.contract.joint_states import measured
 from thirdhand.contract.messages import (
+    BASE,
     JointState,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -161,9 +162,13 @@ class InputMonitor:
             return explained(Condition.MALFORMED, Evidence(mistake=str(arrivals.refusal)))
         refused = intake.refused[name, Cause[cause.upper()]]
         if name == "wish":
-            return refused_wish(
-                refused.cause, refused.sample, refused.newest_ns, self._settings.tracker_frames
+            settings = self._settings
+            frames = tuple(
+                frame
+                for frame in settings.tracker_frames
+                if frame in ("", BASE) or settings.hands_in(frame).axes == "right-handed"
             )
+            return refused_wish(refused.cause, refused.sample, refused.newest_ns, frames)
         return explained(refused.cause, evidence(refused, self._settings, arrivals))
 
     def _source(self, source: str, controller: Controller, state: Record, now_s: float) -> Source:
@@ -188,7 +193,6 @@ class InputMonitor:
             self._stream(source, now_s, controller.intake),
             age_ms=None if sample_tick < 0 else round((tick - sample_tick) * period_ms, 1),
             fresh=sample_tick >= 0 and (tick - due_tick) * period_ms < silent_ms,
-            unit=self._unit_of(self.arrivals[self._keys[source]].newest),
             **of_its_kind,
         )
 
@@ -206,6 +210,7 @@ class InputMonitor:
         return {
             "late_ms": None if late_ms is None else round(late_ms[0], 1),
             "late_95_ms": None if late_ms is None else round(late_ms[1], 1),
+            "unit": self._unit_of(arrivals.newest),
             "scatter_mm": round(1e3 * float(state["noise_variance"][index]) ** 0.5, 2)
             if is_seen
             else None,

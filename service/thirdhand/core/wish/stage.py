@@ -56,6 +56,8 @@ class WishStage(SkillStage):
             steady_ticks=tuning.wish.steady_s / period_s,
             leap_m=fixed.LEAP_M,
             leap_mps=fixed.LEAP_MPS,
+            leap_ticks=fixed.LEAP_HOLD_S / period_s,
+            largest_variance=fixed.LARGEST_VARIANCE,
             fade_rate_per_s=tuning.wish.fade_rate_per_s,
             fade_mps=settings.tool.max_speed,
             rad_as_m=fixed.RAD_AS_M,
@@ -65,7 +67,6 @@ class WishStage(SkillStage):
             unknown_std_m=fixed.UNKNOWN_STD[0],
             unknown_std_rad=fixed.UNKNOWN_STD[1],
         )
-        self._leap_ticks = fixed.LEAP_HOLD_S / period_s
         self._silent_ticks = settings.skill.silent_ms / 1e3 / period_s
         self._mappings = _mappings(settings)
 
@@ -112,7 +113,8 @@ class WishStage(SkillStage):
 
         sources = BY_WISHES if wanted is None else BY_WISHES | BY_SKILL
         wanted = self._led(state, frame, wanted, sources)
-        leapt = 0 <= state["tick"] - self._wishes[0]["wish_leap_tick"] < self._leap_ticks
+        begin, end = self._wishes[0]["wish_leap"].tolist()
+        leapt = begin <= state["tick"] < end
         inside = is_inside(wanted.target.position, WHOLE_REACH, self.rules[0]["reach"])
         return wanted, WISH_LEADS | WISH_JUMPED * bool(leapt) | WISH_OUTSIDE * (not inside)
 

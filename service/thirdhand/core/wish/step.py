@@ -85,8 +85,12 @@ def _fault(rules: Records, pose: Vector, ahead_s: float, covariance: Vector) -> 
     if not (np.isfinite(pose).all() and np.isfinite(covariance).all()):
         return NOT_FINITE
     for i in range(6):
-        if covariance[i, i] < 0.0:
+        if not 0.0 <= covariance[i, i] <= rule.largest_variance:
             return NOT_FINITE
+        for j in range(i):
+            most = covariance[i, i] * covariance[j, j]
+            if covariance[i, j] ** 2 > (1.0 + 1e-9) * most:
+                return NOT_FINITE
     norm = math.sqrt(dot(pose[3:6], pose[3:6]) + pose[6] * pose[6])
     if abs(norm - 1.0) > rule.norm_tolerance:
         return NOT_A_ROTATION
@@ -121,35 +125,23 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     Where an earlier chunk has the path x already, until a time u after the tick, the pose p that is
     due after t becomes (1 - t/u) (x + p) / 2 + t/u p. Poses of earlier chunks between two of one
     chunk are dropped, and so are those nearer than nearest_ticks; those after its end stay. A pose
-    farther than leap_m from the path is noted as a leap; where the path has ended, leap_mps is
-    added for the time since.
+    that follows the one before it by less than nearest_ticks is left out. One farther than leap_m
+    from the path is noted as a leap, from the pose before it on; where the path has ended, leap_mps
+    is added for the time since.
     """
     wish = wishes[0]
     rule = rules[0]
     count = _forget_passed(wishes, wish.wish_count, tick)
     wish.wish_count = count
+    since = due - wish.wish_newest_due
+    if count and 0.0 <= since < rule.nearest_ticks - 1e-6:
+        return True
+    if count == MOST_WISHES:
+        return False
     if count:
-        motion = np.empty((3, 6))
-        quaternion = np.empty(4)
-        at(wishes, rules, due, motion, quaternion)
-        silent_s = max(due - wish.wish_due[count - 1], 0.0) * rule.period_s
-        leap_m = rule.leap_m + rule.leap_mps * silent_s
-        if squared_distance(pose[:3], motion[0, :3]) > leap_m * leap_m:
-            wish.wish_leap_tick = tick
-        elif wish.wish_due[0] <= due <= wish.wish_due[count - 1]:
-            ahead = max(due - tick, 0.0) / max(wish.wish_due[count - 1] - tick, 1.0)
-            share = 0.5 * (1.0 + min(ahead, 1.0))
-            turn = np.empty(3)
-            turn_between(quaternion, pose[3:], turn)
-            for axis in range(3):
-                pose[axis] = motion[0, axis] + share * (pose[axis] - motion[0, axis])
-                turn[axis] *= share
-            turn_on(quaternion, turn)
-            pose[3:] = quaternion
+        _merge(wishes, rules, tick, due, pose)
 
-    begin = min(wish.wish_newest_due, due - rule.nearest_ticks)
-    if due < wish.wish_newest_due:
-        begin = due - rule.nearest_ticks
+    begin = wish.wish_newest_due if since > 0.0 else due - rule.nearest_ticks
     wish.wish_newest_due = due
     place = 0
     for i in range(count):
@@ -158,9 +150,6 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
             wish.wish_poses[place] = wish.wish_poses[i]
             place += 1
     count = place
-    wish.wish_count = count
-    if count == MOST_WISHES:
-        return False
 
     place = count
     while place and wish.wish_due[place - 1] > due:
@@ -172,6 +161,40 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     wish.wish_count = count + 1
     wish.wish_is_new = 1
     return True
+
+
+@compiled
+def _merge(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> None:
+    """Replace a pose (7,) by its mean with the path of earlier chunks, or note a leap; see
+    `_insert`.
+    """
+    wish = wishes[0]
+    rule = rules[0]
+    motion = np.empty((3, 6))
+    quaternion = np.empty(4)
+    at(wishes, rules, due, motion, quaternion)
+    last_due = wish.wish_due[wish.wish_count - 1]
+    leap_m = rule.leap_m + rule.leap_mps * max(due - last_due, 0.0) * rule.period_s
+    if squared_distance(pose[:3], motion[0, :3]) > leap_m * leap_m:
+        begin = float(tick)
+        for i in range(wish.wish_count):
+            if wish.wish_due[i] < due:
+                begin = max(begin, wish.wish_due[i])
+        if tick < wish.wish_leap[1]:
+            begin = min(begin, wish.wish_leap[0])
+        wish.wish_leap[0] = begin
+        wish.wish_leap[1] = max(wish.wish_leap[1], max(due, float(tick)) + rule.leap_ticks)
+        return
+    if wish.wish_due[0] <= due <= last_due:
+        ahead = max(due - tick, 0.0) / max(last_due - tick, 1.0)
+        share = 0.5 * (1.0 + min(ahead, 1.0))
+        turn = np.empty(3)
+        turn_between(quaternion, pose[3:], turn)
+        for axis in range(3):
+            pose[axis] = motion[0, axis] + share * (pose[axis] - motion[0, axis])
+            turn[axis] *= share
+        turn_on(quaternion, turn)
+        pose[3:] = quaternion
 
 
 @compiled
@@ -354,6 +377,8 @@ def _weigh(wishes: Records, frames: Records, motion: Vector, quaternion: Vector)
 def _gain(skill: Vector, wish: Vector) -> Vector:
     """W = A (A + B)⁻¹ (3, 3) of two covariances A and B (3, 3), by the adjugate."""
     total = skill + wish
+    for i in range(3):
+        total[i, i] += 1e-12  # [m²] a micrometre: sure of the same plane, they have an inverse
     inverse = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -402,9 +427,9 @@ def _join(
     """Make the target of this tick from what leads now, `motion` (3, 6) and `quaternion` (4,) as
     written by `at`: an offset d is added, which fades out.
 
-    Where the path has changed, where something else leads (`sources` differs) or where ticks were
-    missed, d is set so that the target goes on from the one before, position, velocity and
-    acceleration. Then it obeys
+    Where the path has begun or changed, where something else leads (`sources` differs) or where
+    ticks were missed, d is set so that the target goes on from the one before, position, velocity
+    and acceleration. From then on it obeys
 
         d''' = -w³ d - 3 w² d' - 3 w d'',   w = min(fade_rate_per_s, fade_mps / (2 / e² |d|))
 
@@ -419,10 +444,11 @@ def _join(
     offset = wish.wish_offset
     passed_s = (tick - wish.wish_told_tick) * rule.period_s
     changed = wish.wish_is_new or sources != wish.wish_sources
+    if wish.wish_count and sources != BY_SKILL:
+        changed = changed or wish.wish_told_tick < wish.wish_due[0] <= tick  # the path begins
     if changed or tick != wish.wish_told_tick + 1:
         _begin_offset(wishes, rules, passed_s, motion, quaternion)
-    else:
-        _fade(offset, wish.wish_rate, rule.period_s)
+    _fade(offset, wish.wish_rate, min(passed_s, rule.goes_on_s))
 
     motion += offset
     turn_on(quaternion, offset[0, 3:])
@@ -438,7 +464,7 @@ def _join(
 def _begin_offset(
     wishes: Records, rules: Records, passed_s: float, motion: Vector, quaternion: Vector
 ) -> None:
-    """Set the offset and its rate so that the target goes on from that of `passed_s` ago."""
+    """Set the offset of `passed_s` ago and its rate, so that the target goes on from then."""
     wish = wishes[0]
     rule = rules[0]
     offset = wish.wish_offset
@@ -448,17 +474,17 @@ def _begin_offset(
         return
     told = wish.wish_told
     for axis in range(3):
-        speed = told[1, axis] + passed_s * told[2, axis]
-        ahead = told[0, axis] + passed_s * (told[1, axis] + 0.5 * passed_s * told[2, axis])
-        offset[0, axis] = ahead - motion[0, axis]
-        offset[1, axis] = speed - motion[1, axis]
+        # what leads now, as it was then
+        speed = motion[1, axis] - passed_s * motion[2, axis]
+        position = motion[0, axis] - passed_s * (speed + 0.5 * passed_s * motion[2, axis])
+        offset[0, axis] = told[0, axis] - position
+        offset[1, axis] = told[1, axis] - speed
         offset[2, axis] = told[2, axis] - motion[2, axis]
-    turned = wish.wish_turn.copy()
-    step = passed_s * told[3]
-    turn_on(turned, step)
-    turn_between(quaternion, turned, offset[0, 3:])
-    for axis in range(3):
         offset[1, 3 + axis] = told[3, axis] - motion[1, 3 + axis]
+    before = quaternion.copy()
+    step = -passed_s * motion[1, 3:]
+    turn_on(before, step)
+    turn_between(before, wish.wish_turn, offset[0, 3:])
     turn = offset[0, 3:]
     away_m = math.sqrt(dot(offset[0, :3], offset[0, :3]) + rule.rad_as_m**2 * dot(turn, turn))
     wish.wish_rate = rule.fade_rate_per_s

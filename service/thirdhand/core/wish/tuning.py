@@ -28,4 +28,5 @@ FARTHEST_S = (
     1.05  # a pose may be due a second after it arrives; clocks differ by less than the rest
 )
 WISH_NORM_TOLERANCE = 0.01  # a quaternion whose norm is farther from 1 is no rotation
+LARGEST_VARIANCE = 1e6  # [m², rad²] a larger one, or one below 0, is a mistake
 LATEST_S = 1.0  # a pose that was due earlier is not taken

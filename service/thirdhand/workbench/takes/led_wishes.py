@@ -19,7 +19,7 @@ from thirdhand.core.skill.model import NORMAL, REGION_95
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.recordings.recording import Recording
-from thirdhand.skills.no_skill import no_skill
+from thirdhand.skills.no_skill import leads_alone, no_skill
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.workbench.learning.choice import LEAST_BLOCKS
 from thirdhand.workbench.learning.records import TimedErrors
@@ -68,8 +68,8 @@ def _errors(path: Path) -> TimedErrors:
     """The errors of the wishes in a recording, where a person leads the arm."""
     recording = Recording.open(path).require_whole()
     settings = recording.settings
-    if not settings.skill.has_wishes:
-        raise SkillError(f"{path}: a recording of a cell whose tool wishes lead needed")
+    if not leads_alone(settings):
+        raise SkillError(f"{path}: a recording of a cell whose tool wishes lead alone needed")
     if decoded(recording.skill, origin=str(path)).regions != NORMAL:
         raise SkillError(f"{path}: its covariances are calibrated already; record without that")
     frames = [
