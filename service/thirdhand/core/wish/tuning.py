@@ -17,7 +17,7 @@ class WishTuning(NamedTuple):
 RETAINED = 12  # poses before now, from which a velocity is estimated
 # largest speed of an offset d that fades out at the rate w from rest is this times |d| w: 2 / e²
 FADING_SHARE = 0.2706705664732254
-NEAREST_S = 0.01  # of wishes due closer together than this only the newest is kept
+NEAREST_S = 0.01  # a wish due so soon after another one is left out
 LEAP_M = 0.25  # a wish farther from the path than this is another task's, or a mistake
 LEAP_MPS = 0.5  # and by this for each second in which no wish was due
 LEAP_HOLD_S = 0.5  # the arm holds for so long after such a wish
