@@ -420,7 +420,7 @@ def test_watch_yields_in_order_and_none_in_silence(
     """
     encode = channels.BY_KEY["tool/setpoint"].codec.encode
     poses = [PoseStamped(n, "base", (0.0, 0.0, float(n)), (0.0, 0.0, 0.0, 1.0)) for n in range(3)]
-    with cell.watch("tool/setpoint", timeout_s=0.2) as watch:
+    with cell.watch("tool/setpoint", timeout_s=1.0) as watch:
         assert next(watch) is None
         daemon = Publisher(listener, "bench", "tool/setpoint")
         wait_until_heard(daemon, timeout_s=10)
