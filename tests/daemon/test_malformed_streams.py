@@ -12,13 +12,24 @@ from thirdhand.cli.diagnosis import findings
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.requests import Status
 
-EVERY_INPUT = (
-    f'{LISTENING}\n[hands]\nclutch = "key"\ngripper = "key"\n[recording]\nalso = ["camera"]\n'
-)
+EVERY_INPUT = f"""{LISTENING}
+[hands]
+clutch = "key"
+gripper = "key"
+[skill]
+source = "tool/wish"
+[recording]
+also = ["camera"]
+"""
 HEARD = [
     channel.key for channel in channels.CHANNELS if channel.direction == "in" and channel.recorded
 ]
-SOURCES = {"hands/left": "left hand", "hands/right": "right hand", "joints/state": "arm"}
+SOURCES = {
+    "hands/left": "left hand",
+    "hands/right": "right hand",
+    "joints/state": "arm",
+    "tool/wish": "wish",
+}
 
 
 @pytest.mark.timeout(120)

@@ -26,7 +26,7 @@ from thirdhand.daemon.launch import launched
 from thirdhand.daemon.single_instance import NETWORK_BOUNDS
 
 CELL = "bench"
-NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish")
+NOT_DEMONSTRATED = ("objects", "clutch", "gripper/wish", "tool/wish")
 INPUTS = (
     "hands/left",
     "hands/right",
