@@ -115,7 +115,6 @@ def test_a_cell_moves_it(address: str, tmp_path: Path) -> None:
                 time.sleep(0.5)
                 if np.abs(arm.read()[0] - begin).max() > 0.1:
                     break
-            assert daemon.client.status().mode == "follow"
         assert np.abs(arm.read()[0] - begin).max() > 0.1
         assert np.abs(arm.read()[1]).max() < 0.01
 
