@@ -20,10 +20,9 @@ from thirdhand.contract.incidents import (
     word,
 )
 from thirdhand.contract.messages import JointState, PoseStamped
-from thirdhand.contract.records import SIDES, Cause, Flag, Reason
+from thirdhand.contract.records import FARTHEST_WISH_S, SIDES, Cause, Flag, Reason
 from thirdhand.contract.requests import Source
 
-MOST_AHEAD_MS = 1050.0  # a wish that is due later is not taken
 LONGEST_NAME = 64  # characters of a frame's name
 # reasons that a busy machine causes too, unless the samples of these sources are rejected
 OF_A_BUSY_MACHINE = {
@@ -282,7 +281,7 @@ def refused_wish(cause: Cause, wish: Any, now_ns: int, frames: tuple[str, ...]) 
                 f"due {lasting(-off_ms)} ago; up to 1 s accepted",
                 f"drop what a policy answers too late; {clock}",
             )
-        case Cause.AHEAD if off_ms <= MOST_AHEAD_MS:
+        case Cause.AHEAD if off_ms <= 1000.0 * FARTHEST_WISH_S:
             return Explanation("128 poses wait already", "send poses farther apart, or fewer")
         case Cause.AHEAD:
             return Explanation(

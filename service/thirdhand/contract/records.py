@@ -13,6 +13,8 @@ from typing import NamedTuple, TypeAlias
 SIDES = ("left", "right")
 # a hand that the skill does not need has disappeared after this time; occlusions are shorter
 GONE_S = 5.0
+# a wish may be due a second after it arrives; clocks differ by less than the rest
+FARTHEST_WISH_S = 1.05
 SOURCES = (*SIDES, "arm", "wish")
 
 

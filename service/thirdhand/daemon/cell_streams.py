@@ -23,7 +23,7 @@ from thirdhand.contract import cdr, channels, ros2
 from thirdhand.contract.joint_states import JointStates
 from thirdhand.contract.messages import JointState, PoseStamped, WireError
 from thirdhand.contract.other_types import Refusal
-from thirdhand.contract.records import SIDES
+from thirdhand.contract.records import FARTHEST_WISH_S, SIDES
 from thirdhand.core.frame import Event, Frame, Record
 from thirdhand.daemon.ros2_domain import Ros2Domain
 from thirdhand.settings.config import Settings
@@ -31,7 +31,6 @@ from thirdhand.settings.config import Settings
 KEPT_DELAYS = 256  # the delays of this many messages are stored
 CLOCK_STEP_NS = 100_000_000  # a delay this far below the minimum shows a clock that was set
 HELD_UP_NS = 50_000_000  # a message was held up if its delay exceeds that of the next by this
-LONGEST_CHUNK_S = 1.05  # a wish that is due later is not taken
 TAKEOVER_S = 0.5  # another publisher of a hand is heard after a silence of this time
 # a tracker measures no pose twice, bit for bit; over this time it is not the tracker's rate
 FROZEN_S = 0.5
@@ -338,7 +337,7 @@ class CellStreams:
             return None
         at_ns = time.time_ns()
         if suffix == TOOL_WISH and sole is not None:  # a chunk leads until its end
-            sole.lasts(now_s + min((message.stamp_ns - at_ns) / 1e9, LONGEST_CHUNK_S))
+            sole.lasts(now_s + min((message.stamp_ns - at_ns) / 1e9, FARTHEST_WISH_S))
         arrivals.take(message, at_ns)
         hand = self._frozen.get(suffix)
         if hand is not None and hand.is_frozen(message):

@@ -34,7 +34,6 @@ from thirdhand.contract.incidents import (
 )
 from thirdhand.contract.joint_states import measured
 from thirdhand.contract.messages import (
-    BASE,
     JointState,
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -48,6 +47,7 @@ from thirdhand.core.intake.far_away import too_far, unit_meant
 from thirdhand.core.intake.late_samples import lateness_ms
 from thirdhand.core.intake.stage import Intake, Refused
 from thirdhand.core.tuning import TUNING
+from thirdhand.core.wish.stage import wish_frames
 from thirdhand.core.wish.step import newest_due
 from thirdhand.daemon.cell_streams import Arrivals, heard
 from thirdhand.daemon.side_streams import side_keys
@@ -162,12 +162,7 @@ class InputMonitor:
             return explained(Condition.MALFORMED, Evidence(mistake=str(arrivals.refusal)))
         refused = intake.refused[name, Cause[cause.upper()]]
         if name == "wish":
-            settings = self._settings
-            frames = tuple(
-                frame
-                for frame in settings.tracker_frames
-                if frame in ("", BASE) or settings.hands_in(frame).axes == "right-handed"
-            )
+            frames = wish_frames(self._settings)
             return refused_wish(refused.cause, refused.sample, refused.newest_ns, frames)
         return explained(refused.cause, evidence(refused, self._settings, arrivals))
 

@@ -19,11 +19,11 @@ from numpy.random import Generator, default_rng
 from scipy.interpolate import CubicSpline
 
 from thirdhand.contract.messages import BASE, PoseStamped
+from thirdhand.contract.records import FARTHEST_WISH_S
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Tick
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.tuning import TUNING, Tuning
-from thirdhand.core.wish.tuning import FARTHEST_S
 from thirdhand.recordings.shipped import recordings
 from thirdhand.settings.config import Settings, SkillSettings, robot_description
 from thirdhand.skills.no_skill import no_skill
@@ -160,7 +160,7 @@ class OurArm:
 
     def take(self, chunk: Chunk, now_s: float) -> None:
         for due_s, position in zip(chunk.due_s, chunk.positions.tolist(), strict=True):
-            if due_s - now_s < FARTHEST_S:
+            if due_s - now_s < FARTHEST_WISH_S:
                 stamp_ns = START_NS + round(1e9 * due_s)
                 wish = PoseStamped(stamp_ns, BASE, tuple(position), self._turned)
                 self._events.append(Event("tool/wish", b"", wish))

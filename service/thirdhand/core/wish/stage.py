@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thirdhand.contract.messages import BASE, PoseStamped, PoseWithCovarianceStamped
-from thirdhand.contract.records import Cause
+from thirdhand.contract.records import FARTHEST_WISH_S, Cause
 from thirdhand.core.codes import (
     BY_SKILL,
     BY_WISHES,
@@ -62,7 +62,7 @@ class WishStage(SkillStage):
             fade_mps=settings.tool.max_speed,
             rad_as_m=fixed.RAD_AS_M,
             goes_on_s=fixed.GOES_ON_S,
-            farthest_s=fixed.FARTHEST_S,
+            farthest_s=FARTHEST_WISH_S,
             latest_s=fixed.LATEST_S,
             unknown_std_m=fixed.UNKNOWN_STD[0],
             unknown_std_rad=fixed.UNKNOWN_STD[1],
@@ -151,13 +151,22 @@ class WishStage(SkillStage):
         self._conclude(as_array(state), as_array(frame), known, Turn(*turn), NO_GRIPPER, 0.0, 0.0)
 
 
+def wish_frames(settings: Settings) -> tuple[str, ...]:
+    """Names of the frames that a wish may have; the empty name stands for `base`."""
+    return tuple(
+        frame
+        for frame in settings.tracker_frames
+        if frame in ("", BASE) or settings.hands_in(frame).axes == "right-handed"
+    )
+
+
 def _mappings(settings: Settings) -> dict[str, Vector]:
     """The mapping (4, 4) of poses in each frame that a wish may have to frame base, see `take`."""
     mappings = {BASE: np.eye(4)}
     mappings[BASE][3] = 0.0
-    for frame in settings.tracker_frames:
-        of_frame = settings.hands_in(frame)
-        if frame not in ("", BASE) and of_frame.axes == "right-handed":
+    for frame in wish_frames(settings):
+        if frame not in mappings and frame:
+            of_frame = settings.hands_in(frame)
             mapping = np.zeros((4, 4))
             mapping[:3] = base_from(of_frame)
             turn_between(IDENTITY, np.array(of_frame.base_from_tracker[3:]), mapping[3, :3])

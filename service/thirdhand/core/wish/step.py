@@ -151,7 +151,6 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
             place += 1
     count = place
 
-    place = count
     while place and wish.wish_due[place - 1] > due:
         wish.wish_due[place] = wish.wish_due[place - 1]
         wish.wish_poses[place] = wish.wish_poses[place - 1]
@@ -494,7 +493,7 @@ def _begin_offset(
 
 @compiled
 def _fade(offset: Vector, w: float, t: float) -> None:
-    """Advance an offset (3, 6), value and two derivatives, by a time t [s], see `join`."""
+    """Advance an offset (3, 6), value and two derivatives, by a time t [s], see `_join`."""
     fading = exp(-w * t)
     for axis in range(6):
         c0 = offset[0, axis]

@@ -24,9 +24,6 @@ LEAP_HOLD_S = 0.5  # the arm holds for so long after such a wish
 GOES_ON_S = 0.2  # after a longer gap, a target does not go on from the one before
 RAD_AS_M = 0.2  # [m/rad] an offset of orientation fades out as one of position of this size
 UNKNOWN_STD = (0.01, 0.05)  # [m, rad] deviation of a wish without a covariance
-FARTHEST_S = (
-    1.05  # a pose may be due a second after it arrives; clocks differ by less than the rest
-)
 WISH_NORM_TOLERANCE = 0.01  # a quaternion whose norm is farther from 1 is no rotation
 LARGEST_VARIANCE = 1e6  # [m², rad²] a larger one, or one below 0, is a mistake
 LATEST_S = 1.0  # a pose that was due earlier is not taken
