@@ -50,7 +50,7 @@ def output_map(parameters: Hyperparameters, reference: Gaussians) -> Array | Non
     """T (O, O) for these parameters and normals; None where it is the identity."""
     prior = parameters.prior_covariance
     values = parameters.channel_outputs
-    root: Array = np.eye(values) if prior is None else np.linalg.cholesky(prior)
+    root: NDArray[Any] = np.eye(values) if prior is None else np.linalg.cholesky(prior)
     rotated = None
     if parameters.kernel.channels == 1 and reference.mean.size > _SMALL:
         rotated = _basis(root, reference.covariance)
@@ -72,7 +72,7 @@ def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
     inner = symmetric(inverse @ shape @ inverse.T)
     if not (inner - np.diag(np.diagonal(inner))).any():
         return None
-    return np.asarray(np.linalg.eigh(inner)[1])
+    return np.asarray(np.linalg.eigh(inner)[1], dtype=np.float64)
 
 
 def inner_problem(

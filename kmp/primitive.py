@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,9 +33,10 @@ from kmp.arrays.immutable import frozen
 from kmp.constraints import LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians, check_gaussians, check_pairs
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
+from kmp.goals import moved_means
 from kmp.kernel import Kernel
-from kmp.low_rank import RANK, TOLERANCE
+from kmp.low_rank import RANK, TOLERANCE, LowRank
 from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
@@ -388,11 +389,12 @@ class KMP(Predictor, Plotted):
 
     def adapt_many(
         self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
-    ) -> tuple[KMP, ...]:
-        """A new primitive for each pair of inputs (V, I) and V normals, as by `adapt`.
+    ) -> Alternatives:
+        """A new primitive for each of G pairs of inputs (V, I) and V normals, as by `adapt`.
 
-        Each is adapted from this primitive: for alternative goals, people or rollouts. Raises
-        ValueError as `adapt` does.
+        Each is adapted from this primitive: for alternative goals, people or rollouts. It is made
+        when it is indexed; `Alternatives.mean` gives the means of all at once. Raises ValueError
+        as `adapt` does.
         """
         pairs = parts_of("points", points)
         for i, pair in enumerate(pairs):
@@ -401,7 +403,38 @@ class KMP(Predictor, Plotted):
                     f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals "
                     "needed."
                 )
-        return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
+        if tolerance is None:
+            tolerance = self.base.spacing / 2
+        not_negative("tolerance", tolerance)
+        inputs = [numbers("inputs", given, "V", self._dimensions) for given, _ in pairs]
+        for via, (_, desired) in zip(inputs, pairs, strict=True):
+            check_pairs("desired", via, desired, self.outputs)
+        return Alternatives(self, inputs, [desired for _, desired in pairs], tolerance)
+
+    def goal_jacobian(self, queries: ArrayLike) -> Array:
+        """The derivatives (M, O, V, O) of the mean at queries (M, I) by the means of the V
+        via-points: it is affine in these, so that they hold for any goal at the same inputs.
+
+        Raises ValueError as `mean` does, or if there are constraints.
+        """
+        before: Solution = self.inner.solution
+        if constraints_of(before) is not None:
+            raise ValueError(
+                "goal_jacobian: a primitive with constraints given, whose mean is not affine in "
+                "its goals; one without needed."
+            )
+        wanted = Functionals(self._checked_many(queries))
+        changes = self.inner.changes
+        at_rest = mean_of(before, wanted)
+        goals = changes.points.mean
+        jacobian = np.empty((*at_rest.shape, *goals.shape))
+        for index in np.ndindex(goals.shape):
+            moved = np.array(goals)
+            moved[index] += 1.0
+            points = unchecked(moved, changes.points.covariance)
+            other = before.adapted(changes._replace(points=points))
+            jacobian[:, :, *index] = mean_of(other, wanted) - at_rest
+        return jacobian
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
         """Distances (I,) [unit of the inputs] up to which a via-point at `query` (I,) matters.
@@ -494,3 +527,68 @@ def checked_primitive(value: object, name: str = "primitive") -> KMP:
     """The value as a `KMP`. Raises ValueError if it is none."""
     check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
     return cast(KMP, value)
+
+
+class Alternatives(Sequence[KMP]):
+    """Primitives that `KMP.adapt_many` adapts from one, made when they are indexed."""
+
+    def __init__(
+        self,
+        primitive: KMP,
+        inputs: Sequence[Array],
+        desired: Sequence[Gaussians],
+        tolerance: float,
+    ) -> None:
+        self._primitive = primitive
+        self._inputs = inputs
+        self._desired = desired
+        self._tolerance = tolerance
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    @overload
+    def __getitem__(self, index: int) -> KMP: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[KMP, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> KMP | tuple[KMP, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(len(self))[index])
+        return self._primitive.adapt(
+            self._inputs[index], self._desired[index], tolerance=self._tolerance
+        )
+
+    def mean(self, queries: ArrayLike) -> Array:
+        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
+
+        Of goals with the same number of via-points it takes hardly more time than of one. Raises
+        ValueError as `KMP.mean` does.
+        """
+        primitive = self._primitive
+        solution: Solution = primitive.inner.solution
+        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
+        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
+            return np.stack([adapted.mean(queries) for adapted in self])
+        inputs = np.stack(self._inputs)
+        covariance = np.stack([desired.covariance for desired in self._desired])
+        goals = np.stack([desired.mean for desired in self._desired])
+        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
+            first = self[0]
+            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
+            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
+            away = (goals - goals[0]).reshape(len(self), -1)
+            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
+        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
+            return np.stack([adapted.mean(queries) for adapted in self])
+        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
+        normals = unchecked(
+            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
+        )
+        added = Database(points, resolved(solution.hyperparameters, points, normals))
+        replaced = [
+            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
+            for via in self._inputs
+        ]
+        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)

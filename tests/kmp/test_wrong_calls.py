@@ -110,6 +110,7 @@ RIGHT = {
         "directions": np.zeros((2, 2)),
     },
     TAUGHT.without_via_points: {"inputs": S[:1] + 9, "tolerance": 0.1},
+    TAUGHT.goal_jacobian: {"queries": S},
     ONE.adapt_many: {"points": [(S[:2], R[:2]), (S[2:3], R[2:3])], "tolerance": 0.1},
     ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
     ONE.via_point_reach: {"query": S[0], "share": 0.5},
