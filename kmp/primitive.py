@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast, overload
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,9 +34,8 @@ from kmp.constraints import LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
-from kmp.goals import moved_means
 from kmp.kernel import Kernel
-from kmp.low_rank import RANK, TOLERANCE, LowRank
+from kmp.low_rank import RANK, TOLERANCE
 from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
@@ -47,12 +46,27 @@ from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
 
+if TYPE_CHECKING:
+    from kmp.goals import Alternatives
+
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
-_FREE = 1e6  # [unit of the outputs / unit of the inputs] deviation of a rate that is not prescribed
+
+
+class Saved:
+    """Values with a method that writes them to a file."""
+
+    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
+        """Write this and the units of its numbers to an .npz file, as `kmp.save` does.
+
+        Raises OSError if the file cannot be written.
+        """
+        from kmp.storage import save
+
+        save(path, self, input_unit=input_unit, output_unit=output_unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KMP(Predictor, Plotted):
+class KMP(Predictor, Plotted, Saved):
     """A skill: a reference database, the via-points in it, and its solution.
 
     `fit`, `adapt` and `load` return one. N points in all, I inputs, O outputs. Immutable, so that
@@ -89,7 +103,7 @@ class KMP(Predictor, Plotted):
         rank: int = RANK,
         rank_tolerance: float = TOLERANCE,
     ) -> KMP:
-        """The primitive of a reference database: inputs (N, I), N normals over O outputs.
+        """The primitive of a reference database: inputs (N, I) or (N,), N normals over O outputs.
 
         The mean returns to `prior_mean` (O,) [unit of the outputs] far from the inputs; None is 0.
         An `AffineMean` depends on the input. The covariance does not depend on it.
@@ -344,15 +358,6 @@ class KMP(Predictor, Plotted):
         )
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
-    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
-        """Write the primitive and the units of its numbers to an .npz file, as `kmp.save` does.
-
-        Raises OSError if the file cannot be written.
-        """
-        from kmp.storage import save
-
-        save(path, self, input_unit=input_unit, output_unit=output_unit)
-
     @classmethod
     def load(cls, path: str | Path, *, kernels: Mapping[str, type] | None = None) -> KMP:
         """The primitive that `save` wrote; `kmp.load` gives its units too, and explains `kernels`.
@@ -409,6 +414,8 @@ class KMP(Predictor, Plotted):
         inputs = [numbers("inputs", given, "V", self._dimensions) for given, _ in pairs]
         for via, (_, desired) in zip(inputs, pairs, strict=True):
             check_pairs("desired", via, desired, self.outputs)
+        from kmp.goals import Alternatives
+
         return Alternatives(self, inputs, [desired for _, desired in pairs], tolerance)
 
     def goal_jacobian(self, queries: ArrayLike) -> Array:
@@ -452,7 +459,7 @@ class KMP(Predictor, Plotted):
             raise ValueError(f"share is {share:g}, and must be between 0 and 1.")
         values = self.outputs // self.kernel.channels
         desired = Gaussians.of(
-            self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs]
+            self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, np.inf], values)[: self.outputs]
         )
         point = Functionals(s[None])
         adapted = self._through(
@@ -527,68 +534,3 @@ def checked_primitive(value: object, name: str = "primitive") -> KMP:
     """The value as a `KMP`. Raises ValueError if it is none."""
     check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
     return cast(KMP, value)
-
-
-class Alternatives(Sequence[KMP]):
-    """Primitives that `KMP.adapt_many` adapts from one, made when they are indexed."""
-
-    def __init__(
-        self,
-        primitive: KMP,
-        inputs: Sequence[Array],
-        desired: Sequence[Gaussians],
-        tolerance: float,
-    ) -> None:
-        self._primitive = primitive
-        self._inputs = inputs
-        self._desired = desired
-        self._tolerance = tolerance
-
-    def __len__(self) -> int:
-        return len(self._inputs)
-
-    @overload
-    def __getitem__(self, index: int) -> KMP: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[KMP, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> KMP | tuple[KMP, ...]:
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(len(self))[index])
-        return self._primitive.adapt(
-            self._inputs[index], self._desired[index], tolerance=self._tolerance
-        )
-
-    def mean(self, queries: ArrayLike) -> Array:
-        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
-
-        Of goals with the same number of via-points it takes hardly more time than of one. Raises
-        ValueError as `KMP.mean` does.
-        """
-        primitive = self._primitive
-        solution: Solution = primitive.inner.solution
-        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
-        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
-            return np.stack([adapted.mean(queries) for adapted in self])
-        inputs = np.stack(self._inputs)
-        covariance = np.stack([desired.covariance for desired in self._desired])
-        goals = np.stack([desired.mean for desired in self._desired])
-        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
-            first = self[0]
-            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
-            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
-            away = (goals - goals[0]).reshape(len(self), -1)
-            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
-        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
-            return np.stack([adapted.mean(queries) for adapted in self])
-        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
-        normals = unchecked(
-            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
-        )
-        added = Database(points, resolved(solution.hyperparameters, points, normals))
-        replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
-            for via in self._inputs
-        ]
-        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)
