@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from kmp.arrays.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
 from kmp.arrays.immutable import Immutable, frozen
-from kmp.criteria.cross_validation import preferred, rms
+from kmp.criteria.errors import preferred, rms
 from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
 from kmp.functionals import Functionals

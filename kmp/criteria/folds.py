@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
-from kmp.criteria.cross_validation import rms
+from kmp.criteria.errors import rms
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, between
