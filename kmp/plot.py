@@ -59,7 +59,7 @@ class Plotted:
         """M normals at queries (M, I)."""
 
     @abstractmethod
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The points that are drawn with the predictions."""
 
     def plot(
@@ -100,7 +100,7 @@ class Plotted:
             ("output_unit", output_unit),
         ):
             check_kind(name, text, str, "a text")
-        plot_data = self.to_plot()
+        plot_data = self._to_plot()
         s = (
             _along(plot_data)
             if queries is None

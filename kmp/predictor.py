@@ -266,11 +266,6 @@ class Predictor(Immutable):
         return self.inner.solution.hyperparameters.prior_mean
 
     @property
-    def prior_offset(self) -> Array:
-        """The prior mean (O,) [unit of the outputs] at inputs of 0."""
-        return self.inner.solution.hyperparameters.prior_offset
-
-    @property
     def outputs(self) -> int:
         """O, the number of outputs."""
         return self.inner.solution.hyperparameters.outputs
@@ -279,34 +274,6 @@ class Predictor(Immutable):
     def representation(self) -> Literal["dense", "low_rank"]:
         """The kind of solution."""
         return self.inner.solution.representation
-
-    @property
-    def weights(self) -> Array:
-        """The weights of equation (8): alpha (N, O) of equation (9), or of the low rank centres."""
-        return self.inner.solution.weights
-
-    @property
-    def centres(self) -> Array:
-        """The inputs (N, I) to which the weights belong: reference points and via-points."""
-        return self.inner.solution.centres
-
-    @property
-    def error_bound(self) -> float:
-        """Upper bound of the distance between the mean and equation (9)'s [unit of the outputs].
-
-        It holds at any query, and is 0 for the dense solution. For the low rank it is 5 to 100
-        times the error itself. The error is largest far from the points; for queries near them,
-        `error_bound_at_points` is lower.
-        """
-        return self.inner.solution.error_bounds.anywhere
-
-    @property
-    def error_bound_at_points(self) -> float:
-        """As `error_bound`, but at the reference points and via-points only [unit of the outputs].
-
-        For the low rank it is 10 to 1000 times the error itself.
-        """
-        return self.inner.solution.error_bounds.at_points
 
     @cached_property
     def _spanned(self) -> Features:

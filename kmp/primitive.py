@@ -325,7 +325,7 @@ class KMP(Predictor, Plotted):
             return Constrained(changed, before.constraints)
         return changed
 
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""
         database = self.inner.solution.database
         count = len(self.inputs) - len(self.via_inputs)

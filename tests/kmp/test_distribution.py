@@ -74,7 +74,7 @@ def test_it_holds_this_tree_and_nothing_else(wheel):
         if line.startswith("Requires-D")
     }
     assert {line for line in needed if "extra" not in line} == {"numpy>=2.1", "scipy>=1.14"}
-    for name, extra in (("scikit-learn", "mixture"), ("numba", "fast"), ("matplotlib", "plot")):
+    for name, extra in (("scikit-learn", "sklearn"), ("numba", "fast"), ("matplotlib", "plot")):
         assert any(line.startswith(name) and f"extra == '{extra}'" in line for line in needed)
     assert wheel.stat().st_size < 250_000
 

@@ -10,9 +10,9 @@ from kmp import (
     Gaussians,
     LocalKMP,
     VelocityKernel,
-    gaussian_process_reference,
     superposed,
 )
+from kmp.reference import gaussian_process_reference
 from support.shown_skills import off, two_hands
 
 

@@ -16,7 +16,6 @@ from kmp import (
     KMP,
     AffineMean,
     CoordinateFrame,
-    Correlation,
     GaussianKernel,
     GaussianMixture,
     Gaussians,
@@ -30,6 +29,10 @@ from kmp import (
     named_arrays,
     orientation,
 )
+from kmp.correlation import Correlation, improve
+from kmp.reference import gaussian_process_reference
+from kmp.sklearn import KMPRegressor
+from support.primitives import offered
 
 S = np.random.default_rng(0).normal(size=(6, 2))
 R = Gaussians(S, np.tile(0.01 * np.eye(2), (6, 1, 1)))
@@ -63,7 +66,7 @@ IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts":
 def regressor(*, ell, lambda_mean, lambda_covariance, noise, components, random_state):
     """scikit-learn checks a parameter when it is used, so the estimator is fitted too."""
     arguments = locals()
-    return kmp.KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
+    return KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
 
 
 # Right arguments of each public callable.
@@ -136,7 +139,7 @@ RIGHT = {
     Correlation.neutral: {"centres": S, "width": 1.0, "outputs": 2},
     NEUTRAL.__call__: {"inputs": S},
     NEUTRAL.applied: {"primitive": ONE},
-    kmp.improve: {
+    improve: {
         "primitive": ONE,
         "reward": lambda path: -float(path.sum()),
         "queries": S,
@@ -178,7 +181,7 @@ RIGHT = {
     orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
     orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
     orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
-    kmp.gaussian_process_reference: {
+    gaussian_process_reference: {
         "demonstrations": PAIRS,
         "inputs": S,
         "count": 12,
@@ -473,8 +476,7 @@ def test_each_right_call_works(tmp_path, monkeypatch):
 
 def public():
     """Each public callable of the package, by type and name, and its parameters."""
-    for name in kmp.__all__:
-        member = getattr(kmp, name)
+    for name, member in offered().items():
         if not inspect.isclass(member):
             yield "", name, inspect.signature(member).parameters
         elif not issubclass(member, Warning):

@@ -221,9 +221,9 @@ class LocalKMP(Immutable, Plotted):
         )
         return LocalKMP(tuple(adapted), self.frames)
 
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""
-        plots = [primitive.to_plot() for primitive in self.primitives]
+        plots = [primitive._to_plot() for primitive in self.primitives]  # noqa: SLF001
         placed = [
             Points(plot.references.inputs, frame.placed(plot.references.normals))
             for frame, plot in zip(self.frames, plots, strict=True)
