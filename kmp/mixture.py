@@ -6,8 +6,10 @@ of P(xi | s). The paper, section II-A; Cohn, Ghahramani, Jordan 1996 for the reg
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import cache
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -142,13 +144,11 @@ def mixture_of(
     if len(data) < components:
         shortage = f"{len(data)} samples given for {components} components"
         raise ValueError(f"{shortage}: give at least {components} samples, or fewer components.")
-    # scikit-learn loads slowly, and predictions do not need it.
     from sklearn.cluster import KMeans
-    from threadpoolctl import threadpool_limits
 
     try:
         # k-means sums its threads' results in the order in which they finish
-        with threadpool_limits(1):
+        with one_thread():
             if start is None:
                 k_means = KMeans(components, n_init=1, random_state=seed).fit(data)
                 share = (k_means.labels_ == np.arange(components)[:, None]).astype(float)
@@ -163,6 +163,23 @@ def mixture_of(
             "found, as one of their covariances is singular. Give a larger regularization, or "
             "fewer components."
         ) from None
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """A context in which matrices and k-means are computed by one thread.
+
+    More threads gain nothing on small matrices, and lose much where other programs compute.
+    """
+    return _thread_pools().limit(limits=1)  # type: ignore[no-any-return]
+
+
+@cache
+def _thread_pools() -> Any:
+    # scikit-learn loads slowly, and predictions do not need it; its threads must be found, too
+    import sklearn.cluster  # noqa: F401
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def _likeliest(data: Array, parts: _Parts, added: float) -> _Parts:

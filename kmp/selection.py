@@ -6,6 +6,7 @@ marginal likelihood of the reference.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -18,12 +19,10 @@ from kmp.arrays.immutable import Immutable, frozen
 from kmp.criteria.errors import preferred, rms
 from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
-from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, checked_kernel
-from kmp.mixture import GaussianMixture, mixture_of
+from kmp.mixture import GaussianMixture, mixture_of, one_thread
 from kmp.primitive import KMP
-from kmp.problem.database import Database
 from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
 
@@ -301,16 +300,18 @@ def learn(
         asked = [is_shown, False] if points == "auto" and is_shown else [is_shown]
         search = _Search(kernel, lambda_mean, scales == "one")
         choices = [recipe.folds(data, mixtures, option) for option in asked]
-        folds, kernel, lambda_mean, scores = search.best(choices)
+        # over one input the matrices are those of few features
+        with one_thread() if data[0][0].shape[1] == 1 else nullcontext():
+            folds, kernel, lambda_mean, scores = search.best(choices)
+            if lambda_covariance is None:
+                lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
         is_shown = folds.shown
         plain = float(np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds.each])))
-        if lambda_covariance is None:
-            lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
     full = recipe.reference(data, mixture, is_shown)
     if is_incomplete and criterion == "likelihood":
         start = 0.5 / _variances(full.inputs)
         likeliest = most_likely(
-            Database(Functionals(full.inputs), full.reference),
+            full.database,
             full.prior_mean,
             kernel or (VelocityKernel(float(start[0])) if velocity else GaussianKernel(start)),
             lambda_mean,
