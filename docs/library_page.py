@@ -53,7 +53,7 @@ Joints are in radians, or in metres if they slide.
 `pip install .` in a clone installs the client alone, for Python 3.11 or later on Linux, macOS and
 Windows, with `eclipse-zenoh` and `msgspec`."""
 KMP_GROUPS = {
-    "Learn": ("learn", "GaussianMixture", "Gaussians"),
+    "Learn": ("learn", "aligned", "GaussianMixture", "Gaussians"),
     "Primitives": (
         "KMP",
         "OrientationKMP",

@@ -12,7 +12,7 @@ fitted weights.
 
 The method, in the order in which it computes:
 
-* `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
+* `alignment`, `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
 * `kernel`: k between `functionals`, the values and derivatives of the output. `radial`,
   `time_kernels`: the kernels; `composition`: sums and products of them.
 * `problem/`: the reference database with its via-points, and the hyper-parameters.
@@ -30,6 +30,7 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
+    from kmp.alignment import aligned as aligned
     from kmp.arrays.checks import RankReached as RankReached
     from kmp.arrays.checks import ViaPointMissed as ViaPointMissed
     from kmp.constraints import LinearConstraints as LinearConstraints
@@ -55,6 +56,7 @@ if typing.TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _NAMES = {
+    "alignment": "aligned",
     "arrays.checks": "RankReached ViaPointMissed",
     "constraints": "LinearConstraints",
     "frames": "CoordinateFrame LocalKMP",

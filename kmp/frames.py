@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of
+from kmp.arrays.checks import Array, Seed, brief, check_some, not_negative, numbers, pair, parts_of
 from kmp.arrays.immutable import Immutable
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.kernel import Kernel, checked_kernel
@@ -125,7 +125,7 @@ class LocalKMP(Immutable, Plotted):
         lambda_mean: float,
         lambda_covariance: float | None = None,
         components: int,
-        seed: int,
+        seed: Seed = 0,
         regularization: float = 1e-6,
     ) -> LocalKMP:
         """The skill of demonstrations, each inputs (T, I), outputs (T, O), and F frames for each.

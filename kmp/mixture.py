@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from kmp.arrays.checks import (
     Array,
+    Seed,
     brief,
     check_finite,
     check_some,
@@ -65,13 +66,13 @@ class GaussianMixture(Immutable):
 
     @classmethod
     def fit(
-        cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6
+        cls, samples: ArrayLike, *, components: int, seed: Seed = 0, regularization: float = 1e-6
     ) -> GaussianMixture:
         """The mixture that EM finds from a k-means start: samples (M, I+O), the inputs first.
 
         `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2
-        where the unit is the metre. The same seed gives the same mixture, whatever the number of
-        threads.
+        where the unit is the metre. `seed`, a whole number or a numpy Generator, is
+        that of k-means. The same seed gives the same mixture, whatever the number of threads.
 
         Raises ValueError if the shape differs, a number is not finite, there are fewer samples than
         components, or a parameter is out of its range.
@@ -104,7 +105,7 @@ class GaussianMixture(Immutable):
         check_finite("inputs", mean, "far outside the mixture: its mean there")
         return Gaussians(mean, symmetric(covariance))
 
-    def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
+    def sample_inputs(self, count: int, *, dimensions: int, seed: Seed = 0) -> Array:
         """Inputs (count, I) of a reference, drawn from the marginal P(s), with I = `dimensions`.
 
         Raises ValueError if the count is below 1, or no output remains.
@@ -131,7 +132,7 @@ def mixture_of(
     samples: ArrayLike,
     *,
     components: int,
-    seed: int,
+    seed: Seed,
     regularization: float,
     start: GaussianMixture | None = None,
 ) -> GaussianMixture:
@@ -140,7 +141,7 @@ def mixture_of(
     check_some("samples", data.T)
     added = positive("regularization", regularization)
     whole("components", components)
-    seeded(seed)
+    seed = seeded(seed)
     if len(data) < components:
         shortage = f"{len(data)} samples given for {components} components"
         raise ValueError(f"{shortage}: give at least {components} samples, or fewer components.")

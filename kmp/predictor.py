@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, check_finite, check_shape, real, seeded, whole
+from kmp.arrays.checks import Array, Seed, check_finite, check_shape, real, seeded, whole
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
 from kmp.functionals import Functionals
@@ -137,8 +137,10 @@ class Predictor(Immutable):
         )
         return unchecked(self.mean(s).reshape(1, -1), covariance)
 
-    def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
+    def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
+
+        `seed` is a whole number or a numpy Generator.
 
         Raises ValueError as `predict` does, or if the count is below 1.
         """

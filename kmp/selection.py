@@ -14,7 +14,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
+from kmp.arrays.checks import (
+    Array,
+    Seed,
+    check_kind,
+    checked_demonstrations,
+    one_of,
+    positive,
+    seeded,
+    whole,
+)
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.criteria.errors import preferred, rms
 from kmp.criteria.folds import Fold
@@ -227,7 +236,7 @@ def learn(
     demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
     *,
     components: int,
-    seed: int,
+    seed: Seed = 0,
     count: int = 200,
     velocity: bool = False,
     kernel: Kernel | None = None,
@@ -242,7 +251,10 @@ def learn(
 
     The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs, and
     the primitive, whose mean returns to the reference's. `regularization` is that of
-    `GaussianMixture.fit`, as a share of the variance of each input and output.
+    `GaussianMixture.fit`, as a share of the variance of each input and output, and `seed` its seed.
+
+    Demonstrations may have different lengths T. Over time, those of different durations should be
+    `aligned` first: they then have a common phase.
 
     `points`: the inputs are "drawn" from the marginal as in the paper (evenly spaced over time,
     where I is 1), or "shown", the demonstrations' own. "auto": drawn where I is 1; else those
@@ -281,7 +293,7 @@ def learn(
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
     deviation = np.concatenate([np.hstack(pair) for pair in data]).std(axis=0)
     unit = np.where(deviation > 0, deviation, 1.0)  # of a column that never changes
-    recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1, unit)
+    recipe = _Recipe(components, seeded(seed), count, regularization, 2 if velocity else 1, unit)
     mixture = recipe.mixture(data)
     _check_precision(data)
     is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)

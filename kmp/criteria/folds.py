@@ -185,7 +185,7 @@ class _System:
         )
         roots = self.fold.inverse_roots.reshape(*self.fold.reference.mean.shape, z.shape[1], -1)
         rows = np.einsum("nocd,ncr->nord", roots, z)
-        return rows.reshape(self.fold.reference.mean.size, -1)
+        return np.asarray(rows.reshape(self.fold.reference.mean.size, -1))
 
     @cached_property
     def _pulls(self) -> Array:

@@ -187,6 +187,7 @@ RIGHT = {
         "count": 12,
         "regularization": 1e-6,
     },
+    kmp.aligned: {"demonstrations": [(T, S)], "velocity": False},
     kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
     kmp.learn: {
         "demonstrations": PAIRS,
@@ -353,7 +354,7 @@ def wrong_arrays(array):
 def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
     """Values that are wrong for an argument like this, and values that may work."""
     if name in {"seed", "random_state"}:
-        return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
+        return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3), np.random.default_rng(0)]
     if name in WHOLE:
         return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
     if name == "tolerance":
