@@ -11,7 +11,7 @@ import pytest
 
 import kmp
 from kmp import KMP, GaussianKernel, Gaussians, LinearConstraints, VelocityKernel
-from support.paths import ROOT
+from support.paths import LIBRARY
 
 # some via-points have neighbours of other deviations
 pytestmark = pytest.mark.filterwarnings("ignore::kmp.ViaPointMissed")
@@ -139,7 +139,7 @@ def test_names_and_modules_are_loaded_when_needed():
         "kmp.sklearn.KMPRegressor(); assert sys.modules['sklearn'] is not kmp.sklearn; "
         "assert 'KMP' in dir(kmp)"
     )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, check=True)
     with pytest.raises(AttributeError, match="no attribute 'Unknown'"):
         _ = kmp.Unknown
 
