@@ -19,6 +19,8 @@ from kmp.named_arrays import from_arrays, to_arrays
 from kmp.primitive import KMP
 
 _FORMAT = 1  # number of the file format
+# begin of a file that Git LFS has not fetched
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 class Stored(NamedTuple):
@@ -86,6 +88,13 @@ def load(path: str | Path, *, kernels: Mapping[str, type] | None = None) -> Stor
     except Exception:  # NumPy documents no list of errors for damaged archives
         arrays = {}
     if "kmp_format" not in arrays:
+        with Path(path).open("rb") as file:
+            is_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
+        if is_pointer:
+            raise ValueError(
+                f"{path}: a pointer of Git LFS and not the file itself; `git lfs pull` fetches "
+                "that."
+            )
         raise ValueError(
             f"{path}: not an .npz file that `kmp.save` wrote, or damaged: save it again."
         )
