@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -199,8 +199,8 @@ class _Recipe:
         miss = (self.regressed(mixture, inputs).mean - outputs)[
             :, : outputs.shape[1] // self.channels
         ]
-        return Fold(
-            training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss)
+        return replace(
+            training, held_inputs=inputs, held_outputs=outputs, regression_rmse=rms(miss)
         )
 
 
