@@ -33,6 +33,8 @@ SINGLE = 450  # N O up to which a fit takes less than a millisecond, and less th
 # a border is faster than a fit if at least this share of points precedes the first change
 _LEAST_SHARED = 0.75
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
+# least lambda_c Sigma / k(s, s) from which a product with the inverse is exact to 1e-9
+_PRECISE = 1e-2
 _COLUMNS = 64  # columns of a factor that are copied at once
 
 
@@ -118,7 +120,7 @@ class Dense(Expansion):
 
     # A copy in another process predicts without the factors; only `adapted` computes them again.
     _not_pickled = frozenset(
-        {"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver"}
+        {"mean_factor", "covariance_factor", "_mean_solver", "_covariance_solver", "_precision"}
     )
 
     hyperparameters: Hyperparameters
@@ -170,6 +172,16 @@ class Dense(Expansion):
         )
 
     def posterior_covariance(self, rows: Array) -> Array:
+        if self._precision is not None:
+            d = self.distinct
+            covariance = np.tile(self._prior_covariance, (len(rows), 1, 1))
+            for i in range(d):
+                for j in range(i + 1):
+                    explained = np.vecdot(rows @ self._precision[i, j], rows)
+                    covariance[:, i, j] -= explained
+                    if i != j:
+                        covariance[:, j, i] -= explained
+            return self._for_all_outputs(covariance)
         roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
         return self._for_all_outputs(
             np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots)
@@ -228,6 +240,22 @@ class Dense(Expansion):
     @cached_property
     def inverse_factor(self) -> InverseCholeskyFactor:
         return InverseCholeskyFactor.of(self.covariance_factor, self.distinct)
+
+    @cached_property
+    def _precision(self) -> Array | None:
+        """The blocks (D, D, N, N) of (K + lambda_c Sigma)^-1, whose products with one query's row
+        are half of those of L^-1; None over several channels, or where rounding would show.
+        """
+        parameters = self.hyperparameters
+        kernel = parameters.kernel
+        share = parameters.lambda_covariance * self.database.least_shares(kernel).min()
+        if kernel.channels > 1 or share < _PRECISE:
+            return None
+        lower, _ = lapack.dpotri(self.covariance_factor, lower=1)
+        inverse = np.tril(lower) + np.tril(lower, -1).T
+        n = len(self.database)
+        blocks: Array = inverse.reshape(n, -1, n, self.distinct).transpose(1, 3, 0, 2).copy()
+        return frozen(blocks)
 
     @cached_property
     def mean_factor(self) -> Array:
