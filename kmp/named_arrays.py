@@ -17,14 +17,22 @@ from numpy.typing import NDArray
 from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
 from kmp.arrays.immutable import frozen
 from kmp.composition import ProductKernel, SumKernel
-from kmp.constraints import Constrained, LinearConstraints
-from kmp.dense import Dense
+from kmp.constraints import LinearConstraints
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.kernel import Kernel
 from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP
+from kmp.outputs import (
+    Decoupled,
+    Mapped,
+    as_one,
+    constrained,
+    constraints_of,
+    decoupled_groups,
+    inner_problem,
+)
 from kmp.predictor import Inner, Uncertainty
 from kmp.primitive import KMP
 from kmp.problem.database import Changes, Database
@@ -33,6 +41,7 @@ from kmp.query import MotionPrediction
 from kmp.radial import GaussianKernel, Matern32, Matern52
 from kmp.references.correlation import Correlation, Improvement
 from kmp.references.frames import CoordinateFrame, LocalKMP
+from kmp.representation import dense
 from kmp.selection import Learned, Score
 from kmp.solution import Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
@@ -142,8 +151,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
     for name, functionals in (("base", base.database.functionals), ("via", changes.functionals)):
         if functionals.directions is not None:
             arrays[f"{name}_directions"] = functionals.directions
-    if isinstance(solution, Constrained):
-        constraints = solution.constraints
+    if parameters.prior_covariance is not None:
+        arrays["prior_covariance"] = parameters.prior_covariance
+    if (constraints := constraints_of(solution)) is not None:
         arrays |= {
             name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS
         }
@@ -162,8 +172,11 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
         )
     base = _base(arrays, kinds)
     changes = _changes(arrays, base.database)
+    has_constraints = any(name in arrays for name in _OF_CONSTRAINTS)
+    if has_constraints and base.representation == "dense":
+        base = _weighted(as_one(base), "base_weights", arrays)
     solution = base.adapted(changes) if len(changes.inputs) else base
-    if any(name in arrays for name in _OF_CONSTRAINTS):
+    if has_constraints:
         solution = _constrained(solution, arrays)
     unadapted = KMP(Inner.of_base(base))
     if solution is base:
@@ -173,20 +186,20 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
     )
 
 
-def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Constrained:
+def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Solution:
     if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
         raise ValueError(
             f"The primitive's arrays lack {', '.join(missing)}: give all of "
             f"{', '.join(_OF_CONSTRAINTS)}, or none."
         )
-    if not isinstance(solution, Dense):
+    if solution.representation == "low_rank":
         raise ValueError(
             "constraints: given for a low rank solution, a dense one needed. Leave out the arrays "
             "of either."
         )
     inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
     constraints = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
-    return Constrained(solution, constraints)
+    return constrained(solution, constraints)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solution:
@@ -201,15 +214,36 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solut
         float(numbers("lambda_mean", arrays["lambda_mean"])),
         float(numbers("lambda_covariance", arrays["lambda_covariance"])),
         AffineMean(prior[:, 1:], prior[:, 0]) if prior.ndim == 2 else prior,
+        arrays.get("prior_covariance"),
         inputs=inputs.shape[1],
         outputs=reference.outputs,
     )
     database = Database(Functionals.checked(inputs, arrays.get("base_directions")), reference)
-    low_rank = "pivots" in arrays
-    solution = (
-        LowRank.of_arrays(parameters, database, arrays) if low_rank else Dense(parameters, database)
-    )
-    return _weighted(solution, "base_weights", arrays)
+    if "output_map" not in arrays:
+        return _weighted(_plain(parameters, database, arrays), "base_weights", arrays)
+    t = numbers("output_map", arrays["output_map"], reference.outputs, reference.outputs)
+    inner = _plain(*inner_problem(parameters, database, t), arrays)
+    return _weighted(Mapped(parameters, database, t, inner, database), "base_weights", arrays)
+
+
+def _plain(
+    parameters: Hyperparameters, database: Database, arrays: Mapping[str, NDArray[Any]]
+) -> Solution:
+    """The solution without its outputs' map."""
+    if "pivots" not in arrays:
+        return dense(parameters, database)
+    information = real("information", arrays["information"])
+    groups = decoupled_groups(parameters, database.reference, alike=False)
+    if len(groups) == 1:
+        return LowRank.of_arrays(parameters, database, arrays)
+    check_shape("information", information, len(groups), "r", "r")
+    features = numbers("features", arrays["features"], "r", parameters.channel_outputs)
+
+    def part(of: Hyperparameters, points: Database, group: NDArray[np.intp]) -> LowRank:
+        own = {"information": information[group[0]], "features": features[:, group[:1]]}
+        return LowRank.of_arrays(of, points, {**arrays, **own})
+
+    return Decoupled.of_parts(parameters, database, groups, part)
 
 
 def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from kmp.arrays.checks import Array, check_finite, check_shape, real, seeded, whole
 from kmp.arrays.immutable import Immutable, frozen
-from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
+from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
 from kmp.kernel import Kernel, between
@@ -223,8 +223,8 @@ class Predictor(Immutable):
         total = self.predict(s).covariance
         c = self.kernel.channels
         z = self._spanned(Functionals(s)).T.reshape(len(s), c, len(self._spanned.pivots))
-        residual = kron_identity(
-            self.kernel.prior_variance - z @ z.transpose(0, 2, 1), self.outputs // c
+        residual = self.inner.solution.hyperparameters.over_outputs(
+            self.kernel.prior_variance - z @ z.transpose(0, 2, 1)
         )
         distance = nearest_positive_semidefinite(residual) * self.inner.query.covariance_scale
         return Uncertainty(
@@ -258,7 +258,8 @@ class Predictor(Immutable):
         penalty = parameters.lambda_covariance
         if self.representation == "low_rank":
             penalty = min(penalty, parameters.lambda_mean)
-        return float(least_variances(parameters, anywhere, penalty)[0, 0])
+        least = least_variances(parameters, anywhere, penalty)[0, 0]
+        return float(least * parameters.prior_variances.max())
 
     @property
     def prior_mean(self) -> Array | AffineMean:
@@ -269,6 +270,12 @@ class Predictor(Immutable):
     def prior_offset(self) -> Array:
         """The prior mean (O,) [unit of the outputs] at inputs of 0."""
         return self.inner.solution.hyperparameters.prior_offset
+
+    @property
+    def prior_covariance(self) -> Array:
+        """B (D, D) [unit of the outputs^2] of the D outputs of a channel."""
+        known = self.inner.solution.hyperparameters.prior_covariance
+        return np.eye(self.outputs // self.kernel.channels) if known is None else known
 
     @property
     def outputs(self) -> int:

@@ -30,12 +30,13 @@ from kmp.arrays.checks import (
     whole,
 )
 from kmp.arrays.immutable import frozen
-from kmp.constraints import Constrained, LinearConstraints
+from kmp.constraints import LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
+from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
 from kmp.problem.database import Changes, Database, warn_of_missed
@@ -81,6 +82,7 @@ class KMP(Predictor, Plotted):
         lambda_mean: float,
         lambda_covariance: float | None = None,
         prior_mean: ArrayLike | AffineMean | None = None,
+        prior_covariance: ArrayLike | None = None,
         directions: ArrayLike | None = None,
         representation: Literal["auto", "dense", "low_rank"] = "auto",
         rank: int = RANK,
@@ -91,6 +93,11 @@ class KMP(Predictor, Plotted):
         The mean returns to `prior_mean` (O,) [unit of the outputs] far from the inputs; None is 0.
         An `AffineMean` depends on the input. The covariance does not depend on it.
         `lambda_covariance` None is `lambda_mean`; another value costs a second factor.
+
+        `prior_covariance` B [unit of the outputs^2], variances (O,) or a covariance (O, O), is that
+        of the outputs far from the inputs, over N / lambda_c; None is the identity. The prior
+        is K (x) B. With the squares of the outputs' sizes, no output's unit changes another's
+        prediction. With a `VelocityKernel`, B is that of the values alone.
 
         If a row of `directions` (N, I) [unit of the inputs] is not zero, the normal is that of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction.
@@ -114,6 +121,7 @@ class KMP(Predictor, Plotted):
             lambda_mean,
             lambda_covariance,
             prior_mean,
+            prior_covariance,
             inputs=s.shape[1],
             outputs=reference.outputs,
         )
@@ -191,8 +199,8 @@ class KMP(Predictor, Plotted):
             tolerance = self.base.spacing / 2
         before: Solution = self.inner.solution
         base = self.base
-        if isinstance(before, Constrained):
-            base = base.constrained(before.constraints)
+        if (known := constraints_of(before)) is not None:
+            base = base.constrained(known)
         points = changes.functionals.take(remaining)
         return base._through(  # noqa: SLF001 (of its own kind)
             points, changes.points.take(remaining), not_negative("tolerance", tolerance)
@@ -241,20 +249,19 @@ class KMP(Predictor, Plotted):
             if count != needed:
                 raise ValueError(f"constraints: {count} {name} given, {needed} needed.")
         solution: Solution = self.inner.solution
-        if isinstance(solution, Constrained):
-            constraints = solution.constraints.joined(constraints)
-            solution = solution.solution
-        if not isinstance(solution, Dense):
-            base = self.base.inner.solution.database
-            if (size := base.reference.mean.size) > LARGE:
+        if (known := constraints_of(solution)) is not None:
+            constraints = known.joined(constraints)
+        if not is_one(solution):
+            base = self.base.inner.solution
+            size = base.database.reference.mean.size
+            if solution.representation == "low_rank" and size > LARGE:
                 raise ValueError(
                     f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} "
                     "or the dense "
                     'representation needed. Fit fewer points, or with representation="dense".'
                 )
-            dense = KMP(Inner.of_base(Dense(solution.hyperparameters, base)))
-            return self._on(dense).constrained(constraints)
-        return self._changed(Constrained(solution, constraints), self.inner.changes, self.base)
+            return self._on(KMP(Inner.of_base(as_one(base).solved()))).constrained(constraints)
+        return self._changed(constrained(solution, constraints), self.inner.changes, self.base)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
@@ -321,9 +328,8 @@ class KMP(Predictor, Plotted):
         changed: Solution = base.inner.solution
         if len(self.via_inputs):
             changed = changed.adapted(self.inner.changes)
-        if isinstance(before, Constrained) and isinstance(changed, Dense):
-            return Constrained(changed, before.constraints)
-        return changed
+        known = constraints_of(before)
+        return changed if known is None else constrained(changed, known)
 
     def to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""

@@ -13,6 +13,14 @@ import numpy as np
 from kmp.arrays.checks import RankReached
 from kmp.dense import Dense
 from kmp.low_rank import Features, LowRank
+from kmp.outputs import (
+    Decoupled,
+    Mapped,
+    decoupled_groups,
+    inner_problem,
+    output_map,
+    variances_over_prior,
+)
 from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
@@ -37,11 +45,35 @@ def solved(
     tolerance: float,
 ) -> Solution:
     """The solution of the database. Warns `RankReached` if the rank does not suffice."""
+    t = output_map(parameters, database.reference)
+    if t is None:
+        return _solved(parameters, database, representation, rank, tolerance)
+    with variances_over_prior(parameters):
+        inside = inner_problem(parameters, database, t)
+        inner = _solved(*inside, representation, rank, tolerance)
+    return Mapped(parameters, database, t, inner, database).solved()
+
+
+def dense(parameters: Hyperparameters, database: Database) -> Dense | Decoupled:
+    """The dense solution, of each group of outputs by itself where these decouple."""
+    groups = decoupled_groups(parameters, database.reference, alike=True)
+    if len(groups) == 1:
+        return Dense(parameters, database)
+    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: Dense(p, d))
+
+
+def _solved(
+    parameters: Hyperparameters,
+    database: Database,
+    representation: str,
+    rank: int,
+    tolerance: float,
+) -> Solution:
     size = database.reference.mean.size
     if representation == "dense" or (
         representation == "auto" and not _may_be_low(parameters, database)
     ):
-        return Dense(parameters, database).solved()
+        return dense(parameters, database).solved()
     optional = representation == "auto" and size <= LARGE
     most = min(rank, int(_LOW * len(database) * parameters.kernel.channels)) if optional else rank
     points = database.functionals
@@ -52,8 +84,18 @@ def solved(
     reached = len(features.pivots) >= most
     enough = residual <= max(tolerance if reached else 100 * tolerance, _ROUNDING)
     if optional and not (enough and is_resolved(parameters, database)):
-        return Dense(parameters, database).solved()
-    solution = LowRank.fit(parameters, database, features, values=values).solved()
+        return dense(parameters, database).solved()
+    groups = decoupled_groups(parameters, database.reference, alike=False)
+    solution: LowRank | Decoupled = (
+        LowRank.fit(parameters, database, features, values=values)
+        if len(groups) == 1
+        else Decoupled.of_parts(
+            parameters,
+            database,
+            groups,
+            lambda p, d, _: LowRank.fit(p, d, features, values=values),
+        )
+    ).solved()
     if not enough:
         error_bound = solution.error_bounds.at_points
         warnings.warn(
@@ -62,7 +104,7 @@ def solved(
             f"off by up to {error_bound:.2g} [unit of the outputs]. Raise the rank, or take a "
             "smaller ell or fewer points with the dense solution.",
             RankReached,
-            stacklevel=3,
+            stacklevel=4,
         )
     return solution
 

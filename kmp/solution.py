@@ -180,6 +180,7 @@ def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussian
         return normals
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
+    least = least * np.tile(parameters.prior_variances, parameters.kernel.channels)
     covariance = normals.covariance.copy()
     n, o = np.nonzero(exact)
     covariance[n, o, :] = covariance[n, :, o] = 0.0

@@ -1,4 +1,4 @@
-"""Hyper-parameters of a primitive: kernel, lambda, lambda_c, prior mean.
+"""Hyper-parameters of a primitive: kernel, lambda, lambda_c, prior mean and covariance.
 
 The prior mean m(s) = A s + b is subtracted before fitting and added to predictions.
 """
@@ -11,9 +11,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, brief, check_shape, numbers, positive
+from kmp.arrays.checks import Array, brief, check_shape, numbers, positive, real
 from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
+from kmp.gaussians import covariances
 from kmp.kernel import Kernel, checked_kernel
 
 
@@ -49,6 +51,8 @@ class Hyperparameters(Immutable):
     lambda_covariance: float
     prior_offset: Array  # (O,) [unit of the outputs]
     prior_matrix: Array | None = None  # (O, I) where the prior mean is affine
+    # B (D, D) [unit of the outputs^2] of the outputs of a channel; None: the identity
+    prior_covariance: Array | None = None
 
     @classmethod
     def checked(
@@ -57,6 +61,7 @@ class Hyperparameters(Immutable):
         lambda_mean: float,
         lambda_covariance: float | None,
         prior_mean: ArrayLike | AffineMean | None,
+        prior_covariance: ArrayLike | None = None,
         *,
         inputs: int,
         outputs: int,
@@ -93,7 +98,26 @@ class Hyperparameters(Immutable):
                     f"prior_mean: rates of {brief(rates)} given, {brief(slopes)} needed: those of "
                     "the values' prior mean."
                 )
-        return cls(kernel, penalty, other, offset, matrix)
+        values = outputs // kernel.channels
+        return cls(kernel, penalty, other, offset, matrix, _covariance(prior_covariance, values))
+
+    @cached_property
+    def prior_variances(self) -> Array:
+        """(D,) [unit of the outputs^2] by which a variance counts as lost in rounding, which that
+        of an output's prior is times the largest eigenvalue of their correlations.
+        """
+        if self.prior_covariance is None:
+            return np.ones(self.channel_outputs)
+        own = np.diagonal(self.prior_covariance)
+        correlation = self.prior_covariance / np.sqrt(np.outer(own, own))
+        return np.asarray(own * np.linalg.eigvalsh(correlation)[-1])
+
+    def over_outputs(self, blocks: Array) -> Array:
+        """x (x) B of blocks (..., C, C): (..., O, O)."""
+        wide = kron_identity(blocks, self.channel_outputs)
+        if self.prior_covariance is None:
+            return wide
+        return np.asarray(wide @ np.kron(np.eye(self.kernel.channels), self.prior_covariance))
 
     @property
     def prior_mean(self) -> Array | AffineMean:
@@ -140,3 +164,13 @@ class Hyperparameters(Immutable):
     def channel_outputs(self) -> int:
         """D, the outputs of each of the kernel's C channels: O = C D."""
         return len(self.prior_offset) // self.kernel.channels
+
+
+def _covariance(value: ArrayLike | None, outputs: int) -> Array | None:
+    """B (D, D) of variances (D,) or of a covariance; None if it is the identity."""
+    if value is None:
+        return None
+    given = real("prior_covariance", value)
+    matrix = np.diag(numbers("prior_covariance", given, outputs)) if given.ndim == 1 else given
+    covariance = covariances("prior_covariance", np.asarray(matrix)[None], 1, outputs)[0]
+    return None if np.array_equal(covariance, np.eye(outputs)) else covariance

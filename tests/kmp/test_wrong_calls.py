@@ -96,6 +96,7 @@ RIGHT = {
         "kernel": K,
         "lambda_mean": 1.0,
         "lambda_covariance": 2.0,
+        "prior_covariance": [1.0, 2.0],
         "prior_mean": np.zeros(2),
         "directions": np.zeros((6, 2)),
         "representation": "low_rank",
@@ -256,6 +257,7 @@ OF_ANY_SIZE = {GaussianKernel, Matern32, Matern52, Gaussians.of, regressor}
 OPTIONAL = {
     "kernels",
     "lambda_covariance",
+    "prior_covariance",
     "prior_mean",
     "directions",
     "angular_velocities",

@@ -8,6 +8,7 @@ own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -239,10 +240,13 @@ def _lag_s(tool: Array, meant: Array) -> float:
     return float(SEAM_LAGS_S[int(np.argmin(squares))])
 
 
-def tool_paths(folder: Path) -> dict[str, Array]:
-    """The tools' paths (N, 3) [m] of the takes in a folder, one point a tick, after a rest."""
+def tool_paths(folder: Path, share: float) -> dict[str, Array]:
+    """The tools' paths (N, 3) [m] of a share of the takes in a folder, one point a tick, after a
+    rest.
+    """
+    files = sorted(folder.glob("demonstration-*.mcap"))
     paths = {}
-    for file in sorted(folder.glob("demonstration-*.mcap")):
+    for file in files[: math.ceil(share * len(files))]:
         take = read_demonstration(file)
         times_s = (take.stamps_ns - take.stamps_ns[0]) / 1e9
         even_s = np.arange(0.0, times_s[-1], PERIOD_S)
@@ -273,7 +277,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     orientation = OurArm(settings).orientation
     arms: dict[str, Callable[[], PolicyArm]] = {OURS: lambda: OurArm(settings)}
     tried: dict[str, dict[float, float]] = {}
-    paths = tool_paths(recordings())
+    paths = tool_paths(recordings(), options.share)
     draws = seeds.tuning["policies"].share(options.share)
     for name, (queue, numbers) in QUEUES.items():
         behind = {
@@ -286,7 +290,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         arms[name] = behind[min(numbers, key=tried[name].__getitem__)]
         results.say(f"{name}: {brief(tried[name])}")
 
-    paths = tool_paths(recordings() / "people")
+    paths = tool_paths(recordings() / "people", options.share)
     draws = seeds.evaluation["policies"].share(options.share)
     judged: dict[str, Any] = {}
     for name, made in arms.items():
@@ -294,7 +298,8 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         judged[name] = {key: _mean(by_run, key) for key in by_run[0] if key != "covered"}
         for covered in (True, False):
             part = [row for row in by_run if row["covered"] == covered]
-            judged[name]["error_mm, " + COVERED[covered]] = _mean(part, "error_mm")
+            if part:  # of a quick look, there may be none
+                judged[name]["error_mm, " + COVERED[covered]] = _mean(part, "error_mm")
         results.say(f"{name}: {brief(judged[name])}")
     _draw(results, arms, next(iter(paths.values())), settings)
     changed = {

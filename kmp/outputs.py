@@ -1,0 +1,353 @@
+"""Outputs with a prior covariance B, and outputs that decouple in some coordinates.
+
+The equation (9) with B is alpha = (I (x) B) (K (x) B + lambda Sigma)^-1 (mu - m). With B = T T^T,
+the coordinates x of y = T x have the prior covariance K (x) I. Where every Sigma_n is s_n A, T is
+chosen so that T^-1 A T^-T is diagonal, too. Where all of T^-1 Sigma_n T^-T are diagonal, or have
+blocks, each block is a system of its own: D systems of N rows instead of one of N D.
+
+Over C channels, T is the same for the values and for their rates: I (x) T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kmp.arrays.checks import Array
+from kmp.arrays.immutable import frozen
+from kmp.arrays.linear_algebra import symmetric
+from kmp.constraints import Constrained, LinearConstraints
+from kmp.dense import Dense
+from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, unchecked
+from kmp.low_rank import LowRank
+from kmp.problem.database import Changes, Database
+from kmp.problem.hyperparameters import Hyperparameters
+from kmp.solution import ErrorBounds, Expansion, Solution
+
+_SMALL = 450  # N O up to which one system is as fast as several
+_ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
+
+
+@contextmanager
+def variances_over_prior(parameters: Hyperparameters) -> Iterator[None]:
+    """A ValueError from within says in which unit its variances are."""
+    try:
+        yield
+    except ValueError as error:
+        if parameters.prior_covariance is None:
+            raise
+        raise ValueError(f"{error} Variances are over those of prior_covariance.") from None
+
+
+def output_map(parameters: Hyperparameters, reference: Gaussians) -> Array | None:
+    """T (O, O) for these parameters and normals; None where it is the identity."""
+    prior = parameters.prior_covariance
+    values = parameters.channel_outputs
+    root: Array = np.eye(values) if prior is None else np.linalg.cholesky(prior)
+    rotated = None
+    if parameters.kernel.channels == 1 and reference.mean.size > _SMALL:
+        rotated = _basis(root, reference.covariance)
+    if prior is None and rotated is None:
+        return None
+    inside = root if rotated is None else root @ rotated
+    return frozen(np.kron(np.eye(parameters.kernel.channels), inside))
+
+
+def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
+    """The eigenvectors (O, O) of R^-1 A R^-T, if all covariances (N, O, O) are s_n A and it is not
+    diagonal.
+    """
+    sizes = np.trace(covariance, axis1=1, axis2=2)
+    shape = covariance[0] / sizes[0]
+    if np.abs(covariance / sizes[:, None, None] - shape).max() > _ONE_SHAPE:
+        return None
+    inverse = np.linalg.inv(root)
+    inner = symmetric(inverse @ shape @ inverse.T)
+    if not (inner - np.diag(np.diagonal(inner))).any():
+        return None
+    return np.asarray(np.linalg.eigh(inner)[1])
+
+
+def inner_problem(
+    parameters: Hyperparameters, database: Database, t: Array
+) -> tuple[Hyperparameters, Database]:
+    """The problem in the coordinates x = T^-1 y."""
+    inverse = np.linalg.inv(t)
+    matrix = parameters.prior_matrix
+    inside = replace(
+        parameters,
+        prior_offset=frozen(inverse @ parameters.prior_offset),
+        prior_matrix=None if matrix is None else frozen(inverse @ matrix),
+        prior_covariance=None,
+    )
+    return inside, Database(database.functionals, _inside(inverse, database.reference))
+
+
+def _inside(inverse: NDArray[Any], normals: Gaussians) -> Gaussians:
+    """Normals in the coordinates x; entries that rounding leaves beside the diagonal are 0."""
+    covariance = symmetric(inverse @ normals.covariance @ inverse.T)
+    size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    covariance[np.abs(covariance) < _ONE_SHAPE * size[:, :, None] * size[:, None, :]] = 0.0
+    return unchecked(normals.mean @ inverse.T, covariance)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mapped(Expansion):
+    """The solution y = T x of a solution for x. The members are those of `Solution`."""
+
+    hyperparameters: Hyperparameters
+    database: Database
+    t: Array
+    inner: Solution
+    base: Database
+    """The database before any adaptation."""
+    constraints: LinearConstraints | None = None
+
+    @property
+    def representation(self) -> Literal["dense", "low_rank"]:
+        return self.inner.representation
+
+    @property
+    def functionals(self) -> Functionals:
+        return self.inner.functionals
+
+    @cached_property
+    def weights(self) -> Array:
+        return frozen(self.inner.weights @ self.t.T)
+
+    @property
+    def error_bounds(self) -> ErrorBounds:
+        size = float(np.linalg.norm(self.t, 2))
+        return ErrorBounds(*(size * bound for bound in self.inner.error_bounds))
+
+    def solved(self) -> Mapped:
+        with variances_over_prior(self.hyperparameters):
+            self.inner.solved()
+        self.weights  # noqa: B018
+        return self
+
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        inner = self.inner.posterior_covariance_one(row, prior)
+        outputs = len(self.t)
+        blocks = inner.reshape(-1, outputs, len(inner) // outputs, outputs)
+        mapped = np.einsum("io,aobp,jp->aibj", self.t, blocks, self.t, optimize=True)
+        return np.asarray(mapped.reshape(inner.shape))
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        return np.asarray(self.t @ self.inner.posterior_covariance(rows) @ self.t.T)
+
+    def adapted(self, changes: Changes) -> Mapped:
+        inside = changes._replace(points=_inside(np.linalg.inv(self.t), changes.points))
+        return replace(self, database=self.base.changed(changes), inner=self.inner.adapted(inside))
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
+        inside, _ = inner_problem(hyperparameters, self.database, self.t)
+        return replace(
+            self, hyperparameters=hyperparameters, inner=self.inner.with_hyperparameters(inside)
+        )
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        return self.inner.to_arrays() | {"output_map": self.t}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Decoupled(Expansion):
+    """Solutions of groups of outputs, which do not depend on each other. The members are those of
+    `Solution`.
+    """
+
+    hyperparameters: Hyperparameters
+    database: Database
+    parts: tuple[Any, ...]  # a solution of each group
+    groups: tuple[NDArray[np.intp], ...]  # the outputs of each group
+    base: Database
+    """The database before any adaptation."""
+
+    @property
+    def representation(self) -> Literal["dense", "low_rank"]:
+        kind: Literal["dense", "low_rank"] = self.parts[0].representation
+        return kind
+
+    @property
+    def functionals(self) -> Functionals:
+        functionals: Functionals = self.parts[0].functionals
+        return functionals
+
+    @cached_property
+    def weights(self) -> Array:
+        weights = np.empty((len(self.functionals), self.hyperparameters.outputs))
+        for part, group in zip(self.parts, self.groups, strict=True):
+            weights[:, group] = part.weights
+        return frozen(weights)
+
+    @property
+    def error_bounds(self) -> ErrorBounds:
+        bounds = np.array([part.error_bounds for part in self.parts])
+        return ErrorBounds(*np.sqrt((bounds**2).sum(axis=0)).tolist())
+
+    def solved(self) -> Decoupled:
+        for part in self.parts:
+            part.solved()
+        self.weights  # noqa: B018
+        return self
+
+    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+        outputs = self.hyperparameters.outputs
+        queries = 1 if prior is None else len(prior) // self.hyperparameters.kernel.channels
+        out = np.zeros((queries * outputs, queries * outputs))
+        for part, group in zip(self.parts, self.groups, strict=True):
+            mine = (np.arange(queries)[:, None] * outputs + group).ravel()
+            out[np.ix_(mine, mine)] = part.posterior_covariance_one(row, prior)
+        return out
+
+    def posterior_covariance(self, rows: Array) -> Array:
+        outputs = self.hyperparameters.outputs
+        queries = len(rows) // self.hyperparameters.kernel.channels
+        out = np.zeros((queries, outputs, outputs))
+        for part, group in zip(self.parts, self.groups, strict=True):
+            out[:, group[:, None], group] = part.posterior_covariance(rows)
+        return out
+
+    def adapted(self, changes: Changes) -> Solution:
+        if not _is_decoupled(changes.points, self.groups):
+            return self._together.adapted(changes)
+        parts = tuple(
+            part.adapted(changes._replace(points=_of_group(changes.points, group)))
+            for part, group in zip(self.parts, self.groups, strict=True)
+        )
+        return replace(self, database=self.base.changed(changes), parts=parts)
+
+    @property
+    def _together(self) -> Solution:
+        """The base's solution as one system."""
+        first = self.parts[0].base or self.parts[0]
+        if isinstance(first, LowRank):
+            return LowRank.fit(self.hyperparameters, self.base, first.features)
+        return Dense(self.hyperparameters, self.base)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Decoupled:
+        parts = tuple(
+            part.with_hyperparameters(_parameters_of(hyperparameters, group))
+            for part, group in zip(self.parts, self.groups, strict=True)
+        )
+        return replace(self, hyperparameters=hyperparameters, parts=parts)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        stored: list[dict[str, NDArray[np.float64]]] = [part.to_arrays() for part in self.parts]
+        if not stored[0]:
+            return {}
+        information = np.stack([arrays["information"] for arrays in stored])
+        features = np.hstack([arrays["features"] for arrays in stored])
+        return stored[0] | {"information": information, "features": features}
+
+    @classmethod
+    def of_parts(
+        cls,
+        parameters: Hyperparameters,
+        database: Database,
+        groups: tuple[NDArray[np.intp], ...],
+        solution: Any,
+    ) -> Decoupled:
+        """The solution by `solution(parameters, database, group)` of each group of outputs."""
+        parts = tuple(
+            solution(
+                _parameters_of(parameters, group),
+                Database(database.functionals, _of_group(database.reference, group)),
+                group,
+            )
+            for group in groups
+        )
+        return cls(parameters, database, parts, groups, database)
+
+
+def decoupled_groups(
+    parameters: Hyperparameters, reference: Gaussians, *, alike: bool
+) -> tuple[NDArray[np.intp], ...]:
+    """The groups of outputs (each value with its rate) that no covariance couples to others.
+
+    Outputs whose covariances are `alike` share a group, as one factor serves them all.
+    """
+    values = parameters.channel_outputs
+    channels = parameters.kernel.channels
+    everything = (np.arange(parameters.outputs),)
+    if values == 1 or reference.mean.size <= _SMALL:
+        return everything
+    blocks = reference.covariance.reshape(-1, channels, values, channels, values)
+    coupled = blocks.any(axis=(0, 1, 3))
+    if (coupled & ~np.eye(values, dtype=bool)).any():
+        return everything
+    own = [blocks[:, :, value, :, value] for value in range(values)]
+    groups: list[list[int]] = []
+    for value in range(values):
+        group = next((g for g in groups if alike and np.array_equal(own[g[0]], own[value])), None)
+        if group is None:
+            groups.append([value])
+        else:
+            group.append(value)
+    if len(groups) == 1:
+        return everything
+    every = values * np.arange(channels)[:, None]
+    return tuple((every + np.array(group)).ravel() for group in groups)
+
+
+def _is_decoupled(normals: Gaussians, groups: tuple[NDArray[np.intp], ...]) -> bool:
+    """True if no covariance couples two groups."""
+    number = np.empty(normals.outputs, dtype=np.intp)
+    for n, group in enumerate(groups):
+        number[group] = n
+    return not normals.covariance[:, number[:, None] != number].any()
+
+
+def _of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
+    return unchecked(normals.mean[:, group], normals.covariance[:, group[:, None], group])
+
+
+def _parameters_of(parameters: Hyperparameters, group: NDArray[np.intp]) -> Hyperparameters:
+    matrix = parameters.prior_matrix
+    return replace(
+        parameters,
+        prior_offset=parameters.prior_offset[group],
+        prior_matrix=None if matrix is None else matrix[group],
+    )
+
+
+def constraints_of(solution: Solution) -> LinearConstraints | None:
+    """The constraints on a solution's mean, if it has any."""
+    return solution.constraints if isinstance(solution, (Constrained, Mapped)) else None
+
+
+def as_one(base: Solution) -> Solution:
+    """The dense solution of a base as one system, to which constraints can be added."""
+    if isinstance(base, Mapped):
+        return replace(base, inner=as_one(base.inner))
+    return base if isinstance(base, Dense) else Dense(base.hyperparameters, base.database)
+
+
+def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
+    """A solution as one system with these constraints instead of any other."""
+    if isinstance(solution, Mapped):
+        inside = LinearConstraints(
+            constraints.inputs,
+            constraints.normals @ solution.t,
+            constraints.bounds,
+            constraints.directions,
+        )
+        inner = constrained(solution.inner, inside)
+        return replace(solution, inner=inner, constraints=constraints)
+    if isinstance(solution, Constrained):
+        return constrained(solution.solution, constraints)
+    assert isinstance(solution, Dense), "as one"
+    return Constrained(solution, constraints)
+
+
+def is_one(solution: Solution) -> bool:
+    """True if constraints can be added to the solution."""
+    inner = solution.inner if isinstance(solution, Mapped) else solution
+    return isinstance(inner, (Dense, Constrained))
