@@ -4,6 +4,7 @@ import ast
 import io
 import runpy
 import sys
+import textwrap
 import warnings
 from pathlib import Path
 
@@ -67,7 +68,8 @@ def page() -> str:
     parts = [
         f"\n## {script.stem.replace('_', ' ').capitalize()}\n\n"
         f"![{script.stem.replace('_', ' ')}](pictures/{script.stem}.png)\n\n"
-        f"{caption(script)} [{script.name}](gallery/{script.name})\n"
+        + textwrap.fill(f"{caption(script)} [{script.name}](gallery/{script.name})", 100)
+        + "\n"
         for script in SCRIPTS
     ]
     return HEAD + "".join(parts)

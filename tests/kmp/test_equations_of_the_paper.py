@@ -46,15 +46,15 @@ def predicted(t, mean, covariance, channels):
 def inserted(t, mean, covariance, time, desired, variance):
     """Algorithm 1: the desired point replaces one within the tolerance, or is appended."""
     nearest = np.abs(t - time).argmin()
-    at = nearest if abs(t[nearest] - time) < TOLERANCE_S else len(t)
+    index = nearest if abs(t[nearest] - time) < TOLERANCE_S else len(t)
     return [
-        np.concatenate([old[:at], [new], old[at + 1 :]])
+        np.concatenate([old[:index], [new], old[index + 1 :]])
         for old, new in ((t, time), (mean, desired), (covariance, variance))
     ]
 
 
-def check(found, expected):
-    for ours, theirs in zip((found.mean, found.covariance), expected, strict=True):
+def check(prediction, expected):
+    for ours, theirs in zip((prediction.mean, prediction.covariance), expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
 
 

@@ -1,4 +1,4 @@
-"""The site of kmp: its pages' code runs, its pictures are drawn, and it builds without a warning."""
+"""The site of kmp: code on its pages, pictures, notebooks, and the build without a warning."""
 
 import io
 import json

@@ -10,9 +10,9 @@ from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP
 from kmp.orientation import exp, log
 
 angle = 0.5 * np.sin(2 * TIMES)  # [rad]
-shown = exp(np.hstack([angle, 0.4 * angle, 0.3 * TIMES]), np.array([0, 0, 0, 1.0]))  # x y z w
-auxiliary = shown[50]
-tangent = Gaussians.of(log(shown, auxiliary), deviation=0.1)  # [rad, half of the angle]
+quaternions = exp(np.hstack([angle, 0.4 * angle, 0.3 * TIMES]), np.array([0, 0, 0, 1.0]))  # x y z w
+auxiliary = quaternions[50]
+tangent = Gaussians.of(log(quaternions, auxiliary), deviation=0.1)  # [rad, half of the angle]
 kernel = GaussianKernel(4)
 skill = OrientationKMP(KMP.fit(TIMES, tangent, kernel=kernel, lambda_mean=1), auxiliary)
 adapted = skill.adapt([[1.0]], [[0, 0, 0, 1]], np.zeros((3, 3)))

@@ -12,8 +12,8 @@ letter = demonstrations()[0][1]  # [cm]
 first = Gaussians.of(letter, deviation=0.2)
 second = Gaussians.of(letter * [-1, 1] + [6, 0], deviation=0.2)  # its mirror image
 priority = np.clip(0.5 + (1 - TIMES[:, 0]) / 0.4, 1e-3, 1 - 1e-3)
-both = superposed([first, second], [priority, 1 - priority])
-skill = KMP.fit(TIMES, both, kernel=GaussianKernel(8), lambda_mean=0.1)
+blended = superposed([first, second], [priority, 1 - priority])
+skill = KMP.fit(TIMES, blended, kernel=GaussianKernel(8), lambda_mean=0.1)
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 3.6), layout="constrained")
 for name, reference in (("first", first), ("second", second)):
