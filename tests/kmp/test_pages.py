@@ -90,3 +90,21 @@ def test_site_is_built_without_a_warning(tmp_path):
         assert page.stem == "index" or f'href="{page.stem}.html"' in front
     reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
     assert "without_via_points" in reference
+
+
+def test_page_of_the_benchmark_has_each_task_and_size():
+    """The calls of the program run."""
+    program = runpy.run_path(str(SITE / "benchmark.py"))
+    text = (SITE / "benchmark.md").read_text(encoding="utf-8")
+    tasks = program["calls"](50, 6)
+    for size in program["SIZES"]:
+        assert f"over time, {size} points" in text.lower()
+        assert f"over six inputs, {size} points" in text.lower()
+    for name, trio in tasks.items():
+        assert text.count(f"| {name} |") == 2 * len(program["SIZES"])
+        for call in trio:
+            call()
+    skill, plain = (trio() for trio in tasks["fit"][:2])
+    np.testing.assert_allclose(skill.mean(plain.inputs), plain.mean(plain.inputs), atol=1e-9)
+    covariance = skill.predict(plain.inputs[:1]).covariance[0]
+    np.testing.assert_allclose(covariance, plain.covariance(plain.inputs[:1]), atol=1e-9)
