@@ -29,7 +29,7 @@ All three were measured in turn in one run, on one thread of {machine}, with thr
 {compiled}. The first prediction of a skill takes longer, since it inverts the triangular factor; it
 is not counted.
 
-* **Plain NumPy** is ten lines: a Cholesky factor of K + lambda Sigma, and triangular solves with it.
+* **Plain NumPy** is ten lines: a Cholesky factor of K + lambda Sigma, and triangular solves.
   A via-point is a new fit.
 * **scikit-learn** is its `GaussianProcessRegressor`, without a search for parameters. It takes one
   variance for each point, where the others take a covariance between the outputs.
