@@ -119,6 +119,7 @@ class MethodTask(NamedTuple):
     people: int
     scenes: int
     hands: Path | None
+    first: int = 0  # number of the first person, or of the first breaking scene
 
 
 @functools.cache
@@ -133,14 +134,15 @@ def _learned(method: str, candidate: int) -> RivalModel[Places]:
 
 @functools.lru_cache(maxsize=8)
 def _sessions(
-    group: Group, kind: str, people: int, scenes: int, hands: Path | None
+    group: Group, kind: str, people: int, scenes: int, hands: Path | None, first: int
 ) -> list[SeenSession]:
     """The sessions of a group, with alternating sigma from scene to scene; in breaking scenes the
     places are exact.
     """
     if kind:
-        return [seen(breaking(kind, number, group=group)) for number in range(scenes)]
-    everyone = [person(group, number) for number in range(people)]
+        numbers = range(first, first + scenes)
+        return [seen(breaking(kind, number, group=group)) for number in numbers]
+    everyone = [person(group, number) for number in range(first, first + people)]
     if hands is not None and group == "tuning":
         everyone += recorded_people(hands)
     return [
@@ -152,7 +154,7 @@ def _sessions(
 
 def outcomes(task: MethodTask) -> list[TrialOutcome]:
     """The outcomes of a task's sessions."""
-    runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
+    runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands, task.first)
     if task.method == TEACHER:
         return [judge(None, trial) for trial in runs]
     model = _learned(task.method, task.candidate)
@@ -220,7 +222,7 @@ def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
             )
         for kind in BREAKING:
             tasks.append(MethodTask(method, 0, group, kind, 0, breaking_scenes, None))
-    return tasks
+    return [task._replace(first=options.seed_offset) for task in tasks]
 
 
 def _say_better_candidates(results: Results, by_task: dict[MethodTask, list[TrialOutcome]]) -> None:
