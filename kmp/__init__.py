@@ -36,7 +36,7 @@ if typing.TYPE_CHECKING:
     from kmp.gaussians import Gaussians
     from kmp.kernel import Kernel
     from kmp.mixture import GaussianMixture
-    from kmp.orientation import OrientationKMP
+    from kmp.orientation import OrientationKMP, PoseKMP
     from kmp.predictor import Uncertainty
     from kmp.primitive import KMP
     from kmp.problem.hyperparameters import AffineMean
@@ -70,6 +70,7 @@ __all__ = [
     "MotionPrediction",
     "OrientationKMP",
     "PeriodicKernel",
+    "PoseKMP",
     "RadialKernel",
     "RankReached",
     "Score",
@@ -105,6 +106,7 @@ _MODULES = {
     "MotionPrediction": "kmp.query",
     "OrientationKMP": "kmp.orientation",
     "PeriodicKernel": "kmp.time_kernels",
+    "PoseKMP": "kmp.orientation",
     "RadialKernel": "kmp.radial",
     "RankReached": "kmp.arrays.checks",
     "Score": "kmp.selection",

@@ -29,6 +29,7 @@ from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, Expansion, check_resolved
 
+SINGLE = 450  # N O up to which a fit takes less than a millisecond, and less than a change of one
 # a border is faster than a fit if at least this share of points precedes the first change
 _LEAST_SHARED = 0.75
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
@@ -182,6 +183,8 @@ class Dense(Expansion):
         replaced = changes.replaced
         database = base.database.changed(changes)
         first = int(replaced[0]) if len(replaced) else count
+        if len(replaced) and base.database.reference.mean.size <= SINGLE:
+            return Dense(self.hyperparameters, database, base)  # a fit takes less than a change
         if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
             solution = Dense(self.hyperparameters, database, base, count - len(replaced), replaced)
             if solution.distinct >= base.distinct:

@@ -16,6 +16,8 @@ from kmp.arrays.linear_algebra import symmetric
 _SYMMETRIC = 1e-9  # largest asymmetry that counts as rounding, as a share of the largest entry
 _EXACT = 1e-200  # [unit^2] the variance that stands for an exact output
 _EXACT_BELOW = 1e-150  # [unit^2] a smaller variance is exact: rotation and scaling enlarge _EXACT
+_FREE = 1e100  # [unit^2] the variance that stands for a free output
+_FREE_ABOVE = 1e90
 _MACHINE = float(np.finfo(np.float64).eps)
 
 
@@ -42,7 +44,7 @@ class Gaussians(Immutable):
 
         deviation [unit of the outputs]: one number for all, or one for each output (O,), or for
         each number (N, O). 0 stands for an exact output: whatever is fitted to it takes the least
-        variance that rounding does not hide.
+        variance that rounding does not hide. Infinity stands for a free output.
 
         Raises ValueError if a number is not finite, shapes do not agree, or a deviation is below 0.
         """
@@ -55,19 +57,27 @@ class Gaussians(Immutable):
                 f"deviation: shape {deviations.shape} given, {shape_text} needed for a mean of "
                 f"{means.shape}."
             )
+        is_free = deviations == np.inf
+        deviations = np.where(is_free, 0.0, deviations)
         check_finite("deviation", deviations)
         if (deviations < 0).any():
             raise ValueError(
                 f"deviation: {deviations.min():g} given, and it must not be below 0. 0 means exact."
             )
-        variances = np.maximum(np.broadcast_to(deviations, means.shape) ** 2, _EXACT)
+        variances = np.maximum(deviations**2, _EXACT)
         check_finite("deviation", variances, "too large for its square:")
+        variances = np.broadcast_to(np.where(is_free, _FREE, variances), means.shape)
         return unchecked(means.copy(), variances[:, :, None] * np.eye(means.shape[1]))
 
     @property
     def exact(self) -> NDArray[np.bool_]:
         """(N, O) true where an output is exact: its deviation in `of` was 0."""
         return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) < _EXACT_BELOW)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(N, O) true where an output is free: its deviation in `of` was infinite."""
+        return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) > _FREE_ABOVE)
 
     def __len__(self) -> int:
         return len(self.mean)

@@ -23,7 +23,7 @@ from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.kernel import Kernel
 from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
-from kmp.orientation import OrientationKMP
+from kmp.orientation import OrientationKMP, PoseKMP
 from kmp.outputs import (
     Decoupled,
     Mapped,
@@ -69,6 +69,7 @@ _KINDS: dict[str, Any] = {
     for kind in (
         KMP,
         OrientationKMP,
+        PoseKMP,
         LocalKMP,
         CoordinateFrame,
         LinearConstraints,

@@ -10,6 +10,7 @@ left, so that axes, angular velocities and deviations are those of the world.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,12 +19,13 @@ from kmp.arrays.checks import Array, check_finite, not_negative, numbers, real
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances, unchecked
-from kmp.primitive import KMP, checked_primitive
+from kmp.predictor import Uncertainty
+from kmp.primitive import KMP, Saved, checked_primitive
+from kmp.query import MotionPrediction
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
 _CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
 _UNIT = 1e-3  # a norm farther from 1 is an error of the caller
-_FREE = 1e6  # variance of a rate that is not prescribed, over the largest one of the reference
 
 
 def continuous(quaternions: ArrayLike) -> Array:
@@ -104,8 +106,7 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
     """
     vector = 2 * numbers("zeta", zeta, 3)
     angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = _cross(vector)
     if angle < _TINY:
         return np.asarray(2 * (np.eye(3) + cross / 2 + cross @ cross / 6))
     first = (1 - np.cos(angle)) / angle**2
@@ -113,72 +114,147 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
     return np.asarray(2 * (np.eye(3) + first * cross + second * (cross @ cross)))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class OrientationKMP(Immutable):
-    """A skill whose output is an orientation: a primitive of zeta, over time with its rate.
+def rotation_rate_per_zeta(zeta: ArrayLike, rate: ArrayLike) -> Array:
+    """dJ/dt (3, 3) of `rotation_per_zeta` at zeta (3,), which changes by `rate` (3,) [1/s].
 
-    To learn one: make each demonstration's quaternions `continuous`, take `log` with a common
-    auxiliary quaternion near the middle of them, learn a reference of zeta (over time with its rate
-    and a VelocityKernel), and fit the primitive. Raises ValueError if the primitive has other
-    outputs, or the auxiliary quaternion is not one.
+    With J = 2 (I + f [v] + g [v]^2): 2 (f' [v] + f [v'] + g' [v]^2 + g ([v'][v] + [v][v'])).
+    """
+    v = 2 * numbers("zeta", zeta, 3)
+    change = 2 * numbers("rate", rate, 3)
+    angle = float(np.linalg.norm(v))
+    cross = _cross(v)
+    moved = _cross(change)
+    first = 0.5
+    second = 1 / 6
+    bends = np.array([-1 / 12, -1 / 60])  # f' and g' over v . v'
+    if angle >= _TINY:
+        first = (1 - np.cos(angle)) / angle**2
+        second = (angle - np.sin(angle)) / angle**3
+        bends[0] = (angle * np.sin(angle) - 2 * (1 - np.cos(angle))) / angle**4
+        bends[1] = (angle * (1 - np.cos(angle)) - 3 * (angle - np.sin(angle))) / angle**5
+    bend_first, bend_second = bends * float(v @ change)
+    return np.asarray(
+        2
+        * (
+            bend_first * cross
+            + first * moved
+            + bend_second * cross @ cross
+            + second * (moved @ cross + cross @ moved)
+        )
+    )
+
+
+def _cross(v: Array) -> Array:
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Rotating(Immutable, Saved):
+    """A primitive of P positions and zeta, over time with their rates. n = P + 3.
+
+    Raises ValueError if the primitive has other outputs, or the auxiliary quaternion is not one.
     """
 
     primitive: KMP
     auxiliary: Array
     """(4,) q_a, x y z w."""
 
+    _positions: ClassVar[int] = 0
+
     def __post_init__(self) -> None:
-        needed_outputs = 3 * checked_primitive(self.primitive).kernel.channels
-        if (outputs := self.primitive.outputs) != needed_outputs:
-            raise ValueError(
-                f"primitive: {outputs} outputs given, {needed_outputs} needed for an orientation."
-            )
+        needed = self._size * checked_primitive(self.primitive).kernel.channels
+        if (outputs := self.primitive.outputs) != needed:
+            raise ValueError(f"primitive: {outputs} outputs given, {needed} needed.")
         auxiliary = _unit("auxiliary", self.auxiliary, 4)
         object.__setattr__(self, "auxiliary", frozen(auxiliary.copy()))
 
     def mean(self, queries: ArrayLike) -> Array:
-        """The orientations (M, 4) at queries (M, I), x y z w. Raises ValueError as `KMP.mean`."""
-        return exp(self.primitive.mean(queries)[:, :3], self.auxiliary)
+        """The means (M, P + 4) at queries (M, I): positions, then quaternions x y z w.
+
+        Raises ValueError as `KMP.mean`.
+        """
+        return self._placed(self.primitive.mean(queries))
 
     def predict(self, queries: ArrayLike) -> tuple[Array, Array]:
-        """The orientations (M, 4) at queries (M, I), and covariances J Sigma J^T (M, 3, 3) [rad^2].
+        """The means (M, P + 4) at queries (M, I), and covariances J Sigma J^T (M, n, n).
 
-        The covariances are those of small rotations in the world, with J of `rotation_per_zeta`.
-        Raises ValueError as `KMP.predict`.
+        The covariances are those of positions [unit^2] and small rotations in the world [rad^2],
+        with J of `rotation_per_zeta`. Raises ValueError as `KMP.predict`.
         """
         prediction = self.primitive.predict(queries)
-        zeta = prediction.mean[:, :3]
-        turn = np.array([rotation_per_zeta(tangent) for tangent in zeta]).reshape(-1, 3, 3)
-        return exp(zeta, self.auxiliary), turn @ prediction.covariance[:, :3, :3] @ turn.transpose(
-            0, 2, 1
-        )
+        turn = self._turn(prediction.mean)
+        return self._placed(prediction.mean), self._turned(turn, prediction.covariance)
 
-    def angular_velocity(self, query: ArrayLike, velocity: ArrayLike) -> Array:
-        """omega (3,) [rad/s] at one query (I,) that moves with (I,) [unit of the inputs / s].
+    def predict_motion(
+        self,
+        query: ArrayLike,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        *,
+        covariance: bool = True,
+    ) -> MotionPrediction:
+        """The mean (P + 4,) at one query (I,), and its motion with the input, as
+        `KMP.predict_motion`: velocities and accelerations (n,) of positions and of rotation [rad/s,
+        rad/s^2], omega = J dzeta/dt. If the input is time, its velocity is 1.
 
-        omega = J dzeta/dt with J of `rotation_per_zeta`. If the input is time, its velocity is 1.
         Raises ValueError if a shape differs or a number is not finite.
         """
+        inner = self.primitive.predict_motion(query, velocity, acceleration, covariance=covariance)
+        size = self._size
+        turn = self._turn(inner.mean[None])
+        pushed = np.zeros(size)
+        rate = inner.velocity[self._positions : size]
+        pushed[self._positions :] = (
+            rotation_rate_per_zeta(inner.mean[self._positions : size], rate) @ rate
+        )
+        return MotionPrediction(
+            self._placed(inner.mean[None])[0],
+            turn[0] @ inner.velocity[:size],
+            turn[0] @ inner.acceleration[:size] + pushed,
+            None if inner.covariance is None else self._turned(turn, inner.covariance[None])[0],
+            turn[0] @ inner.jacobian[:size],
+            turn[0] @ inner.curvature[:size] + pushed,
+        )
+
+    def jacobian(self, query: ArrayLike) -> Array:
+        """Motion and small rotation [rad] by the input (n, I) at one query (I,).
+
+        Raises ValueError as `KMP.jacobian`.
+        """
         still = np.zeros(self.primitive.inputs.shape[1])
-        moving = self.primitive.predict_motion(query, velocity, still, covariance=False)
-        return np.asarray(rotation_per_zeta(moving.mean[:3]) @ moving.velocity[:3])
+        return self.predict_motion(query, still, still, covariance=False).jacobian
+
+    def sample(self, queries: ArrayLike, count: int, *, seed: int = 0) -> Array:
+        """Paths through queries (M, I): (count, M, P + 4). Raises ValueError as `KMP.sample`."""
+        drawn = self.primitive.sample(queries, count, seed=seed)
+        return self._placed(drawn.reshape(-1, drawn.shape[2])).reshape(*drawn.shape[:2], -1)
+
+    def uncertainty(self, queries: ArrayLike) -> Uncertainty:
+        """The covariances of `predict`, by their causes. Raises ValueError as that does."""
+        turn = self._turn(self.primitive.mean(queries))
+        causes = self.primitive.uncertainty(queries)
+        return Uncertainty(
+            self._turned(turn, causes.variability), self._turned(turn, causes.distance)
+        )
 
     def adapt(
         self,
         inputs: ArrayLike,
-        quaternions: ArrayLike,
+        desired: ArrayLike,
         covariance: ArrayLike,
         *,
         tolerance: float | None = None,
-        angular_velocities: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
         velocity_covariance: ArrayLike | None = None,
-    ) -> OrientationKMP:
-        """A new skill that also goes through orientations (V, 4) at inputs (V, I). x y z w.
+    ) -> Self:
+        """A new skill that also goes through desired (V, P + 4) at inputs (V, I), as of `mean`.
 
-        Of q and -q, the one nearer to the skill's present mean is used. `covariance` (3, 3) or
-        (V, 3, 3) [rad^2] is that of small rotations; 0 is the least that rounding does not hide.
-        Skills with rates take angular velocities too, (V, 3) [rad/s] with their covariance
-        [(rad/s)^2]; None leaves them free. `tolerance` [unit of the inputs] is that of `KMP.adapt`.
+        Of q and -q, the one nearer to the skill's present mean is used. `covariance` (n, n) or (V,
+        n, n) [unit^2, rad^2] is that of positions and small rotations; where its rows are 0, of
+        all three of a rotation, they are met as exactly as rounding allows. Skills with rates take
+        velocities too, (V, n) [unit/s, rad/s] with their covariance; None leaves them free.
+        `tolerance` [unit of the inputs] is that of `KMP.adapt`.
 
         Raises ValueError as `KMP.adapt` does, if a quaternion has another norm than 1, or if rates
         are given to a skill without.
@@ -186,58 +262,77 @@ class OrientationKMP(Immutable):
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
         if tolerance is not None:
             not_negative("tolerance", tolerance)
-        q = _unit("quaternions", numbers("quaternions", quaternions, len(where), 4))
-        zeta = self._nearest(where, q)
-        back = np.array([np.linalg.inv(rotation_per_zeta(tangent)) for tangent in zeta]).reshape(
-            -1, 3, 3
-        )
-        turned = self._turned("covariance", covariance, back, self.primitive.least_variance)
-        if self.primitive.kernel.channels == 1:
-            if angular_velocities is not None or velocity_covariance is not None:
+        size = self._size
+        wanted = numbers("desired", desired, len(where), size + 1)
+        present = self.mean(where)[:, self._positions :]
+        q = _unit("desired", wanted[:, self._positions :])
+        signs = np.where((present * q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+        zeta = log(signs * q, self.auxiliary)
+        values = np.hstack([wanted[:, : self._positions], zeta])
+        back = np.asarray(np.linalg.inv(self._turn(values)), dtype=np.float64)
+        least = self.primitive.least_variance
+        turned = self._back("covariance", covariance, back, least)
+        has_rates = self.primitive.kernel.channels > 1
+        if (velocities is None) != (velocity_covariance is None):
+            raise ValueError("velocities and velocity_covariance: give both, or none.")
+        if not has_rates:
+            if velocities is not None:
                 raise ValueError(
-                    "angular_velocities: the skill has no rates; fit it with a VelocityKernel."
+                    "velocities: the skill has no rates; fit it with a VelocityKernel."
                 )
-            return self._adapted(where, unchecked(zeta, turned), tolerance)
-        if (angular_velocities is None) != (velocity_covariance is None):
-            raise ValueError("angular_velocities and velocity_covariance: give both, or none.")
-        if angular_velocities is None or velocity_covariance is None:
-            rates = self.primitive.mean(where)[:, 3:]
-            variance = _FREE * np.max(np.abs(self.primitive.reference.covariance))
-            rate_covariance = np.tile(variance * np.eye(3), (len(where), 1, 1))
+            return self._adapted(where, unchecked(values, turned), tolerance)
+        if velocities is None or velocity_covariance is None:
+            rates = np.zeros((len(where), size))
+            rate_covariance = Gaussians.of(rates, deviation=np.inf).covariance
         else:
-            omega = numbers("angular_velocities", angular_velocities, len(where), 3)
-            rates = (back @ omega[:, :, None])[:, :, 0]
-            least = self.primitive.least_variance * float(
-                self.primitive.kernel.prior_variance[1, 1]
+            moving = numbers("velocities", velocities, len(where), size)
+            rates = (back @ moving[:, :, None])[:, :, 0]
+            least *= float(self.primitive.kernel.prior_variance[1, 1])
+            rate_covariance = self._back("velocity_covariance", velocity_covariance, back, least)
+        whole = np.zeros((len(where), 2 * size, 2 * size))
+        whole[:, :size, :size] = turned
+        whole[:, size:, size:] = rate_covariance
+        return self._adapted(where, unchecked(np.hstack([values, rates]), whole), tolerance)
+
+    @property
+    def _size(self) -> int:
+        return self._positions + 3
+
+    def _placed(self, values: Array) -> Array:
+        """Positions and quaternions (M, P + 4) of the primitive's outputs (M, O)."""
+        turned = exp(values[:, self._positions : self._size], self.auxiliary)
+        return np.hstack([values[:, : self._positions], turned])
+
+    def _turn(self, values: Array) -> Array:
+        """J (M, n, n) of motion and rotation by the outputs (M, O)."""
+        turn = np.tile(np.eye(self._size), (len(values), 1, 1))
+        for n, row in enumerate(values):
+            turn[n, self._positions :, self._positions :] = rotation_per_zeta(
+                row[self._positions : self._size]
             )
-            rate_covariance = self._turned("velocity_covariance", velocity_covariance, back, least)
-        whole = np.zeros((len(where), 6, 6))
-        whole[:, :3, :3] = turned
-        whole[:, 3:, 3:] = rate_covariance
-        return self._adapted(
-            where, unchecked(np.hstack([zeta, rates]), symmetric(whole)), tolerance
-        )
+        return turn
 
-    @staticmethod
-    def _turned(name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
-        """Covariances J^-1 S J^-T (V, 3, 3) of zeta or its rate, of S of rotations; 0 is exact.
+    def _turned(self, turn: Array, covariance: Array) -> Array:
+        size = self._size
+        return symmetric(turn @ covariance[:, :size, :size] @ turn.mT)
 
-        `back` is J^-1 (V, 3, 3). `least` is the least variance of zeta that rounding does not hide;
-        a rotation's is at most 4 times that of zeta. Raises ValueError if a covariance is not
+    def _back(self, name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
+        """Covariances J^-1 S J^-T (V, n, n) of outputs or rates, of S of rotations; 0 is exact.
+
+        `back` is J^-1 (V, n, n). `least` is the least variance of an output that rounding does not
+        hide; a rotation's is at most 4 times that. Raises ValueError if a covariance is not
         positive definite, or too small.
         """
-        count = len(back)
-        array = real(name, covariance)
-        array = numbers(
-            name,
-            np.broadcast_to(array, (count, 3, 3)) if array.shape == (3, 3) else array,
-            count,
-            3,
-            3,
-        )
-        exact = ~array.any(axis=(1, 2), keepdims=True)
-        checked = covariances(name, np.where(exact, np.eye(3), array), count, 3)
-        turned = symmetric(back @ checked @ back.transpose(0, 2, 1))
+        count, size, _ = back.shape
+        given = real(name, covariance)
+        given = np.broadcast_to(given, back.shape) if given.shape == (size, size) else given
+        array = numbers(name, given, count, size, size)
+        exact = ~array.any(axis=2)
+        rows, outputs = np.nonzero(exact)
+        filled = np.array(array)
+        filled[rows, outputs, outputs] = 1.0
+        checked = covariances(name, filled, count, size)
+        turned = symmetric(back @ checked @ back.mT)
         check_finite(name, turned, "too large:")
         for n in np.flatnonzero(np.linalg.eigvalsh(turned)[:, 0] < least)[:1]:
             smallest = np.linalg.eigvalsh(array[n])[0]
@@ -246,21 +341,30 @@ class OrientationKMP(Immutable):
                 f"{smallest:.3g}, and {4.1 * least:.2g} is enough. Give 0 for the least, or the "
                 "primitive a larger lambda_covariance."
             )
-        return np.where(exact, Gaussians.of(np.zeros(3), deviation=0).covariance, turned)
+        turned[rows, outputs, :] = turned[rows, :, outputs] = 0.0
+        turned[rows, outputs, outputs] = Gaussians.of([0.0], deviation=0).covariance[0, 0, 0]
+        return turned
 
-    def _adapted(
-        self, inputs: Array, desired: Gaussians, tolerance: float | None
-    ) -> OrientationKMP:
-        return OrientationKMP(
-            self.primitive.adapt(inputs, desired, tolerance=tolerance), self.auxiliary
-        )
+    def _adapted(self, inputs: Array, desired: Gaussians, tolerance: float | None) -> Self:
+        adapted = self.primitive.adapt(inputs, desired, tolerance=tolerance)
+        return type(self)(adapted, self.auxiliary)
 
-    def _nearest(self, inputs: Array, quaternions: Array) -> Array:
-        """zeta (V, 3) of q or -q, whichever is nearer to the skill's present mean."""
-        signs = np.where(
-            (self.mean(inputs) * quaternions).sum(axis=1, keepdims=True) < 0, -1.0, 1.0
-        )
-        return log(signs * quaternions, self.auxiliary)
+
+class OrientationKMP(_Rotating):
+    """A skill whose output is an orientation, n = 3: a primitive of zeta, over time with its rate.
+
+    To learn one: make each demonstration's quaternions `continuous`, take `log` with a common
+    auxiliary quaternion near the middle of them, learn a reference of zeta (over time with its rate
+    and a VelocityKernel), and fit the primitive.
+    """
+
+
+class PoseKMP(_Rotating):
+    """A skill whose output is a position and an orientation, n = 6, with their correlations: a
+    primitive of position and zeta, over time with their rates. As for an `OrientationKMP`.
+    """
+
+    _positions = 3
 
 
 def _unit(name: str, quaternions: ArrayLike, *shape: int) -> Array:

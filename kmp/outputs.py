@@ -23,7 +23,7 @@ from kmp.arrays.checks import Array
 from kmp.arrays.immutable import frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.constraints import Constrained, LinearConstraints
-from kmp.dense import Dense
+from kmp.dense import SINGLE, Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
 from kmp.low_rank import LowRank
@@ -31,7 +31,6 @@ from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import ErrorBounds, Expansion, Solution
 
-_SMALL = 450  # N O up to which one system is as fast as several
 _ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
 
 
@@ -50,9 +49,9 @@ def output_map(parameters: Hyperparameters, reference: Gaussians) -> Array | Non
     """T (O, O) for these parameters and normals; None where it is the identity."""
     prior = parameters.prior_covariance
     values = parameters.channel_outputs
-    root: Array = np.eye(values) if prior is None else np.linalg.cholesky(prior)
+    root: NDArray[Any] = np.eye(values) if prior is None else np.linalg.cholesky(prior)
     rotated = None
-    if parameters.kernel.channels == 1 and reference.mean.size > _SMALL:
+    if parameters.kernel.channels == 1 and reference.mean.size > SINGLE:
         rotated = _basis(root, reference.covariance)
     if prior is None and rotated is None:
         return None
@@ -72,7 +71,7 @@ def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
     inner = symmetric(inverse @ shape @ inverse.T)
     if not (inner - np.diag(np.diagonal(inner))).any():
         return None
-    return np.asarray(np.linalg.eigh(inner)[1])
+    return np.asarray(np.linalg.eigh(inner)[1], dtype=np.float64)
 
 
 def inner_problem(
@@ -277,7 +276,7 @@ def decoupled_groups(
     values = parameters.channel_outputs
     channels = parameters.kernel.channels
     everything = (np.arange(parameters.outputs),)
-    if values == 1 or reference.mean.size <= _SMALL:
+    if values == 1 or reference.mean.size <= SINGLE:
         return everything
     blocks = reference.covariance.reshape(-1, channels, values, channels, values)
     coupled = blocks.any(axis=(0, 1, 3))

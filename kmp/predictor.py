@@ -72,7 +72,10 @@ class Uncertainty(Immutable):
 
 
 class Predictor(Immutable):
-    """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs."""
+    """The predictions of a solution, which `KMP` inherits. M queries, I inputs, O outputs.
+
+    Where I is 1, queries may be (M,), and one query a number.
+    """
 
     inner: Inner
     """Arrays and solutions, for other packages of this project; they may change."""
@@ -83,7 +86,7 @@ class Predictor(Immutable):
         Without Numba, a query alone and the same query in a set may differ by rounding. Raises
         ValueError if the shape differs or a number is not finite.
         """
-        s = real("queries", queries)
+        s = self._columns(real("queries", queries))
         if (mean_and_row := self._compiled_mean(s)) is not None:
             return mean_and_row[0]
         s = self._checked_many(s)
@@ -101,7 +104,7 @@ class Predictor(Immutable):
         predict once before a deadline matters. Raises ValueError if the shape differs, a number is
         not finite, or a stored primitive cannot be solved with these libraries.
         """
-        s = real("queries", queries)
+        s = self._columns(real("queries", queries))
         compiled = self.inner.compiled_query if s.shape[:1] == (1,) else None
         if compiled is not None and (mean_and_row := self._compiled_mean(s)) is not None:
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
@@ -142,12 +145,9 @@ class Predictor(Immutable):
 
         Raises ValueError as `predict` does, or if the count is below 1.
         """
-        whole("count", count)
         joint = self.predict_joint(queries)
-        values, vectors = np.linalg.eigh(joint.covariance[0])
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        drawn = np.random.default_rng(seeded(seed)).standard_normal((count, len(values))) @ root.T
-        return np.asarray((joint.mean + drawn).reshape(count, -1, self.outputs))
+        drawn = drawn_paths(joint.mean[0], joint.covariance[0], count, seed)
+        return drawn.reshape(count, -1, self.outputs)
 
     def predict_motion(
         self,
@@ -351,13 +351,27 @@ class Predictor(Immutable):
 
     def _checked(self, name: str, value: ArrayLike) -> Array:
         s = real(name, value)
+        s = s[None] if s.ndim == 0 and self._dimensions == 1 else s
         check_shape(name, s, self._dimensions)
         check_finite(name, s)
         return s
 
+    def _columns(self, queries: Array) -> Array:
+        """Queries (M,) of one input as (M, 1)."""
+        return queries[:, None] if queries.ndim == self._dimensions == 1 else queries
+
     def _checked_many(self, queries: ArrayLike) -> Array:
-        s = real("queries", queries)
+        s = self._columns(real("queries", queries))
         if s.ndim != 2 or s.shape[1] != self._dimensions:
             check_shape("queries", s, "M", self._dimensions)
         check_finite("queries", s)
         return self._wrapped(s)
+
+
+def drawn_paths(mean: Array, covariance: Array, count: int, seed: int) -> Array:
+    """Draws (count, n) of a normal, whose covariance may be singular."""
+    whole("count", count)
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    random = np.random.default_rng(seeded(seed))
+    return np.asarray(mean + random.standard_normal((count, len(values))) @ root.T)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +33,7 @@ from kmp.arrays.immutable import frozen
 from kmp.constraints import LinearConstraints
 from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians, check_gaussians, check_pairs
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel
 from kmp.low_rank import RANK, TOLERANCE
 from kmp.outputs import as_one, constrained, constraints_of, is_one
@@ -46,12 +46,27 @@ from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
 
+if TYPE_CHECKING:
+    from kmp.goals import Alternatives
+
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
-_FREE = 1e6  # [unit of the outputs / unit of the inputs] deviation of a rate that is not prescribed
+
+
+class Saved:
+    """Values with a method that writes them to a file."""
+
+    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
+        """Write this and the units of its numbers to an .npz file, as `kmp.save` does.
+
+        Raises OSError if the file cannot be written.
+        """
+        from kmp.storage import save
+
+        save(path, self, input_unit=input_unit, output_unit=output_unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KMP(Predictor, Plotted):
+class KMP(Predictor, Plotted, Saved):
     """A skill: a reference database, the via-points in it, and its solution.
 
     `fit`, `adapt` and `load` return one. N points in all, I inputs, O outputs. Immutable, so that
@@ -88,7 +103,7 @@ class KMP(Predictor, Plotted):
         rank: int = RANK,
         rank_tolerance: float = TOLERANCE,
     ) -> KMP:
-        """The primitive of a reference database: inputs (N, I), N normals over O outputs.
+        """The primitive of a reference database: inputs (N, I) or (N,), N normals over O outputs.
 
         The mean returns to `prior_mean` (O,) [unit of the outputs] far from the inputs; None is 0.
         An `AffineMean` depends on the input. The covariance does not depend on it.
@@ -343,15 +358,6 @@ class KMP(Predictor, Plotted):
         )
         return Shown(references, via, self.kernel.channels, self.kernel.period)
 
-    def save(self, path: str | Path, *, input_unit: str = "", output_unit: str = "") -> None:
-        """Write the primitive and the units of its numbers to an .npz file, as `kmp.save` does.
-
-        Raises OSError if the file cannot be written.
-        """
-        from kmp.storage import save
-
-        save(path, self, input_unit=input_unit, output_unit=output_unit)
-
     @classmethod
     def load(cls, path: str | Path, *, kernels: Mapping[str, type] | None = None) -> KMP:
         """The primitive that `save` wrote; `kmp.load` gives its units too, and explains `kernels`.
@@ -388,11 +394,12 @@ class KMP(Predictor, Plotted):
 
     def adapt_many(
         self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
-    ) -> tuple[KMP, ...]:
-        """A new primitive for each pair of inputs (V, I) and V normals, as by `adapt`.
+    ) -> Alternatives:
+        """A new primitive for each of G pairs of inputs (V, I) and V normals, as by `adapt`.
 
-        Each is adapted from this primitive: for alternative goals, people or rollouts. Raises
-        ValueError as `adapt` does.
+        Each is adapted from this primitive: for alternative goals, people or rollouts. It is made
+        when it is indexed; `Alternatives.mean` gives the means of all at once. Raises ValueError
+        as `adapt` does.
         """
         pairs = parts_of("points", points)
         for i, pair in enumerate(pairs):
@@ -401,7 +408,40 @@ class KMP(Predictor, Plotted):
                     f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals "
                     "needed."
                 )
-        return tuple(self.adapt(inputs, desired, tolerance=tolerance) for inputs, desired in pairs)
+        if tolerance is None:
+            tolerance = self.base.spacing / 2
+        not_negative("tolerance", tolerance)
+        inputs = [numbers("inputs", given, "V", self._dimensions) for given, _ in pairs]
+        for via, (_, desired) in zip(inputs, pairs, strict=True):
+            check_pairs("desired", via, desired, self.outputs)
+        from kmp.goals import Alternatives
+
+        return Alternatives(self, inputs, [desired for _, desired in pairs], tolerance)
+
+    def goal_jacobian(self, queries: ArrayLike) -> Array:
+        """The derivatives (M, O, V, O) of the mean at queries (M, I) by the means of the V
+        via-points: it is affine in these, so that they hold for any goal at the same inputs.
+
+        Raises ValueError as `mean` does, or if there are constraints.
+        """
+        before: Solution = self.inner.solution
+        if constraints_of(before) is not None:
+            raise ValueError(
+                "goal_jacobian: a primitive with constraints given, whose mean is not affine in "
+                "its goals; one without needed."
+            )
+        wanted = Functionals(self._checked_many(queries))
+        changes = self.inner.changes
+        at_rest = mean_of(before, wanted)
+        goals = changes.points.mean
+        jacobian = np.empty((*at_rest.shape, *goals.shape))
+        for index in np.ndindex(goals.shape):
+            moved = np.array(goals)
+            moved[index] += 1.0
+            points = unchecked(moved, changes.points.covariance)
+            other = before.adapted(changes._replace(points=points))
+            jacobian[:, :, *index] = mean_of(other, wanted) - at_rest
+        return jacobian
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
         """Distances (I,) [unit of the inputs] up to which a via-point at `query` (I,) matters.
@@ -419,7 +459,7 @@ class KMP(Predictor, Plotted):
             raise ValueError(f"share is {share:g}, and must be between 0 and 1.")
         values = self.outputs // self.kernel.channels
         desired = Gaussians.of(
-            self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, _FREE], values)[: self.outputs]
+            self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, np.inf], values)[: self.outputs]
         )
         point = Functionals(s[None])
         adapted = self._through(

@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 
 from kmp.arrays.checks import RankReached
-from kmp.dense import Dense
+from kmp.dense import SINGLE, Dense
 from kmp.low_rank import Features, LowRank
 from kmp.outputs import (
     Decoupled,
@@ -25,7 +25,6 @@ from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
 
-_TINY = 450  # N O up to which the dense solution takes at most a millisecond
 _SMALL = 1500  # N O up to which finding the rank of several inputs costs more than it can save
 LARGE = 6000  # N O above which the dense solution takes seconds and 300 MB
 # the low rank is faster below these r / (N C), estimated and found
@@ -113,7 +112,7 @@ def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
     """True if the low rank may be the faster solution, estimated before features exist."""
     size = database.reference.mean.size
     kernel = parameters.kernel
-    if size <= _TINY or size > _SMALL:
+    if size <= SINGLE or size > _SMALL:
         return size > _SMALL
     if database.inputs.shape[1] > 1:  # the rank grows with the number of inputs
         return False

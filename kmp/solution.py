@@ -23,6 +23,7 @@ from kmp.problem.hyperparameters import Hyperparameters
 
 BLOCK = 256  # queries computed at once: their kernel rows fit into the processor's cache
 _RESOLVED = 1e-11  # least lambda Sigma / k(s, s): the covariance then has 3 correct digits
+_FREE = 1e-9  # k(s, s) / lambda Sigma of a free output
 _ROUND_UP = 1.01  # factor on a least variance, because a message shows two digits of it
 
 
@@ -174,15 +175,19 @@ def least_variances(parameters: Hyperparameters, points: Functionals, penalty: f
 
 
 def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussians) -> Gaussians:
-    """The normals of N points, in which exact outputs have the least variance instead of 0."""
+    """The normals of N points, with the least variance for exact outputs instead of 0, and for free
+    ones one that hardly pulls.
+    """
     exact = normals.exact
-    if not exact.any():
+    free = normals.free
+    if not (exact.any() or free.any()):
         return normals
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
     least = least * np.tile(parameters.prior_variances, parameters.kernel.channels)
     covariance = normals.covariance.copy()
-    n, o = np.nonzero(exact)
-    covariance[n, o, :] = covariance[n, :, o] = 0.0
-    covariance[n, o, o] = least[n, o]
+    for chosen, variance in ((exact, least), (free, least / (_ROUND_UP * _RESOLVED * _FREE))):
+        n, o = np.nonzero(chosen)
+        covariance[n, o, :] = covariance[n, :, o] = 0.0
+        covariance[n, o, o] = variance[n, o]
     return unchecked(normals.mean, covariance)

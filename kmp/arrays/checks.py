@@ -40,9 +40,13 @@ def real(name: str, value: ArrayLike) -> Array:
 def numbers(name: str, value: ArrayLike, *shape: int | str) -> Array:
     """A read-only copy of `value`, which must have this shape; a word stands for any length.
 
+    Where the second length may be 1, (N,) is (N, 1): of one input, or one output.
+
     Raises ValueError if the shape differs or a number is not real and finite.
     """
     array = np.array(real(name, value), dtype=np.float64, order="C")
+    if array.ndim == 1 and array.size and shape[1:] in (("I",), (1,)):
+        array = array[:, None]
     check_shape(name, array, *shape)
     check_finite(name, array)
     return frozen(array)
@@ -95,6 +99,11 @@ def check_shape(name: str, array: Array, *shape: int | str) -> None:
 def positive(name: str, value: float | Array) -> float:
     """The value as a float. Raises ValueError unless it is one finite number above 0."""
     array = real(name, value)
+    if array.ndim and name.startswith("lambda"):
+        raise ValueError(
+            f"{name}: shape {array.shape} given, one number needed. For points that are met less, "
+            "as by a lambda over time, multiply their covariances in the reference."
+        )
     check_shape(name, array)
     number = float(array)
     if not (math.isfinite(number) and number > 0):

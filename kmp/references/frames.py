@@ -12,13 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, brief, check_some, not_negative, numbers, pair, parts_of
-from kmp.arrays.immutable import Immutable
+from kmp.arrays.checks import (
+    Array,
+    brief,
+    check_some,
+    not_negative,
+    numbers,
+    pair,
+    parts_of,
+    whole,
+)
+from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs
 from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture
 from kmp.plot import Plotted, Points, Shown
-from kmp.primitive import KMP, checked_primitive
+from kmp.predictor import Uncertainty, drawn_paths
+from kmp.primitive import KMP, Saved, checked_primitive
+from kmp.query import MotionPrediction
+
+_DIFFERENCE = (
+    3e-3  # of differences, over the kernel's length: error of fourth order and rounding balance
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,12 +109,14 @@ def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LocalKMP(Immutable, Plotted):
+class LocalKMP(Immutable, Plotted, Saved):
     """A skill in F coordinate frames: a primitive in each, and the frames' present positions.
 
     `learn` returns it with the frames of the last demonstration; `placed` moves it. Each frame's
     prediction is mapped to the world, (A mu + b, A Sigma A^T); the prediction is the product of
     these normals, in which the smallest covariance weighs most. IJRR 2019.
+
+    To add a frame, make another one of all primitives and frames.
     """
 
     primitives: tuple[KMP, ...]
@@ -202,24 +220,118 @@ class LocalKMP(Immutable, Plotted):
         """The mean (M, O) [unit of the outputs] of `predict`. Raises ValueError as that does."""
         return self.predict(queries).mean
 
+    def jacobian(self, query: ArrayLike) -> Array:
+        """d mean / ds (O, I) at one query (I,), by differences, to some 1e-9 of its size.
+
+        Raises ValueError as `KMP.jacobian` does.
+        """
+        s = self._checked("query", query)
+        columns = [self._differences(s, axis)[1] for axis in np.eye(len(s))]
+        return np.stack(columns, axis=1)
+
+    def predict_motion(
+        self,
+        query: ArrayLike,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        *,
+        covariance: bool = True,
+    ) -> MotionPrediction:
+        """The output at one query (I,) and its motion with the input, as `KMP.predict_motion`.
+
+        By differences, to some 1e-9 of their sizes. Raises ValueError as that does.
+        """
+        s = self._checked("query", query)
+        v = self._checked("velocity", velocity)
+        a = self._checked("acceleration", acceleration)
+        mean, along, curvature = self._differences(s, v)
+        jacobian = self.jacobian(s)
+        spread = self.predict(s[None]).covariance[0] if covariance else None
+        return MotionPrediction(mean, along, jacobian @ a + curvature, spread, jacobian, curvature)
+
+    def _checked(self, name: str, value: ArrayLike) -> Array:
+        return self.primitives[0]._checked(name, value)  # noqa: SLF001 (of its own kind)
+
+    def _differences(self, query: Array, velocity: Array) -> tuple[Array, Array, Array]:
+        """Mean and its two derivatives (O,) along a line through the query, of fourth order."""
+        speed = float(np.linalg.norm(velocity))
+        mean = self.mean(query[None])[0]
+        if speed == 0.0:
+            return mean, 0.0 * mean, 0.0 * mean
+        step = _DIFFERENCE / (speed * np.sqrt(np.max(self.primitives[0].kernel.ell)))
+        first, second, third, fourth = self.mean(
+            query + step * np.array([-2.0, -1.0, 1.0, 2.0])[:, None] * velocity
+        )
+        slope = (first - 8 * second + 8 * third - fourth) / (12 * step)
+        bend = (-first + 16 * second - 30 * mean + 16 * third - fourth) / (12 * step**2)
+        return mean, slope, bend
+
+    def sample(self, queries: ArrayLike, count: int, *, seed: int = 0) -> Array:
+        """Paths (count, M, O) through queries (M, I), of the product of the frames' joint normals.
+
+        Raises ValueError as `KMP.sample` does.
+        """
+        whole("count", count)
+        joint = [primitive.predict_joint(queries) for primitive in self.primitives]
+        outputs = len(self.frames[0].offset)
+        points = joint[0].outputs // outputs
+        mean = np.zeros(points * outputs)
+        covariance = np.zeros((0, 0))
+        for frame, normal in zip(self.frames, joint, strict=True):
+            wide = np.kron(np.eye(points), frame.matrix)
+            other = wide @ normal.mean[0] + np.tile(frame.offset, points)
+            spread = wide @ normal.covariance[0] @ wide.T
+            if not covariance.size:
+                mean, covariance = other, spread
+                continue
+            gain = np.linalg.lstsq(covariance + spread, covariance, rcond=1e-14)[0].T
+            mean = mean + gain @ (other - mean)
+            covariance = symmetric(covariance - gain @ covariance)
+        return drawn_paths(mean, covariance, count, seed).reshape(count, points, outputs)
+
+    def uncertainty(self, queries: ArrayLike) -> Uncertainty:
+        """The covariance of `predict`, by its causes, of which each frame's share counts as in the
+        mean. Raises ValueError as `predict` does.
+        """
+        total = self.predict(queries).covariance
+        variability, distance = np.zeros((2, *total.shape))
+        for frame, primitive in zip(self.frames, self.primitives, strict=True):
+            causes = primitive.uncertainty(queries)
+            whole_causes = causes.variability + causes.distance
+            share = total @ np.linalg.inv(frame.matrix @ whole_causes @ frame.matrix.T)
+            mapped = share @ frame.matrix
+            variability += mapped @ causes.variability @ mapped.mT
+            distance += mapped @ causes.distance @ mapped.mT
+        return Uncertainty(frozen(symmetric(variability)), frozen(symmetric(distance)))
+
     def adapt(
-        self, inputs: ArrayLike, desired: Gaussians, *, tolerance: float | None = None
+        self,
+        inputs: ArrayLike,
+        desired: Gaussians,
+        *,
+        frame: int | None = None,
+        tolerance: float | None = None,
     ) -> LocalKMP:
         """A new skill through desired points (V, I), V normals in the world's coordinates.
 
-        They are mapped into each frame, where `tolerance` [unit of the inputs] is that of
-        `KMP.adapt`. Raises ValueError as that does.
+        They are mapped into each frame, or into the one with this number only: they then move with
+        it. `tolerance` [unit of the inputs] is that of `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
         if tolerance is not None:
             not_negative("tolerance", tolerance)
+        if frame is not None:
+            whole("frame", frame, least=0, most=len(self.frames) - 1)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
-        pairs = zip(self.frames, self.primitives, strict=True)
-        adapted = (
-            primitive.adapt(via, frame.localised(desired), tolerance=tolerance)
-            for frame, primitive in pairs
+        adapted = tuple(
+            primitive.adapt(via, where.localised(desired), tolerance=tolerance)
+            if frame in (None, number)
+            else primitive
+            for number, (where, primitive) in enumerate(
+                zip(self.frames, self.primitives, strict=True)
+            )
         )
-        return LocalKMP(tuple(adapted), self.frames)
+        return LocalKMP(adapted, self.frames)
 
     def to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""

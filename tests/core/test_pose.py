@@ -80,7 +80,9 @@ def test_learned_orientation_is_that_of_kmp() -> None:
         mean, covariance = kmp.predict(query[None])
         assert abs(prediction.orientation @ mean[0]) == pytest.approx(1.0, abs=1e-9)
         np.testing.assert_allclose(
-            prediction.velocity, kmp.angular_velocity(query, velocity), atol=2e-5
+            prediction.velocity,
+            kmp.predict_motion(query, velocity, 0 * velocity).velocity,
+            atol=2e-5,
         )
         np.testing.assert_allclose(
             prediction.covariance, covariance[0], atol=1e-8 + 1e-4 * np.abs(covariance).max()

@@ -22,6 +22,7 @@ from kmp import (
     Matern52,
     OrientationKMP,
     PeriodicKernel,
+    PoseKMP,
     VelocityKernel,
     named_arrays,
 )
@@ -37,6 +38,10 @@ ONE = KMP.fit(S, R, kernel=K, lambda_mean=1.0)
 CONSTRAINED = ONE.constrained(LinearConstraints(S[:3], S[:3], np.zeros(3)))
 TURNING = OrientationKMP(
     KMP.fit(S, Gaussians(0.1 * S @ np.eye(2, 3), EYES), kernel=K, lambda_mean=1.0), [0, 0, 0, 1]
+)
+POSE = PoseKMP(
+    KMP.fit(S, Gaussians.of(0.1 * S @ np.eye(2, 6), deviation=0.1), kernel=K, lambda_mean=1.0),
+    [0, 0, 0, 1],
 )
 DEMONSTRATIONS = [(S, S + 0.1 * i) for i in range(3)]
 FRAMES = [(CoordinateFrame.at([0.1 * i, 0]), CoordinateFrame.at([0, 1])) for i in range(3)]
@@ -88,6 +93,7 @@ VALUES = [
     CONSTRAINED,
     ONE.adapt_jacobian(S[:1], [np.eye(2)], deviation=1.0),
     TURNING,
+    POSE,
     LOCAL,
     FRAMES[1][0],
     R,

@@ -6,7 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kmp import KMP, GaussianKernel, Gaussians, OrientationKMP, VelocityKernel, orientation
+from kmp import (
+    KMP,
+    GaussianKernel,
+    Gaussians,
+    OrientationKMP,
+    PoseKMP,
+    VelocityKernel,
+    load,
+    orientation,
+)
 
 properties = settings(max_examples=20, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -102,8 +111,14 @@ def test_skill_has_orientation_and_angular_velocity(velocity):
     for now in t:
         ahead, behind = (Rotation.from_quat(primitive.mean([[now + d]])[0]) for d in (h, -h))
         omega = (ahead * behind.inv()).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(primitive.angular_velocity([now], [1.0]), omega, atol=1e-5)
-        np.testing.assert_allclose(primitive.angular_velocity([now], [-2.0]), -2 * omega, atol=1e-5)
+        moving = primitive.predict_motion(now, 1.0, 0.0)
+        np.testing.assert_allclose(moving.velocity, omega, atol=1e-5)
+        np.testing.assert_allclose(moving.jacobian[:, 0], omega, atol=1e-5)
+        np.testing.assert_allclose(primitive.jacobian(now)[:, 0], omega, atol=1e-5)
+        faster = [primitive.predict_motion(now + d, 1.0, 0.0).velocity for d in (-h, h)]
+        np.testing.assert_allclose(
+            moving.acceleration, (faster[1] - faster[0]) / (2 * h), atol=1e-4
+        )
 
 
 def test_via_points_of_either_sign_are_met():
@@ -127,11 +142,64 @@ def test_via_point_may_fix_angular_velocity():
         desired,
         1e-8 * np.eye(3),
         tolerance=0.02,
-        angular_velocities=omega,
+        velocities=omega,
         velocity_covariance=1e-8 * np.eye(3),
     )
     same(fixed.mean([[0.7]]), desired)
-    np.testing.assert_allclose(fixed.angular_velocity([0.7], [1.0]), omega[0], atol=1e-3)
+    np.testing.assert_allclose(fixed.predict_motion(0.7, 1.0, 0.0).velocity, omega[0], atol=1e-3)
+
+
+def test_pose_turns_as_its_orientation_and_is_correlated():
+    """Position and orientation of one primitive: a via-point of the position moves the other."""
+    turning = skill(velocity=False)
+    t = turning.primitive.inputs
+    zeta = turning.primitive.reference.mean
+    mean = np.hstack([np.sin(t), np.cos(t), t, zeta])
+    correlated = 1e-4 * np.eye(6)
+    correlated[0, 3] = correlated[3, 0] = 8e-5
+    reference = Gaussians(mean, np.tile(correlated, (len(t), 1, 1)))
+    pose = PoseKMP(
+        KMP.fit(t, reference, kernel=GaussianKernel(5.0), lambda_mean=0.1), turning.auxiliary
+    )
+    found, covariance = pose.predict([0.7])
+    same(found[:, 3:], turning.mean([0.7]), atol=1e-4)
+    np.testing.assert_allclose(found[0, :3], [np.sin(0.7), np.cos(0.7), 0.7], atol=1e-3)
+    assert covariance.shape == (1, 6, 6)
+    assert pose.sample([0.5, 0.7], 3).shape == (3, 2, 7)
+    causes = pose.uncertainty([0.7])
+    np.testing.assert_allclose(causes.variability + causes.distance, covariance, atol=1e-9)
+
+    desired = np.array(found)
+    desired[0, 0] += 0.05
+    only_position = np.diag([0.0, 0.0, 0.0, 1e4, 1e4, 1e4])
+    moved = pose.adapt([0.7], desired, only_position)
+    np.testing.assert_allclose(moved.mean([0.7])[0, :3], desired[0, :3], atol=1e-5)
+    step = pose.jacobian(0.7)
+    np.testing.assert_allclose(step[:3, 0], [np.cos(0.7), -np.sin(0.7), 1.0], atol=1e-2)
+
+
+@pytest.mark.parametrize("kind", [OrientationKMP, PoseKMP])
+def test_rotating_skill_is_stored(kind, tmp_path):
+    size = 3 if kind is OrientationKMP else 6
+    t = np.linspace(0.0, 1.0, 20)
+    reference = Gaussians.of(0.1 * np.random.default_rng(1).normal(size=(20, size)), deviation=0.01)
+    made = kind(KMP.fit(t, reference, kernel=GaussianKernel(4.0), lambda_mean=1.0), [0, 0, 0, 1])
+    made.save(tmp_path / "turn.npz")
+    again = load(tmp_path / "turn.npz").value
+    assert type(again) is kind
+    np.testing.assert_array_equal(again.mean(t), made.mean(t))
+
+
+@properties
+@given(seeds, st.floats(1e-6, 3.0))
+def test_rate_of_the_rotations_jacobian(seed, size):
+    zeta, rate = np.random.default_rng(seed).normal(size=(2, 3))
+    zeta *= size / (2 * np.linalg.norm(zeta))
+    h = 1e-6
+    ahead, behind = (orientation.rotation_per_zeta(zeta + d * rate) for d in (h, -h))
+    np.testing.assert_allclose(
+        orientation.rotation_rate_per_zeta(zeta, rate), (ahead - behind) / (2 * h), atol=1e-6
+    )
 
 
 def test_covariance_is_of_world_rotations():
@@ -163,7 +231,14 @@ def test_impossible_orientations_are_refused():
             r"quaternions\[0\] is .* give -q",
         ),
         (
-            lambda: model.adapt([[0.5]], q, np.eye(3), tolerance=0, angular_velocities=[[0, 0, 0]]),
+            lambda: model.adapt(
+                [[0.5]],
+                q,
+                np.eye(3),
+                tolerance=0,
+                velocities=[[0, 0, 0]],
+                velocity_covariance=np.eye(3),
+            ),
             "the skill has no rates; fit it with a VelocityKernel",
         ),
     ):
@@ -172,5 +247,5 @@ def test_impossible_orientations_are_refused():
     flat = KMP.fit(
         [[0.0]], Gaussians([[0.0]], [[[1.0]]]), kernel=GaussianKernel(1.0), lambda_mean=1
     )
-    with pytest.raises(ValueError, match="primitive: 1 outputs given, 3 needed for an orientation"):
+    with pytest.raises(ValueError, match="primitive: 1 outputs given, 3 needed"):
         OrientationKMP(flat, [0, 0, 0, 1])

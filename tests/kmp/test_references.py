@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kmp import (
+    KMP,
     CoordinateFrame,
     GaussianKernel,
     GaussianMixture,
@@ -11,6 +12,7 @@ from kmp import (
     LocalKMP,
     VelocityKernel,
     gaussian_process_reference,
+    load,
     superposed,
 )
 from support.shown_skills import off, two_hands
@@ -83,6 +85,55 @@ def test_via_points_are_met_in_other_frames():
     adapted = placed.adapt([[0.5]], desired, tolerance=0.01)
     np.testing.assert_allclose(adapted.mean([[0.5]]), desired.mean, atol=1e-3)
     np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
+
+
+def test_via_point_of_one_frame_moves_with_it():
+    skill, t = learned()
+    goal = skill.frames[1]
+    near_goal = Gaussians.of(goal.offset[None] + [[-0.2, 0.1]], deviation=1e-4)
+    adapted = skill.adapt([0.9], near_goal, frame=1)
+    away = np.array([0.3, -0.2])
+    moved = adapted.placed([skill.frames[0], CoordinateFrame.at(goal.offset + away)])
+    np.testing.assert_allclose(moved.mean([0.9]), near_goal.mean + away, atol=2e-3)
+    assert moved.primitives[0] is skill.primitives[0]
+
+    third = KMP.fit(
+        t,
+        Gaussians.of(0 * t + [[0.5, 0.5]], deviation=1e-3),
+        kernel=GaussianKernel(20.0),
+        lambda_mean=1.0,
+    )
+    more = LocalKMP((*skill.primitives, third), (*skill.frames, CoordinateFrame.at([0.0, 0.1])))
+    assert len(more.frames) == 3
+    np.testing.assert_allclose(more.mean([0.5]), [[0.5, 0.6]], atol=0.05)
+
+
+def test_motion_of_frames_is_the_derivative_of_their_mean():
+    skill, _ = learned()
+    h = 3e-4
+    motion = skill.predict_motion(0.43, 1.5, -2.0)
+    before, now, after = (skill.mean([0.43 + 1.5 * d - d * d])[0] for d in (-h, 0.0, h))
+    np.testing.assert_allclose(motion.mean, now, atol=1e-12)
+    np.testing.assert_allclose(motion.velocity, (after - before) / (2 * h), rtol=1e-4)
+    np.testing.assert_allclose(motion.acceleration, (after - 2 * now + before) / h**2, rtol=1e-3)
+    np.testing.assert_allclose(1.5 * skill.jacobian(0.43)[:, 0], motion.velocity, rtol=1e-7)
+
+
+def test_uncertainty_and_samples_of_frames_are_those_of_their_product(tmp_path):
+    skill, t = learned()
+    expected = skill.predict(t[::6])
+    causes = skill.uncertainty(t[::6])
+    total = causes.variability + causes.distance
+    np.testing.assert_allclose(total, expected.covariance, atol=1e-3 * expected.covariance.max())
+    drawn = skill.sample(t[::6], 4000, seed=1)
+    spread = drawn.std(axis=0)
+    deviation = np.sqrt(np.diagonal(expected.covariance, axis1=1, axis2=2))
+    # joint normals of all points know more than those of one point
+    assert (spread < 1.1 * deviation).all()
+    np.testing.assert_allclose(drawn.mean(axis=0), expected.mean, atol=0.5 * deviation.max())
+    skill.save(tmp_path / "frames.npz")
+    again = load(tmp_path / "frames.npz").value
+    np.testing.assert_array_equal(again.mean(t), skill.mean(t))
 
 
 def test_velocity_is_turned_and_not_moved():

@@ -102,7 +102,8 @@ def test_outputs_solved_as_one_change(first):
         (1, 2) if first == "alike" else (2, 1)
     )
     anew = KMP.fit(adapted.inputs, adapted.reference, **options)
-    assert adapted.inner.solution.same > 0
+    # a small primitive whose points are replaced is fitted again
+    assert (adapted.inner.solution.same > 0) == (first == "alike")
     np.testing.assert_allclose(adapted.mean(S), anew.mean(S), atol=1e-9)
     covariance, other = (
         x.predict(S).covariance / n
@@ -118,7 +119,7 @@ def test_lost_point_is_refused_where_replaced():
         inputs, REFERENCE, kernel=GaussianKernel(0.5), lambda_mean=1.0, representation="dense"
     )
     twice = Gaussians(np.zeros((2, 2)), np.tile(1e-18 * np.eye(2), (2, 1, 1)))
-    with pytest.raises(ValueError, match="at point 40"):
+    with pytest.raises(ValueError, match="at point 39"):
         base.adapt([[3.0], [3.0]], twice, tolerance=0.1)
 
 

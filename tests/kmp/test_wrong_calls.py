@@ -26,6 +26,7 @@ from kmp import (
     Matern52,
     OrientationKMP,
     PeriodicKernel,
+    PoseKMP,
     VelocityKernel,
     named_arrays,
     orientation,
@@ -46,6 +47,9 @@ T = np.linspace(0, 1, 6)[:, None]
 SIX = Gaussians(np.hstack([ZETA.mean, ZETA.mean]), np.tile(0.01 * np.eye(6), (6, 1, 1)))
 IN_TIME = KMP.fit(T, SIX, kernel=VelocityKernel(1.0), lambda_mean=1.0).adapt(
     T[:1], SIX[:1], tolerance=0.1
+)
+POSE = PoseKMP(
+    KMP.fit(S, Gaussians.of(np.tile(ZETA.mean, 2), deviation=0.1), kernel=K, lambda_mean=1.0), Q[0]
 )
 TURNING_IN_TIME = OrientationKMP(IN_TIME, Q[0])
 FRAME = CoordinateFrame.at([0.0, 1.0])
@@ -110,6 +114,7 @@ RIGHT = {
         "directions": np.zeros((2, 2)),
     },
     TAUGHT.without_via_points: {"inputs": S[:1] + 9, "tolerance": 0.1},
+    TAUGHT.goal_jacobian: {"queries": S},
     ONE.adapt_many: {"points": [(S[:2], R[:2]), (S[2:3], R[2:3])], "tolerance": 0.1},
     ONE.with_lambda_covariance: {"lambda_covariance": 2.0},
     ONE.via_point_reach: {"query": S[0], "share": 0.5},
@@ -161,17 +166,34 @@ RIGHT = {
     LOCAL.placed: {"frames": FRAMES[0]},
     LOCAL.mean: {"queries": S},
     LOCAL.predict: {"queries": S},
-    LOCAL.adapt: {"inputs": S[:1], "desired": R[:1], "tolerance": 0.1},
+    LOCAL.adapt: {"inputs": S[:1], "desired": R[:1], "frame": 0, "tolerance": 0.1},
+    LOCAL.jacobian: {"query": S[0]},
+    LOCAL.predict_motion: {
+        "query": S[0],
+        "velocity": S[1],
+        "acceleration": S[2],
+    },
+    LOCAL.sample: {"queries": S, "count": 2, "seed": 0},
+    LOCAL.uncertainty: {"queries": S},
+    orientation.rotation_rate_per_zeta: {"zeta": [0.1, 0.2, 0.3], "rate": [1.0, 0.0, 2.0]},
+    PoseKMP: {"primitive": POSE.primitive, "auxiliary": Q[0]},
     OrientationKMP: {"primitive": TURNING.primitive, "auxiliary": Q[0]},
     TURNING.mean: {"queries": S},
     TURNING.predict: {"queries": S},
-    TURNING.angular_velocity: {"query": S[0], "velocity": S[1]},
+    TURNING.jacobian: {"query": S[0]},
+    TURNING.predict_motion: {
+        "query": S[0],
+        "velocity": S[1],
+        "acceleration": S[2],
+    },
+    TURNING.sample: {"queries": S, "count": 2, "seed": 0},
+    TURNING.uncertainty: {"queries": S},
     TURNING_IN_TIME.adapt: {
         "inputs": T[:2],
-        "quaternions": Q[:2],
+        "desired": Q[:2],
         "covariance": 0.01 * np.eye(3),
         "tolerance": 0.1,
-        "angular_velocities": np.zeros((2, 3)),
+        "velocities": np.zeros((2, 3)),
         "velocity_covariance": np.eye(3),
     },
     orientation.continuous: {"quaternions": Q},
@@ -260,7 +282,8 @@ OPTIONAL = {
     "prior_covariance",
     "prior_mean",
     "directions",
-    "angular_velocities",
+    "velocities",
+    "frame",
     "velocity_covariance",
 }
 WHOLE = {"components", "count", "rank", "dimensions", "updates", "rollouts", "outputs"}
@@ -353,6 +376,8 @@ def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
     """Values that are wrong for an argument like this, and values that may work."""
     if name in {"seed", "random_state"}:
         return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
+    if name == "frame":
+        return [value for value in NO_SCALARS if value is not None] + [1.5, True, 9], [0]
     if name in WHOLE:
         return [*NO_SCALARS, 1.5, 0, True, np.array(2.0)], [1, np.int64(2)]
     if name == "tolerance":
@@ -405,6 +430,10 @@ def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
     ], []
 
 
+def is_infinite(value):
+    return isinstance(value, np.ndarray) and value.dtype.kind == "f" and (value == np.inf).any()
+
+
 def calls():
     """Each call: function, name of the argument, right arguments, wrong value, and True if it must
     fail.
@@ -417,6 +446,8 @@ def calls():
             for candidate in wrong:
                 if function in OF_ANY_SIZE and isinstance(candidate, float):
                     continue  # one number for all inputs is right
+                if function == Gaussians.of and name == "deviation" and is_infinite(candidate):
+                    continue  # a free output
                 if function is regressor and name == "components" and candidate is None:
                     continue  # None: each sample is a reference point
                 if candidate is None and (

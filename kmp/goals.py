@@ -1,0 +1,187 @@
+"""Many alternative goals at once: the mean is affine in the means of via-points.
+
+With the posterior covariance P = k - k (K + lambda Sigma)^-1 k^T of the mean's cost and the U
+points that change, added with S = Sigma and removed with S = -Sigma,
+
+    mean'(s) = mean(s) + P(s, U) (P(U, U) + lambda S)^-1 (mu - mean(U))
+
+Rasmussen and Williams 2006, section A.2. P(a, b) is a residual plus or minus R_a^T R_b, with the
+roots R = L^-1 k of a dense solution, or lambda^1/2 L^-1 z of a low rank one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
+
+from kmp.arrays.checks import Array
+from kmp.arrays.linear_algebra import kron_identity
+from kmp.dense import Dense
+from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, unchecked
+from kmp.kernel import between
+from kmp.low_rank import LowRank
+from kmp.outputs import constraints_of
+from kmp.primitive import KMP
+from kmp.problem.database import Database
+from kmp.solution import Solution, mean_of, resolved
+
+
+def moved_means(
+    solution: Dense | LowRank,
+    added: Database,
+    replaced: list[NDArray[np.intp]],
+    queries: Functionals,
+) -> Array:
+    """How far the mean moves at M queries (G, M, O) with each of G goals, by one triangular solve.
+
+    `added` has the V via-points of each goal, one goal after the other; `replaced` the indices of
+    the solution's points that each replaces.
+    """
+    database = solution.database
+    gone = np.unique(np.concatenate(replaced))
+    both = added.joined(Database(database.functionals.take(gone), database.reference.take(gone)))
+    outputs = both.reference.outputs
+    errors = both.reference.mean - mean_of(solution, both.functionals)
+    noise = solution.hyperparameters.lambda_mean * both.reference.covariance
+    noise[len(added) :] *= -1.0
+    posterior = _Posterior(solution, both.functionals, queries)
+    goals = len(replaced)
+    counts = np.array([len(rows) for rows in replaced])
+    pulls = np.zeros((goals, len(both), outputs))
+    for count in np.unique(counts):
+        mine = np.flatnonzero(counts == count)
+        own = np.arange(len(added)).reshape(goals, -1)[mine]
+        others = len(added) + np.searchsorted(gone, np.array([replaced[g] for g in mine]))
+        rows = np.concatenate([own, others.reshape(len(mine), -1)], axis=1)  # (G', U)
+        system = posterior.within(rows)
+        each = np.arange(rows.shape[1])
+        system[:, each, :, each] += noise[rows].transpose(1, 0, 2, 3)
+        size = rows.shape[1] * outputs
+        solved = np.linalg.solve(
+            system.reshape(len(mine), size, size), errors[rows].reshape(len(mine), size, 1)
+        )
+        pulls[mine[:, None], rows] = solved.reshape(*rows.shape, outputs)
+    return posterior.across(pulls)
+
+
+class _Posterior:
+    """P within U points, and between these and M queries. C channels, O = C D outputs."""
+
+    def __init__(
+        self, solution: Dense | LowRank, points: Functionals, queries: Functionals
+    ) -> None:
+        kernel = solution.hyperparameters.kernel
+        self._d = solution.hyperparameters.channel_outputs
+        self._c = kernel.channels
+        self._residual = between(kernel, points, points)
+        self._across = between(kernel, queries, points)
+        if isinstance(solution, LowRank):
+            own, z = (solution.features(f) for f in (points, queries))
+            self._residual -= own.T @ own
+            self._across -= z.T @ own
+            scale = np.sqrt(solution.hyperparameters.lambda_mean)
+            rows = [scale * own, scale * z]
+            copies = self._d
+            self._sign = 1.0
+        else:
+            rows = [between(kernel, solution.functionals, f) for f in (points, queries)]
+            copies = solution.distinct
+            self._sign = -1.0
+        self._own, self._of_queries = (
+            lapack.dtrtrs(solution.mean_factor, kron_identity(row, copies), lower=1)[0]
+            for row in rows
+        )
+        self._copies = copies
+
+    def within(self, rows: NDArray[np.intp]) -> Array:
+        """P (G, U, O, U, O) of the points of each goal (G, U)."""
+        goals, count = rows.shape
+        at = (self._c * rows[:, :, None] + np.arange(self._c)).reshape(goals, -1)
+        residual = kron_identity(self._residual[at[:, :, None], at[:, None, :]], self._d)
+        width = self._c * self._copies
+        columns = (width * rows[:, :, None] + np.arange(width)).reshape(goals, -1)
+        roots = self._own.T[columns]  # (G, U C D', p)
+        explained = kron_identity(roots @ roots.mT, self._d // self._copies)
+        outputs = self._c * self._d
+        return np.asarray(residual + self._sign * explained).reshape(
+            goals, count, outputs, count, outputs
+        )
+
+    def across(self, pulls: Array) -> Array:
+        """P between queries and points times pulls (G, U, O): (G, M, O)."""
+        goals, _, outputs = pulls.shape
+        stacked = np.moveaxis(pulls, 0, 2)  # (U, O, G)
+        near = self._across @ stacked.reshape(self._across.shape[1], -1)
+        inner = self._own @ stacked.reshape(self._own.shape[1], -1)
+        total = near.ravel() + self._sign * (self._of_queries.T @ inner).ravel()
+        return np.asarray(np.moveaxis(total.reshape(-1, outputs, goals), 2, 0))
+
+
+class Alternatives(Sequence[KMP]):
+    """Primitives that `KMP.adapt_many` adapts from one, made when they are indexed."""
+
+    def __init__(
+        self,
+        primitive: KMP,
+        inputs: Sequence[Array],
+        desired: Sequence[Gaussians],
+        tolerance: float,
+    ) -> None:
+        self._primitive = primitive
+        self._inputs = inputs
+        self._desired = desired
+        self._tolerance = tolerance
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    @overload
+    def __getitem__(self, index: int) -> KMP: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[KMP, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> KMP | tuple[KMP, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(len(self))[index])
+        return self._primitive.adapt(
+            self._inputs[index], self._desired[index], tolerance=self._tolerance
+        )
+
+    def mean(self, queries: ArrayLike) -> Array:
+        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
+
+        Of goals with the same number of via-points it takes hardly more time than of one. Raises
+        ValueError as `KMP.mean` does.
+        """
+        primitive = self._primitive
+        solution: Solution = primitive.inner.solution
+        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
+        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
+            return np.stack([adapted.mean(queries) for adapted in self])
+        inputs = np.stack(self._inputs)
+        covariance = np.stack([desired.covariance for desired in self._desired])
+        goals = np.stack([desired.mean for desired in self._desired])
+        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
+            first = self[0]
+            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
+            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
+            away = (goals - goals[0]).reshape(len(self), -1)
+            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
+        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
+            return np.stack([adapted.mean(queries) for adapted in self])
+        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
+        normals = unchecked(
+            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
+        )
+        added = Database(points, resolved(solution.hyperparameters, points, normals))
+        replaced = [
+            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
+            for via in self._inputs
+        ]
+        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)
