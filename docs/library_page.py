@@ -64,6 +64,7 @@ KMP_GROUPS = {
         "MotionPrediction",
         "Uncertainty",
         "OrientationKMP",
+        "PoseKMP",
         "LocalKMP",
         "CoordinateFrame",
     ),
