@@ -1,7 +1,9 @@
 """The site of kmp: code on its pages, pictures, notebooks, and the build without a warning."""
 
+import inspect
 import io
 import json
+import operator
 import re
 import runpy
 import subprocess
@@ -10,6 +12,7 @@ import sys
 import numpy as np
 import pytest
 
+import kmp
 from support.paths import ROOT
 
 pytest.importorskip("matplotlib", reason="pip install 'kmp[plot]'")
@@ -65,6 +68,17 @@ def test_blocks_of_a_page_run_in_order(page):
         exec(compile("\n" * line + match.group(1), str(page), "exec"), names)
 
 
+def test_calls_that_replace_those_of_other_code_exist():
+    text = (SITE / "from-the-authors-code.md").read_text(encoding="utf-8")
+    cells = [line.strip("| ").split(" | ")[-1] for line in text.splitlines() if line[:1] == "|"]
+    calls = {name for cell in cells for name in re.findall(r"`([A-Za-z][\w.]*)[`(]", cell)}
+    parameters = {*inspect.signature(kmp.KMP.fit).parameters, "tolerance", "adapt"}
+    parts = {"distance", "variability"}
+    assert len(calls) > 15
+    for name in calls - parameters - parts:
+        operator.attrgetter(name)(kmp)
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_cells_of_a_notebook_run_in_order(path):
     """Without Jupyter, in one namespace; no output is stored."""
@@ -79,6 +93,7 @@ def test_cells_of_a_notebook_run_in_order(path):
 
 
 def test_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip("sphinx", reason="pip install '.[docs]'")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q"]
     places = ["-d", str(tmp_path / "read"), str(SITE), str(tmp_path / "site")]
     done = subprocess.run(
