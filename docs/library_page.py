@@ -12,7 +12,7 @@ from typing import Any
 
 import kmp
 import thirdhand
-from kmp import estimator, orientation
+from kmp import correlation, orientation, reference, results, selection, sklearn
 from thirdhand.contract import requests
 
 HERE = Path(__file__).parent
@@ -51,18 +51,9 @@ Joints are in radians, or in metres if they slide.
 `pip install .` in a clone installs the client alone, for Python 3.11 or later on Linux, macOS and
 Windows, with `eclipse-zenoh` and `msgspec`."""
 KMP_GROUPS = {
-    "Learn": (
-        "learn",
-        "Learned",
-        "Score",
-        "GaussianMixture",
-        "gaussian_process_reference",
-        "Gaussians",
-    ),
+    "Learn": ("learn", "aligned", "GaussianMixture", "Gaussians"),
     "Primitives": (
         "KMP",
-        "MotionPrediction",
-        "Uncertainty",
         "OrientationKMP",
         "PoseKMP",
         "LocalKMP",
@@ -78,8 +69,15 @@ KMP_GROUPS = {
         "Kernel",
         "AffineMean",
     ),
-    "Beyond": ("LinearConstraints", "superposed", "Correlation", "improve", "Improvement"),
-    "Files and warnings": ("save", "load", "Stored", "RankReached", "ViaPointMissed"),
+    "Beyond": ("LinearConstraints", "superposed"),
+    "Files and warnings": ("save", "load", "RankReached", "ViaPointMissed"),
+}
+KMP_MODULES = {
+    "Results of `learn`": (selection, ("Learned", "Score")),
+    "Other results": (results, ("MotionPrediction", "Uncertainty", "Stored")),
+    "References by Gaussian processes": (reference, ("gaussian_process_reference",)),
+    "Covariances from a reward": (correlation, ("Correlation", "improve", "Improvement")),
+    "With scikit-learn": (sklearn, ("KMPRegressor",)),
 }
 CLIENT_GROUPS = {
     "Connect": ("connect", "Connection", "Watch", "SceneObject"),
@@ -101,7 +99,7 @@ WITHOUT_METHODS = {
     *("GaussianKernel", "Matern32", "Matern52", "PeriodicKernel", "VelocityKernel"),
     *("RadialKernel", "KMPRegressor"),
 }
-INSIDE = {"to_plot", "inner"}
+INSIDE = {"inner"}
 SAME = {"LocalKMP.plot": "KMP.plot"}  # members with the docstring of another one
 # errors of wrong shapes and of numbers that are not finite, or those of another member
 PLAIN_ERROR = re.compile(
@@ -138,10 +136,9 @@ def _library() -> str:
     for name, value in inspect.getmembers(orientation, inspect.isfunction):
         if value.__module__ == orientation.__name__ and not name.startswith("_"):
             parts += _described(name, value)
-    parts += [
-        "## With scikit-learn, `kmp.estimator`",
-        *_described("KMPRegressor", estimator.KMPRegressor),
-    ]
+    for heading, (module, names) in KMP_MODULES.items():
+        parts.append(f"## {heading}, `{module.__name__}`")
+        parts += [part for name in names for part in _described(name, getattr(module, name))]
     return "\n\n".join(parts) + "\n"
 
 

@@ -12,7 +12,7 @@ fitted weights.
 
 The method, in the order in which it computes:
 
-* `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
+* `alignment`, `mixture`: demonstrations become a reference, `gaussians` at inputs (section II-A).
 * `kernel`: k between `functionals`, the values and derivatives of the output. `radial`,
   `time_kernels`: the kernels; `composition`: sums and products of them.
 * `problem/`: the reference database with its via-points, and the hyper-parameters.
@@ -21,117 +21,74 @@ The method, in the order in which it computes:
 * `query`, `loops/`: equation (8) and its derivatives for one query.
 * `predictor`, `primitive`: the class `KMP`.
 
-Beyond the method: `selection` and `criteria/` choose hyper-parameters; `references/` makes
-references in other ways; `orientation`, `constraints`, `plot`, `estimator`; `storage` and
-`named_arrays` write files.
+Beyond the method: `selection` and `criteria/` choose hyper-parameters; `frames` and `superposition`
+make primitives and references of several. `reference`, `correlation`, `selection`, `results` and
+`sklearn` offer names of their own; `storage` and `named_arrays` write files.
 """
 
 import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from kmp.arrays.checks import RankReached, ViaPointMissed
-    from kmp.constraints import LinearConstraints
-    from kmp.estimator import KMPRegressor as KMPRegressor
-    from kmp.gaussians import Gaussians
-    from kmp.kernel import Kernel
-    from kmp.mixture import GaussianMixture
-    from kmp.orientation import OrientationKMP, PoseKMP
-    from kmp.predictor import Uncertainty
-    from kmp.primitive import KMP
-    from kmp.problem.hyperparameters import AffineMean
-    from kmp.query import MotionPrediction
-    from kmp.radial import GaussianKernel, Matern32, Matern52, RadialKernel
-    from kmp.references.correlation import Correlation, Improvement, improve
-    from kmp.references.frames import CoordinateFrame, LocalKMP
-    from kmp.references.gaussian_process import gaussian_process_reference
-    from kmp.references.superposition import superposed
-    from kmp.selection import Learned, Score, learn
-    from kmp.storage import Stored, load, save
-    from kmp.time_kernels import PeriodicKernel, VelocityKernel
+    from kmp.alignment import aligned as aligned
+    from kmp.arrays.checks import RankReached as RankReached
+    from kmp.arrays.checks import ViaPointMissed as ViaPointMissed
+    from kmp.constraints import LinearConstraints as LinearConstraints
+    from kmp.frames import CoordinateFrame as CoordinateFrame
+    from kmp.frames import LocalKMP as LocalKMP
+    from kmp.gaussians import Gaussians as Gaussians
+    from kmp.kernel import Kernel as Kernel
+    from kmp.mixture import GaussianMixture as GaussianMixture
+    from kmp.orientation import OrientationKMP as OrientationKMP
+    from kmp.orientation import PoseKMP as PoseKMP
+    from kmp.primitive import KMP as KMP
+    from kmp.problem.hyperparameters import AffineMean as AffineMean
+    from kmp.radial import GaussianKernel as GaussianKernel
+    from kmp.radial import Matern32 as Matern32
+    from kmp.radial import Matern52 as Matern52
+    from kmp.radial import RadialKernel as RadialKernel
+    from kmp.selection import learn as learn
+    from kmp.storage import load as load
+    from kmp.storage import save as save
+    from kmp.superposition import superposed as superposed
+    from kmp.time_kernels import PeriodicKernel as PeriodicKernel
+    from kmp.time_kernels import VelocityKernel as VelocityKernel
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "KMP",
-    "AffineMean",
-    "CoordinateFrame",
-    "Correlation",
-    "GaussianKernel",
-    "GaussianMixture",
-    "Gaussians",
-    "Improvement",
-    "Kernel",
-    "Learned",
-    "LinearConstraints",
-    "LocalKMP",
-    "Matern32",
-    "Matern52",
-    "MotionPrediction",
-    "OrientationKMP",
-    "PeriodicKernel",
-    "PoseKMP",
-    "RadialKernel",
-    "RankReached",
-    "Score",
-    "Stored",
-    "Uncertainty",
-    "VelocityKernel",
-    "ViaPointMissed",
-    "gaussian_process_reference",
-    "improve",
-    "learn",
-    "load",
-    "save",
-    "superposed",
-]
-
-
-_MODULES = {
-    "AffineMean": "kmp.problem.hyperparameters",
-    "CoordinateFrame": "kmp.references.frames",
-    "Correlation": "kmp.references.correlation",
-    "GaussianKernel": "kmp.radial",
-    "GaussianMixture": "kmp.mixture",
-    "Gaussians": "kmp.gaussians",
-    "Improvement": "kmp.references.correlation",
-    "KMP": "kmp.primitive",
-    "KMPRegressor": "kmp.estimator",
-    "Kernel": "kmp.kernel",
-    "Learned": "kmp.selection",
-    "LinearConstraints": "kmp.constraints",
-    "LocalKMP": "kmp.references.frames",
-    "Matern32": "kmp.radial",
-    "Matern52": "kmp.radial",
-    "MotionPrediction": "kmp.query",
-    "OrientationKMP": "kmp.orientation",
-    "PeriodicKernel": "kmp.time_kernels",
-    "PoseKMP": "kmp.orientation",
-    "RadialKernel": "kmp.radial",
-    "RankReached": "kmp.arrays.checks",
-    "Score": "kmp.selection",
-    "Stored": "kmp.storage",
-    "Uncertainty": "kmp.predictor",
-    "VelocityKernel": "kmp.time_kernels",
-    "ViaPointMissed": "kmp.arrays.checks",
-    "gaussian_process_reference": "kmp.references.gaussian_process",
-    "improve": "kmp.references.correlation",
-    "learn": "kmp.selection",
-    "load": "kmp.storage",
-    "save": "kmp.storage",
-    "superposed": "kmp.references.superposition",
+_NAMES = {
+    "alignment": "aligned",
+    "arrays.checks": "RankReached ViaPointMissed",
+    "constraints": "LinearConstraints",
+    "frames": "CoordinateFrame LocalKMP",
+    "gaussians": "Gaussians",
+    "kernel": "Kernel",
+    "mixture": "GaussianMixture",
+    "orientation": "OrientationKMP PoseKMP",
+    "primitive": "KMP",
+    "problem.hyperparameters": "AffineMean",
+    "radial": "GaussianKernel Matern32 Matern52 RadialKernel",
+    "selection": "learn",
+    "storage": "load save",
+    "superposition": "superposed",
+    "time_kernels": "PeriodicKernel VelocityKernel",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> typing.Any:
     """A name or a module of this package, which is imported when it is first needed."""
-    if name not in _MODULES:
-        try:
-            return importlib.import_module(f"kmp.{name}")
-        except ModuleNotFoundError:
-            raise AttributeError(f"module 'kmp' has no attribute {name!r}") from None
-    value = getattr(importlib.import_module(_MODULES[name]), name)
-    globals()[name] = value
+    module = f"kmp.{_MODULES.get(name, name)}"
+    try:
+        value = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        raise AttributeError(f"module 'kmp' has no attribute {name!r}") from None
+    if name in _MODULES:
+        value = globals()[name] = getattr(value, name)
     return value
 
 

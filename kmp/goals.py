@@ -11,24 +11,18 @@ roots R = L^-1 k of a dense solution, or lambda^1/2 L^-1 z of a low rank one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import overload
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.dense import Dense
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians, unchecked
 from kmp.kernel import between
 from kmp.low_rank import LowRank
-from kmp.outputs import constraints_of
-from kmp.primitive import KMP
 from kmp.problem.database import Database
-from kmp.solution import Solution, mean_of, resolved
+from kmp.solution import mean_of
 
 
 def moved_means(
@@ -120,68 +114,3 @@ class _Posterior:
         inner = self._own @ stacked.reshape(self._own.shape[1], -1)
         total = near.ravel() + self._sign * (self._of_queries.T @ inner).ravel()
         return np.asarray(np.moveaxis(total.reshape(-1, outputs, goals), 2, 0))
-
-
-class Alternatives(Sequence[KMP]):
-    """Primitives that `KMP.adapt_many` adapts from one, made when they are indexed."""
-
-    def __init__(
-        self,
-        primitive: KMP,
-        inputs: Sequence[Array],
-        desired: Sequence[Gaussians],
-        tolerance: float,
-    ) -> None:
-        self._primitive = primitive
-        self._inputs = inputs
-        self._desired = desired
-        self._tolerance = tolerance
-
-    def __len__(self) -> int:
-        return len(self._inputs)
-
-    @overload
-    def __getitem__(self, index: int) -> KMP: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[KMP, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> KMP | tuple[KMP, ...]:
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(len(self))[index])
-        return self._primitive.adapt(
-            self._inputs[index], self._desired[index], tolerance=self._tolerance
-        )
-
-    def mean(self, queries: ArrayLike) -> Array:
-        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
-
-        Of goals with the same number of via-points it takes hardly more time than of one. Raises
-        ValueError as `KMP.mean` does.
-        """
-        primitive = self._primitive
-        solution: Solution = primitive.inner.solution
-        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
-        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
-            return np.stack([adapted.mean(queries) for adapted in self])
-        inputs = np.stack(self._inputs)
-        covariance = np.stack([desired.covariance for desired in self._desired])
-        goals = np.stack([desired.mean for desired in self._desired])
-        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
-            first = self[0]
-            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
-            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
-            away = (goals - goals[0]).reshape(len(self), -1)
-            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
-        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
-            return np.stack([adapted.mean(queries) for adapted in self])
-        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
-        normals = unchecked(
-            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
-        )
-        added = Database(points, resolved(solution.hyperparameters, points, normals))
-        replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
-            for via in self._inputs
-        ]
-        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)

@@ -6,14 +6,17 @@ of P(xi | s). The paper, section II-A; Cohn, Ghahramani, Jordan 1996 for the reg
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from kmp.arrays.checks import (
     Array,
+    Seed,
     brief,
     check_finite,
     check_some,
@@ -28,6 +31,10 @@ from kmp.gaussians import Gaussians, covariances
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000  # EM stops after this many steps
+_NO_SAMPLES = 1e-15  # added to the number of samples of a component, which may be 0
+
+_Parts: TypeAlias = tuple[Array, Array, Array]
+"""Weights (K,), means (K, D) and covariances (K, D, D)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,13 +66,13 @@ class GaussianMixture(Immutable):
 
     @classmethod
     def fit(
-        cls, samples: ArrayLike, *, components: int, seed: int, regularization: float = 1e-6
+        cls, samples: ArrayLike, *, components: int, seed: Seed = 0, regularization: float = 1e-6
     ) -> GaussianMixture:
         """The mixture that EM finds from a k-means start: samples (M, I+O), the inputs first.
 
         `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2
-        where the unit is the metre. The same seed gives the same mixture, whatever the number of
-        threads.
+        where the unit is the metre. `seed`, a whole number or a numpy Generator, is
+        that of k-means. The same seed gives the same mixture, whatever the number of threads.
 
         Raises ValueError if the shape differs, a number is not finite, there are fewer samples than
         components, or a parameter is out of its range.
@@ -85,12 +92,7 @@ class GaussianMixture(Immutable):
         s = numbers("inputs", inputs, "N", "I")
         i = self._checked_dimensions(s.shape[1])
         to_input = s[:, None, :] - self.means[:, :i]  # (N, K, I)
-        root = np.linalg.cholesky(self.covariances[:, :i, :i])  # (K, I, I)
-        white = np.linalg.solve(root, to_input.transpose(1, 2, 0))  # (K, I, N)
-        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        with np.errstate(divide="ignore"):  # log 0 of a component of weight 0: its share is 0
-            log_share = np.log(self.weights) - 0.5 * (log_det + (white**2).sum(axis=1).T)  # (N, K)
-        share = np.exp(log_share - logsumexp(log_share, axis=1, keepdims=True))
+        share = _shares(self.weights, to_input.transpose(1, 2, 0), self.covariances[:, :i, :i])[0].T
 
         across = self.covariances[:, :i, i:]  # (K, I, O)
         gain = np.linalg.solve(self.covariances[:, :i, :i], across)  # (K, I, O)
@@ -103,7 +105,7 @@ class GaussianMixture(Immutable):
         check_finite("inputs", mean, "far outside the mixture: its mean there")
         return Gaussians(mean, symmetric(covariance))
 
-    def sample_inputs(self, count: int, *, dimensions: int, seed: int) -> Array:
+    def sample_inputs(self, count: int, *, dimensions: int, seed: Seed = 0) -> Array:
         """Inputs (count, I) of a reference, drawn from the marginal P(s), with I = `dimensions`.
 
         Raises ValueError if the count is below 1, or no output remains.
@@ -130,7 +132,7 @@ def mixture_of(
     samples: ArrayLike,
     *,
     components: int,
-    seed: int,
+    seed: Seed,
     regularization: float,
     start: GaussianMixture | None = None,
 ) -> GaussianMixture:
@@ -139,37 +141,86 @@ def mixture_of(
     check_some("samples", data.T)
     added = positive("regularization", regularization)
     whole("components", components)
-    seeded(seed)
+    seed = seeded(seed)
     if len(data) < components:
         shortage = f"{len(data)} samples given for {components} components"
         raise ValueError(f"{shortage}: give at least {components} samples, or fewer components.")
-    # scikit-learn loads slowly, and predictions do not need it.
-    from sklearn.mixture import GaussianMixture as Estimator
-    from threadpoolctl import threadpool_limits
+    from sklearn.cluster import KMeans
 
-    initial = {}
-    if start is not None:
-        precisions = np.asarray(np.linalg.inv(start.covariances), dtype=np.float64)
-        initial = {"weights_init": start.weights / start.weights.sum(), "means_init": start.means}
-        initial["precisions_init"] = symmetric(precisions)
-    estimator = Estimator(
-        components,
-        covariance_type="full",
-        init_params="kmeans",
-        random_state=seed,
-        reg_covar=added,
-        tol=_TOLERANCE,
-        max_iter=_ITERATIONS,
-        **initial,
-    )
     try:
         # k-means sums its threads' results in the order in which they finish
-        with threadpool_limits(1):
-            fitted = estimator.fit(data)
-        return GaussianMixture(fitted.weights_, fitted.means_, symmetric(fitted.covariances_))
+        with one_thread():
+            if start is None:
+                k_means = KMeans(components, n_init=1, random_state=seed).fit(data)
+                share = (k_means.labels_ == np.arange(components)[:, None]).astype(float)
+                parts = _maximised(data, share, added)
+            else:
+                parts = start.weights, start.means, start.covariances
+            weights, means, covariances = _likeliest(data, parts, added)
+        return GaussianMixture(weights, means, symmetric(covariances))
     except ValueError:  # a covariance is not positive definite
         raise ValueError(
             f"samples: with regularization {added:g} no mixture of {components} components was "
             "found, as one of their covariances is singular. Give a larger regularization, or "
             "fewer components."
         ) from None
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """A context in which matrices and k-means are computed by one thread.
+
+    More threads gain nothing on small matrices, and lose much where other programs compute.
+    """
+    return _thread_pools().limit(limits=1)  # type: ignore[no-any-return]
+
+
+@cache
+def _thread_pools() -> Any:
+    # scikit-learn loads slowly, and predictions do not need it; its threads must be found, too
+    import sklearn.cluster  # noqa: F401
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def _likeliest(data: Array, parts: _Parts, added: float) -> _Parts:
+    """The weights, means and covariances to which EM converges from these, for data (M, D)."""
+    log_likelihood = -np.inf
+    for _ in range(_ITERATIONS):
+        weights, means, covariances = parts
+        share, log_density = _shares(weights, data.T - means[:, :, None], covariances)
+        parts = _maximised(data, share, added)
+        before = log_likelihood
+        log_likelihood = log_density.mean()
+        if abs(log_likelihood - before) < _TOLERANCE:
+            break
+    return parts
+
+
+def _maximised(data: Array, share: Array, added: float) -> _Parts:
+    """The M step: weights, means and covariances of data (M, D), of which each component has a
+    share (K, M).
+    """
+    total = share.sum(axis=1) + _NO_SAMPLES
+    means = share @ data / total[:, None]
+    offsets = data.T - means[:, :, None]
+    scatter = (share[:, None] * offsets) @ offsets.mT
+    covariances = scatter / total[:, None, None] + added * np.eye(data.shape[1])
+    return total / total.sum(), means, covariances
+
+
+def _shares(weights: Array, offsets: Array, covariances: Array) -> tuple[Array, Array]:
+    """Each component's share (K, M) of points, and the points' log densities (M,), plus a constant.
+
+    The offsets (K, D, M) of the points are from the means.
+    """
+    root = np.linalg.cholesky(covariances)
+    white = np.linalg.inv(root) @ offsets
+    log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    with np.errstate(divide="ignore"):  # log 0 of a component of weight 0: its share is 0
+        log_factor = np.log(weights) - 0.5 * log_det
+    log_share = log_factor[:, None] - 0.5 * (white**2).sum(axis=1)
+    largest = log_share.max(axis=0)
+    share = np.exp(log_share - largest)
+    total = share.sum(axis=0)
+    return share / total, largest + np.log(total)

@@ -18,6 +18,8 @@ from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
 from kmp.arrays.immutable import frozen
 from kmp.composition import ProductKernel, SumKernel
 from kmp.constraints import LinearConstraints
+from kmp.correlation import Correlation, Improvement
+from kmp.frames import CoordinateFrame, LocalKMP
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_pairs, covariances, unchecked
 from kmp.kernel import Kernel
@@ -39,8 +41,6 @@ from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.query import MotionPrediction
 from kmp.radial import GaussianKernel, Matern32, Matern52
-from kmp.references.correlation import Correlation, Improvement
-from kmp.references.frames import CoordinateFrame, LocalKMP
 from kmp.representation import dense
 from kmp.selection import Learned, Score
 from kmp.solution import Solution

@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, check_finite, not_negative, numbers, real
+from kmp.arrays.checks import Array, Seed, check_finite, not_negative, numbers, real
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances, unchecked
@@ -225,7 +225,7 @@ class _Rotating(Immutable, Saved):
         still = np.zeros(self.primitive.inputs.shape[1])
         return self.predict_motion(query, still, still, covariance=False).jacobian
 
-    def sample(self, queries: ArrayLike, count: int, *, seed: int = 0) -> Array:
+    def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Paths through queries (M, I): (count, M, P + 4). Raises ValueError as `KMP.sample`."""
         drawn = self.primitive.sample(queries, count, seed=seed)
         return self._placed(drawn.reshape(-1, drawn.shape[2])).reshape(*drawn.shape[:2], -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -59,7 +59,7 @@ class Plotted:
         """M normals at queries (M, I)."""
 
     @abstractmethod
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The points that are drawn with the predictions."""
 
     def plot(
@@ -100,7 +100,7 @@ class Plotted:
             ("output_unit", output_unit),
         ):
             check_kind(name, text, str, "a text")
-        plot_data = self.to_plot()
+        plot_data = self._to_plot()
         s = (
             _along(plot_data)
             if queries is None
@@ -179,16 +179,8 @@ def _draw_over_input(
     mean = found.mean[:, i]
     deviation = np.sqrt(found.covariance[:, i, i])
     [line] = axes.plot(x, mean, label=label, zorder=4)
-    for times, opacity, region_label in _REGIONS:
-        style: dict[str, Any] = {
-            "color": line.get_color(),
-            "alpha": opacity,
-            "linewidth": 0,
-            "zorder": 2,
-        }
-        axes.fill_between(
-            x, mean - times * deviation, mean + times * deviation, label=region_label, **style
-        )
+    for times, style in _regions(line):
+        axes.fill_between(x, mean - times * deviation, mean + times * deviation, **style)
     if alone:  # with more inputs, no axis shows their position
         references = shown.references
         via = shown.via_points
@@ -207,18 +199,19 @@ def _draw_over_input(
             )
 
 
+def _regions(line: Any) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The deviations of each region around a mean's line, and its style."""
+    for times, opacity, label in _REGIONS:
+        style = {"color": line.get_color(), "alpha": opacity, "linewidth": 0, "zorder": 2}
+        yield times, style | {"label": label}
+
+
 def _draw_plane(axes: Axes, found: Gaussians, shown: Shown, plane: list[int], label: str) -> None:
     from matplotlib.patches import PathPatch
 
     [line] = axes.plot(*found.mean[:, plane].T, label=label, zorder=4)
-    for times, opacity, region_label in _REGIONS:
-        style: dict[str, Any] = {
-            "color": line.get_color(),
-            "alpha": opacity,
-            "linewidth": 0,
-            "zorder": 2,
-        }
-        axes.add_patch(PathPatch(_ellipses(found, plane, times), label=region_label, **style))
+    for times, style in _regions(line):
+        axes.add_patch(PathPatch(_ellipses(found, plane, times), **style))
     via = shown.via_points.normals
     axes.plot(*shown.references.normals.mean[:, plane].T, label="reference", **_REFERENCE)
     if len(via):

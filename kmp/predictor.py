@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, check_finite, check_shape, real, seeded, whole
+from kmp.arrays.checks import Array, Seed, check_finite, check_shape, real, seeded, whole
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Functionals
@@ -140,8 +140,10 @@ class Predictor(Immutable):
         )
         return unchecked(self.mean(s).reshape(1, -1), covariance)
 
-    def sample(self, queries: ArrayLike, count: int, *, seed: int) -> Array:
+    def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
+
+        `seed` is a whole number or a numpy Generator.
 
         Raises ValueError as `predict` does, or if the count is below 1.
         """
@@ -267,11 +269,6 @@ class Predictor(Immutable):
         return self.inner.solution.hyperparameters.prior_mean
 
     @property
-    def prior_offset(self) -> Array:
-        """The prior mean (O,) [unit of the outputs] at inputs of 0."""
-        return self.inner.solution.hyperparameters.prior_offset
-
-    @property
     def prior_covariance(self) -> Array:
         """B (D, D) [unit of the outputs^2] of the D outputs of a channel."""
         known = self.inner.solution.hyperparameters.prior_covariance
@@ -286,34 +283,6 @@ class Predictor(Immutable):
     def representation(self) -> Literal["dense", "low_rank"]:
         """The kind of solution."""
         return self.inner.solution.representation
-
-    @property
-    def weights(self) -> Array:
-        """The weights of equation (8): alpha (N, O) of equation (9), or of the low rank centres."""
-        return self.inner.solution.weights
-
-    @property
-    def centres(self) -> Array:
-        """The inputs (N, I) to which the weights belong: reference points and via-points."""
-        return self.inner.solution.centres
-
-    @property
-    def error_bound(self) -> float:
-        """Upper bound of the distance between the mean and equation (9)'s [unit of the outputs].
-
-        It holds at any query, and is 0 for the dense solution. For the low rank it is 5 to 100
-        times the error itself. The error is largest far from the points; for queries near them,
-        `error_bound_at_points` is lower.
-        """
-        return self.inner.solution.error_bounds.anywhere
-
-    @property
-    def error_bound_at_points(self) -> float:
-        """As `error_bound`, but at the reference points and via-points only [unit of the outputs].
-
-        For the low rank it is 10 to 1000 times the error itself.
-        """
-        return self.inner.solution.error_bounds.at_points
 
     @cached_property
     def _spanned(self) -> Features:
@@ -368,7 +337,7 @@ class Predictor(Immutable):
         return self._wrapped(s)
 
 
-def drawn_paths(mean: Array, covariance: Array, count: int, seed: int) -> Array:
+def drawn_paths(mean: Array, covariance: Array, count: int, seed: Seed) -> Array:
     """Draws (count, n) of a normal, whose covariance may be singular."""
     whole("count", count)
     values, vectors = np.linalg.eigh(covariance)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +35,7 @@ from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel
-from kmp.low_rank import RANK, TOLERANCE
+from kmp.low_rank import RANK, TOLERANCE, LowRank
 from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
@@ -45,9 +45,6 @@ from kmp.radial import GaussianKernel
 from kmp.representation import LARGE, solved
 from kmp.solution import Solution, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
-
-if TYPE_CHECKING:
-    from kmp.goals import Alternatives
 
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
 
@@ -346,7 +343,7 @@ class KMP(Predictor, Plotted, Saved):
         known = constraints_of(before)
         return changed if known is None else constrained(changed, known)
 
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""
         database = self.inner.solution.database
         count = len(self.inputs) - len(self.via_inputs)
@@ -414,8 +411,6 @@ class KMP(Predictor, Plotted, Saved):
         inputs = [numbers("inputs", given, "V", self._dimensions) for given, _ in pairs]
         for via, (_, desired) in zip(inputs, pairs, strict=True):
             check_pairs("desired", via, desired, self.outputs)
-        from kmp.goals import Alternatives
-
         return Alternatives(self, inputs, [desired for _, desired in pairs], tolerance)
 
     def goal_jacobian(self, queries: ArrayLike) -> Array:
@@ -534,3 +529,70 @@ def checked_primitive(value: object, name: str = "primitive") -> KMP:
     """The value as a `KMP`. Raises ValueError if it is none."""
     check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
     return cast(KMP, value)
+
+
+class Alternatives(Sequence[KMP]):
+    """Primitives that `KMP.adapt_many` adapts from one, made when they are indexed."""
+
+    def __init__(
+        self,
+        primitive: KMP,
+        inputs: Sequence[Array],
+        desired: Sequence[Gaussians],
+        tolerance: float,
+    ) -> None:
+        self._primitive = primitive
+        self._inputs = inputs
+        self._desired = desired
+        self._tolerance = tolerance
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    @overload
+    def __getitem__(self, index: int) -> KMP: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[KMP, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> KMP | tuple[KMP, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(len(self))[index])
+        return self._primitive.adapt(
+            self._inputs[index], self._desired[index], tolerance=self._tolerance
+        )
+
+    def mean(self, queries: ArrayLike) -> Array:
+        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
+
+        Of goals with the same number of via-points it takes hardly more time than of one. Raises
+        ValueError as `KMP.mean` does.
+        """
+        primitive = self._primitive
+        solution: Solution = primitive.inner.solution
+        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
+        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
+            return np.stack([adapted.mean(queries) for adapted in self])
+        inputs = np.stack(self._inputs)
+        covariance = np.stack([desired.covariance for desired in self._desired])
+        goals = np.stack([desired.mean for desired in self._desired])
+        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
+            first = self[0]
+            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
+            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
+            away = (goals - goals[0]).reshape(len(self), -1)
+            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
+        from kmp.goals import moved_means  # rarely used
+
+        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
+            return np.stack([adapted.mean(queries) for adapted in self])
+        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
+        normals = unchecked(
+            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
+        )
+        added = Database(points, resolved(solution.hyperparameters, points, normals))
+        replaced = [
+            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
+            for via in self._inputs
+        ]
+        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)

@@ -6,6 +6,7 @@ marginal likelihood of the reference.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -13,17 +14,24 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, check_kind, checked_demonstrations, one_of, positive, whole
+from kmp.arrays.checks import (
+    Array,
+    Seed,
+    check_kind,
+    checked_demonstrations,
+    one_of,
+    positive,
+    seeded,
+    whole,
+)
 from kmp.arrays.immutable import Immutable, frozen
-from kmp.criteria.cross_validation import preferred, rms
+from kmp.criteria.errors import preferred, rms
 from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
-from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, checked_kernel
-from kmp.mixture import GaussianMixture, mixture_of
+from kmp.mixture import GaussianMixture, mixture_of, one_thread
 from kmp.primitive import KMP
-from kmp.problem.database import Database
 from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
 
@@ -228,7 +236,7 @@ def learn(
     demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
     *,
     components: int,
-    seed: int,
+    seed: Seed = 0,
     count: int = 200,
     velocity: bool = False,
     kernel: Kernel | None = None,
@@ -243,7 +251,10 @@ def learn(
 
     The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs, and
     the primitive, whose mean returns to the reference's. `regularization` is that of
-    `GaussianMixture.fit`, as a share of the variance of each input and output.
+    `GaussianMixture.fit`, as a share of the variance of each input and output, and `seed` its seed.
+
+    Demonstrations may have different lengths T. Over time, those of different durations should be
+    `aligned` first: they then have a common phase.
 
     `points`: the inputs are "drawn" from the marginal as in the paper (evenly spaced over time,
     where I is 1), or "shown", the demonstrations' own. "auto": drawn where I is 1; else those
@@ -282,7 +293,7 @@ def learn(
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
     deviation = np.concatenate([np.hstack(pair) for pair in data]).std(axis=0)
     unit = np.where(deviation > 0, deviation, 1.0)  # of a column that never changes
-    recipe = _Recipe(components, seed, count, regularization, 2 if velocity else 1, unit)
+    recipe = _Recipe(components, seeded(seed), count, regularization, 2 if velocity else 1, unit)
     mixture = recipe.mixture(data)
     _check_precision(data)
     is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
@@ -301,16 +312,18 @@ def learn(
         asked = [is_shown, False] if points == "auto" and is_shown else [is_shown]
         search = _Search(kernel, lambda_mean, scales == "one")
         choices = [recipe.folds(data, mixtures, option) for option in asked]
-        folds, kernel, lambda_mean, scores = search.best(choices)
+        # over one input the matrices are those of few features
+        with one_thread() if data[0][0].shape[1] == 1 else nullcontext():
+            folds, kernel, lambda_mean, scores = search.best(choices)
+            if lambda_covariance is None:
+                lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
         is_shown = folds.shown
         plain = float(np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds.each])))
-        if lambda_covariance is None:
-            lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
     full = recipe.reference(data, mixture, is_shown)
     if is_incomplete and criterion == "likelihood":
         start = 0.5 / _variances(full.inputs)
         likeliest = most_likely(
-            Database(Functionals(full.inputs), full.reference),
+            full.database,
             full.prior_mean,
             kernel or (VelocityKernel(float(start[0])) if velocity else GaussianKernel(start)),
             lambda_mean,

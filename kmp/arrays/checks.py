@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from kmp.arrays.immutable import frozen
 
 Array: TypeAlias = NDArray[np.float64]
+Seed: TypeAlias = int | np.random.Generator
 
 
 class ViaPointMissed(UserWarning):
@@ -129,7 +130,12 @@ def squared(name: str, deviation: float | Array) -> float:
 
 
 def seeded(value: object) -> int:
-    """The seed. Raises ValueError unless it is a whole number from 0 to 2^32 - 1."""
+    """The seed, or one that is drawn from a generator.
+
+    Raises ValueError unless it is a generator, or a whole number from 0 to 2^32 - 1.
+    """
+    if isinstance(value, np.random.Generator):
+        return int(value.integers(2**32))
     return whole("seed", value, least=0, most=2**32 - 1)
 
 

@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity, nearest_positive_semidefinite
-from kmp.criteria.cross_validation import rms
+from kmp.criteria.errors import rms
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, between
@@ -40,6 +40,22 @@ class Fold:
     held_inputs: Array
     held_outputs: Array
     regression_rmse: float
+
+    @cached_property
+    def database(self) -> Database:
+        """The reference points."""
+        return Database(Functionals(self.inputs), self.reference)
+
+    @cached_property
+    def inverse_roots(self) -> Array:
+        """Sigma^-1/2, the inverse Cholesky factors (N, O, O) of the covariances."""
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.reference.covariance)))
+
+    @cached_property
+    def whitened_target(self) -> Array:
+        """Sigma^-1/2 (mu - m): (N O,)."""
+        target = (self.reference.mean - self.prior_mean)[:, :, None]
+        return np.asarray(self.inverse_roots @ target).ravel()
 
     def fitted(self, kernel: Kernel, lambda_mean: float, lambda_covariance: float | None) -> KMP:
         """The primitive of the reference."""
@@ -99,13 +115,10 @@ class _System:
     def mean(self, penalty: float) -> Array:
         """The mean (M, O). Raises ValueError if not solvable, or rounding hides lambda Sigma."""
         self._check(penalty)
-        target = self.fold.reference.mean - self.fold.prior_mean
         if self._features is not None:
-            values, vectors = self._modes
-            pulls = self._whitened(target.reshape(-1, 1))[:, 0] @ self._rows @ vectors
-            return np.asarray(
-                (self._held_modes @ (pulls / (values + penalty))).reshape(self._shape)
-            ) + (self.fold.prior_mean)
+            shrunk = self._pulls / (self._modes[0] + penalty)
+            return (self._held_modes @ shrunk).reshape(self._shape) + self.fold.prior_mean
+        target = self.fold.reference.mean - self.fold.prior_mean
         total = self._gram.copy()
         count = len(target)
         points = np.arange(count)
@@ -139,7 +152,7 @@ class _System:
 
     def _check(self, penalty: float) -> None:
         parameters = Hyperparameters(self.kernel, penalty, penalty, self.fold.prior_mean)
-        check_resolved(parameters, Database(Functionals(self.fold.inputs), self.fold.reference))
+        check_resolved(parameters, self.fold.database)
 
     @property
     def _shape(self) -> tuple[int, int]:
@@ -147,23 +160,17 @@ class _System:
 
     @property
     def _own(self) -> Array:
-        return kron_identity(
-            self.kernel.prior_variance, self.fold.reference.outputs // self.kernel.channels
-        )
+        return self._wide(self.kernel.prior_variance)
 
     def _whitened(self, rows: Array) -> Array:
         """Sigma^-1/2 times rows (N O, J), with the inverse Cholesky factors of the covariances."""
         stacked = rows.reshape(*self.fold.reference.mean.shape, -1)
-        return np.asarray(self._inverse_roots @ stacked).reshape(rows.shape)
-
-    @cached_property
-    def _inverse_roots(self) -> Array:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.fold.reference.covariance)))
+        return np.asarray(self.fold.inverse_roots @ stacked).reshape(rows.shape)
 
     @cached_property
     def _features(self) -> Features | None:
         rank = int(_MOST_FEATURES * len(self.fold.inputs))
-        points = Functionals(self.fold.inputs)
+        points = self.fold.database.functionals
         if rank == 0 or self.fold.inputs.shape[1] > 1:  # with more inputs the rank is too high
             return None
         features, left = Features.of(self.kernel, points, rank=rank, tolerance=_RESIDUAL)
@@ -173,20 +180,28 @@ class _System:
     def _rows(self) -> Array:
         """Sigma^-1/2 times the features of the points, for each output: (N O, r D)."""
         assert self._features is not None
-        return self._whitened(self._wide(self._features(Functionals(self.fold.inputs)).T))
+        z = self._features(self.fold.database.functionals).T.reshape(
+            len(self.fold.inputs), self.kernel.channels, -1
+        )
+        roots = self.fold.inverse_roots.reshape(*self.fold.reference.mean.shape, z.shape[1], -1)
+        rows = np.einsum("nocd,ncr->nord", roots, z)
+        return np.asarray(rows.reshape(self.fold.reference.mean.size, -1))
+
+    @cached_property
+    def _pulls(self) -> Array:
+        """V^T z^T Sigma^-1/2 (mu - m) of the features z: (r D,)."""
+        return np.asarray(self.fold.whitened_target @ self._rows @ self._modes[1])
 
     @cached_property
     def _gram(self) -> Array:
         """K (x) I (N O, N O)."""
-        points = Functionals(self.fold.inputs)
+        points = self.fold.database.functionals
         return self._wide(between(self.kernel, points, points))
 
     @cached_property
     def _across(self) -> Array:
         """k between the held-out inputs and the points: (M C, N C)."""
-        return between(
-            self.kernel, Functionals(self.fold.held_inputs), Functionals(self.fold.inputs)
-        )
+        return between(self.kernel, self._held, self.fold.database.functionals)
 
     @cached_property
     def _modes(self) -> tuple[Array, Array]:
@@ -202,26 +217,26 @@ class _System:
     def _held_modes(self) -> Array:
         """k Sigma^-1/2 V of the held-out inputs (M O, N O), or z V of their features (M O, r D)."""
         if self._features is not None:
-            return np.asarray(
-                self._wide(self._features(Functionals(self.fold.held_inputs)).T) @ self._modes[1]
-            )
+            vectors = self._modes[1].reshape(self._held_features.shape[1], -1)
+            return (self._held_features @ vectors).reshape(-1, len(self._modes[0]))
         across = self._whitened(np.ascontiguousarray(self._wide(self._across).T))
         return np.asarray(across.T @ self._modes[1])
 
     @cached_property
     def _residual(self) -> Array:
         """The residual of the features at the held-out inputs: (M, O, O)."""
+        z = self._held_features.reshape(len(self._held), self.kernel.channels, -1)
+        return self._wide(self.kernel.prior_variance - z @ z.mT)
+
+    @cached_property
+    def _held_features(self) -> Array:
+        """z of the held-out inputs: (M C, r)."""
         assert self._features is not None
-        z = self._features(Functionals(self.fold.held_inputs)).T.reshape(
-            len(self.fold.held_inputs), -1, self._rank
-        )
-        d = self.fold.reference.outputs // self.kernel.channels
-        return kron_identity(self.kernel.prior_variance - z @ z.transpose(0, 2, 1), d)
+        return np.ascontiguousarray(self._features(self._held).T)
 
     @property
-    def _rank(self) -> int:
-        assert self._features is not None
-        return len(self._features.pivots)
+    def _held(self) -> Functionals:
+        return Functionals(self.fold.held_inputs)
 
     def _wide(self, matrix: Array) -> Array:
         """x (x) I of a matrix over channels, with I of size D."""

@@ -67,10 +67,10 @@ def calls(count, dimensions):
     covariance = root @ root.mT + 0.01 * np.eye(3)
     reference = kmp.Gaussians(mean, covariance)
     parameters = {"kernel": kmp.GaussianKernel(ELL), "lambda_mean": 1.0}
-    one = inputs[:1] + 0.01
-    many = np.repeat(inputs, 1000 // count, axis=0) + 0.01
+    query = inputs[:1] + 0.01
+    queries = np.repeat(inputs, 1000 // count, axis=0) + 0.01
     point = kmp.Gaussians.of(mean[:1] + 0.1, deviation=0.1)
-    new = [np.concatenate(pair) for pair in ((inputs, one), (mean, point.mean))]
+    new = [np.concatenate(pair) for pair in ((inputs, query), (mean, point.mean))]
     new_covariance = np.concatenate([covariance, point.covariance])
 
     variances = np.trace(covariance, axis1=1, axis2=2) / 3
@@ -87,22 +87,22 @@ def calls(count, dimensions):
             lambda: regressor.fit(inputs, mean),
         ),
         "mean of 1": (
-            lambda: skill.mean(one),
-            lambda: plain.mean(one),
-            lambda: regressor.predict(one),
+            lambda: skill.mean(query),
+            lambda: plain.mean(query),
+            lambda: regressor.predict(query),
         ),
         "mean of 1000": (
-            lambda: skill.mean(many),
-            lambda: plain.mean(many),
-            lambda: regressor.predict(many),
+            lambda: skill.mean(queries),
+            lambda: plain.mean(queries),
+            lambda: regressor.predict(queries),
         ),
         "predict 1": (
-            lambda: skill.predict(one),
-            lambda: (plain.mean(one), plain.covariance(one)),
-            lambda: regressor.predict(one, return_cov=True),
+            lambda: skill.predict(query),
+            lambda: (plain.mean(query), plain.covariance(query)),
+            lambda: regressor.predict(query, return_cov=True),
         ),
         "via-point": (
-            lambda: skill.adapt(one, point, tolerance=0.0),
+            lambda: skill.adapt(query, point, tolerance=0.0),
             lambda: Plain(*new, new_covariance),
             lambda: grown.fit(*new),
         ),
@@ -110,7 +110,7 @@ def calls(count, dimensions):
 
 
 def seconds(call):
-    """The time of a call, of as many as take 20 ms."""
+    """The time of a call, of as queries as take 20 ms."""
     timer = timeit.Timer(call)
     once = timer.timeit(1)
     number = max(1, int(0.02 / max(once, 1e-7)))

@@ -62,7 +62,7 @@ def test_equals_learning_the_remainder(kernel, representation, how):
     """The result equals learning from the remaining data."""
     prior, primitive, remainder = both(kernel, representation, how)
     queries = np.random.default_rng(1).normal(size=(5, primitive.inputs.shape[1]))
-    close = {"rtol": 0, "atol": 1e-8 * np.abs(primitive.weights).max()}
+    close = {"rtol": 0, "atol": 1e-8 * np.abs(primitive.inner.solution.weights).max()}
     np.testing.assert_allclose(
         primitive.mean(queries), remainder.mean(queries) + at(prior, Functionals(queries)), **close
     )

@@ -12,7 +12,7 @@ import pytest
 
 from kmp.compiled import compiled
 from kmp.loops.mean import exponentials
-from support.paths import ROOT
+from support.paths import LIBRARY, ROOT
 
 numba = pytest.importorskip("numba")
 
@@ -78,7 +78,7 @@ def test_bits_are_those_of_a_plain_cpu():
     command = [sys.executable, "-c", OPERATIONS]
     native, generic = (
         subprocess.run(
-            command, env=environment | more, cwd=ROOT, capture_output=True, text=True, check=True
+            command, env=environment | more, cwd=LIBRARY, capture_output=True, text=True, check=True
         ).stdout
         for more in ({}, {"NUMBA_CPU_NAME": "generic"})
     )
@@ -100,7 +100,7 @@ def test_first_compilation_is_announced_once(tmp_path):
     command = [sys.executable, "-c", FIRST]
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
-        subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, check=True)
+        subprocess.run(command, env=env, cwd=LIBRARY, capture_output=True, text=True, check=True)
         for _ in range(2)
     )
     assert first.stderr.splitlines() == [

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from support.paths import ROOT
+from support.paths import LIBRARY
 
 pytest.importorskip("numba")
 
@@ -84,7 +84,7 @@ class Checkout:
 
     def run(self, program: str, *arguments: str) -> list[float]:
         """The numbers that a program prints in a new process."""
-        path = os.pathsep.join(map(str, (self.folder.parent, ROOT)))
+        path = os.pathsep.join(map(str, (self.folder.parent, LIBRARY)))
         environment = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(self.cache)}
         done = subprocess.run(
             [sys.executable, "-c", program, *arguments],

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from kmp import KMP, Correlation, GaussianKernel, Gaussians, improve
+from kmp import KMP, GaussianKernel, Gaussians
+from kmp.correlation import Correlation, improve
 
 T = np.linspace(0, 2, 60)[:, None]
 

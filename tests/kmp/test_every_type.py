@@ -12,7 +12,6 @@ from kmp import (
     KMP,
     AffineMean,
     CoordinateFrame,
-    Correlation,
     GaussianKernel,
     GaussianMixture,
     Gaussians,
@@ -27,8 +26,9 @@ from kmp import (
     named_arrays,
 )
 from kmp.arrays.immutable import Immutable
+from kmp.correlation import Correlation, improve
 from kmp.storage import checksum
-from support.primitives import same_bits
+from support.primitives import offered, same_bits
 
 S = np.random.default_rng(0).normal(size=(20, 2))
 R = Gaussians.of(S, deviation=0.1)
@@ -48,7 +48,7 @@ FRAMES = [(CoordinateFrame.at([0.1 * i, 0]), CoordinateFrame.at([0, 1])) for i i
 LOCAL = LocalKMP.learn(DEMONSTRATIONS, FRAMES, S, kernel=K, lambda_mean=1.0, components=2, seed=0)
 NEUTRAL = Correlation.neutral(S[:2], width=1.0, outputs=2)
 LEARNED = kmp.learn(DEMONSTRATIONS, components=2, seed=0, count=20, kernel=K, lambda_mean=1.0)
-IMPROVED = kmp.improve(
+IMPROVED = improve(
     ONE,
     lambda x: -float(x.sum()),
     S[:3],
@@ -79,7 +79,7 @@ def used(representation, kernel=K, inputs=S, reference=R):
             primitive.predict(inputs[:1]),
             primitive.uncertainty(inputs),
             primitive.jacobian(inputs[0]),
-            primitive.error_bound,
+            primitive.inner.solution.error_bounds,
         )
     return adapted
 
@@ -205,10 +205,10 @@ def test_pickle_leaves_factors_out(representation):
 
 def test_every_public_type_is_tested():
     """The cases contain all types of the package."""
-    types = {name for name in kmp.__all__ if isinstance(getattr(kmp, name), type)}
-    offered = {n for n in types if not issubclass(getattr(kmp, n), Warning)}
+    types = {value for value in offered().values() if isinstance(value, type)}
+    names = {kind.__name__ for kind in types if not issubclass(kind, Warning)}
     tested = {type(value).__name__ for value in VALUES} - {"SumKernel"}
-    assert offered - {"Stored", "Kernel", "RadialKernel"} == tested
+    assert names - {"Stored", "Kernel", "RadialKernel"} == tested
 
 
 def test_other_values_are_refused(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kmp import GaussianKernel, Gaussians, VelocityKernel
+from kmp.criteria.errors import preferred
 from kmp.criteria.folds import Fold
 
 
@@ -71,3 +72,9 @@ def test_what_rounding_hides_is_no_candidate(dimensions):
     assert held.rmses(kernel, [1e-13, 1.0], 1)[1] < np.inf
     assert held.negative_log_likelihoods(kernel, 1.0, [1e-13], 1) == [np.inf]
     assert held.negative_log_likelihoods(kernel, 1e-13, [1.0], 1) == [np.inf]
+
+
+def test_first_good_candidate_is_preferred():
+    assert preferred("abc", [3.0, 1.1, 1.0], 1.2) == "b"
+    with pytest.raises(ValueError, match="at least the least score, 1"):
+        preferred("abc", [3.0, 1.1, 1.0], 0.9)

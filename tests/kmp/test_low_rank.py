@@ -166,7 +166,7 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
         # The order of the points changes the dense solution by rounding only.
         rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
         assert error < max(1e-5, 2.0 * rounding)
-        assert error <= b.error_bound_at_points
+        assert error <= b.inner.solution.error_bounds.at_points
         scale = np.abs(a.predict(t).covariance).max()
         np.testing.assert_allclose(
             b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale
@@ -182,7 +182,7 @@ def test_rank_decides_over_time(one):
     automatic = KMP.fit(t, reference, kernel=one, lambda_mean=10.0)
     dense = KMP.fit(t, reference, kernel=one, lambda_mean=10.0, representation="dense")
     assert automatic.representation == "low_rank"
-    assert len(automatic.weights) < 40
+    assert len(automatic.inner.solution.weights) < 40
     np.testing.assert_allclose(automatic.mean(t), dense.mean(t), atol=1e-9)
     short = replace(one, ell=4000.0)
     assert KMP.fit(t, reference, kernel=short, lambda_mean=10.0).representation == "dense"
@@ -210,8 +210,8 @@ def test_reached_rank_is_reported_with_error_bound(rank):
             inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank
         )
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
-    assert 1e-6 < error < low.error_bound_at_points
-    assert f"{low.error_bound_at_points:.2g} [unit" in str(caught[0].message)
+    assert 1e-6 < error < low.inner.solution.error_bounds.at_points
+    assert f"{low.inner.solution.error_bounds.at_points:.2g} [unit" in str(caught[0].message)
     assert caught[0].filename == __file__
 
 
@@ -225,16 +225,14 @@ def test_the_error_bound_holds(seed, left, adapted):
             primitive.adapt(inputs, desired, tolerance=0.02) for primitive in (dense, low)
         )
     data = dense.inputs[:300]
-    assert (
-        np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= low.error_bound_at_points
-    )
+    bounds = low.inner.solution.error_bounds
+    assert np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= bounds.at_points
     elsewhere = np.concatenate(
         [dense.inputs, 0.5 * np.random.default_rng(seed).normal(size=(500, 6))]
     )
-    assert (
-        np.linalg.norm(low.mean(elsewhere) - dense.mean(elsewhere), axis=1).max() <= low.error_bound
-    )
-    assert dense.error_bound == dense.error_bound_at_points == 0
+    errors = np.linalg.norm(low.mean(elsewhere) - dense.mean(elsewhere), axis=1)
+    assert errors.max() <= bounds.anywhere
+    assert dense.inner.solution.error_bounds == (0, 0)
 
 
 # the taught rate differs from the neighbours'
@@ -252,7 +250,8 @@ def test_derivatives_are_features_too(count, ell):
     options = {"kernel": VelocityKernel(ell), "lambda_mean": 0.1, "directions": along}
     dense, low = of_both(t, reference, rank=400, **options)
     queries = np.linspace(-1, 3, 301)[:, None]
-    assert np.abs(low.mean(queries) - dense.mean(queries)).max() <= low.error_bound
+    bound = low.inner.solution.error_bounds.anywhere
+    assert np.abs(low.mean(queries) - dense.mean(queries)).max() <= bound
     np.testing.assert_allclose(low.mean(t), dense.mean(t), atol=1e-9)
     restored = named_arrays.from_arrays(named_arrays.to_arrays(low))
     assert np.array_equal(restored.mean(queries), low.mean(queries))

@@ -11,10 +11,10 @@ from kmp import (
     Gaussians,
     LocalKMP,
     VelocityKernel,
-    gaussian_process_reference,
     load,
     superposed,
 )
+from kmp.reference import gaussian_process_reference
 from support.shown_skills import off, two_hands
 
 

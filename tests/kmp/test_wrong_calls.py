@@ -16,7 +16,6 @@ from kmp import (
     KMP,
     AffineMean,
     CoordinateFrame,
-    Correlation,
     GaussianKernel,
     GaussianMixture,
     Gaussians,
@@ -31,6 +30,10 @@ from kmp import (
     named_arrays,
     orientation,
 )
+from kmp.correlation import Correlation, improve
+from kmp.reference import gaussian_process_reference
+from kmp.sklearn import KMPRegressor
+from support.primitives import offered
 
 S = np.random.default_rng(0).normal(size=(6, 2))
 R = Gaussians(S, np.tile(0.01 * np.eye(2), (6, 1, 1)))
@@ -67,7 +70,7 @@ IMPROVE = {"correlation": NEUTRAL, "exploration": 0.1, "updates": 1, "rollouts":
 def regressor(*, ell, lambda_mean, lambda_covariance, noise, components, random_state):
     """scikit-learn checks a parameter when it is used, so the estimator is fitted too."""
     arguments = locals()
-    return kmp.KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
+    return KMPRegressor(**arguments).fit(S, S).predict(S, return_std=True)
 
 
 # Right arguments of each public callable.
@@ -142,7 +145,7 @@ RIGHT = {
     Correlation.neutral: {"centres": S, "width": 1.0, "outputs": 2},
     NEUTRAL.__call__: {"inputs": S},
     NEUTRAL.applied: {"primitive": ONE},
-    kmp.improve: {
+    improve: {
         "primitive": ONE,
         "reward": lambda path: -float(path.sum()),
         "queries": S,
@@ -201,12 +204,13 @@ RIGHT = {
     orientation.log: {"quaternions": Q, "auxiliary": Q[0]},
     orientation.exp: {"zeta": ZETA.mean, "auxiliary": Q[0]},
     orientation.rotation_per_zeta: {"zeta": ZETA.mean[0]},
-    kmp.gaussian_process_reference: {
+    gaussian_process_reference: {
         "demonstrations": PAIRS,
         "inputs": S,
         "count": 12,
         "regularization": 1e-6,
     },
+    kmp.aligned: {"demonstrations": [(T, S)], "velocity": False},
     kmp.superposed: {"references": [R, R], "priorities": np.full((2, 6), 0.5)},
     kmp.learn: {
         "demonstrations": PAIRS,
@@ -375,7 +379,7 @@ def wrong_arrays(array):
 def wrong_values(name, right):  # noqa: C901, PLR0912 - a case for each kind
     """Values that are wrong for an argument like this, and values that may work."""
     if name in {"seed", "random_state"}:
-        return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3)]
+        return [*NO_SCALARS, 1.5, True, 2**40], [0, np.int64(3), np.random.default_rng(0)]
     if name == "frame":
         return [value for value in NO_SCALARS if value is not None] + [1.5, True, 9], [0]
     if name in WHOLE:
@@ -506,8 +510,7 @@ def test_each_right_call_works(tmp_path, monkeypatch):
 
 def public():
     """Each public callable of the package, by type and name, and its parameters."""
-    for name in kmp.__all__:
-        member = getattr(kmp, name)
+    for name, member in offered().items():
         if not inspect.isclass(member):
             yield "", name, inspect.signature(member).parameters
         elif not issubclass(member, Warning):

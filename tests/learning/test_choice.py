@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kmp import KMP, GaussianKernel, Gaussians
-from kmp.criteria.cross_validation import rms
-from kmp.criteria.direct import DirectSelection, ridge_mean
+from kmp.criteria.errors import rms
 from thirdhand.workbench.learning.choice import (
     MAX_GAIN,
     POSITION_SCALES,
@@ -15,6 +14,7 @@ from thirdhand.workbench.learning.choice import (
     sampled,
     selection_of,
 )
+from thirdhand.workbench.learning.direct_selection import DirectSelection, ridge_mean
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript, Teacher
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from kmp import KMP, AffineMean
-from kmp.criteria.cross_validation import rms
-from kmp.criteria.direct import DirectSelection, ridge_mean
+from kmp.criteria.errors import rms
 from support.circling import circling
 from support.paths import RECORDINGS
 from thirdhand.skills.skill_file import SkillError, StoredSkill, decoded, with_file
 from thirdhand.workbench.learning.baselines import held_out_errors, linear
 from thirdhand.workbench.learning.choice import MAX_GAIN, RIDGE_M, selection_of
+from thirdhand.workbench.learning.direct_selection import DirectSelection, ridge_mean
 from thirdhand.workbench.learning.learn import learn
 from thirdhand.workbench.learning.records import Evidence
 

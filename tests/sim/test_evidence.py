@@ -34,7 +34,7 @@ from thirdhand_sim.lab.evidence import (
     staleness,
     tree,
 )
-from thirdhand_sim.lab.people.comparison import _sessions, _tasks
+from thirdhand_sim.lab.people.comparison import sessions_of, tasks_of
 from thirdhand_sim.lab.reproduction.letters import WRITTEN, gathered
 from thirdhand_sim.lab.reproduction.writing import write
 from thirdhand_sim.lab.results import ExperimentError, Options, Results
@@ -205,10 +205,10 @@ class TestSeedOffset:
         np.testing.assert_array_equal(letter.demonstrations, many[5:])
 
     def test_people_and_scenes_are_others(self) -> None:
-        moved = {task.first for task in _tasks(Options(seed_offset=24), 2)}
+        moved = {task.first for task in tasks_of(Options(seed_offset=24), 2)}
         assert moved == {24}
         first, second = (
-            [trial.session.told for trial in _sessions("test", "", 1, 1, None, number)]
+            [trial.session.told for trial in sessions_of("test", "", 1, 1, None, number)]
             for number in (0, 24)
         )
         assert not np.array_equal(first[0].board, second[0].board)

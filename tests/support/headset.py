@@ -62,6 +62,12 @@ EMULATED = """
       hand.updatePinchValue(value);
     }
   };
+  // `iwer` says of each controller that its position is emulated; that of a tracked one is not.
+  const getPose = XRFrame.prototype.getPose;
+  XRFrame.prototype.getPose = function (...spaces) {
+    const pose = getPose.apply(this, spaces);
+    return pose && {transform: pose.transform, emulatedPosition: false};
+  };
   // What `iwer` keeps behind symbols: the offset of a space from its parent.
   const inside = one => String(one).includes("xr-space");
   window.offset = space => space[Object.getOwnPropertySymbols(space).find(inside)].offsetMatrix;

@@ -2,5 +2,8 @@
 
 from pathlib import Path
 
+import kmp
+
 ROOT = Path(__file__).parents[2]
 RECORDINGS = ROOT / "recordings"
+LIBRARY = Path(kmp.__file__).parents[1]  # where `import kmp` finds it

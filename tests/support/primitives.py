@@ -5,6 +5,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
+import kmp
 from kmp import KMP, GaussianKernel, Gaussians, VelocityKernel
 from kmp.functionals import Functionals
 from kmp.kernel import between
@@ -13,11 +14,25 @@ properties = settings(max_examples=15, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
 representations = st.sampled_from(["dense", "low_rank"])
 kernel = GaussianKernel(0.5)
+OF_MODULES = {
+    "correlation": ("Correlation", "Improvement", "improve"),
+    "reference": ("gaussian_process_reference",),
+    "results": ("MotionPrediction", "Stored", "Uncertainty"),
+    "selection": ("Learned", "Score"),
+}
 KERNELS = {
     "one length": GaussianKernel(0.5),
     "a length an input": GaussianKernel([0.5, 1.0, 2.0]),
     "velocity": VelocityKernel(2.0),
 }
+
+
+def offered():
+    """All names that the package offers, and their values."""
+    members = {name: getattr(kmp, name) for name in kmp.__all__}
+    for module, names in OF_MODULES.items():
+        members |= {name: getattr(getattr(kmp, module), name) for name in names}
+    return members
 
 
 def curve(kernel):

@@ -24,6 +24,7 @@ from support.cell import LISTENING, serving, until
 from support.chromium import Tab
 from support.page_hands import Heard
 from thirdhand.client import Client, endpoints, open_session
+from thirdhand.contract import cdr
 from thirdhand.contract.messages import PoseStamped
 
 pytestmark = pytest.mark.skipif(bool(lacks := headset.lacking()), reason=lacks)
@@ -188,6 +189,51 @@ def test_a_phone_is_one_hand_and_a_touch_its_pinch(
         tab.ask("device.controllers.right.updateButtonValue('trigger', 0)")
         until(lambda: not clutch[-1], within_s=TIMEOUT_S)
     subscriber.undeclare()
+
+
+@pytest.mark.thorough
+def test_controller_leads_the_tool_while_its_trigger_is_pressed(tmp_path: Path) -> None:
+    """The tool moves and turns with it, from where it was; the other hand remains one."""
+    wishes = f'{LISTENING}{CELL}[skill]\nsource = "tool/wish"\n[tool]\norientation = "full"\n'
+    place = "device.controllers.right.position.set(.25, {}, -.4)"
+    with (
+        serving(tmp_path, "--joints", "assumed", "--rate", "100", network=wishes) as daemon,
+        headset.serving_hands(daemon.endpoint, tmp_path, "--lead", "right") as served,
+        headset.worn(served.url, tmp_path, without=("anchors",)) as tab,
+    ):
+        setpoints: list[PoseStamped] = []
+        subscriber = daemon.session.declare_subscriber(
+            "thirdhand/tool/setpoint",
+            lambda sample: setpoints.append(cdr.decode_pose(sample.payload.to_bytes())),
+        )
+        tab.ask("device.primaryInputMode = 'controller'")
+        tab.ask(place.format(1.0))
+        daemon.until(lambda now: now["reason"] == "no_wish", TIMEOUT_S)
+        until(lambda: setpoints, within_s=TIMEOUT_S)
+        began = setpoints[-1]
+        tab.ask("device.controllers.right.updateButtonValue('trigger', 1)")
+        daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
+        for step in range(1, 21):
+            tab.ask(place.format(1.0 + 0.004 * step))
+            time.sleep(0.1)
+        turn = Rotation.from_rotvec([0.0, 0.2, 0.0])
+        tab.ask("device.controllers.right.quaternion.set({}, {}, {}, {})".format(*turn.as_quat()))
+        up = (0.0, 0.0, 0.08)  # y of the headset is z of the base
+        until(
+            lambda: np.allclose(
+                np.subtract(setpoints[-1].position, began.position), up, atol=0.003
+            ),
+            within_s=TIMEOUT_S,
+        )
+
+        def turned() -> float:
+            now = Rotation.from_quat(setpoints[-1].orientation)
+            return float((now * Rotation.from_quat(began.orientation).inv()).as_rotvec()[2])
+
+        until(lambda: abs(turned() - 0.2) < 0.02, within_s=TIMEOUT_S)
+        tab.ask("device.controllers.right.updateButtonValue('trigger', 0)")
+        daemon.until(lambda now: now["reason"] == "stale_wish", TIMEOUT_S)
+        subscriber.undeclare()
 
 
 def test_a_headset_without_hand_tracking_does_not_start(

@@ -8,7 +8,7 @@ from matplotlib import pyplot as plt
 
 import kmp
 
-skill = kmp.learn(demonstrations(), components=8, seed=0).primitive
+skill = kmp.learn(demonstrations(), components=8).primitive
 normals = np.repeat([[0.0, 1.0], [-1.0, 0.0]], len(TIMES), axis=0)
 bounds_cm = np.repeat([-6.0, -3.0], len(TIMES))  # normal · output >= bound
 limits = kmp.LinearConstraints(np.vstack([TIMES, TIMES]), normals, bounds_cm)

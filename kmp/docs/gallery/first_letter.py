@@ -8,7 +8,7 @@ from matplotlib import pyplot as plt
 
 import kmp
 
-skill = kmp.learn(demonstrations(), components=8, seed=0).primitive
+skill = kmp.learn(demonstrations(), components=8).primitive
 
 figure = plt.figure(figsize=(7.2, 4.4), layout="constrained")
 panels = figure.subplot_mosaic([["plane", "x"], ["plane", "y"]])

@@ -16,7 +16,7 @@ letters = [
     for (times, path), (start, goal) in zip(demonstrations(8), ends_cm, strict=True)
 ]
 frames = [CoordinateFrame.start_and_goal(path) for _, path in letters]
-choice = {"kernel": GaussianKernel(8), "lambda_mean": 0.01, "components": 16, "seed": 0}
+choice = {"kernel": GaussianKernel(8), "lambda_mean": 0.01, "components": 16}
 skill = LocalKMP.learn(letters, frames, TIMES, **choice)
 
 figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")

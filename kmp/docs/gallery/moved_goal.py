@@ -7,7 +7,7 @@ from matplotlib import pyplot as plt
 
 import kmp
 
-skill = kmp.learn(demonstrations(), components=8, seed=0).primitive
+skill = kmp.learn(demonstrations(), components=8).primitive
 goals = [kmp.Gaussians.of(goal, deviation=0.01) for goal in ([-7, -3], [-8, -8], [-2, -4])]  # [cm]
 
 figure, axes = plt.subplots(figsize=(5.4, 4.4), layout="constrained")

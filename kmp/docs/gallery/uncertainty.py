@@ -8,7 +8,7 @@ from matplotlib import pyplot as plt
 
 import kmp
 
-skill = kmp.learn(demonstrations(), components=8, seed=0).primitive
+skill = kmp.learn(demonstrations(), components=8).primitive
 times = np.linspace(-0.5, 3, 200)[:, None]  # [s]; the demonstrations end at 2 s
 parts = skill.uncertainty(times)
 

@@ -9,7 +9,7 @@ from matplotlib import pyplot as plt
 import kmp
 
 with_rates = [(t, np.hstack([x, np.gradient(x, t[:, 0], axis=0)])) for t, x in demonstrations()]
-skill = kmp.learn(with_rates, components=8, seed=0, velocity=True).primitive
+skill = kmp.learn(with_rates, components=8, velocity=True).primitive
 now = skill.mean([[1.0]])[0]  # x y [cm], then their rates [cm/s]
 points = {"at rest": [*now[:2], 0, 0], "twice as fast": [*now[:2], *2 * now[2:]]}
 

@@ -33,7 +33,8 @@ def flat_gripper(skill_inputs: Vector, *, ell: float) -> LearnedGripper:
 
 def is_flat(primitive: KMP) -> bool:
     """True if the primitive is constant, but for its via-points."""
-    return bool((primitive.base.reference.mean == primitive.prior_offset).all())
+    prior = primitive.inner.solution.hyperparameters.prior_offset
+    return bool((primitive.base.reference.mean == prior).all())
 
 
 def even(inputs: Vector, outputs: Vector, kernel: Kernel, prior: Vector) -> KMP:

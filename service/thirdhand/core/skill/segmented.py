@@ -111,16 +111,17 @@ class Placed(Immutable):
 
         sizes["scale"], _ = cast(GaussianKernel, primitive.kernel).coordinates(1)
         sizes["std"] = at.std
-        sizes["prior"] = primitive.prior_offset
+        solution = primitive.inner.solution
+        sizes["prior"] = solution.hyperparameters.prior_offset
 
         # compiled functions always have a clock as the last input
-        inputs = primitive.centres
+        inputs = solution.centres
         count = len(off)
         if clock is None or not clock.weight:
             inputs = np.column_stack([inputs, np.zeros(len(inputs))])
         else:
             sizes["clock_weight"] = clock.weight
-        centres = table_of(inputs, primitive.weights.reshape(-1, OUTPUTS))
+        centres = table_of(inputs, solution.weights.reshape(-1, OUTPUTS))
 
         columns = ERROR_SEGMENT_DISTANCE * np.eye(count)[errors[:, 2].astype(int)]
         rows = (

@@ -24,6 +24,7 @@ from thirdhand.workbench.cli.web_address import serve_page, web_address
 from thirdhand.workbench.trackers.address import Address
 from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.hands_page import HandsPage, HeadsetPage
+from thirdhand.workbench.trackers.lead import Lead
 from thirdhand.workbench.trackers.mouse_page import MousePage
 from thirdhand.workbench.trackers.pinch import Pinches
 from thirdhand.workbench.trackers.web_server import server_certificate
@@ -92,9 +93,9 @@ def _web(args: argparse.Namespace) -> int:
             pinches = Pinches(
                 session, args.cell, clutch=args.pinch_clutch, gripper=args.pinch_gripper
             )
-            page = HeadsetPage(
-                tracker, client, Latest(session, args.cell), pinches=pinches, **served
-            )
+            latest = Latest(session, args.cell)
+            lead = Lead(session, args.cell, args.lead, latest) if args.lead else None
+            page = HeadsetPage(tracker, client, latest, pinches=pinches, lead=lead, **served)
 
         def listening(address: Address) -> None:
             page_address = Address(certificate.name, address.port) if certificate else address

@@ -143,6 +143,8 @@ def hands(add: AddCommand) -> None:
     c.add_argument("--pinch-clutch", choices=SIDES, help=clutch)
     gripper = "close the gripper of `[hands] gripper` with the fingers of this hand (--web)"
     c.add_argument("--pinch-gripper", choices=SIDES, help=gripper)
+    lead = "lead the tool by this hand or controller while it pinches: tool/wish (--web)"
+    c.add_argument("--lead", choices=SIDES, help=lead)
     flag(c, "--open", "open the page of --mouse in this machine's browser")
     reach(c)
 

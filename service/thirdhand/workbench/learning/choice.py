@@ -1,5 +1,5 @@
 """Selection of hyper-parameters for takes, in metres: the reference points, and the scales of
-`kmp.criteria.direct`.
+`direct_selection`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.criteria.direct import DirectSelection, Scales
 from thirdhand.core.frame import Vector
 from thirdhand.skills.via_points import MAX_GAIN
+from thirdhand.workbench.learning.direct_selection import DirectSelection, Scales
 
 # an input that varies by less, as trembling hands do, does not move the affine mean
 RIDGE_M = 0.005

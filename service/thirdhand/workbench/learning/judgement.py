@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.criteria.cross_validation import rms
+from kmp.criteria.errors import rms
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.model import LEVELS, Regions
 from thirdhand.core.skill.skill import is_reachable

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from kmp.criteria.cross_validation import rms
+from kmp.criteria.errors import rms
 from thirdhand.process.parallel import workers_of
 from thirdhand.settings.config import Reach
 from thirdhand.skills.demonstration import Demonstration, exchanged

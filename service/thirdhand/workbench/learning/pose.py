@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp import GaussianKernel
-from kmp.criteria.cross_validation import rms
-from kmp.criteria.direct import DirectSelection, Parameters
+from kmp.criteria.errors import rms
 from kmp.orientation import continuous, log
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import angles
@@ -23,6 +22,7 @@ from thirdhand.core.skill.pose import CLOSED, UNKNOWN, LearnedGripper, LearnedOr
 from thirdhand.skills.flat import UNDECIDED, even
 from thirdhand.workbench.learning.ambiguity import contradictions
 from thirdhand.workbench.learning.choice import selection_of
+from thirdhand.workbench.learning.direct_selection import DirectSelection, Parameters
 from thirdhand.workbench.learning.records import HeldOut, Pose, Verdict, by_fold, folds_of
 
 # an orientation that stays this near to its mean counts as constant

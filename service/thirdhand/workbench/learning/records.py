@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.criteria.cross_validation import mahalanobis
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill.model import Model, Regions, standard_deviations
 from thirdhand.core.skill.pose import LearnedGripper, LearnedOrientation
@@ -20,6 +19,7 @@ from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.process.parallel import Workers, here
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.skill_file import StoredSkill
+from thirdhand.workbench.learning.cross_validation import mahalanobis
 from thirdhand.workbench.learning.gate import Gate
 
 Progress = Callable[[str], None]

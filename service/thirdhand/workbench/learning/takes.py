@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kmp.criteria.cross_validation import rms
+from kmp.criteria.errors import rms
 from thirdhand.contract.records import SIDES
 from thirdhand.core.skill.tuning import UNSURE_M
 from thirdhand.skills.demonstration import (

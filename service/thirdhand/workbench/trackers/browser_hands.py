@@ -29,6 +29,7 @@ from thirdhand.contract.messages import WireError
 from thirdhand.workbench.trackers import web_server
 from thirdhand.workbench.trackers.cell_view import Latest, carried_out, corrected
 from thirdhand.workbench.trackers.hand_message import PageHands, decode_hands, is_ping, pong
+from thirdhand.workbench.trackers.lead import Lead
 from thirdhand.workbench.trackers.pinch import Pinches
 
 MAX_PAGES = 8  # pages that are open at once: headset, phone, screens beside the bench
@@ -64,6 +65,7 @@ class BrowserHands:
         frame: str,
         has_token: Callable[[str], bool],
         pinches: Pinches | None = None,
+        lead: Lead | None = None,
     ) -> None:
         self._tracker = tracker
         self._client = client
@@ -71,6 +73,7 @@ class BrowserHands:
         self._frame = frame
         self._has_token = has_token
         self._pinches = pinches
+        self._lead = lead
         self._name = f"hands {secrets.token_hex(4)}"  # name of the person who holds by a sign
         self._pages: set[web.WebSocketResponse] = set()
         self._owner: web.WebSocketResponse | None = None
@@ -172,6 +175,9 @@ class BrowserHands:
             return True
         frame_id = f"{self._frame}{hands.epoch or ''}"
         for hand in hands.hands:
+            if self._lead is not None and hand.side == self._lead.side:
+                self._lead.follow(hand, frame_id, hands.stamp_ns)
+                continue
             self._tracker.publish(
                 hand.side,
                 hand.position,
@@ -190,6 +196,8 @@ class BrowserHands:
         """
         if self._pinches is not None:
             self._pinches.release()
+        if self._lead is not None:
+            self._lead.release()
 
     async def _tell(self, page: web.WebSocketResponse) -> None:
         """Send the status until the page leaves. A page that does not read it is disconnected."""

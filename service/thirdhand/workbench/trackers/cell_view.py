@@ -57,6 +57,11 @@ class Latest:
         with contextlib.suppress(WireError):  # the daemon reports them
             self._objects = channels.BY_KEY["objects"].codec.decode(sample.payload.to_bytes())
 
+    def mapping(self, frame: str) -> tuple[float, ...] | None:
+        """The pose of a tracker's frame in base, x y z [m] and x y z w; None if there is none."""
+        known = self._status.trackers.get(frame) if self._status else None
+        return tuple(known) if known else None
+
     def objects(self) -> list[dict[str, Any]]:
         """The objects on the bench: name, shape, position [m], size [m], colour, `held`: true if
         the position is in a frame of the arm, which holds it.

@@ -11,6 +11,7 @@ from aiohttp import web
 from thirdhand.client import Client, Tracker
 from thirdhand.workbench.trackers.browser_hands import NO_TOKEN, BrowserHands
 from thirdhand.workbench.trackers.cell_view import Latest
+from thirdhand.workbench.trackers.lead import Lead
 from thirdhand.workbench.trackers.pinch import Pinches
 from thirdhand.workbench.trackers.web_server import (
     HTML,
@@ -51,11 +52,18 @@ class HandsPage:
         token: str = "",
         more: Iterable[web.AbstractRouteDef] = (),
         pinches: Pinches | None = None,
+        lead: Lead | None = None,
         **fields: str,
     ) -> None:
         self._fields = {"cell": html.escape(cell), "frame": self.frame} | fields
         self.hands = BrowserHands(
-            tracker, client, latest, frame=self.frame, has_token=self.has_token, pinches=pinches
+            tracker,
+            client,
+            latest,
+            frame=self.frame,
+            has_token=self.has_token,
+            pinches=pinches,
+            lead=lead,
         )
         page_routes = [
             ("/", self._front),

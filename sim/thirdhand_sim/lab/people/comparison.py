@@ -133,7 +133,7 @@ def _learned(method: str, candidate: int) -> RivalModel[Places]:
 
 
 @functools.lru_cache(maxsize=8)
-def _sessions(
+def sessions_of(
     group: Group, kind: str, people: int, scenes: int, hands: Path | None, first: int
 ) -> list[SeenSession]:
     """The sessions of a group, with alternating sigma from scene to scene; in breaking scenes the
@@ -154,7 +154,7 @@ def _sessions(
 
 def outcomes(task: MethodTask) -> list[TrialOutcome]:
     """The outcomes of a task's sessions."""
-    runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands, task.first)
+    runs = sessions_of(task.group, task.kind, task.people, task.scenes, task.hands, task.first)
     if task.method == TEACHER:
         return [judge(None, trial) for trial in runs]
     model = _learned(task.method, task.candidate)
@@ -165,7 +165,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: all candidates on the tuning set, or the chosen ones on the test set."""
     group = options.group
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
-    tasks = _tasks(options, breaking_scenes)
+    tasks = tasks_of(options, breaking_scenes)
     by_task: dict[MethodTask, list[TrialOutcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
         by_task[task] = rows
@@ -207,7 +207,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
+def tasks_of(options: Options, breaking_scenes: int) -> list[MethodTask]:
     """The tasks: the teacher, each method with its candidates, and each method in breaking
     scenes.
     """

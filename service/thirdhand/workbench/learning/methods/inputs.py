@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp import KMP
-from kmp.criteria.cross_validation import preferred, squared_distances
-from kmp.criteria.direct import DirectSelection
+from kmp.criteria.errors import preferred
 from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
@@ -30,6 +29,8 @@ from thirdhand.core.skill.task_clock import REQUESTED, RUNS, WAITS, TaskClock
 from thirdhand.process.parallel import Workers, here
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.workbench.learning.choice import ADVISED, is_clear, selection_of
+from thirdhand.workbench.learning.cross_validation import squared_distances
+from thirdhand.workbench.learning.direct_selection import DirectSelection
 from thirdhand.workbench.learning.division import task_of
 from thirdhand.workbench.learning.gate import CEILING_M
 from thirdhand.workbench.learning.methods.clock import Tempo, clock_of, paired, remark_on

@@ -24,7 +24,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians, ViaPointMissed
-from kmp.criteria.cross_validation import held_out_residuals, preferred, rms
+from kmp.criteria.errors import preferred, rms
 from thirdhand.contract.records import SIDES
 from thirdhand.core.frame import Vector
 from thirdhand.core.skill import ORDER
@@ -37,6 +37,7 @@ from thirdhand.core.skill.tuning import SEGMENT_DISTANCE, SEGMENT_DISTANCE_BESID
 from thirdhand.skills.demonstration import Demonstration
 from thirdhand.skills.recognition import covered, recognised
 from thirdhand.workbench.learning.choice import is_clear, rows_at, sampled, selection_of
+from thirdhand.workbench.learning.cross_validation import held_out_residuals
 from thirdhand.workbench.learning.division import (
     NEAR,
     Divided,

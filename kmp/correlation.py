@@ -23,6 +23,7 @@ from scipy.spatial.distance import cdist
 
 from kmp.arrays.checks import (
     Array,
+    Seed,
     check_kind,
     check_shape,
     numbers,
@@ -123,7 +124,7 @@ def improve(
     exploration: float,
     updates: int,
     rollouts: int,
-    seed: int,
+    seed: Seed = 0,
 ) -> Improvement:
     """The Lambda(s) of equation (11) that raises the reward of the trajectory at `queries` (M, I).
 

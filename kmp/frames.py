@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from kmp.arrays.checks import (
     Array,
+    Seed,
     brief,
     check_some,
     not_negative,
@@ -143,7 +144,7 @@ class LocalKMP(Immutable, Plotted, Saved):
         lambda_mean: float,
         lambda_covariance: float | None = None,
         components: int,
-        seed: int,
+        seed: Seed = 0,
         regularization: float = 1e-6,
     ) -> LocalKMP:
         """The skill of demonstrations, each inputs (T, I), outputs (T, O), and F frames for each.
@@ -266,7 +267,7 @@ class LocalKMP(Immutable, Plotted, Saved):
         bend = (-first + 16 * second - 30 * mean + 16 * third - fourth) / (12 * step**2)
         return mean, slope, bend
 
-    def sample(self, queries: ArrayLike, count: int, *, seed: int = 0) -> Array:
+    def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Paths (count, M, O) through queries (M, I), of the product of the frames' joint normals.
 
         Raises ValueError as `KMP.sample` does.
@@ -333,9 +334,9 @@ class LocalKMP(Immutable, Plotted, Saved):
         )
         return LocalKMP(adapted, self.frames)
 
-    def to_plot(self) -> Shown:
+    def _to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""
-        plots = [primitive.to_plot() for primitive in self.primitives]
+        plots = [primitive._to_plot() for primitive in self.primitives]  # noqa: SLF001
         placed = [
             Points(plot.references.inputs, frame.placed(plot.references.normals))
             for frame, plot in zip(self.frames, plots, strict=True)

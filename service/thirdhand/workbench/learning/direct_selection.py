@@ -33,18 +33,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array
-from kmp.criteria.cross_validation import (
-    held_out_covariances,
-    held_out_residuals,
-    mahalanobis,
-    preferred,
-    rms,
-    squared_distances,
-)
+from kmp.criteria.errors import preferred, rms
 from kmp.gaussians import Gaussians
 from kmp.primitive import KMP
 from kmp.problem.hyperparameters import AffineMean
 from kmp.radial import GaussianKernel
+from thirdhand.workbench.learning.cross_validation import (
+    held_out_covariances,
+    held_out_residuals,
+    mahalanobis,
+    squared_distances,
+)
 
 _NOISES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # candidates for r
 _SPREADS = 10.0 ** np.arange(-3.0, 1.1, 0.5)  # candidates for q

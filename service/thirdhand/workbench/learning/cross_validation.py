@@ -10,15 +10,12 @@ the inverse Q = (K + r I)^-1 = V diag(1 / (v + r)) V^T for all r. With Q_gg its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array
-
-T = TypeVar("T")
 
 
 def squared_distances(points: Array) -> Array:
@@ -80,26 +77,7 @@ def held_out_covariances(
     return np.asarray(0.5 * (out + out.mT))
 
 
-def rms(errors: Array) -> float:
-    """The root mean square length of errors (M, O)."""
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
-
-
 def mahalanobis(errors: Array, covariance: Array) -> Array:
     """The squared Mahalanobis distances (M,) of errors (M, O) under covariances (M, O, O)."""
     white = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
     return np.asarray(np.einsum("ni,ni->n", errors, white))
-
-
-def preferred(candidates: Sequence[T], scores: Sequence[float], limit: float) -> T:
-    """The first candidate, in the order of preference, whose score is at most the limit.
-
-    Raises ValueError if there is none.
-    """
-    for candidate, score in zip(candidates, scores, strict=True):
-        if score <= limit:
-            return candidate
-    raise ValueError(
-        f"limit: {limit:g} given, at least the least score, {min(scores, default=np.nan):g}, "
-        "needed."
-    )

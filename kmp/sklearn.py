@@ -1,7 +1,4 @@
-"""The primitive as a scikit-learn estimator: for pipelines, searches and cross-validation.
-
-`kmp.KMPRegressor` imports this module when it is first used, as scikit-learn loads slowly.
-"""
+"""The primitive as a scikit-learn estimator: for pipelines, searches and cross-validation."""
 
 from __future__ import annotations
 

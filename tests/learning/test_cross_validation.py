@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from kmp.criteria.cross_validation import (
+from thirdhand.workbench.learning.cross_validation import (
     held_out_covariances,
     held_out_residuals,
     mahalanobis,
-    preferred,
     squared_distances,
 )
 
@@ -53,8 +52,5 @@ def test_covariances_are_those_without_the_group():
             np.testing.assert_allclose(covariances[i], expected, atol=1e-9)
 
 
-def test_first_good_candidate_is_preferred():
-    assert preferred("abc", [3.0, 1.1, 1.0], 1.2) == "b"
-    with pytest.raises(ValueError, match="at least the least score, 1"):
-        preferred("abc", [3.0, 1.1, 1.0], 0.9)
+def test_mahalanobis_distance_is_in_deviations():
     assert mahalanobis(np.array([[2.0, 0.0]]), np.diag([4.0, 1.0])[None]) == pytest.approx([1.0])

@@ -10,7 +10,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
 
-from kmp.estimator import KMPRegressor
+from kmp.sklearn import KMPRegressor
 
 RANDOM = np.random.default_rng(0)
 X = RANDOM.uniform(-2, 2, size=(150, 2))

@@ -25,6 +25,7 @@ from kmp.arrays.checks import (
 )
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
+from kmp.mixture import one_thread
 
 _SIGNAL = 1e-3, 1e3  # bounds of the function's variance over the variance of the output
 _LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
@@ -102,13 +103,12 @@ def _process(
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    from threadpoolctl import threadpool_limits
 
     count = s.shape[1]
     kernel = ConstantKernel(1.0, _SIGNAL) * RBF(
         np.full(count, np.sqrt(count)), _LENGTH
     ) + WhiteKernel(0.01, _NOISE)
-    with warnings.catch_warnings(), threadpool_limits(1):
+    with warnings.catch_warnings(), one_thread():
         # an input without effect has no finite length
         warnings.simplefilter("ignore", ConvergenceWarning)
         likeliest = GaussianProcessRegressor(kernel).fit(s, y).kernel_

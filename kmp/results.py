@@ -1,0 +1,7 @@
+"""Types of the values that calls of this package return, for annotations."""
+
+from kmp.predictor import Uncertainty
+from kmp.query import MotionPrediction
+from kmp.storage import Stored
+
+__all__ = ["MotionPrediction", "Stored", "Uncertainty"]
