@@ -21,7 +21,7 @@ from kmp.functionals import Functionals
 from kmp.kernel import between
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, Expansion, mean_of
+from kmp.solution import Expansion, mean_of
 
 _VIOLATION = 1e-9  # [unit of the outputs] largest violation, for a normal of norm 1
 _CONVERGED = 1e-13  # [unit of the outputs] the search ends at this violation of active constraints
@@ -94,7 +94,6 @@ class Constrained(Expansion):
     constraints: LinearConstraints
 
     representation: ClassVar[Literal["dense"]] = "dense"
-    error_bounds: ClassVar[ErrorBounds] = ErrorBounds(0.0, 0.0)
 
     @property
     def hyperparameters(self) -> Hyperparameters:

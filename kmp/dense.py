@@ -27,7 +27,7 @@ from kmp.functionals import Functionals
 from kmp.kernel import between
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, Expansion, check_resolved
+from kmp.solution import Expansion, check_resolved
 
 SINGLE = 450  # N O up to which a fit takes less than a millisecond, and less than a change of one
 # a border is faster than a fit if at least this share of points precedes the first change
@@ -130,7 +130,6 @@ class Dense(Expansion):
     """The base's points that were removed; None: all from index `same` on."""
 
     representation: ClassVar[Literal["dense"]] = "dense"
-    error_bounds: ClassVar[ErrorBounds] = ErrorBounds(0.0, 0.0)
 
     @property
     def functionals(self) -> Functionals:

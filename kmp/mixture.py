@@ -71,8 +71,8 @@ class GaussianMixture(Immutable):
         """The mixture that EM finds from a k-means start: samples (M, I+O), the inputs first.
 
         `regularization` [unit^2] is added to the diagonal of each covariance: 1e-6 is (1 mm)^2
-        where the unit is the metre. `seed`, a whole number or a numpy Generator, is
-        that of k-means. The same seed gives the same mixture, whatever the number of threads.
+        where the unit is the metre. `seed`, a whole number or a numpy Generator, is that of
+        k-means. The same seed gives the same mixture, whatever the number of threads.
 
         Raises ValueError if the shape differs, a number is not finite, there are fewer samples than
         components, or a parameter is out of its range.
@@ -145,6 +145,7 @@ def mixture_of(
     if len(data) < components:
         shortage = f"{len(data)} samples given for {components} components"
         raise ValueError(f"{shortage}: give at least {components} samples, or fewer components.")
+    # scikit-learn loads slowly, and predictions do not need it.
     from sklearn.cluster import KMeans
 
     try:
@@ -176,7 +177,7 @@ def one_thread() -> AbstractContextManager[Any]:
 
 @cache
 def _thread_pools() -> Any:
-    # scikit-learn loads slowly, and predictions do not need it; its threads must be found, too
+    # loaded first, so that its threads are found
     import sklearn.cluster  # noqa: F401
     from threadpoolctl import ThreadpoolController
 

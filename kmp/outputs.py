@@ -29,7 +29,7 @@ from kmp.gaussians import Gaussians, unchecked
 from kmp.low_rank import LowRank
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, Expansion, Solution
+from kmp.solution import Expansion, Solution
 
 _ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
 
@@ -121,11 +121,6 @@ class Mapped(Expansion):
     def weights(self) -> Array:
         return frozen(self.inner.weights @ self.t.T)
 
-    @property
-    def error_bounds(self) -> ErrorBounds:
-        size = float(np.linalg.norm(self.t, 2))
-        return ErrorBounds(*(size * bound for bound in self.inner.error_bounds))
-
     def solved(self) -> Mapped:
         with variances_over_prior(self.hyperparameters):
             self.inner.solved()
@@ -185,11 +180,6 @@ class Decoupled(Expansion):
         for part, group in zip(self.parts, self.groups, strict=True):
             weights[:, group] = part.weights
         return frozen(weights)
-
-    @property
-    def error_bounds(self) -> ErrorBounds:
-        bounds = np.array([part.error_bounds for part in self.parts])
-        return ErrorBounds(*np.sqrt((bounds**2).sum(axis=0)).tolist())
 
     def solved(self) -> Decoupled:
         for part in self.parts:

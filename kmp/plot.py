@@ -92,7 +92,7 @@ class Plotted:
             from matplotlib import pyplot as plt
             from matplotlib.axes import Axes
         except ModuleNotFoundError as error:
-            message = "plot draws with Matplotlib, which is not installed: pip install 'kmp[plot]'"
+            message = "plot draws with Matplotlib, which is not installed: pip install matplotlib"
             raise ModuleNotFoundError(message, name=error.name) from None
         for name, text in (
             ("label", label),

@@ -96,12 +96,11 @@ def _solved(
         )
     ).solved()
     if not enough:
-        error_bound = solution.error_bounds.at_points
         warnings.warn(
             f"rank: {rank} features leave up to {residual:.2g} of the kernel at the "
-            f"{len(database)} inputs, and {tolerance:.2g} is required: the mean at them may be "
-            f"off by up to {error_bound:.2g} [unit of the outputs]. Raise the rank, or take a "
-            "smaller ell or fewer points with the dense solution.",
+            f"{len(database)} inputs, and {tolerance:.2g} is required: the mean differs from the "
+            "dense solution's. Raise the rank, or take a smaller ell or fewer points with the "
+            "dense solution.",
             RankReached,
             stacklevel=4,
         )

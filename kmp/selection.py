@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -59,9 +59,9 @@ class Score(Immutable):
     lambda_covariance: float | None
     """None where only the mean was tried."""
     rmse: float
-    """[unit of the outputs] of the mean, over all demonstrations; rates do not count."""
+    """Of the mean, over all demonstrations, each output over its deviation; rates do not count."""
     negative_log_likelihood: float | None
-    """[nat] the mean of a point's, None where only the mean was tried."""
+    """[nat] the mean of a point's, so standardised; None where only the mean was tried."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +77,7 @@ class Learned(Immutable):
     scores: tuple[Score, ...]
     """The best first."""
     regression_rmse: float
-    """[unit of the outputs] of mixture regression without a kernel; nan if none was tried."""
+    """Of mixture regression without a kernel; nan if none was tried."""
 
     @cached_property
     def reach(self) -> Array:
@@ -199,8 +199,8 @@ class _Recipe:
         miss = (self.regressed(mixture, inputs).mean - outputs)[
             :, : outputs.shape[1] // self.channels
         ]
-        return Fold(
-            training.inputs, training.reference, training.prior_mean, inputs, outputs, rms(miss)
+        return replace(
+            training, held_inputs=inputs, held_outputs=outputs, regression_rmse=rms(miss)
         )
 
 
@@ -250,8 +250,10 @@ def learn(
     """The primitive of demonstrations, each inputs (T, I) and outputs (T, O), and its scores.
 
     The paper, sections II-A, II-B: a mixture of `components`, its regression at `count` inputs, and
-    the primitive, whose mean returns to the reference's. `regularization` is that of
-    `GaussianMixture.fit`, as a share of the variance of each input and output, and `seed` its seed.
+    the primitive, whose mean returns to the reference's. Each output is standardised, so that none
+    depends on the unit of another: its variance in the demonstrations is the `prior_covariance` of
+    `KMP.fit`. `regularization` is that of `GaussianMixture.fit`, as a share of the variance of each
+    input and output, and `seed` its seed.
 
     Demonstrations may have different lengths T. Over time, those of different durations should be
     `aligned` first: they then have a common phase.
@@ -291,11 +293,15 @@ def learn(
         checked_kernel(kernel).check(data[0][0].shape[1], data[0][1].shape[1])
     elif velocity:
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
-    deviation = np.concatenate([np.hstack(pair) for pair in data]).std(axis=0)
-    unit = np.where(deviation > 0, deviation, 1.0)  # of a column that never changes
-    recipe = _Recipe(components, seeded(seed), count, regularization, 2 if velocity else 1, unit)
-    mixture = recipe.mixture(data)
+    channels = 2 if velocity else 1
+    values = data[0][1].shape[1] // channels
+    size = _deviations(np.concatenate([xi[:, :values] for _, xi in data]))
+    output_unit = np.tile(size, channels)
+    data = [(s, xi / output_unit) for s, xi in data]
+    unit = _deviations(np.concatenate([np.hstack(pair) for pair in data]))
+    recipe = _Recipe(components, seeded(seed), count, regularization, channels, unit)
     _check_precision(data)
+    mixture = recipe.mixture(data)
     is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
     plain = np.nan
@@ -335,9 +341,22 @@ def learn(
     assert kernel is not None, "given or chosen"
     assert lambda_mean is not None, "given or chosen"
     order = sorted(scores, key=_best_first)
-    return Learned(
-        full.fitted(kernel, lambda_mean, lambda_covariance), mixture, tuple(order), plain
+    primitive = KMP.fit(
+        full.inputs,
+        full.reference.affine(np.diag(output_unit), np.zeros(len(output_unit))),
+        kernel=kernel,
+        lambda_mean=lambda_mean,
+        lambda_covariance=lambda_covariance,
+        prior_mean=full.prior_mean * output_unit,
+        prior_covariance=size**2,
     )
+    return Learned(primitive, mixture, tuple(order), plain)
+
+
+def _deviations(columns: Array) -> Array:
+    """The deviation of each column; 1 of one that never changes."""
+    deviation = columns.std(axis=0)
+    return np.where(deviation > 0, deviation, 1.0)
 
 
 def _check_precision(data: Sequence[tuple[Array, Array]]) -> None:

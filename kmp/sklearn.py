@@ -26,9 +26,8 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     with the seed `random_state`. `lambda_mean` and `lambda_covariance` are those of `KMP.fit`. Far
     from the samples, the mean returns to the mean of y.
 
-    Each output is standardised, so that none depends on the unit of another: its prior covariance
-    is K times its variance. After `fit`: the `KMP` of the standardised outputs as `primitive_`,
-    their means `y_mean_` (O,) and deviations `y_deviation_` (O,), and `n_features_in_`.
+    Each output is standardised, so that none depends on the unit of another: its variance is its
+    `prior_covariance`. After `fit`: the `KMP` as `primitive_`, and `n_features_in_`.
     """
 
     def __init__(
@@ -63,18 +62,17 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         )
         self._one_output = outputs.ndim == 1
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
+        mean = outputs.mean(axis=0)
         deviation = outputs.std(axis=0)
-        self.y_mean_ = outputs.mean(axis=0)
-        self.y_deviation_ = np.where(deviation > 0, deviation, 1.0)  # of a constant output
-        outputs = (outputs - self.y_mean_) / self.y_deviation_
-        variance = squared("noise", self.noise) * np.eye(outputs.shape[1])
+        deviation = np.where(deviation > 0, deviation, 1.0)  # of a constant output
+        noise = squared("noise", self.noise) * np.diag(deviation**2)
         if self.components is None:
-            reference = Gaussians(outputs, np.tile(variance, (len(inputs), 1, 1)))
+            reference = Gaussians(outputs, np.tile(noise, (len(inputs), 1, 1)))
         else:
-            samples = np.hstack([inputs, outputs])
+            samples = np.hstack([inputs, (outputs - mean) / deviation])
             seed = whole("random_state", self.random_state, least=0, most=2**32 - 1)
             mixture = GaussianMixture.fit(samples, components=self.components, seed=seed)
-            reference = mixture.regress(inputs)
+            reference = mixture.regress(inputs).affine(np.diag(deviation), mean)
         self.primitive_ = KMP.fit(
             inputs,
             reference,
@@ -83,6 +81,8 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             lambda_covariance=None
             if self.lambda_covariance is None
             else positive("lambda_covariance", self.lambda_covariance),
+            prior_mean=mean,
+            prior_covariance=deviation**2,
         )
         return self
 
@@ -94,14 +94,10 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         check_is_fitted(self)
         inputs = validate_data(self, X, reset=False, dtype=np.float64)
         if not return_std:
-            return self._in_units_of_y(self.primitive_.mean(inputs))
+            return self._shaped(self.primitive_.mean(inputs))
         prediction = self.primitive_.predict(inputs)
         deviations = np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2))
-        mean = self._in_units_of_y(prediction.mean)
-        return mean, self._shaped(deviations * self.y_deviation_)
-
-    def _in_units_of_y(self, standardised: Array) -> Array:
-        return self._shaped(self.y_mean_ + self.y_deviation_ * standardised)
+        return self._shaped(prediction.mean), self._shaped(deviations)
 
     def _shaped(self, outputs: Array) -> Array:
         return outputs[:, 0] if self._one_output else outputs

@@ -8,7 +8,7 @@ of k(s_n, s_n), or rounding would hide it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Literal, NamedTuple, Protocol, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,6 @@ BLOCK = 256  # queries computed at once: their kernel rows fit into the processo
 _RESOLVED = 1e-11  # least lambda Sigma / k(s, s): the covariance then has 3 correct digits
 _FREE = 1e-9  # k(s, s) / lambda Sigma of a free output
 _ROUND_UP = 1.01  # factor on a least variance, because a message shows two digits of it
-
-
-class ErrorBounds(NamedTuple):
-    """Upper bounds of the distance between a mean and equation (9)'s [unit of the outputs]."""
-
-    at_points: float
-    """At the reference points."""
-    anywhere: float
-    """At any query. For a kernel with rates, in the larger of the two channels' units."""
 
 
 class Expansion(Immutable):
@@ -82,10 +73,6 @@ class Solution(Protocol):
     @property
     def weights(self) -> Array:
         """w_r (R, O)."""
-
-    @property
-    def error_bounds(self) -> ErrorBounds:
-        """Upper bounds of the distance between the mean and equation (9)'s."""
 
     def solved(self) -> Self:
         """This solution, with weights and factors computed. Raises ValueError if that fails."""

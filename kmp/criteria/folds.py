@@ -21,7 +21,6 @@ from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, between
 from kmp.low_rank import Features
-from kmp.primitive import KMP
 from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import check_resolved
@@ -56,17 +55,6 @@ class Fold:
         """Sigma^-1/2 (mu - m): (N O,)."""
         target = (self.reference.mean - self.prior_mean)[:, :, None]
         return np.asarray(self.inverse_roots @ target).ravel()
-
-    def fitted(self, kernel: Kernel, lambda_mean: float, lambda_covariance: float | None) -> KMP:
-        """The primitive of the reference."""
-        return KMP.fit(
-            self.inputs,
-            self.reference,
-            kernel=kernel,
-            lambda_mean=lambda_mean,
-            lambda_covariance=lambda_covariance,
-            prior_mean=self.prior_mean,
-        )
 
     def rmses(self, kernel: Kernel, penalties: Sequence[float], outputs: int) -> list[float]:
         """RMSE of the mean on the held-out samples, per penalty; infinite if not solvable.

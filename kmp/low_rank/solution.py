@@ -29,11 +29,10 @@ from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import between
-from kmp.low_rank.error_bound import error_bounds
 from kmp.low_rank.features import BLOCK, KEPT, Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import ErrorBounds, Expansion, check_resolved
+from kmp.solution import Expansion, check_resolved
 
 RANK = 400  # default of the largest number of features
 TOLERANCE = 4e-12  # default of the largest residual at a reference point, as a share of k(s, s)
@@ -147,10 +146,6 @@ class LowRank(Expansion):
     def weights(self) -> Array:
         """(r, O) the weights of the pivots' kernels."""
         return frozen(self.features.kernel_weights(self.w))
-
-    @cached_property
-    def error_bounds(self) -> ErrorBounds:
-        return error_bounds(self, self.features)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018
@@ -338,10 +333,6 @@ class Conditioned(Expansion):
         )
         added = pull.reshape(len(self._points), -1)[: self._added]
         return frozen(np.concatenate([base.features.kernel_weights(w), added]))
-
-    @cached_property
-    def error_bounds(self) -> ErrorBounds:
-        return error_bounds(self, self.base.features, added=self._added)
 
     def solved(self) -> Self:
         self.weights  # noqa: B018

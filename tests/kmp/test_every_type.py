@@ -79,7 +79,6 @@ def used(representation, kernel=K, inputs=S, reference=R):
             primitive.predict(inputs[:1]),
             primitive.uncertainty(inputs),
             primitive.jacobian(inputs[0]),
-            primitive.inner.solution.error_bounds,
         )
     return adapted
 

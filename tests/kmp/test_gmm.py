@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
+from sklearn.mixture import GaussianMixture as Estimator
 
 from kmp import GaussianMixture
 
@@ -123,3 +124,18 @@ def test_impossible_mixtures_are_refused(call, says):
     """Impossible requests are refused, with what is possible."""
     with pytest.raises(ValueError, match=says):
         call()
+
+
+@pytest.mark.parametrize("components", [1, 4, 9])
+def test_mixture_is_that_of_scikit_learn(components):
+    random = np.random.default_rng(0)
+    samples = random.normal(size=(300, 3)) + random.integers(0, 4, size=(300, 1))
+    options = {"tol": 1e-5, "max_iter": 1000, "reg_covar": 1e-6, "random_state": 0}
+    theirs = Estimator(components, **options).fit(samples)
+    ours = GaussianMixture.fit(samples, components=components)
+    for own, other in zip(
+        (ours.weights, ours.means, ours.covariances),
+        (theirs.weights_, theirs.means_, theirs.covariances_),
+        strict=True,
+    ):
+        np.testing.assert_allclose(own, other, rtol=1e-6, atol=1e-9)

@@ -166,7 +166,6 @@ def test_correlated_outputs_with_any_kernel(one, outputs, spread):
         # The order of the points changes the dense solution by rounding only.
         rounding = np.linalg.norm(c.mean(t) - a.mean(t), axis=1).max()
         assert error < max(1e-5, 2.0 * rounding)
-        assert error <= b.inner.solution.error_bounds.at_points
         scale = np.abs(a.predict(t).covariance).max()
         np.testing.assert_allclose(
             b.predict(t).covariance, a.predict(t).covariance, atol=0.02 * scale
@@ -200,8 +199,8 @@ def test_dense_where_rounding_would_hide():
 
 
 @pytest.mark.parametrize("rank", [10, 20, 40])
-def test_reached_rank_is_reported_with_error_bound(rank):
-    """A rank that is reached is reported, and the error is within the stated bound."""
+def test_reached_rank_is_reported(rank):
+    """And the mean differs from the dense one."""
     inputs, reference = tube(0, 300)
     dense = KMP.fit(inputs, reference, kernel=kernel, lambda_mean=2, representation="dense")
     says = rf"rank: {rank} features leave up to .* 4e-12 is required: .* Raise the rank"
@@ -210,29 +209,8 @@ def test_reached_rank_is_reported_with_error_bound(rank):
             inputs, reference, kernel=kernel, lambda_mean=2, representation="low_rank", rank=rank
         )
     error = np.abs(low.mean(inputs) - dense.mean(inputs)).max()
-    assert 1e-6 < error < low.inner.solution.error_bounds.at_points
-    assert f"{low.inner.solution.error_bounds.at_points:.2g} [unit" in str(caught[0].message)
+    assert error > 1e-6
     assert caught[0].filename == __file__
-
-
-@properties
-@given(seeds, st.sampled_from([1e-6, 1e-9, 1e-12]), st.booleans())
-def test_the_error_bound_holds(seed, left, adapted):
-    dense, low = both(seed, rank_tolerance=left)
-    if adapted:
-        inputs, desired = points(seed, 1)
-        dense, low = (
-            primitive.adapt(inputs, desired, tolerance=0.02) for primitive in (dense, low)
-        )
-    data = dense.inputs[:300]
-    bounds = low.inner.solution.error_bounds
-    assert np.linalg.norm(low.mean(data) - dense.mean(data), axis=1).max() <= bounds.at_points
-    elsewhere = np.concatenate(
-        [dense.inputs, 0.5 * np.random.default_rng(seed).normal(size=(500, 6))]
-    )
-    errors = np.linalg.norm(low.mean(elsewhere) - dense.mean(elsewhere), axis=1)
-    assert errors.max() <= bounds.anywhere
-    assert dense.inner.solution.error_bounds == (0, 0)
 
 
 # the taught rate differs from the neighbours'
@@ -250,8 +228,6 @@ def test_derivatives_are_features_too(count, ell):
     options = {"kernel": VelocityKernel(ell), "lambda_mean": 0.1, "directions": along}
     dense, low = of_both(t, reference, rank=400, **options)
     queries = np.linspace(-1, 3, 301)[:, None]
-    bound = low.inner.solution.error_bounds.anywhere
-    assert np.abs(low.mean(queries) - dense.mean(queries)).max() <= bound
     np.testing.assert_allclose(low.mean(t), dense.mean(t), atol=1e-9)
     restored = named_arrays.from_arrays(named_arrays.to_arrays(low))
     assert np.array_equal(restored.mean(queries), low.mean(queries))

@@ -89,10 +89,25 @@ def test_the_choice_follows_the_units(criterion, ells, ell_within, lambda_within
     np.testing.assert_allclose(
         c**2 * after.kernel.ell[:ells], before.kernel.ell[:ells], rtol=ell_within
     )
-    np.testing.assert_allclose(c**2 * after.lambda_mean, before.lambda_mean, rtol=lambda_within)
+    np.testing.assert_allclose(after.lambda_mean, before.lambda_mean, rtol=lambda_within)
     for large, small in zip(other.scores[:1], choice.scores[:1], strict=True):
-        np.testing.assert_allclose(large.rmse, c * small.rmse, rtol=1e-3)
+        np.testing.assert_allclose(large.rmse, small.rmse, rtol=1e-3)
         np.testing.assert_allclose(other.reach, c * choice.reach, rtol=1e-2)
+
+
+@pytest.mark.parametrize("criterion", ["left-out", "likelihood"])
+def test_unit_of_one_output_does_not_change_another(criterion):
+    """The second output x 1000."""
+    takes = [(s, np.hstack([xi[:, :1], np.cos(3 * s) + 0.1 * xi[:, 1:2]])) for s, xi in over_time()]
+    queries = takes[0][0][::7]
+    options = {"components": 6, "count": 60, "criterion": criterion}
+    usual = kmp.learn(takes, **options).primitive
+    scaled = kmp.learn([(s, xi * [1.0, 1000.0]) for s, xi in takes], **options).primitive
+    np.testing.assert_allclose(scaled.kernel.ell, usual.kernel.ell, rtol=1e-6)
+    expected = usual.predict(queries)
+    found = scaled.predict(queries)
+    np.testing.assert_allclose(found.mean, expected.mean * [1.0, 1000.0], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found.covariance[:, 0, 0], expected.covariance[:, 0, 0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("criterion", ["left-out", "likelihood"])

@@ -24,5 +24,5 @@ for axes in (left, right):
     axes.set(xlabel="time [s]", ylabel="deviation of x [cm]")
     axes.legend(frameon=False, loc="upper center")
 left.set(yscale="log", ylim=(1e-3, 10))
-right.set(ylim=(0, 2))
+right.set(ylim=(0, 1.2))
 plt.show()
