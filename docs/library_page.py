@@ -20,15 +20,13 @@ LIBRARY = """# The library `kmp`
 
 <!-- Written by `python docs/library_page.py` from the docstrings in kmp/: change it there. -->
 
-All names are those of `import kmp`, except where a heading names a module. Start with the [tutorial
-of kmp](../kmp/README.md). [Another page](coming-from.md) compares pbdlib, gmr and
-movement_primitives with `kmp`.
+All names are those of `import kmp`, except where a heading names a module. Start with the [site of
+kmp](../kmp/docs/index.md): a first letter, a gallery, questions. [Another page](coming-from.md)
+compares pbdlib, gmr and movement_primitives with `kmp`.
 
 Letters: N reference points, M queries, V via-points, T samples, I inputs, O outputs. Values are
 immutable. A wrong argument, like a wrong shape or a number that is not finite, raises a ValueError
-that names it.
-
-![A primitive over time: its mean, regions of 1 and 2 standard deviations, and a via-point](kmp-over-time.png)"""
+that names it."""
 CLIENT = """# The Python client
 
 <!-- Written by `python docs/library_page.py` from the docstrings in service/thirdhand/client: change it there. -->
@@ -57,6 +55,7 @@ KMP_GROUPS = {
     "Primitives": (
         "KMP",
         "OrientationKMP",
+        "PoseKMP",
         "LocalKMP",
         "CoordinateFrame",
     ),

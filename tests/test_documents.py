@@ -197,7 +197,7 @@ def test_foxglove_layout_shows_existing_topics() -> None:
 
 
 # All pages except the log of changes.
-FOLDERS = (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "recordings")
+FOLDERS = (ROOT, ROOT / "docs", ROOT / "kmp", ROOT / "kmp" / "docs", ROOT / "recordings")
 ALL_PAGES = [path for folder in FOLDERS for path in folder.glob("*.md")]
 PAGES = sorted(path for path in ALL_PAGES if path.name != "CHANGELOG.md")
 

@@ -28,7 +28,7 @@ from thirdhand_sim.lab.people.moving_hands import SMALL_KINDS
 DOCS = ROOT / "docs"
 PAGES = sorted(
     path
-    for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "recordings")
+    for folder in (ROOT, DOCS, ROOT / "kmp", ROOT / "kmp" / "docs", ROOT / "recordings")
     for path in folder.glob("*.md")
 )
 UNITS = (

@@ -81,6 +81,7 @@ class _Arm:
 
     endpoint: str
     settings: Settings
+    seed: int
     steps: list[tuple[float, ...]] = field(default_factory=list)  # time [s], tool [m], speed [m/s]
 
     def __post_init__(self) -> None:
@@ -91,7 +92,7 @@ class _Arm:
     def _run(self) -> None:
         before_others()
         with (
-            Bench(HandScript(Scene(), seed=Scene().seed), settings=self.settings) as bench,
+            Bench(HandScript(Scene(), seed=self.seed), settings=self.settings) as bench,
             open_session(connect=[self.endpoint]) as session,
             contextlib.closing(Bridge(session, Live(cell=CELL), bench.joint_names)) as bridge,
         ):
@@ -127,12 +128,18 @@ class FaultyCell:
     """
 
     def __init__(
-        self, folder: Path, *, network: Network = "relays", settings: Settings | None = None
+        self,
+        folder: Path,
+        *,
+        network: Network = "relays",
+        settings: Settings | None = None,
+        seed: int = Scene().seed,
     ) -> None:
         self.settings = settings or Settings()
         self.folder = folder
         self.records = folder / "records"
         self.network = network
+        self.seed = seed  # of the hands
         self.commands: list[Command] = []  # commands of the service before its first restart
         self.unasked = 0  # number of faults that were not injected, caused by a busy machine
         self._parts = contextlib.ExitStack()
@@ -161,8 +168,9 @@ class FaultyCell:
             with as_usual_afterwards():
                 self.session = parts.enter_context(open_session(connect=[self.service.endpoint]))
             self.client = Client(self.session, CELL)
-            self.tracker = self._part(parts, "tracker", to_tracker)
-            self.arm = parts.enter_context(contextlib.closing(_Arm(to_arm, self.settings)))
+            self.tracker = self._part(parts, "tracker", to_tracker, "--seed", str(self.seed))
+            arm = _Arm(to_arm, self.settings, self.seed)
+            self.arm = parts.enter_context(contextlib.closing(arm))
             self._listen()
             self.until_fast()
             self._parts = parts.pop_all()

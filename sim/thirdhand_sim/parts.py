@@ -74,7 +74,7 @@ def script_time(time_s: float) -> float:
     return MIDDLE_S + SWING_S * math.sin(FASTEST / SWING_S * time_s)
 
 
-def track(endpoint: str) -> None:
+def track(endpoint: str, seed: int) -> None:
     """Publish both hands forever. From SIGUSR1 on the last sample is repeated; SIGUSR2 sets the
     clock of the stamps.
     """
@@ -88,7 +88,7 @@ def track(endpoint: str) -> None:
 
     signal.signal(signal.SIGUSR1, lambda *_: repeats.set())
     signal.signal(signal.SIGUSR2, set_the_clock)
-    script = HandScript(Scene(), seed=Scene().seed)
+    script = HandScript(Scene(), seed=seed)
     sides = ("left", "right")
     with open_session(connect=[endpoint]) as session:
         publishers = [Publisher(session, CELL, f"hands/{side}") for side in sides]
@@ -266,6 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
     tracker.add_argument(
         "endpoint", metavar="ENDPOINT", help="the endpoint of the service or of a router"
     )
+    tracker.add_argument("--seed", type=int, default=Scene().seed, help="of the hands")
     relaying = kinds.add_parser("relay", help="a network between two ends")
     relaying.add_argument(
         "target", metavar="TARGET", help="the endpoint of the other end, like tcp/127.0.0.1:7447"
@@ -279,7 +280,7 @@ def main(arguments: list[str] | None = None) -> int:
     child.end_with_parent()
     before_others()
     if args.kind == "tracker":
-        track(args.endpoint)
+        track(args.endpoint, args.seed)
     elif args.kind == "relay":
         asyncio.run(relay(args.target, args.port))
     else:

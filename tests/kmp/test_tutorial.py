@@ -1,4 +1,4 @@
-"""The tutorial's blocks of code, run in order as they stand."""
+"""The guide's blocks of code, run in order as they stand."""
 
 import re
 
@@ -6,14 +6,14 @@ import pytest
 
 from support.paths import ROOT
 
-PAGE = ROOT / "kmp" / "README.md"
+PAGE = ROOT / "kmp" / "docs" / "guide.md"
 BLOCKS = [
     (PAGE.read_text(encoding="utf-8")[: match.start(1)].count("\n"), match.group(1))
     for match in re.finditer(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 ]
 
 
-def test_tutorial_runs_as_it_stands():
+def test_guide_runs_as_it_stands():
     """The output is the one on the page."""
     names: dict[str, object] = {}
     for line, block in BLOCKS:

@@ -24,9 +24,20 @@ from thirdhand.settings.config import Settings
 from thirdhand_sim.golden import record
 from thirdhand_sim.lab import evidence
 from thirdhand_sim.lab.__main__ import main
-from thirdhand_sim.lab.catalogue import EXPERIMENTS, Stream
-from thirdhand_sim.lab.evidence import core_digest, kmp_digest, options_of, origin, staleness, tree
-from thirdhand_sim.lab.results import ExperimentError, Options
+from thirdhand_sim.lab.catalogue import EXPERIMENTS, Stream, overlap
+from thirdhand_sim.lab.evidence import (
+    RESULTS,
+    core_digest,
+    kmp_digest,
+    options_of,
+    origin,
+    staleness,
+    tree,
+)
+from thirdhand_sim.lab.people.comparison import sessions_of, tasks_of
+from thirdhand_sim.lab.reproduction.letters import WRITTEN, gathered
+from thirdhand_sim.lab.reproduction.writing import write
+from thirdhand_sim.lab.results import ExperimentError, Options, Results
 
 NAMED = {"commit", "date", "machine", "seeds", "options", "depends_on"}
 
@@ -112,7 +123,11 @@ def test_result_names_its_origin(tmp_path: Path) -> None:
     options = Options(data=tmp_path, hands=tmp_path, share=0.5)
     result = origin("partners", options)
     assert set(result) == NAMED
-    assert set(result["options"]) == {"share", "data"}  # this experiment has no option for hands
+    assert set(result["options"]) == {
+        "share",
+        "seed_offset",
+        "data",
+    }  # this experiment has no option for hands
     assert set(result["machine"]) == {"cpu", "cores", "python", "numpy", "scipy", "pin", "ruckig"}
     assert result["seeds"] == EXPERIMENTS["partners"].seeds.named()
     names = EXPERIMENTS["partners"].depends_on
@@ -137,6 +152,66 @@ def test_result_is_stale_where_dependency_changed() -> None:
     assert "share 1.0" in staleness("letters", result, digests, Options(share=0.1))
     assert "unknown version" in staleness("letters", {"figures": []}, digests)
     assert staleness("letters", None, digests)
+
+
+class TestSeedOffset:
+    """Experiments that are repeated with other seeds."""
+
+    def test_moves_the_evaluation_and_nothing_else(self) -> None:
+        for name, experiment in EXPERIMENTS.items():
+            moved = experiment.seeds.moved(1000)
+            assert moved.moved(-1000) == experiment.seeds
+            assert (moved.learned, moved.tuning) == experiment.seeds[2:0:-1]
+            for key, stream in experiment.seeds.evaluation.items():
+                assert len(moved.evaluation[key].numbers) == len(stream.numbers)
+                assert not moved.evaluation[key].overlaps(stream)
+            assert overlap(name, 0) == overlap(name, 1000) == ""
+
+    def test_result_says_so_and_is_not_the_shipped_one(self) -> None:
+        """A result without the option was made without an offset."""
+        options = Options(seed_offset=5)
+        result = origin("letters", options)
+        assert result["options"]["seed_offset"] == 5
+        assert result["seeds"]["evaluation"] == {"letters": "written letter 1: 5 to 9"}
+        assert staleness("letters", result, tree(), options) == ""
+        assert "seed_offset 5" in staleness("letters", result, tree())
+        earlier = origin("letters", Options())
+        del earlier["options"]["seed_offset"]
+        assert staleness("letters", earlier, tree()) == ""
+        assert "seed_offset 0" in staleness("letters", earlier, tree(), options)
+
+    @pytest.mark.parametrize(
+        ("arguments", "reason"),
+        [
+            (["letters", "--seed-offset", "-1"], "0 or more"),
+            (["letters", "--seed-offset", "1", "--output", str(RESULTS)], "another folder"),
+            (["sensitivity", "--seed-offset", "1"], "no random evaluation"),
+            (["people", "--seed-offset", "1", "--set", "tuning"], "--set tuning"),
+            (["motion", "--seed-offset", "100"], "moving hands 0: 300 to 305"),
+        ],
+    )
+    def test_refuses_what_it_cannot_move(
+        self, arguments: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with pytest.raises(SystemExit):
+            main(["--output", str(tmp_path), *arguments])
+        assert reason in " ".join(capsys.readouterr().err.split())
+
+    def test_letters_are_the_next_ones_of_the_stream(self, tmp_path: Path) -> None:
+        results = Results(tmp_path, "letters", said=False)
+        [sets] = gathered(results, Options(share=0.1, seed_offset=5)).values()
+        many = write("B", count=10, seed=WRITTEN.seed)
+        [letter] = [letter for letter in sets if letter.name == "B"]
+        np.testing.assert_array_equal(letter.demonstrations, many[5:])
+
+    def test_people_and_scenes_are_others(self) -> None:
+        moved = {task.first for task in tasks_of(Options(seed_offset=24), 2)}
+        assert moved == {24}
+        first, second = (
+            [trial.session.told for trial in sessions_of("test", "", 1, 1, None, number)]
+            for number in (0, 24)
+        )
+        assert not np.array_equal(first[0].board, second[0].board)
 
 
 class TestAll:

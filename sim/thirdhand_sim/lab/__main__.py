@@ -13,6 +13,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +21,7 @@ from types import ModuleType
 from thirdhand.cli.usage import workers as workers_of
 from thirdhand.contract.explain import ExplainedError, in_words
 from thirdhand_sim.faulty_cell import FaultError
-from thirdhand_sim.lab.catalogue import EXPERIMENTS
+from thirdhand_sim.lab.catalogue import EXPERIMENTS, overlap
 from thirdhand_sim.lab.evidence import RESULTS, commit, origin, result_of, staleness, tree
 from thirdhand_sim.lab.results import ExperimentError, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
@@ -78,6 +79,11 @@ def parser() -> argparse.ArgumentParser:
     )
     share = "of the full size, for a quick look: above 0, up to 1"
     p.add_argument("--share", metavar="X", type=float, default=1.0, help=share)
+    offset = (
+        "added to the numbers of the people, scenes and hands of the evaluation, to repeat an "
+        "experiment with other seeds: with the size of its streams, all are new (default: 0)"
+    )
+    p.add_argument("--seed-offset", metavar="N", type=int, default=0, help=offset)
     arm = "of `faults` and `motion`: wam, franka, ur5 or FILE.toml (default: %(default)s)"
     p.add_argument("--arm", default="wam", help=arm)
     redraw_help = "draw the figures of the numbers in DIR/NAME.json again, without measuring anew"
@@ -96,6 +102,8 @@ def jobs(name: str, options: Options) -> dict[str, Options]:
         names.remove("motion" + OF_OTHERS)
     if options.hands is not None and name == "motion":
         names = [name + OF_OTHERS]
+    if options.seed_offset and name not in EXPERIMENTS:
+        names = [job for job in names if EXPERIMENTS[job].seeds.evaluation]
     tuning = {"people"} if options.group == "tuning" else set()
     return {
         job: options if job.endswith(OF_OTHERS) or job in tuning else replace(options, hands=None)
@@ -145,9 +153,18 @@ def main(arguments: list[str] | None = None) -> int:
     if args.name != "stale" and args.output is None:
         p.error("--output DIR is missing: the folder for the results")
     options = Options(
-        args.letters, args.hands, args.data, args.set, args.workers, args.share, args.arm
+        args.letters,
+        args.hands,
+        args.data,
+        args.set,
+        args.workers,
+        args.share,
+        args.seed_offset,
+        args.arm,
     )
     selected = jobs(args.name, options)
+    if args.seed_offset and (why := no_offset(selected, options, args.output)):
+        p.error(f"--seed-offset {args.seed_offset}: {why}")
     try:
         if args.name == "stale":
             return stale(args.output or RESULTS, selected)
@@ -157,6 +174,22 @@ def main(arguments: list[str] | None = None) -> int:
     except FAILURES as error:
         print(f"python -m thirdhand_sim.lab: {in_words(error)}", file=sys.stderr)
         return 1
+
+
+def no_offset(names: Iterable[str], options: Options, folder: Path | None) -> str:
+    """The reason why results in a folder cannot have the options' seed offset, or ""."""
+    if folder is not None and folder.resolve() == RESULTS:
+        return f"{folder} holds the results of this project: choose another folder"
+    if options.seed_offset < 0:
+        return "0 or more accepted"
+    if options.group == "tuning":
+        return "moves the evaluation, and --set tuning has none"
+    for name in names:
+        if not EXPERIMENTS[name].seeds.evaluation:
+            return f"{name} has no random evaluation"
+        if used := overlap(name, options.seed_offset):
+            return f"{name} would be evaluated on seeds of tuning or learning: {used}"
+    return ""
 
 
 def made(name: str, options: Options, args: argparse.Namespace) -> int:

@@ -31,6 +31,10 @@ class Stream(NamedTuple):
         """The first numbers of the stream: a share of all, and at least `least`."""
         return self.numbers[: max(least, round(len(self.numbers) * share))]
 
+    def moved(self, offset: int) -> Stream:
+        """The stream of as many items, whose numbers are larger by an offset."""
+        return self._replace(numbers=range(self.numbers.start + offset, self.numbers.stop + offset))
+
     def overlaps(self, other: Stream) -> bool:
         """True if two streams have an item in common."""
         return self[:2] == other[:2] and not set(self.numbers).isdisjoint(other.numbers)
@@ -49,6 +53,11 @@ class Seeds(NamedTuple):
     tuning: Mapping[str, Stream] = MappingProxyType({})
     learned: Mapping[str, Stream] = MappingProxyType({})
     method: int = 0
+
+    def moved(self, offset: int) -> Seeds:
+        """The same with other numbers for evaluation, larger by an offset."""
+        moved = {name: stream.moved(offset) for name, stream in self.evaluation.items()}
+        return self._replace(evaluation=moved)
 
     def named(self) -> dict[str, object]:
         """The seeds as in a result's JSON."""
@@ -84,7 +93,7 @@ def _scenes(count: int) -> dict[str, Stream]:
 
 def _hands(seed: int) -> dict[str, Stream]:
     """The hands of the nominal scene."""
-    return {"hands": Stream("hands", seed, range(1))}
+    return {"hands": Stream("hands", 0, range(seed, seed + 1))}
 
 
 def _letters(seed: int) -> dict[str, Stream]:
@@ -169,3 +178,17 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "table": Experiment("reproduction.table", KMP, _WRITTEN, ("letters",)),
     "sensitivity": Experiment("sensitivity", ALL, _SENSITIVITY),
 }
+
+
+def overlap(name: str, offset: int) -> str:
+    """The streams of tuning or learning that an experiment's evaluation, moved by an offset, would
+    use too, in words; empty if there is none.
+    """
+    used = [
+        stream
+        for experiment in EXPERIMENTS.values()
+        for stream in (*experiment.seeds.tuning.values(), *experiment.seeds.learned.values())
+    ]
+    moved = EXPERIMENTS[name].seeds.moved(offset).evaluation.values()
+    common = {str(stream) for stream in used if any(map(stream.overlaps, moved))}
+    return " and ".join(sorted(common))

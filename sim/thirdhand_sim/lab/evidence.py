@@ -47,6 +47,7 @@ DECIMALS = 6  # kmp's outputs are rounded to these decimals, on which CPUs agree
 
 
 USUAL = Options()
+BEFORE = {"seed_offset": 0}  # options of results that do not name them
 
 
 @functools.cache
@@ -161,7 +162,7 @@ def origin(name: str, options: Options) -> dict[str, Any]:
             **{part: machine_facts.get(part, "unknown") for part in MACHINE},
             "cores": os.cpu_count(),
         },
-        "seeds": EXPERIMENTS[name].seeds.named(),
+        "seeds": EXPERIMENTS[name].seeds.moved(options.seed_offset).named(),
         "options": options_of(name, options),
         "depends_on": {
             dependency: digests[dependency] for dependency in EXPERIMENTS[name].depends_on
@@ -171,7 +172,8 @@ def origin(name: str, options: Options) -> dict[str, Any]:
 
 def options_of(name: str, options: Options) -> dict[str, Any]:
     """The options that an experiment uses; folders by their number of files and a digest."""
-    values = {option: getattr(options, option) for option in ("share", *EXPERIMENTS[name].options)}
+    used = ("share", "seed_offset", *EXPERIMENTS[name].options)
+    values = {option: getattr(options, option) for option in used}
     return {
         "set" if option == "group" else option: _folder(value) if isinstance(value, Path) else value
         for option, value in values.items()
@@ -199,7 +201,8 @@ def staleness(
     if "depends_on" not in result:
         return "measured with an unknown version"
     for option, value in options_of(name, options).items():
-        if value is not None and value != (was := result["options"].get(option)):
+        was = result["options"].get(option, BEFORE.get(option))
+        if value is not None and value != was:
             return f"measured with {option} {was}, and {value} is wanted"
     changed = [
         dependency

@@ -35,7 +35,7 @@ from thirdhand_sim.network import RunReport
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.world import pixels
 
-HANDS_SEED = EXPERIMENTS["hands"].seeds.evaluation["hands"].seed
+[HANDS_SEED] = EXPERIMENTS["hands"].seeds.evaluation["hands"].numbers
 NOMINAL = Drawn(Scene(), 1.0, (), HANDS_SEED)
 MOVED = Drawn(
     Scene(handover=(0.56, -0.20, 0.38), glass=(0.42, 0.30, 0.24), soldering=(0.68, 0.09, 0.10)),
@@ -72,11 +72,12 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     scratch = results.folder / "hands-live"
     runs: dict[str, tuple[RunReport | None, Traces]] = {}
     tries: dict[str, int] = {}
-    for name, drawn, taught in (
+    for name, of_stream, taught in (
         ("reproduction", NOMINAL, False),
         ("nominal", NOMINAL, True),
         ("adaptation", MOVED, True),
     ):
+        drawn = of_stream._replace(seed=of_stream.seed + options.seed_offset)
         # quick look: in process
         if options.share < 1:
             runs[name] = (None, _in_process(drawn, taught=taught))
@@ -102,7 +103,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "attempts": tries,
         "evidence_is_periods_skipped_at_most": SKIPPED,
         **{name: _numbers(ran) for name, (ran, _) in runs.items() if ran is not None},
-        "beside_the_paper": differences(options.share),
+        "beside_the_paper": differences(options.share, options.seed_offset),
         "shown": {
             name: {part: line.round(3).T for part, line in traces._asdict().items()}
             for name, (_, traces) in runs.items()

@@ -205,14 +205,16 @@ def followers(skill: Skill, settings: Settings, share: float) -> dict[str, Follo
 def sequences(options: Options, middle: Array) -> list[Moving]:
     """The modelled hands that are followed."""
     share = options.share
-    people = modelled(middle, numbers=PEOPLE.share(share), seconds=max(4.0, SECONDS * share))
+    offset = options.seed_offset
+    people_numbers = PEOPLE.moved(offset).share(share)
+    people = modelled(middle, numbers=people_numbers, seconds=max(4.0, SECONDS * share))
     # quick look
     if share < 1:
         people = [sequence for sequence in people if sequence.group in FLOOR_GROUPS]
-    numbers = STOPS.share(share, least=2)
+    numbers = STOPS.moved(offset).share(share, least=2)
     return [
         *people,
-        *reaches(seeds=[SCENE.seed]),
+        *reaches(seeds=SCENE.moved(offset).numbers),
         *stops(middle, numbers=numbers),
         *stops(middle, numbers=numbers, rate_hz=30, noise=0.002, group="sudden stops, 30 Hz, 2 mm"),
     ]
@@ -423,7 +425,7 @@ def _by_arm(
 def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
     """The gains of small motion by kind, follower and path, rms over the numbers of the stream."""
     rates = list(SMALL_HZ if options.share == 1 else SMALL_HZ[1::4])
-    numbers = SMALL.share(options.share)
+    numbers = SMALL.moved(options.seed_offset).share(options.share)
     tasks = [
         (name, kind, float(hz), number)
         for kind in SMALL_KINDS
@@ -449,7 +451,7 @@ def _gains(results: Results, options: Options, names: dict[str, str]) -> dict[st
 
 def _slow(results: Results, options: Options, names: dict[str, str]) -> dict[str, Any]:
     """Evenness of the tool's motion, and the first curve, by speed and tracker, and follower."""
-    numbers = STOPS.share(options.share / 3.0, least=2)
+    numbers = STOPS.moved(options.seed_offset).share(options.share / 3.0, least=2)
     begin = functools.partial(prepare, options.share, options.arm)
     kinds = list(itertools.product(slow_hands.SLOW_HANDS_MPS, slow_hands.TRACKERS))
     tasks = [

@@ -94,6 +94,7 @@ class Part(NamedTuple):
     out: str
     people: int
     data: Path | None
+    seed_offset: int = 0
 
 
 class SkillFold(NamedTuple):
@@ -124,7 +125,9 @@ class Found(NamedTuple):
 
 
 @functools.lru_cache(maxsize=2)
-def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], list[LeftOut]]:
+def _takes(
+    task: str, people: int, data: Path | None, seed_offset: int = 0
+) -> tuple[list[LeftOut], list[LeftOut]]:
     """Takes to learn from, and takes to judge wherever they are not learned from."""
     if task in TASK_KINDS:
         groups = [
@@ -134,7 +137,10 @@ def _takes(task: str, people: int, data: Path | None) -> tuple[list[LeftOut], li
                     takes(task, people=stream.numbers[:people], each=EACH, seed=stream.seed)
                 )
             ]
-            for stream in (PARTNER_SEEDS.learned[task], PARTNER_SEEDS.evaluation[task])
+            for stream in (
+                PARTNER_SEEDS.learned[task],
+                PARTNER_SEEDS.evaluation[task].moved(seed_offset),
+            )
         ]
         return groups[0], groups[1]
     assert data is not None
@@ -165,7 +171,7 @@ def _group(task: str, number: int, name: str) -> str:
 
 def part(one: Part) -> Found:
     """The fold of one part."""
-    training, asked = _takes(one.task, one.people, one.data)
+    training, asked = _takes(one.task, one.people, one.data, one.seed_offset)
     if one.out:
         training = [t for t in training if t.group != one.out]
         asked = [t for t in asked if t.group == one.out]
@@ -251,7 +257,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers of all sets."""
     people = max(2, round(PARTNERS_SHOWING * options.share))
     parts = [
-        Part(kind, "", people, None)
+        Part(kind, "", people, None, options.seed_offset)
         for kind in TASK_KINDS[: max(2, round(len(TASK_KINDS) * options.share))]
     ]
     if options.data is not None:

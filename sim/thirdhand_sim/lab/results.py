@@ -57,6 +57,7 @@ class Options:
     group: Literal["tuning", "test"] = "test"  # the people of `people`
     workers: str = "1"  # see `thirdhand.process.parallel.spread`
     share: float = 1.0  # share of the full size; less for a quick look
+    seed_offset: int = 0  # added to the numbers of evaluation, to repeat it with other seeds
     arm: str = "wam"  # for `faults` and `motion`: a shipped cell, or a file of settings
 
 

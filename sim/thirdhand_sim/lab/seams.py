@@ -291,7 +291,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         results.say(f"{name}: {brief(tried[name])}")
 
     paths = tool_paths(recordings() / "people", options.share)
-    draws = seeds.evaluation["policies"].share(options.share)
+    draws = seeds.evaluation["policies"].moved(options.seed_offset).share(options.share)
     judged: dict[str, Any] = {}
     for name, made in arms.items():
         by_run = _all_runs(made, paths, draws, settings)

@@ -347,15 +347,15 @@ def _allow(
 
 
 def _kinds_of(n: int) -> list[str]:
-    """The kinds of scene number `n`."""
+    """The kinds of the n-th scene."""
     return [kind for kind in SCENE_KINDS if kind != "unheeded" or n % UNHEEDED_EVERY == 0]
 
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    scenes = RANDOM_SCENES.share(options.share)
+    scenes = RANDOM_SCENES.moved(options.seed_offset).share(options.share)
     by_kind: dict[str, list[SeparationOutcome]] = {kind: [] for kind in SCENE_KINDS}
-    tasks = [(kind, n) for n in scenes for kind in _kinds_of(n)]
+    tasks = [(kind, number) for n, number in enumerate(scenes) for kind in _kinds_of(n)]
     for row in shared_out(run_one, tasks, options.workers):
         by_kind[row.kind].append(row)
         if len(by_kind[row.kind]) % max(1, len(scenes) // 5) == 0:
@@ -370,7 +370,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
         "later_for_a_thrust_s": _later_for(by_kind["thrust"], by_kind["random"]),
         "worst_scene": {kind: _worst(rows) for kind, rows in by_kind.items()},
         "failed_scenes": {kind: _failed(rows) for kind, rows in by_kind.items()},
-        "shown": {kind: _shown(rows) for kind, rows in by_kind.items()},
+        "shown": {kind: _shown(rows, scenes[:SHOWN_SCENES]) for kind, rows in by_kind.items()},
     }
     draw_numbers(results, numbers)
     return numbers
@@ -395,9 +395,9 @@ def _failed(rows: list[SeparationOutcome]) -> list[int]:
     return [row.number for row in rows if not row.success]
 
 
-def _shown(rows: list[SeparationOutcome]) -> dict[str, Any]:
-    """The points of the figure, from its scenes: distances [mm] and speeds [mm/s]."""
-    rows = [row for row in rows if row.number < SHOWN_SCENES]
+def _shown(rows: list[SeparationOutcome], scenes: range) -> dict[str, Any]:
+    """The points of the figure, from some scenes: distances [mm] and speeds [mm/s]."""
+    rows = [row for row in rows if row.number in scenes]
     near = np.concatenate([row.near for row in rows])
     return {
         "scenes": len(rows),
@@ -424,7 +424,8 @@ def _summary(rows: list[SeparationOutcome]) -> dict[str, Any]:
 
 def _later(ours: list[SeparationOutcome], free: list[SeparationOutcome]) -> dict[str, Any]:
     """Delay of the events [s] against the same scenes without separation."""
-    late = np.array([np.subtract(ours[b.number].times_s, b.times_s) for b in free])
+    times_s = {row.number: row.times_s for row in ours}
+    late = np.array([np.subtract(times_s[row.number], row.times_s) for row in free])
     return {
         name: {"mean": float(late[:, i].mean()), "most": float(late[:, i].max())}
         for i, name in enumerate(EVENTS)

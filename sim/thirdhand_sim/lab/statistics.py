@@ -84,7 +84,7 @@ def outcome(task: tuple[str, int]) -> TaskOutcome:
 
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers."""
-    scenes = TASK_SCENES.share(options.share)
+    scenes = TASK_SCENES.moved(options.seed_offset).share(options.share)
     count = len(scenes)
     tasks = [(method, number) for method in TASK_METHODS for number in scenes]
     by_method: dict[str, list[TaskOutcome]] = {method: [] for method in TASK_METHODS}

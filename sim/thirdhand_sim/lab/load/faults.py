@@ -34,6 +34,7 @@ from thirdhand.workbench.report.columns import read
 from thirdhand_sim.faulty_cell import Command, Fault, FaultTimes, FaultyCell, Network
 from thirdhand_sim.lab.results import DESIRED, REFERENCE, TOOL_COLOUR, Options, Results, pyplot
 from thirdhand_sim.parts import PartError
+from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import Array
 
 STANDS_M = 0.001  # a tool that stays within this distance of its end is at rest
@@ -294,6 +295,7 @@ def suffered(
     names: Sequence[str],
     say: Callable[[str], None] = lambda line: None,
     settings: Settings | None = None,
+    seed_offset: int = 0,
 ) -> Suffered:
     """The results of some faults, each caused once, in a cell with some settings.
 
@@ -308,9 +310,9 @@ def suffered(
                 say("disk full: mounting a small disk is not allowed here, left out")
             try:
                 if mine:
-                    _suffer(
-                        result, mine, FaultyCell(folder, network=network, settings=settings), say
-                    )
+                    seed = Scene().seed + seed_offset
+                    cell = FaultyCell(folder, network=network, settings=settings, seed=seed)
+                    _suffer(result, mine, cell, say)
             except PartError as error:
                 if network != "link":
                     raise
@@ -375,7 +377,10 @@ def table(found: dict[str, dict[str, Any]]) -> str:
 def run(results: Results, options: Options) -> dict[str, Any]:
     """The figures of every fault, or of a few for a quick look."""
     came = suffered(
-        list(FAULTS) if options.share == 1 else SHORT, results.say, cell_of(options.arm)
+        list(FAULTS) if options.share == 1 else SHORT,
+        results.say,
+        cell_of(options.arm),
+        options.seed_offset,
     )
     print(table(came.figures), flush=True)
     _draw(results, came)

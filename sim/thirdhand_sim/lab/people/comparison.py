@@ -119,6 +119,7 @@ class MethodTask(NamedTuple):
     people: int
     scenes: int
     hands: Path | None
+    first: int = 0  # number of the first person, or of the first breaking scene
 
 
 @functools.cache
@@ -132,15 +133,16 @@ def _learned(method: str, candidate: int) -> RivalModel[Places]:
 
 
 @functools.lru_cache(maxsize=8)
-def _sessions(
-    group: Group, kind: str, people: int, scenes: int, hands: Path | None
+def sessions_of(
+    group: Group, kind: str, people: int, scenes: int, hands: Path | None, first: int
 ) -> list[SeenSession]:
     """The sessions of a group, with alternating sigma from scene to scene; in breaking scenes the
     places are exact.
     """
     if kind:
-        return [seen(breaking(kind, number, group=group)) for number in range(scenes)]
-    everyone = [person(group, number) for number in range(people)]
+        numbers = range(first, first + scenes)
+        return [seen(breaking(kind, number, group=group)) for number in numbers]
+    everyone = [person(group, number) for number in range(first, first + people)]
     if hands is not None and group == "tuning":
         everyone += recorded_people(hands)
     return [
@@ -152,7 +154,7 @@ def _sessions(
 
 def outcomes(task: MethodTask) -> list[TrialOutcome]:
     """The outcomes of a task's sessions."""
-    runs = _sessions(task.group, task.kind, task.people, task.scenes, task.hands)
+    runs = sessions_of(task.group, task.kind, task.people, task.scenes, task.hands, task.first)
     if task.method == TEACHER:
         return [judge(None, trial) for trial in runs]
     model = _learned(task.method, task.candidate)
@@ -163,7 +165,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     """The numbers: all candidates on the tuning set, or the chosen ones on the test set."""
     group = options.group
     breaking_scenes = max(2, round(BREAKING_SCENES[group] * options.share))
-    tasks = _tasks(options, breaking_scenes)
+    tasks = tasks_of(options, breaking_scenes)
     by_task: dict[MethodTask, list[TrialOutcome]] = {}
     for task, rows in zip(tasks, shared_out(outcomes, tasks, options.workers), strict=True):
         by_task[task] = rows
@@ -205,7 +207,7 @@ def run(results: Results, options: Options) -> dict[str, Any]:
     return numbers
 
 
-def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
+def tasks_of(options: Options, breaking_scenes: int) -> list[MethodTask]:
     """The tasks: the teacher, each method with its candidates, and each method in breaking
     scenes.
     """
@@ -220,7 +222,7 @@ def _tasks(options: Options, breaking_scenes: int) -> list[MethodTask]:
             )
         for kind in BREAKING:
             tasks.append(MethodTask(method, 0, group, kind, 0, breaking_scenes, None))
-    return tasks
+    return [task._replace(first=options.seed_offset) for task in tasks]
 
 
 def _say_better_candidates(results: Results, by_task: dict[MethodTask, list[TrialOutcome]]) -> None:

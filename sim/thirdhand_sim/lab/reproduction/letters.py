@@ -149,7 +149,10 @@ def by_kmp(letter: Letter, case: Case) -> Array:
 def gathered(results: Results, options: Options) -> dict[str, list[Letter]]:
     """The letters of each set: the model's, and recorded ones if a folder is given."""
     names = list(TARGETS)[: max(2, round(len(TARGETS) * options.share))]
-    sets = {"model": {name: write(name, seed=WRITTEN.seed) for name in names}}
+    first, *_, last = WRITTEN.moved(options.seed_offset).numbers
+    sets = {
+        "model": {name: write(name, count=last + 1, seed=WRITTEN.seed)[first:] for name in names}
+    }
     if options.letters is not None:
         real = recorded(options.letters)
         sets["recorded"] = {
