@@ -21,6 +21,7 @@ SCRIPTS = [
         "moved_goal",
         "velocity",
         "uncertainty",
+        "gains",
         "kernels",
         "reach",
         "rhythm",
