@@ -37,24 +37,26 @@ def moved_means(
     the solution's points that each replaces.
     """
     database = solution.database
-    gone = np.unique(np.concatenate(replaced))
-    both = added.joined(Database(database.functionals.take(gone), database.reference.take(gone)))
-    outputs = both.reference.outputs
-    errors = both.reference.mean - mean_of(solution, both.functionals)
-    noise = solution.hyperparameters.lambda_mean * both.reference.covariance
+    removed = np.unique(np.concatenate(replaced))
+    points = added.joined(
+        Database(database.functionals.take(removed), database.reference.take(removed))
+    )
+    outputs = points.reference.outputs
+    errors = points.reference.mean - mean_of(solution, points.functionals)
+    noise = solution.hyperparameters.lambda_mean * points.reference.covariance
     noise[len(added) :] *= -1.0
-    posterior = _Posterior(solution, both.functionals, queries)
+    posterior = _Posterior(solution, points.functionals, queries)
     goals = len(replaced)
     counts = np.array([len(rows) for rows in replaced])
-    pulls = np.zeros((goals, len(both), outputs))
+    pulls = np.zeros((goals, len(points), outputs))
     for count in np.unique(counts):
         mine = np.flatnonzero(counts == count)
-        own = np.arange(len(added)).reshape(goals, -1)[mine]
-        others = len(added) + np.searchsorted(gone, np.array([replaced[g] for g in mine]))
-        rows = np.concatenate([own, others.reshape(len(mine), -1)], axis=1)  # (G', U)
+        added_rows = np.arange(len(added)).reshape(goals, -1)[mine]
+        removed_rows = len(added) + np.searchsorted(removed, np.array([replaced[g] for g in mine]))
+        rows = np.concatenate([added_rows, removed_rows.reshape(len(mine), -1)], axis=1)  # (G', U)
         system = posterior.within(rows)
-        each = np.arange(rows.shape[1])
-        system[:, each, :, each] += noise[rows].transpose(1, 0, 2, 3)
+        diagonal = np.arange(rows.shape[1])
+        system[:, diagonal, :, diagonal] += noise[rows].transpose(1, 0, 2, 3)
         size = rows.shape[1] * outputs
         solved = np.linalg.solve(
             system.reshape(len(mine), size, size), errors[rows].reshape(len(mine), size, 1)
@@ -75,11 +77,11 @@ class _Posterior:
         self._residual = between(kernel, points, points)
         self._across = between(kernel, queries, points)
         if isinstance(solution, LowRank):
-            own, z = (solution.features(f) for f in (points, queries))
-            self._residual -= own.T @ own
-            self._across -= z.T @ own
+            features, z = (solution.features(f) for f in (points, queries))
+            self._residual -= features.T @ features
+            self._across -= z.T @ features
             scale = np.sqrt(solution.hyperparameters.lambda_mean)
-            rows = [scale * own, scale * z]
+            rows = [scale * features, scale * z]
             copies = self._d
             self._sign = 1.0
         else:
@@ -95,8 +97,8 @@ class _Posterior:
     def within(self, rows: NDArray[np.intp]) -> Array:
         """P (G, U, O, U, O) of the points of each goal (G, U)."""
         goals, count = rows.shape
-        at = (self._c * rows[:, :, None] + np.arange(self._c)).reshape(goals, -1)
-        residual = kron_identity(self._residual[at[:, :, None], at[:, None, :]], self._d)
+        places = (self._c * rows[:, :, None] + np.arange(self._c)).reshape(goals, -1)
+        residual = kron_identity(self._residual[places[:, :, None], places[:, None, :]], self._d)
         width = self._c * self._copies
         columns = (width * rows[:, :, None] + np.arange(width)).reshape(goals, -1)
         roots = self._own.T[columns]  # (G, U C D', p)

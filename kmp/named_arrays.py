@@ -241,8 +241,8 @@ def _plain(
     features = numbers("features", arrays["features"], "r", parameters.channel_outputs)
 
     def part(of: Hyperparameters, points: Database, group: NDArray[np.intp]) -> LowRank:
-        own = {"information": information[group[0]], "features": features[:, group[:1]]}
-        return LowRank.of_arrays(of, points, {**arrays, **own})
+        part_arrays = {"information": information[group[0]], "features": features[:, group[:1]]}
+        return LowRank.of_arrays(of, points, {**arrays, **part_arrays})
 
     return Decoupled.of_parts(parameters, database, groups, part)
 

@@ -263,12 +263,12 @@ class _Rotating(Immutable, Saved):
         if tolerance is not None:
             not_negative("tolerance", tolerance)
         size = self._size
-        wanted = numbers("desired", desired, len(where), size + 1)
+        poses = numbers("desired", desired, len(where), size + 1)
         present = self.mean(where)[:, self._positions :]
-        q = _unit("desired", wanted[:, self._positions :])
+        q = _unit("desired", poses[:, self._positions :])
         signs = np.where((present * q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
         zeta = log(signs * q, self.auxiliary)
-        values = np.hstack([wanted[:, : self._positions], zeta])
+        values = np.hstack([poses[:, : self._positions], zeta])
         back = np.asarray(np.linalg.inv(self._turn(values)), dtype=np.float64)
         least = self.primitive.least_variance
         turned = self._back("covariance", covariance, back, least)
@@ -324,9 +324,11 @@ class _Rotating(Immutable, Saved):
         positive definite, or too small.
         """
         count, size, _ = back.shape
-        given = real(name, covariance)
-        given = np.broadcast_to(given, back.shape) if given.shape == (size, size) else given
-        array = numbers(name, given, count, size, size)
+        matrices = real(name, covariance)
+        matrices = (
+            np.broadcast_to(matrices, back.shape) if matrices.shape == (size, size) else matrices
+        )
+        array = numbers(name, matrices, count, size, size)
         exact = ~array.any(axis=2)
         rows, outputs = np.nonzero(exact)
         filled = np.array(array)

@@ -272,10 +272,12 @@ def decoupled_groups(
     coupled = blocks.any(axis=(0, 1, 3))
     if (coupled & ~np.eye(values, dtype=bool)).any():
         return everything
-    own = [blocks[:, :, value, :, value] for value in range(values)]
+    variances = [blocks[:, :, value, :, value] for value in range(values)]
     groups: list[list[int]] = []
     for value in range(values):
-        group = next((g for g in groups if alike and np.array_equal(own[g[0]], own[value])), None)
+        group = next(
+            (g for g in groups if alike and np.array_equal(variances[g[0]], variances[value])), None
+        )
         if group is None:
             groups.append([value])
         else:

@@ -271,8 +271,10 @@ class Predictor(Immutable):
     @property
     def prior_covariance(self) -> Array:
         """B (D, D) [unit of the outputs^2] of the D outputs of a channel."""
-        known = self.inner.solution.hyperparameters.prior_covariance
-        return np.eye(self.outputs // self.kernel.channels) if known is None else known
+        covariance = self.inner.solution.hyperparameters.prior_covariance
+        if covariance is None:
+            return np.eye(self.outputs // self.kernel.channels)
+        return covariance
 
     @property
     def outputs(self) -> int:

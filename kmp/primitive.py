@@ -198,13 +198,13 @@ class KMP(Predictor, Plotted, Saved):
 
         Raises ValueError if there is none at an input, and as `adapt` does.
         """
-        gone = numbers("inputs", inputs, "V", self._dimensions)
+        removed = numbers("inputs", inputs, "V", self._dimensions)
         changes = self.inner.changes
-        same = (changes.inputs[:, None] == gone).all(axis=2)  # (via-points, V)
+        same = (changes.inputs[:, None] == removed).all(axis=2)  # (via-points, V)
         for row in np.flatnonzero(~same.any(axis=0)):
             raise ValueError(
-                f"inputs[{row}]: {brief(gone[row])} given, the input of a via-point needed; they "
-                f"are at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
+                f"inputs[{row}]: {brief(removed[row])} given, the input of a via-point needed; "
+                f"they are at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
             )
         remaining = ~same.any(axis=1)
         if tolerance is None:
@@ -408,7 +408,7 @@ class KMP(Predictor, Plotted, Saved):
         if tolerance is None:
             tolerance = self.base.spacing / 2
         not_negative("tolerance", tolerance)
-        inputs = [numbers("inputs", given, "V", self._dimensions) for given, _ in pairs]
+        inputs = [numbers("inputs", via, "V", self._dimensions) for via, _ in pairs]
         for via, (_, desired) in zip(inputs, pairs, strict=True):
             check_pairs("desired", via, desired, self.outputs)
         return Alternatives(self, inputs, [desired for _, desired in pairs], tolerance)
@@ -425,9 +425,9 @@ class KMP(Predictor, Plotted, Saved):
                 "goal_jacobian: a primitive with constraints given, whose mean is not affine in "
                 "its goals; one without needed."
             )
-        wanted = Functionals(self._checked_many(queries))
+        functionals = Functionals(self._checked_many(queries))
         changes = self.inner.changes
-        at_rest = mean_of(before, wanted)
+        at_rest = mean_of(before, functionals)
         goals = changes.points.mean
         jacobian = np.empty((*at_rest.shape, *goals.shape))
         for index in np.ndindex(goals.shape):
@@ -435,7 +435,7 @@ class KMP(Predictor, Plotted, Saved):
             moved[index] += 1.0
             points = unchecked(moved, changes.points.covariance)
             other = before.adapted(changes._replace(points=points))
-            jacobian[:, :, *index] = mean_of(other, wanted) - at_rest
+            jacobian[:, :, *index] = mean_of(other, functionals) - at_rest
         return jacobian
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
@@ -570,29 +570,36 @@ class Alternatives(Sequence[KMP]):
         """
         primitive = self._primitive
         solution: Solution = primitive.inner.solution
-        wanted = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
+        functionals = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
         if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
             return np.stack([adapted.mean(queries) for adapted in self])
         inputs = np.stack(self._inputs)
         covariance = np.stack([desired.covariance for desired in self._desired])
-        goals = np.stack([desired.mean for desired in self._desired])
         if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
-            first = self[0]
-            jacobian = first.goal_jacobian(queries)[:, :, -inputs.shape[1] :]
-            by_goal = jacobian.reshape(len(wanted), primitive.outputs, -1)
-            away = (goals - goals[0]).reshape(len(self), -1)
-            return np.asarray(first.mean(queries) + np.moveaxis(by_goal @ away.T, 2, 0))
+            return self._at_one_input(functionals)
+        if isinstance(solution, (Dense, LowRank)) and not len(primitive.via_inputs):
+            return mean_of(solution, functionals) + self._moved(solution, functionals)
+        return np.stack([adapted.mean(queries) for adapted in self])
+
+    def _at_one_input(self, queries: Functionals) -> Array:
+        """The means (G, M, O), by one adaptation: they are affine in the goals."""
+        first = self[0]
+        goals = np.stack([desired.mean for desired in self._desired])
+        jacobian = first.goal_jacobian(queries.inputs)[:, :, -goals.shape[1] :]
+        by_goal = jacobian.reshape(len(queries), goals.shape[2], -1)
+        away = (goals - goals[0]).reshape(len(self), -1)
+        return np.asarray(first.mean(queries.inputs) + np.moveaxis(by_goal @ away.T, 2, 0))
+
+    def _moved(self, solution: Dense | LowRank, queries: Functionals) -> Array:
+        """How far the mean moves (G, M, O), by one triangular solve."""
         from kmp.goals import moved_means  # rarely used
 
-        if not isinstance(solution, (Dense, LowRank)) or len(primitive.via_inputs):
-            return np.stack([adapted.mean(queries) for adapted in self])
-        points = Functionals(inputs.reshape(-1, inputs.shape[2]))
-        normals = unchecked(
-            goals.reshape(-1, primitive.outputs), covariance.reshape(-1, *covariance.shape[2:])
-        )
+        points = Functionals(np.concatenate(self._inputs))
+        normals = Gaussians.concatenated(self._desired)
         added = Database(points, resolved(solution.hyperparameters, points, normals))
+        period = self._primitive.kernel.period
         replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, primitive.kernel.period)
+            solution.database.nearest(Functionals(via), self._tolerance, period)
             for via in self._inputs
         ]
-        return mean_of(solution, wanted) + moved_means(solution, added, replaced, wanted)
+        return moved_means(solution, added, replaced, queries)

@@ -108,9 +108,9 @@ class Hyperparameters(Immutable):
         """
         if self.prior_covariance is None:
             return np.ones(self.channel_outputs)
-        own = np.diagonal(self.prior_covariance)
-        correlation = self.prior_covariance / np.sqrt(np.outer(own, own))
-        return np.asarray(own * np.linalg.eigvalsh(correlation)[-1])
+        variances = np.diagonal(self.prior_covariance)
+        correlation = self.prior_covariance / np.sqrt(np.outer(variances, variances))
+        return np.asarray(variances * np.linalg.eigvalsh(correlation)[-1])
 
     def over_outputs(self, blocks: Array) -> Array:
         """x (x) B of blocks (..., C, C): (..., O, O)."""
@@ -170,7 +170,7 @@ def _covariance(value: ArrayLike | None, outputs: int) -> Array | None:
     """B (D, D) of variances (D,) or of a covariance; None if it is the identity."""
     if value is None:
         return None
-    given = real("prior_covariance", value)
-    matrix = np.diag(numbers("prior_covariance", given, outputs)) if given.ndim == 1 else given
+    array = real("prior_covariance", value)
+    matrix = np.diag(numbers("prior_covariance", array, outputs)) if array.ndim == 1 else array
     covariance = covariances("prior_covariance", np.asarray(matrix)[None], 1, outputs)[0]
     return None if np.array_equal(covariance, np.eye(outputs)) else covariance

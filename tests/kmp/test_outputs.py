@@ -161,7 +161,7 @@ def test_unit_of_one_output_does_not_change_another():
     assert_close(prediction.covariance[:, 0, 0], usual.covariance[:, 0, 0], 1e-10)
 
 
-def test_variance_lost_in_rounding_is_said_in_the_unit_of_the_prior():
+def test_variance_lost_in_rounding_is_over_that_of_the_prior():
     with pytest.raises(ValueError, match=r"lost in rounding.*over those of prior_covariance"):
         KMP.fit(
             INPUTS[::20],

@@ -119,7 +119,7 @@ def test_motion_of_frames_is_the_derivative_of_their_mean():
     np.testing.assert_allclose(1.5 * skill.jacobian(0.43)[:, 0], motion.velocity, rtol=1e-7)
 
 
-def test_uncertainty_and_samples_of_frames_are_those_of_their_product(tmp_path):
+def test_uncertainty_and_samples_of_frames_are_of_their_product(tmp_path):
     skill, t = learned()
     expected = skill.predict(t[::6])
     causes = skill.uncertainty(t[::6])
