@@ -48,7 +48,7 @@ def moved_means(
     posterior = _Posterior(solution, points.functionals, queries)
     goals = len(replaced)
     counts = np.array([len(rows) for rows in replaced])
-    pulls = np.zeros((goals, len(points), outputs))
+    moves = np.zeros((goals, len(queries), outputs))
     for count in np.unique(counts):
         mine = np.flatnonzero(counts == count)
         added_rows = np.arange(len(added)).reshape(goals, -1)[mine]
@@ -61,8 +61,8 @@ def moved_means(
         solved = np.linalg.solve(
             system.reshape(len(mine), size, size), errors[rows].reshape(len(mine), size, 1)
         )
-        pulls[mine[:, None], rows] = solved.reshape(*rows.shape, outputs)
-    return posterior.across(pulls)
+        moves[mine] = posterior.across(rows, solved.reshape(*rows.shape, outputs))
+    return moves
 
 
 class _Posterior:
@@ -97,22 +97,35 @@ class _Posterior:
     def within(self, rows: NDArray[np.intp]) -> Array:
         """P (G, U, O, U, O) of the points of each goal (G, U)."""
         goals, count = rows.shape
-        places = (self._c * rows[:, :, None] + np.arange(self._c)).reshape(goals, -1)
+        places = _columns(rows, self._c)
         residual = kron_identity(self._residual[places[:, :, None], places[:, None, :]], self._d)
-        width = self._c * self._copies
-        columns = (width * rows[:, :, None] + np.arange(width)).reshape(goals, -1)
-        roots = self._own.T[columns]  # (G, U C D', p)
+        roots = self._roots(rows)
         explained = kron_identity(roots @ roots.mT, self._d // self._copies)
         outputs = self._c * self._d
         return np.asarray(residual + self._sign * explained).reshape(
             goals, count, outputs, count, outputs
         )
 
-    def across(self, pulls: Array) -> Array:
-        """P between queries and points times pulls (G, U, O): (G, M, O)."""
-        goals, _, outputs = pulls.shape
-        stacked = np.moveaxis(pulls, 0, 2)  # (U, O, G)
-        near = self._across @ stacked.reshape(self._across.shape[1], -1)
-        inner = self._own @ stacked.reshape(self._own.shape[1], -1)
-        total = near.ravel() + self._sign * (self._of_queries.T @ inner).ravel()
-        return np.asarray(np.moveaxis(total.reshape(-1, outputs, goals), 2, 0))
+    def across(self, rows: NDArray[np.intp], pulls: Array) -> Array:
+        """P between the queries and the points of each goal (G, U), times pulls (G, U, O): (G, M,
+        O).
+        """
+        goals = len(rows)
+        near = self._across[:, _columns(rows, self._c)].transpose(1, 0, 2)  # (G, M C, U C)
+        near = near @ pulls.reshape(goals, near.shape[2], -1)
+        roots = self._roots(rows)
+        inner = roots.mT @ pulls.reshape(goals, roots.shape[1], -1)  # (G, p, D')
+        explained = self._of_queries.T @ inner.transpose(1, 0, 2).reshape(inner.shape[1], -1)
+        far = explained.reshape(len(explained), goals, -1).transpose(1, 0, 2)
+        return np.asarray(near.reshape(goals, -1) + self._sign * far.reshape(goals, -1)).reshape(
+            goals, -1, pulls.shape[2]
+        )
+
+    def _roots(self, rows: NDArray[np.intp]) -> Array:
+        """The transposed roots (G, U C D', p) of the points of each goal."""
+        return np.asarray(self._own.T[_columns(rows, self._c * self._copies)])
+
+
+def _columns(rows: NDArray[np.intp], width: int) -> NDArray[np.intp]:
+    """The columns (G, U width) of points (G, U) with this number of columns each."""
+    return (width * rows[:, :, None] + np.arange(width)).reshape(len(rows), -1)
