@@ -90,10 +90,18 @@ def inner_problem(
 
 
 def _inside(inverse: NDArray[Any], normals: Gaussians) -> Gaussians:
-    """Normals in the coordinates x; entries that rounding leaves beside the diagonal are 0."""
+    """Normals in the coordinates x, without the differences that rounding makes: entries beside the
+    diagonal are 0, and equal variances are equal to the bit, so that one factor serves them.
+    """
     covariance = symmetric(inverse @ normals.covariance @ inverse.T)
     size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     covariance[np.abs(covariance) < _ONE_SHAPE * size[:, :, None] * size[:, None, :]] = 0.0
+    variances = size**2
+    for output in range(1, variances.shape[1]):
+        for other in range(output):
+            if np.allclose(variances[:, output], variances[:, other], rtol=_ONE_SHAPE, atol=0.0):
+                covariance[:, output, output] = covariance[:, other, other]
+                break
     return unchecked(normals.mean @ inverse.T, covariance)
 
 

@@ -117,8 +117,8 @@ class KMP(Predictor, Plotted, Saved):
         `representation`: "dense" solves equation (9), N O x N O numbers; "low_rank" solves the cost
         (4) on at most `rank` features of the kernel, whose residual at the inputs is at most
         `rank_tolerance` of k(s, s). "auto" is low rank where that is faster: over time from about
-        200 points, over more inputs from N O = 1500, if the rank is low and no digits are lost. If
-        the rank does not suffice, a `RankReached` warning states the accuracy lost.
+        200 points, over more inputs from N O = 1500 (N, where outputs decouple), if the rank is low
+        and no digits are lost. If the rank does not suffice, `RankReached` warns.
 
         Raises ValueError if there is no point, shapes do not agree, a number is not finite, a
         parameter is out of its range, or the equations cannot be solved to working precision.

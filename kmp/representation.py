@@ -111,10 +111,11 @@ def _may_be_low(parameters: Hyperparameters, database: Database) -> bool:
     """True if the low rank may be the faster solution, estimated before features exist."""
     size = database.reference.mean.size
     kernel = parameters.kernel
+    if database.inputs.shape[1] > 1:  # the rank grows with the number of inputs
+        apart = len(decoupled_groups(parameters, database.reference, alike=False))
+        return size // apart > _SMALL
     if size <= SINGLE or size > _SMALL:
         return size > _SMALL
-    if database.inputs.shape[1] > 1:  # the rank grows with the number of inputs
-        return False
     length = np.ptp(database.inputs) if kernel.period is None else kernel.period
     expected = _RANK_AT_0 + _RANK_PER_LENGTH * length * np.sqrt(np.max(kernel.ell))
     return bool(expected <= _LOW_EXPECTED * len(database) * kernel.channels)
