@@ -9,7 +9,8 @@ import pytest
 import zenoh
 
 from support.cell import until
-from thirdhand.client import Watch, endpoints, open_session
+from thirdhand.client import Publisher, UnreachableError, Watch, endpoints, open_session
+from thirdhand.client.streams import wait_until_heard
 from thirdhand.contract import channels
 from thirdhand.daemon.cell_streams import Arrivals, CellStreams
 from thirdhand.settings.config import Settings
@@ -83,3 +84,15 @@ def test_slow_loop_counts_what_its_queue_dropped() -> None:
             for number in range(4, 260):
                 publisher.put(true, source_info=zenoh.SourceInfo(publisher.id, number))
             until(lambda: watch.lost == 6)  # the queue holds 256 of 260
+
+
+@pytest.mark.parametrize(
+    ("suffix", "setting"),
+    [("tool/wish", r', with `\[skill\] source = "tool/wish"`'), ("hands/left", "")],
+)
+def test_who_is_not_heard_is_told_the_setting(suffix: str, setting: str) -> None:
+    with (
+        open_session(listen=["tcp/127.0.0.1:0"]) as session,
+        pytest.raises(UnreachableError, match=f"nobody listens.* in this cell{setting}\\?"),
+    ):
+        wait_until_heard(Publisher(session, "bench", suffix), timeout_s=0.1)

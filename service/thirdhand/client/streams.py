@@ -132,9 +132,11 @@ def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     def check() -> None:
         for publisher in publishers:
             if not publisher.is_heard:
+                suffix = next(key for key in channels.BY_KEY if publisher.key.endswith(f"/{key}"))
+                setting = channels.BY_KEY[suffix].about.partition("heard with ")[2]
                 raise UnreachableError(
                     f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
-                    "in this cell?"
+                    f"in this cell{setting and f', with {setting}'}?"
                 )
 
     tried(check, timeout_s)
