@@ -2,9 +2,9 @@
 
 The equation (9) with B is alpha = (I (x) B) (K (x) B + lambda Sigma)^-1 (mu - m). With B = T T^T,
 the coordinates x of y = T x have the prior covariance K (x) I. Where every Sigma_n is s_n A, T is
-chosen so that T^-1 A T^-T is diagonal, too. Where all of T^-1 Sigma_n T^-T are diagonal, each output
-is a system of its own, or shares that of those with the same variances: D systems of N rows instead
-of one of N D.
+chosen so that T^-1 A T^-T is diagonal, too. Where all of T^-1 Sigma_n T^-T are diagonal, each
+output is a system of its own, or shares that of those with the same variances: D systems of N rows
+instead of one of N D.
 
 Over C channels, T is the same for the values and for their rates: I (x) T.
 """
