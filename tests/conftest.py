@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,9 @@ from thirdhand.viewer import vulkan
 for name in ("CONNECT", "CELL", "CERTIFICATE", "ZENOH_CONFIG"):
     os.environ.pop(f"THIRDHAND_{name}", None)
 os.environ["XDG_CONFIG_HOME"] = os.devnull  # the user's own client file is ignored
+# a cell that names no folder has its lock apart from the user's, and from those of other workers
+STATE = tempfile.TemporaryDirectory(prefix="thirdhand-tests-")
+os.environ["XDG_STATE_HOME"] = STATE.name
 # without bytecode, each of a thousand processes would compile its imports
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
