@@ -74,7 +74,7 @@ KMP_GROUPS = {
 }
 KMP_MODULES = {
     "Results of `learn`": (selection, ("Learned", "Score")),
-    "Other results": (results, ("MotionPrediction", "Uncertainty", "Stored")),
+    "Other results": (results, ("Alternatives", "MotionPrediction", "Uncertainty", "Stored")),
     "References by Gaussian processes": (reference, ("gaussian_process_reference",)),
     "Covariances from a reward": (correlation, ("Correlation", "improve", "Improvement")),
     "With scikit-learn": (sklearn, ("KMPRegressor",)),
