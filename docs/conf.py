@@ -69,7 +69,6 @@ GROUPS = {
         "status",
         "client",
         "gallery",
-        "library",
         "incidents",
         "faults",
         "glossary",

@@ -1,5 +1,5 @@
-"""`python docs/library_page.py` writes the two pages on Python from docstrings: library.md on
-`kmp`, and client.md on `thirdhand.client`.
+"""`python docs/library_page.py` writes the two pages on Python from docstrings: reference.md in
+kmp/docs on `kmp`, and client.md on `thirdhand.client`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from kmp import correlation, orientation, reference, results, selection, sklearn
 from thirdhand.contract import requests
 
 HERE = Path(__file__).parent
-LIBRARY = """# The library `kmp`
+LIBRARY = """# Reference
 
 <!-- Written by `python docs/library_page.py` from the docstrings in kmp/: change it there. -->
 
-All names are those of `import kmp`, except where a heading names a module. Start with the [site of
-kmp](../kmp/docs/index.md): a first letter, a gallery, questions. [Another page](coming-from.md)
-compares pbdlib, gmr and movement_primitives with `kmp`.
+All names are those of `import kmp`, except where a heading names a module.
 
 Letters: N reference points, M queries, V via-points, T samples, I inputs, O outputs. Values are
 immutable. A wrong argument, like a wrong shape or a number that is not finite, raises a ValueError
@@ -126,7 +124,10 @@ RETURNED = {
 
 def pages() -> dict[Path, str]:
     """The texts of the pages, by their files."""
-    return {HERE / "library.md": _library(), HERE / "client.md": _client()}
+    return {
+        HERE.parent / "kmp" / "docs" / "reference.md": _library(),
+        HERE / "client.md": _client(),
+    }
 
 
 def _library() -> str:

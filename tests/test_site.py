@@ -145,7 +145,7 @@ def test_pages_on_python_are_those_of_the_docstrings() -> None:
     """The pages have every public name."""
     for page, written in program("library_page").pages().items():
         assert page.read_text(encoding="utf-8") == written, "run `python docs/library_page.py`"
-        module = {"library": kmp, "client": client}[page.stem]
+        module = {"reference": kmp, "client": client}[page.stem]
         headings = set(re.findall(r"^### (\w+)$", written, re.MULTILINE))
         assert {
             name
@@ -153,7 +153,7 @@ def test_pages_on_python_are_those_of_the_docstrings() -> None:
             if callable(getattr(module, name)) and name not in INSIDE
         } <= headings
         called = {
-            "library": (
+            "reference": (
                 "KMP.predict(queries)",
                 "KMP.plot(",
                 "LocalKMP.placed(frames)",
