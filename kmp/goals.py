@@ -31,7 +31,7 @@ def moved_means(
     replaced: list[NDArray[np.intp]],
     queries: Functionals,
 ) -> Array:
-    """How far the mean moves at M queries (G, M, O) with each of G goals, by one triangular solve.
+    """The moves (G, M, O) of the mean at M queries with each of G goals, by one triangular solve.
 
     `added` has the V via-points of each goal, one goal after the other; `replaced` the indices of
     the solution's points that each replaces.
@@ -54,14 +54,15 @@ def moved_means(
         added_rows = np.arange(len(added)).reshape(goals, -1)[mine]
         removed_rows = len(added) + np.searchsorted(removed, np.array([replaced[g] for g in mine]))
         rows = np.concatenate([added_rows, removed_rows.reshape(len(mine), -1)], axis=1)  # (G', U)
-        system = posterior.within(rows)
+        roots = posterior.roots(rows)
+        system = posterior.within(rows, roots)
         diagonal = np.arange(rows.shape[1])
         system[:, diagonal, :, diagonal] += noise[rows].transpose(1, 0, 2, 3)
         size = rows.shape[1] * outputs
         solved = np.linalg.solve(
             system.reshape(len(mine), size, size), errors[rows].reshape(len(mine), size, 1)
         )
-        moves[mine] = posterior.across(rows, solved.reshape(*rows.shape, outputs))
+        moves[mine] = posterior.across(rows, roots, solved.reshape(*rows.shape, outputs))
     return moves
 
 
@@ -94,26 +95,24 @@ class _Posterior:
         )
         self._copies = copies
 
-    def within(self, rows: NDArray[np.intp]) -> Array:
-        """P (G, U, O, U, O) of the points of each goal (G, U)."""
+    def within(self, rows: NDArray[np.intp], roots: Array) -> Array:
+        """P (G, U, O, U, O) of the points of each goal (G, U), with their `roots`."""
         goals, count = rows.shape
         places = _columns(rows, self._c)
         residual = kron_identity(self._residual[places[:, :, None], places[:, None, :]], self._d)
-        roots = self._roots(rows)
         explained = kron_identity(roots @ roots.mT, self._d // self._copies)
         outputs = self._c * self._d
         return np.asarray(residual + self._sign * explained).reshape(
             goals, count, outputs, count, outputs
         )
 
-    def across(self, rows: NDArray[np.intp], pulls: Array) -> Array:
-        """P between the queries and the points of each goal (G, U), times pulls (G, U, O): (G, M,
-        O).
+    def across(self, rows: NDArray[np.intp], roots: Array, pulls: Array) -> Array:
+        """P between the queries and the points of each goal (G, U), with their `roots`, times pulls
+        (G, U, O): (G, M, O).
         """
         goals = len(rows)
         near = self._across[:, _columns(rows, self._c)].transpose(1, 0, 2)  # (G, M C, U C)
         near = near @ pulls.reshape(goals, near.shape[2], -1)
-        roots = self._roots(rows)
         inner = roots.mT @ pulls.reshape(goals, roots.shape[1], -1)  # (G, p, D')
         explained = self._of_queries.T @ inner.transpose(1, 0, 2).reshape(inner.shape[1], -1)
         far = explained.reshape(len(explained), goals, -1).transpose(1, 0, 2)
@@ -121,7 +120,7 @@ class _Posterior:
             goals, -1, pulls.shape[2]
         )
 
-    def _roots(self, rows: NDArray[np.intp]) -> Array:
+    def roots(self, rows: NDArray[np.intp]) -> Array:
         """The transposed roots (G, U C D', p) of the points of each goal."""
         return np.asarray(self._own.T[_columns(rows, self._c * self._copies)])
 

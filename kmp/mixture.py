@@ -167,6 +167,12 @@ def mixture_of(
         ) from None
 
 
+def deviations(columns: Array) -> Array:
+    """The deviation of each column; 1 of one that never changes."""
+    deviation = columns.std(axis=0)
+    return np.where(deviation > 0, deviation, 1.0)
+
+
 def one_thread() -> AbstractContextManager[Any]:
     """A context in which matrices and k-means are computed by one thread.
 

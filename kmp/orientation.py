@@ -105,12 +105,8 @@ def rotation_per_zeta(zeta: ArrayLike) -> Array:
     time instead. Raises ValueError if the shape differs or a number is not finite.
     """
     vector = 2 * numbers("zeta", zeta, 3)
-    angle = float(np.linalg.norm(vector))
     cross = _cross(vector)
-    if angle < _TINY:
-        return np.asarray(2 * (np.eye(3) + cross / 2 + cross @ cross / 6))
-    first = (1 - np.cos(angle)) / angle**2
-    second = (angle - np.sin(angle)) / angle**3
+    first, second = _factors(float(np.linalg.norm(vector)))
     return np.asarray(2 * (np.eye(3) + first * cross + second * (cross @ cross)))
 
 
@@ -124,12 +120,9 @@ def rotation_rate_per_zeta(zeta: ArrayLike, rate: ArrayLike) -> Array:
     angle = float(np.linalg.norm(v))
     cross = _cross(v)
     moved = _cross(change)
-    first = 0.5
-    second = 1 / 6
+    first, second = _factors(angle)
     bends = np.array([-1 / 12, -1 / 60])  # f' and g' over v . v'
     if angle >= _TINY:
-        first = (1 - np.cos(angle)) / angle**2
-        second = (angle - np.sin(angle)) / angle**3
         bends[0] = (angle * np.sin(angle) - 2 * (1 - np.cos(angle))) / angle**4
         bends[1] = (angle * (1 - np.cos(angle)) - 3 * (angle - np.sin(angle))) / angle**5
     bend_first, bend_second = bends * float(v @ change)
@@ -142,6 +135,13 @@ def rotation_rate_per_zeta(zeta: ArrayLike, rate: ArrayLike) -> Array:
             + second * (moved @ cross + cross @ moved)
         )
     )
+
+
+def _factors(angle: float) -> tuple[float, float]:
+    """f = (1 - cos|v|) / |v|^2 and g = (|v| - sin|v|) / |v|^3 of an angle |v| [rad]."""
+    if angle < _TINY:
+        return 1 / 2, 1 / 6
+    return (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
 
 
 def _cross(v: Array) -> Array:

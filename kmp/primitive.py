@@ -591,7 +591,7 @@ class Alternatives(Sequence[KMP]):
         return np.asarray(first.mean(queries.inputs) + np.moveaxis(by_goal @ away.T, 2, 0))
 
     def _moved(self, solution: Dense | LowRank, queries: Functionals) -> Array:
-        """How far the mean moves (G, M, O), by one triangular solve."""
+        """The moves (G, M, O) of the mean, by one triangular solve."""
         from kmp.goals import moved_means  # rarely used
 
         points = Functionals(np.concatenate(self._inputs))

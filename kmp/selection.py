@@ -30,7 +30,7 @@ from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, checked_kernel
-from kmp.mixture import GaussianMixture, mixture_of, one_thread
+from kmp.mixture import GaussianMixture, deviations, mixture_of, one_thread
 from kmp.primitive import KMP
 from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
@@ -295,10 +295,10 @@ def learn(
         VelocityKernel(1.0).check(data[0][0].shape[1], data[0][1].shape[1])
     channels = 2 if velocity else 1
     values = data[0][1].shape[1] // channels
-    size = _deviations(np.concatenate([xi[:, :values] for _, xi in data]))
+    size = deviations(np.concatenate([xi[:, :values] for _, xi in data]))
     output_unit = np.tile(size, channels)
     data = [(s, xi / output_unit) for s, xi in data]
-    unit = _deviations(np.concatenate([np.hstack(pair) for pair in data]))
+    unit = deviations(np.concatenate([np.hstack(pair) for pair in data]))
     recipe = _Recipe(components, seeded(seed), count, regularization, channels, unit)
     _check_precision(data)
     mixture = recipe.mixture(data)
@@ -351,12 +351,6 @@ def learn(
         prior_covariance=size**2,
     )
     return Learned(primitive, mixture, tuple(order), plain)
-
-
-def _deviations(columns: Array) -> Array:
-    """The deviation of each column; 1 of one that never changes."""
-    deviation = columns.std(axis=0)
-    return np.where(deviation > 0, deviation, 1.0)
 
 
 def _check_precision(data: Sequence[tuple[Array, Array]]) -> None:

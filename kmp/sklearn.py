@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from kmp.arrays.checks import Array, brief, positive, squared, whole
 from kmp.gaussians import Gaussians
-from kmp.mixture import GaussianMixture
+from kmp.mixture import GaussianMixture, deviations
 from kmp.primitive import KMP
 from kmp.radial import GaussianKernel
 
@@ -63,8 +63,7 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         self._one_output = outputs.ndim == 1
         outputs = np.asarray(outputs, dtype=np.float64).reshape(len(inputs), -1)
         mean = outputs.mean(axis=0)
-        deviation = outputs.std(axis=0)
-        deviation = np.where(deviation > 0, deviation, 1.0)  # of a constant output
+        deviation = deviations(outputs)
         noise = squared("noise", self.noise) * np.diag(deviation**2)
         if self.components is None:
             reference = Gaussians(outputs, np.tile(noise, (len(inputs), 1, 1)))

@@ -1,5 +1,5 @@
-"""How far a via-point at 1 s reaches: the change that it makes, for three values of ell (left) and
-for three kernels (right).
+"""The change that a via-point at 1 s makes at other times, for three values of ell (left) and for
+three kernels (right).
 """
 
 import numpy as np

@@ -94,9 +94,10 @@ class Publisher:
         check_open(session)
         self._session = session
         self._number = 0
+        self.channel = channels.BY_KEY[suffix]
         self.zenoh = session.declare_publisher(
             channels.key(cell, suffix),
-            encoding=ENCODINGS[channels.BY_KEY[suffix].codec.encoding],
+            encoding=ENCODINGS[self.channel.codec.encoding],
             congestion_control=zenoh.CongestionControl.DROP,
             express=True,
             **more,
@@ -132,8 +133,7 @@ def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     def check() -> None:
         for publisher in publishers:
             if not publisher.is_heard:
-                suffix = next(key for key in channels.BY_KEY if publisher.key.endswith(f"/{key}"))
-                setting = channels.BY_KEY[suffix].about.partition("heard with ")[2]
+                setting = publisher.channel.about.partition("heard with ")[2]
                 raise UnreachableError(
                     f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
                     f"in this cell{setting and f', with {setting}'}?"

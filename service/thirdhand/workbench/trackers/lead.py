@@ -14,7 +14,7 @@ from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import BASE, PoseStamped, WireError
 from thirdhand.workbench.trackers.cell_view import Latest
 from thirdhand.workbench.trackers.hand_message import PageHand
-from thirdhand.workbench.trackers.pinch import PARTED_M, PINCHED_M
+from thirdhand.workbench.trackers.pinch import is_pinched
 
 
 class Lead:
@@ -45,8 +45,8 @@ class Lead:
     def follow(self, hand: PageHand, frame: str, stamp_ns: int) -> None:
         """Publish a wish if this hand, seen in a frame at a time, pinches."""
         mapping = self._latest.mapping(frame)
-        is_pinched = hand.pinch_m < (PINCHED_M if self._begun is None else PARTED_M)
-        if not is_pinched or mapping is None or self._tool is None:
+        is_kept = is_pinched(hand.pinch_m, self._begun is not None)
+        if not is_kept or mapping is None or self._tool is None:
             self._begun = None
             return
         frame_turn = Rotation.from_quat(mapping[3:])

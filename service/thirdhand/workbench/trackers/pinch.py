@@ -16,6 +16,11 @@ PARTED_M = 0.04
 OPEN_M = 0.08  # fingers this far apart wish an open gripper
 
 
+def is_pinched(apart_m: float, before: bool) -> bool:
+    """True while thumb and index tip this far apart [m] pinch, after a pinch or none `before`."""
+    return apart_m < (PARTED_M if before else PINCHED_M)
+
+
 class Pinches:
     """Publisher of the clutch, which is pressed while one hand pinches, and of the gripper's wish,
     which follows the distance between the fingers of one hand. `clutch` and `gripper` name these
@@ -52,7 +57,7 @@ class Pinches:
         """
         if self._clutch is not None:
             apart_m = distances_m.get(self._clutch, PARTED_M)
-            self._is_pressed = apart_m < (PARTED_M if self._is_pressed else PINCHED_M)
+            self._is_pressed = is_pinched(apart_m, self._is_pressed)
             self._publishers["clutch"].put(cdr.encode_bool(self._is_pressed))
         if self._gripper is not None and self._gripper in distances_m:
             open_share = (distances_m[self._gripper] - PINCHED_M) / (OPEN_M - PINCHED_M)
