@@ -268,8 +268,9 @@ class LimiterStage:
         kinematics = self._arm.at(moved.position)
         if moved is not stop:
             stop_kinematics = self._arm.at(stop.position)
-            speed = self._largest_speed_in_stop(moved, kinematics)
-            if speed > max(self._max_speed, self._largest_speed_in_stop(stop, stop_kinematics)):
+            speed = self._limiter.speed_in_stop(moved, kinematics)
+            allowed = max(self._max_speed, self._limiter.speed_in_stop(stop, stop_kinematics))
+            if speed > allowed:
                 moved = stop
                 kinematics = stop_kinematics
         moving = take(as_array(state), as_array(frame), kinematics.record, *moved[:3])
