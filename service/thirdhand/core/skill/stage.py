@@ -22,7 +22,7 @@ from thirdhand.core.skill.pose import NO_GRIPPER, Turn
 from thirdhand.core.skill.skill import NEVER, Skill, clamp, reach_of
 from thirdhand.core.skill.step import IS_AMBIGUOUS, IS_OUTSIDE, conclude, tell_segment
 from thirdhand.core.skill.task_clock import BEGUN_TICK, GONE, PROGRESS, forget, is_requested, move
-from thirdhand.core.skill.tuning import MEMORY_LAG_S, MEMORY_LONGEST_STEP_S, UNSURE_M
+from thirdhand.core.skill.tuning import MEMORY_LAG_S, UNSURE_M
 from thirdhand.core.skill.unseen import deviation_m, off_m
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import Settings
@@ -126,7 +126,8 @@ class SkillStage:
         states = as_array(state)
         frames = as_array(frame)
         rules = self.rules
-        self._count(state)
+        if self._clock is not None:
+            move(states, self._sides, self._period_s, self._clock)
         motion = Seen(*self._seen[:6], state["segment_belief"], self._period_s, state["task_clock"])
         is_new = recall(states, rules, motion)
 
@@ -197,20 +198,6 @@ class SkillStage:
     ) -> int:
         """`step.conclude` by this skill's rules."""
         return int(conclude(states, frames, self.rules, motion, turn, closure, error_m, doubt))
-
-    def _count(self, state: Record) -> None:
-        """Advance the clock of the task to this tick, if the skill has one. While a hand is not
-        seen, it waits, unless it is REQUESTED.
-        """
-        if self._clock is None:
-            return
-        before = int(state["memory_ticks"].max())
-        if self._is_requested:
-            before = max(before, int(state["task_clock"][BEGUN_TICK]))
-        passed_s = self._period_s if before < 0 else (int(state["tick"]) - before) * self._period_s
-        if not self._is_requested:
-            passed_s = min(passed_s, MEMORY_LONGEST_STEP_S)
-        move(as_array(state), self._sides, passed_s, self._clock)
 
     def begin(self, state: Record) -> None:
         """Begin the task anew. A clock that is REQUESTED starts; another one starts as the hands

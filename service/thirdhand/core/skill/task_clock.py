@@ -38,7 +38,12 @@ from kmp.elementary import exp
 from thirdhand.core.frame import Records, Vector
 from thirdhand.core.numerics import MEMORY_STEP_S
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M
-from thirdhand.core.skill.tuning import CLOCK_LAG_S, CLOCK_START_MPS, OWN_NEAR_M
+from thirdhand.core.skill.tuning import (
+    CLOCK_LAG_S,
+    CLOCK_START_MPS,
+    MEMORY_LONGEST_STEP_S,
+    OWN_NEAR_M,
+)
 from thirdhand.core.vectors import norm, squared_distance
 
 # entries of `task_clock` in the state
@@ -225,12 +230,20 @@ def _follow(
 
 
 @compiled
-def move(states: Records, sides: NDArray[np.int64], passed_s: float, rows: Vector) -> None:
-    """Advance the clock in the state by `count`, in the most probable segment; memory and belief
-    end where the task begins again. The speeds are those of the hands `sides` (2,) without their
-    tremor.
+def move(states: Records, sides: NDArray[np.int64], period_s: float, rows: Vector) -> None:
+    """Advance the clock in the state to this tick by `count`, in the most probable segment; memory
+    and belief end where the task begins again. The speeds are those of the hands `sides` (2,)
+    without their tremor. While a hand is not seen, a clock waits, unless it is REQUESTED.
     """
     state = states[0]
+    before = state.memory_ticks.max()
+    is_free = rows[0, PACE_AT] == REQUESTED
+    if is_free:
+        before = max(before, int(state.task_clock[BEGUN_TICK]))
+    passed_s = period_s if before < 0 else (state.tick - before) * period_s
+    if not is_free:
+        passed_s = min(passed_s, MEMORY_LONGEST_STEP_S)
+
     hands = np.empty(6)
     speed = 0.0
     still = 1.0
