@@ -149,7 +149,7 @@ def test_the_table_of_the_wire_is_the_table_of_channels() -> None:
     assert rows_of("wire.md", "| `<cell>/") == [
         f"| `<cell>/{channel.key}` | `{channel.codec.type}` | "
         f"`application/{channel.codec.encoding}` | {publisher(channel)} | {channel.rate} | "
-        f"{channel.about} |"
+        f"{channel.about}{channel.condition and f'; heard with {channel.condition}'} |"
         for channel in CHANNELS
         if channel.direction != "recording"
     ]

@@ -133,7 +133,7 @@ def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     def check() -> None:
         for publisher in publishers:
             if not publisher.is_heard:
-                setting = publisher.channel.about.partition("heard with ")[2]
+                setting = publisher.channel.condition
                 raise UnreachableError(
                     f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
                     f"in this cell{setting and f', with {setting}'}?"

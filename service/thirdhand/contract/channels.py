@@ -106,8 +106,18 @@ class Channel(NamedTuple):
     event: EventKind | None = None  # None: nothing enters the loop here
     # setting (section, name) with the time after which the source is silent
     stale_after: tuple[str, str] | None = None
+    # setting (section, name) and the value with which the channel is heard; None: with any
+    heard_with: tuple[str, str, str] | None = None
     queryable: bool = False
     recorded: bool = True
+
+    @property
+    def condition(self) -> str:
+        """The setting with which the channel is heard, as it is written; empty if with any."""
+        if self.heard_with is None:
+            return ""
+        section, name, value = self.heard_with
+        return f'`[{section}] {name} = "{value}"`'
 
     @property
     def kept_as(self) -> Codec:
@@ -135,24 +145,27 @@ CHANNELS = (
         rate="100 - 1000 Hz",
         event=EventKind(2, JOINTS),
         stale_after=("arm", "silent_ms"),
+        heard_with=("arm", "source", "state"),
     ),
     Channel(
         "joints/guided",
         BOOL,
         "in",
-        'true while the arm is led by hand; heard with `[arm] source = "state"`',
+        "true while the arm is led by hand",
         rate="with joints/state",
         event=EventKind(12, BOOL),
         stale_after=("arm", "silent_ms"),
+        heard_with=("arm", "source", "state"),
     ),
     Channel(
         "clutch",
         BOOL,
         "in",
-        'true while the clutch is pressed; heard with `[hands] clutch = "key"`',
+        "true while the clutch is pressed",
         rate="10 - 100 Hz",
         event=EventKind(10, BOOL),
         stale_after=("hands", "clutch_stale_ms"),
+        heard_with=("hands", "clutch", "key"),
     ),
     Channel(
         "joints/command",
@@ -186,21 +199,20 @@ CHANNELS = (
         "gripper/wish",
         CLOSURE,
         "in",
-        "its joint `gripper`: how far to close where the skill does not decide it, 0 to 1; "
-        "heard with "
-        '`[hands] gripper = "key"`',
+        "its joint `gripper`: how far to close where the skill does not decide it, 0 to 1",
         rate="1 - 100 Hz",
         event=EventKind(11, CLOSURE),
+        heard_with=("hands", "gripper", "key"),
     ),
     Channel(
         "tool/wish",
         WISHED_POSE,
         "in",
-        "where a policy wants the tool at the time of the stamp, up to 1 s ahead; also "
-        'PoseStamped; heard with `[skill] source = "tool/wish"`',
+        "where a policy wants the tool at the time of the stamp, up to 1 s ahead; also PoseStamped",
         rate="10 - 1000 Hz, or in chunks",
         event=EventKind(14, WISHED_POSE),
         stale_after=("skill", "silent_ms"),
+        heard_with=("skill", "source", "tool/wish"),
     ),
     Channel(
         "gripper/state",

@@ -46,14 +46,6 @@ UNMEASURED_SHARE = 1e-6
 LEAST_BATCHES = 3  # with fewer pauses than this, a hand was out of sight
 ARM_STATE = "joints/state"
 TOOL_WISH = "tool/wish"
-# channels that are heard with some settings only
-CONFIGURED: Mapping[str, Callable[[Settings], bool]] = {
-    ARM_STATE: lambda settings: settings.arm.source == "state",
-    "joints/guided": lambda settings: settings.arm.source == "state",
-    "clutch": lambda settings: settings.hands.clutch == "key",
-    "gripper/wish": lambda settings: settings.hands.gripper == "key",
-    TOOL_WISH: lambda settings: settings.skill.has_wishes,
-}
 # After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
 MAX_WISHES = 128  # that wait; a chunk is read over several ticks, as it is long
@@ -408,7 +400,15 @@ def _published_topics(settings: Settings) -> list[ros2.Topic]:
 
 def heard(settings: Settings) -> list[channels.Channel]:
     """The input channels of the loop that a cell with these settings subscribes to."""
-    return [c for c in ros2.HEARD if c.key not in CONFIGURED or CONFIGURED[c.key](settings)]
+    return [channel for channel in ros2.HEARD if _is_heard(channel, settings)]
+
+
+def _is_heard(channel: channels.Channel, settings: Settings) -> bool:
+    """True unless the channel is heard with another setting only."""
+    if channel.heard_with is None:
+        return True
+    section, name, value = channel.heard_with
+    return bool(getattr(getattr(settings, section), name) == value)
 
 
 def _most(suffix: str) -> int:
