@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -140,7 +143,7 @@ def test_policy_leads_the_tool_by_actions(
 
 
 def test_hands_lead_by_the_skill_of_a_cell(
-    plug_in: ModuleType, errors: ModuleType, tmp_path: Path
+    plug_in: ModuleType, errors: ModuleType, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Without hands the action is the present tool. A robot only observes such a cell."""
     with serving(tmp_path, "--joints", "assumed") as daemon:
@@ -170,8 +173,28 @@ def test_hands_lead_by_the_skill_of_a_cell(
             target_m = daemon.client.status().target_m
             assert [action[f"tool.{axis}"] for axis in "xyz"] == pytest.approx(target_m, abs=0.005)
             assert arm.send_action(action) == pytest.approx(action)
+        caplog.clear()
+        until(lambda: arm.get_observation()["following"] == 0.0)
+        assert "mode hold: " in caplog.text
         leader.disconnect()
         arm.disconnect()
+
+
+def test_a_program_that_does_not_disconnect_ends(site: Path, tmp_path: Path) -> None:
+    code = """
+import pathlib, sys
+import lerobot_robot_thirdhand as plug_in
+config = plug_in.ThirdhandHandsConfig(endpoint=sys.argv[1])
+config.calibration_dir = pathlib.Path(".")
+plug_in.ThirdhandHands(config).connect()
+sys.exit(3)
+"""
+    paths = [str(site), *sys.path]
+    with serving(tmp_path, "--joints", "assumed") as daemon:
+        command = [sys.executable, "-c", code, daemon.endpoint]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+        done = subprocess.run(command, cwd=tmp_path, env=environment, timeout=60, check=False)
+    assert done.returncode == 3
 
 
 numbers = st.floats(-1.0, 1.0)

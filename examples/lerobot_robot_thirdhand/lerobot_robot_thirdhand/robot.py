@@ -1,5 +1,6 @@
 """The robot `thirdhand`: actions are wishes, observations are what the cell publishes."""
 
+import logging
 import math
 from typing import Any
 
@@ -25,6 +26,7 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
         self.cameras = make_cameras_from_configs(config.cameras)
         self._joints = "joints/state" if config.measured else "joints/command"
         self.needed = ("tool/setpoint", "status", self._joints)
+        self._mode = ""
         self._hands = {f"{side}.{name}": 0.0 for side in SIDES for name in ("x", "y", "z", "seen")}
 
     @property
@@ -61,7 +63,7 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
                 camera.disconnect()
 
     def get_observation(self) -> dict[str, Any]:
-        """The newest values of all features."""
+        """The newest values of all features. Warns once the arm no longer follows."""
         joints = self.newest(self._joints)
         status = self.newest("status")
         positions = dict(zip(joints.names, joints.position, strict=True))
@@ -70,6 +72,9 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
         }
         observation |= self.action(self.newest("tool/setpoint"))
         observation["following"] = float(status.mode == "follow")
+        if status.mode not in (self._mode, "follow"):
+            logging.warning("%s: mode %s: %s", self, status.mode, status.because)
+        self._mode = status.mode
         if self.config.hands:
             for side in SIDES:
                 position_m = status.hands_m.get(side, ())
