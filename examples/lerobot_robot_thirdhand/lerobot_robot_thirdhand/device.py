@@ -15,6 +15,8 @@ from lerobot_robot_thirdhand.poses import POSE, unit
 CONNECT_S = 15.0  # a cell answers and publishes within this time
 SILENT_S = 1.0  # a channel without a message for this time is silent
 GRIPPER = "gripper"
+# LeRobot's mean of a constant is exact for such numbers only, and a policy divides by its deviation
+ROUND_TO = 2.0**-12
 
 
 def _close_at_exit(cell: thirdhand.Connection) -> None:
@@ -113,7 +115,7 @@ class CellDevice:
     def action(self, tool: Any) -> dict[str, float]:
         """The action that has this pose of the tool, and the gripper as commanded."""
         self._orientation = unit(tool.orientation, self._orientation)
-        pose = [*tool.position, *self._orientation]
+        pose = [*tool.position, *(round(q / ROUND_TO) * ROUND_TO for q in self._orientation)]
         action = dict(zip(POSE, pose, strict=True))
         if self.config.gripper:
             command = self.recent("gripper/command")

@@ -71,7 +71,7 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
         }
         observation |= self.action(self.newest("tool/setpoint"))
         if status.mode not in (self._mode, "follow"):
-            logging.warning("%s: mode %s: %s", self, status.mode, status.because)
+            logging.warning("mode %s: %s", status.mode, status.because)
         self._mode = status.mode
         if self.config.hands:
             for side, position_m in status.hands_m.items():
