@@ -70,7 +70,7 @@ class CellDevice:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
         endpoint = self.config.endpoint
         self._cell = cell = thirdhand.connect(endpoint, cell=self.config.cell, timeout_s=CONNECT_S)
-        Thread(target=_close_at_exit, args=(cell,), daemon=True).start()
+        Thread(target=_close_at_exit, args=(cell,)).start()
         try:
             cell.wait_until_ready(timeout_s=CONNECT_S)
             self._newest: dict[str, tuple[float, Any]] = {}
