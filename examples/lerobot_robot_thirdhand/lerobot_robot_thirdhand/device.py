@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Sequence
-from threading import Thread
+from threading import Thread, main_thread
 from typing import Any
 
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
@@ -15,6 +15,16 @@ from lerobot_robot_thirdhand.poses import POSE, unit
 CONNECT_S = 15.0  # a cell answers and publishes within this time
 SILENT_S = 1.0  # a channel without a message for this time is silent
 GRIPPER = "gripper"
+# LeRobot's mean of a constant is exact for such numbers only, and a policy divides by its deviation
+ROUND_TO = 2.0**-12
+
+
+def _close_at_exit(cell: thirdhand.Connection) -> None:
+    """Close a connection when the program ends, whose exit else waits for it: LeRobot's commands do
+    not disconnect after some errors.
+    """
+    main_thread().join()
+    cell.close()
 
 
 class CellDevice:
@@ -60,6 +70,7 @@ class CellDevice:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
         endpoint = self.config.endpoint
         self._cell = cell = thirdhand.connect(endpoint, cell=self.config.cell, timeout_s=CONNECT_S)
+        Thread(target=_close_at_exit, args=(cell,)).start()
         try:
             cell.wait_until_ready(timeout_s=CONNECT_S)
             self._newest: dict[str, tuple[float, Any]] = {}
@@ -104,7 +115,7 @@ class CellDevice:
     def action(self, tool: Any) -> dict[str, float]:
         """The action that has this pose of the tool, and the gripper as commanded."""
         self._orientation = unit(tool.orientation, self._orientation)
-        pose = [*tool.position, *self._orientation]
+        pose = [*tool.position, *(round(q / ROUND_TO) * ROUND_TO for q in self._orientation)]
         action = dict(zip(POSE, pose, strict=True))
         if self.config.gripper:
             command = self.recent("gripper/command")

@@ -1,5 +1,6 @@
 """The robot `thirdhand`: actions are wishes, observations are what the cell publishes."""
 
+import logging
 import math
 from typing import Any
 
@@ -9,8 +10,6 @@ from lerobot.robots import Robot
 from lerobot_robot_thirdhand.config import ThirdhandRobotConfig
 from lerobot_robot_thirdhand.device import CellDevice
 from lerobot_robot_thirdhand.poses import limited, unit
-
-SIDES = ("left", "right")
 
 
 class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
@@ -25,16 +24,18 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
         self.cameras = make_cameras_from_configs(config.cameras)
         self._joints = "joints/state" if config.measured else "joints/command"
         self.needed = ("tool/setpoint", "status", self._joints)
-        self._hands = {f"{side}.{name}": 0.0 for side in SIDES for name in ("x", "y", "z", "seen")}
+        self._mode = ""
+        self._hands = {f"{side}.{axis}": 0.0 for side in ("left", "right") for axis in "xyz"}
 
     @property
     def observation_features(self) -> dict[str, Any]:
         """Joints `NAME.pos` [rad; m if prismatic]; tool and gripper as commanded, named as in
-        actions; `following`, 1 while the arm follows; with hands `left.x` to `right.z` [m] in frame
-        base, 0 until seen, and `left.seen`; pictures (height, width, 3) of each camera.
+        actions; with hands `left.x` to `right.z` [m] in frame base, 0 until seen; pictures (height,
+        width, 3) of each camera. No flags: a policy divides by the standard deviation of each
+        feature, and that of a flag in good demonstrations is 0.
         """
         features: dict[str, Any] = {f"{joint}.pos": float for joint in self.config.joints}
-        features |= self.action_features | {"following": float}
+        features |= self.action_features
         if self.config.hands:
             features |= dict.fromkeys(self._hands, float)
         cameras = self.config.cameras.items()
@@ -61,7 +62,7 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
                 camera.disconnect()
 
     def get_observation(self) -> dict[str, Any]:
-        """The newest values of all features."""
+        """The newest values of all features. Warns once the arm no longer follows."""
         joints = self.newest(self._joints)
         status = self.newest("status")
         positions = dict(zip(joints.names, joints.position, strict=True))
@@ -69,12 +70,12 @@ class ThirdhandRobot(CellDevice, Robot):  # type: ignore[misc]
             f"{name}.pos": positions[name] for name in self.config.joints
         }
         observation |= self.action(self.newest("tool/setpoint"))
-        observation["following"] = float(status.mode == "follow")
+        if status.mode not in (self._mode, "follow"):
+            logging.warning("mode %s: %s", status.mode, status.because)
+        self._mode = status.mode
         if self.config.hands:
-            for side in SIDES:
-                position_m = status.hands_m.get(side, ())
-                self._hands |= zip((f"{side}.{axis}" for axis in "xyz"), position_m, strict=False)
-                self._hands[f"{side}.seen"] = float(side in status.hands_m)
+            for side, position_m in status.hands_m.items():
+                self._hands |= zip((f"{side}.{axis}" for axis in "xyz"), position_m, strict=True)
             observation |= self._hands
         return observation | {name: camera.read_latest() for name, camera in self.cameras.items()}
 
