@@ -5,9 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -178,23 +175,6 @@ def test_hands_lead_by_the_skill_of_a_cell(
         until(lambda: arm.get_observation() and "mode hold: " in caplog.text)
         leader.disconnect()
         arm.disconnect()
-
-
-def test_a_program_that_does_not_disconnect_ends(site: Path, tmp_path: Path) -> None:
-    code = """
-import pathlib, sys
-import lerobot_robot_thirdhand as plug_in
-config = plug_in.ThirdhandHandsConfig(endpoint=sys.argv[1])
-config.calibration_dir = pathlib.Path(".")
-plug_in.ThirdhandHands(config).connect()
-sys.exit(3)
-"""
-    paths = [str(site), *sys.path]
-    with serving(tmp_path, "--joints", "assumed") as daemon:
-        command = [sys.executable, "-c", code, daemon.endpoint]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-        done = subprocess.run(command, cwd=tmp_path, env=environment, timeout=60, check=False)
-    assert done.returncode == 3
 
 
 def test_a_constant_orientation_is_its_own_mean(plug_in: ModuleType, tmp_path: Path) -> None:

@@ -385,6 +385,20 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
                 call()
 
 
+def test_a_program_that_closes_nothing_ends(listener: zenoh.Session) -> None:
+    """Also where the connection is no longer known, and where an error ends the program."""
+    code = """
+import sys, thirdhand
+def watch():
+    return thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.1)
+print(next(watch()), next(watch()))
+sys.exit(3)
+"""
+    command = [sys.executable, "-c", code, *endpoints(listener)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "None None\n", "")
+
+
 def test_an_asynchronous_program_watches_too(listener: zenoh.Session) -> None:
     """Messages arrive in order while others work, silence is None, and closing ends the loop."""
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Sequence
-from threading import Thread, main_thread
+from threading import Thread
 from typing import Any
 
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
@@ -17,14 +17,6 @@ SILENT_S = 1.0  # a channel without a message for this time is silent
 GRIPPER = "gripper"
 # LeRobot's mean of a constant is exact for such numbers only, and a policy divides by its deviation
 ROUND_TO = 2.0**-12
-
-
-def _close_at_exit(cell: thirdhand.Connection) -> None:
-    """Close a connection when the program ends, whose exit else waits for it: LeRobot's commands do
-    not disconnect after some errors.
-    """
-    main_thread().join()
-    cell.close()
 
 
 class CellDevice:
@@ -70,7 +62,6 @@ class CellDevice:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
         endpoint = self.config.endpoint
         self._cell = cell = thirdhand.connect(endpoint, cell=self.config.cell, timeout_s=CONNECT_S)
-        Thread(target=_close_at_exit, args=(cell,)).start()
         try:
             cell.wait_until_ready(timeout_s=CONNECT_S)
             self._newest: dict[str, tuple[float, Any]] = {}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import reprlib
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import AbstractContextManager
@@ -47,6 +49,7 @@ FORMS = {  # by the largest count of numbers
     3: "x y z [m]",
     7: "x y z [m], or x y z and a quaternion x y z w,",
 }
+_OPEN: set[Connection] = set()  # what `connect` opened and nobody has closed
 
 
 def connect(
@@ -57,7 +60,7 @@ def connect(
     zenoh_config: str | Path | None = None,
     timeout_s: float | None = 10.0,
 ) -> Connection:
-    """A connection to a cell; a context manager. The caller closes it.
+    """A connection to a cell; a context manager. It is closed at the latest as the program ends.
 
     Arguments that are None are taken from the environment, the client's file or the defaults, see
     `client_settings`. Connecting is tried for `timeout_s` [s]; None: until Ctrl-C. Raises
@@ -67,7 +70,24 @@ def connect(
     settings = client_settings(
         connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config
     )
-    return Connection(settings.session(timeout_s=timeout_s), settings.cell)
+    connection = Connection(settings.session(timeout_s=timeout_s), settings.cell)
+    _OPEN.add(connection)
+    _await_exit()
+    return connection
+
+
+@functools.cache
+def _await_exit() -> None:
+    """Start the thread, once, that closes what is open when the main thread has ended: Python would
+    wait forever for the threads in which Zenoh receives.
+    """
+
+    def close() -> None:
+        threading.main_thread().join()
+        for connection in tuple(_OPEN):
+            connection.close()
+
+    threading.Thread(target=close).start()
 
 
 class Connection(Client, AbstractContextManager["Connection"]):
@@ -255,6 +275,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def close(self) -> None:
         """Close the session, with all that was opened on it."""
+        _OPEN.discard(self)
         self._session.close()  # type: ignore[no-untyped-call]
 
     def __exit__(self, *_: object) -> None:
