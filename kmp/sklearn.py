@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from kmp.arrays.checks import Array, brief, positive, squared, whole
 from kmp.gaussians import Gaussians
-from kmp.mixture import GaussianMixture, deviations
+from kmp.mixture import GaussianMixture, deviations, varies
 from kmp.primitive import KMP
 from kmp.radial import GaussianKernel
 
@@ -108,4 +108,6 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError(
                 f'ell: {brief(self.ell)} given, a number, one for each input, or "scale" needed.'
             )
-        return 1.0 / (inputs.shape[1] * (float(inputs.var()) or 1.0))
+        columns = inputs.reshape(-1, 1)
+        variance = float(inputs.var()) if varies(columns)[0] else 1.0
+        return 1.0 / (inputs.shape[1] * variance)

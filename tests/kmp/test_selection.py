@@ -111,6 +111,19 @@ def test_unit_of_one_output_does_not_change_another(criterion):
 
 
 @pytest.mark.parametrize("criterion", ["left-out", "likelihood"])
+@pytest.mark.parametrize("constant", [0.0, 0.1])
+def test_constant_output_does_not_change_the_choice(criterion, constant):
+    takes = over_time()
+    options = {"components": 6, "count": 60, "criterion": criterion}
+    usual = kmp.learn(takes, **options).primitive
+    wider = [(s, np.hstack([xi, np.full_like(s, constant)])) for s, xi in takes]
+    skill = kmp.learn(wider, **options).primitive
+    for name in ("kernel", "lambda_mean", "lambda_covariance"):
+        assert getattr(skill, name) == getattr(usual, name)
+    np.testing.assert_allclose(skill.mean([0.3])[0], [*usual.mean([0.3])[0], constant], atol=1e-8)
+
+
+@pytest.mark.parametrize("criterion", ["left-out", "likelihood"])
 @pytest.mark.parametrize("unit", [1e6, 1e3, 1e-3], ids=["um", "mm", "km"])
 def test_units_do_not_change_the_skill(criterion, unit):
     """Predictions and deviations agree to 1e-6 of the amplitude; one second is given."""
