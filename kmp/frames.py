@@ -25,7 +25,7 @@ from kmp.arrays.checks import (
 )
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
-from kmp.gaussians import Gaussians, check_gaussians, check_pairs
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture
 from kmp.plot import Plotted, Points, Shown
@@ -270,7 +270,8 @@ class LocalKMP(Immutable, Plotted, Saved):
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Paths (count, M, O) through queries (M, I), of the product of the frames' joint normals.
 
-        Raises ValueError as `KMP.sample` does.
+        Their mean is not `mean`: that is of a product for each query by itself, and here the
+        correlations between queries count, too. Raises ValueError as `KMP.sample` does.
         """
         whole("count", count)
         joint = [primitive.predict_joint(queries) for primitive in self.primitives]
@@ -288,7 +289,9 @@ class LocalKMP(Immutable, Plotted, Saved):
             gain = np.linalg.lstsq(covariance + spread, covariance, rcond=1e-14)[0].T
             mean = mean + gain @ (other - mean)
             covariance = symmetric(covariance - gain @ covariance)
-        return drawn_paths(mean, covariance, count, seed).reshape(count, points, outputs)
+        product = unchecked(mean[None], covariance[None])
+        drawn = drawn_paths(product, np.ones(len(mean)), count, seed)
+        return drawn.reshape(count, points, outputs)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance of `predict`, by its causes, of which each frame's share counts as in the

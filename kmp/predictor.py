@@ -121,9 +121,7 @@ class Predictor(Immutable):
         stacked = (
             np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
         )
-        return unchecked(
-            self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale
-        )
+        return unchecked(self.mean(s), self._scaled(stacked))
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -135,10 +133,7 @@ class Predictor(Immutable):
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
         posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        covariance = (
-            nearest_positive_semidefinite(posterior[None]) * self.inner.query.covariance_scale
-        )
-        return unchecked(self.mean(s).reshape(1, -1), covariance)
+        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior[None]))
 
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
@@ -148,7 +143,7 @@ class Predictor(Immutable):
         Raises ValueError as `predict` does, or if the count is below 1.
         """
         joint = self.predict_joint(queries)
-        drawn = drawn_paths(joint.mean[0], joint.covariance[0], count, seed)
+        drawn = drawn_paths(joint, self._units(joint.outputs), count, seed)
         return drawn.reshape(count, -1, self.outputs)
 
     def predict_motion(
@@ -228,10 +223,9 @@ class Predictor(Immutable):
         residual = self.inner.solution.hyperparameters.over_outputs(
             self.kernel.prior_variance - z @ z.transpose(0, 2, 1)
         )
-        distance = nearest_positive_semidefinite(residual) * self.inner.query.covariance_scale
-        return Uncertainty(
-            frozen(nearest_positive_semidefinite(total - distance)), frozen(distance)
-        )
+        distance = self._scaled(residual)
+        variability = nearest_positive_semidefinite(total - distance, self._units(self.outputs))
+        return Uncertainty(frozen(variability), frozen(distance))
 
     @property
     def kernel(self) -> Kernel:
@@ -300,6 +294,16 @@ class Predictor(Immutable):
             self.kernel, Functionals(queries, directions), self.inner.solution.functionals
         )
 
+    def _scaled(self, posterior: Array) -> Array:
+        """N / lambda_c times posterior covariances (M, n, n), made positive semi-definite."""
+        nearest = nearest_positive_semidefinite(posterior, self._units(posterior.shape[1]))
+        return nearest * self.inner.query.covariance_scale
+
+    def _units(self, count: int) -> Array:
+        """The prior deviations of `count` outputs, query after query."""
+        deviations = self.inner.solution.hyperparameters.prior_deviations
+        return np.tile(deviations, count // self.outputs)
+
     def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
         """The mean (M, O) by compiled loops, and the last kernel row; None if these cannot."""
         compiled = self.inner.compiled_query
@@ -339,10 +343,13 @@ class Predictor(Immutable):
         return self._wrapped(s)
 
 
-def drawn_paths(mean: Array, covariance: Array, count: int, seed: Seed) -> Array:
-    """Draws (count, n) of a normal, whose covariance may be singular."""
+def drawn_paths(normal: Gaussians, units: Array, count: int, seed: Seed) -> Array:
+    """Draws (count, n) of one normal, whose covariance may be singular.
+
+    `units` (n,) are the outputs' sizes, so that a small output's variance is not lost in rounding.
+    """
     whole("count", count)
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    values, vectors = np.linalg.eigh(normal.covariance[0] / np.outer(units, units))
+    root = units[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     random = np.random.default_rng(seeded(seed))
-    return np.asarray(mean + random.standard_normal((count, len(values))) @ root.T)
+    return np.asarray(normal.mean[0] + random.standard_normal((count, len(values))) @ root.T)

@@ -122,7 +122,9 @@ class Query(Immutable):
     def covariance(self, kernel: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
         posterior = self.solution.posterior_covariance_one(kernel)
-        return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * self.covariance_scale)
+        deviations = self.solution.hyperparameters.prior_deviations
+        nearest = nearest_positive_semidefinite(posterior[None], deviations)[0]
+        return np.asarray(nearest * self.covariance_scale)
 
     def jacobian(self, row: KernelRow) -> Array:
         """dxi/ds (O, I). Equation (8), derived."""

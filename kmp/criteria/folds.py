@@ -136,7 +136,10 @@ class _System:
             left = self._residual
             sign = penalty
         posterior = left + sign * (modes * shrunk) @ modes.transpose(0, 2, 1)
-        return nearest_positive_semidefinite(posterior) * (len(self.fold.inputs) / penalty)
+        deviations = np.sqrt(np.diagonal(self._own))
+        return nearest_positive_semidefinite(posterior, deviations) * (
+            len(self.fold.inputs) / penalty
+        )
 
     def _check(self, penalty: float) -> None:
         parameters = Hyperparameters(self.kernel, penalty, penalty, self.fold.prior_mean)

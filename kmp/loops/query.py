@@ -134,7 +134,8 @@ class CompiledQuery(Immutable):
         if not _posterior(
             values, self.columns, np.zeros((distinct, len(values) * distinct)), posterior
         ):
-            posterior = nearest_positive_semidefinite(posterior[None])[0]
+            unit = q.solution.hyperparameters.prior_deviations[:distinct]
+            posterior = nearest_positive_semidefinite(posterior[None], unit)[0]
         posterior *= q.covariance_scale
         return posterior if distinct > 1 else posterior[0, 0] * np.eye(len(q.prior_mean))
 

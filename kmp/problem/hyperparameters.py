@@ -112,6 +112,12 @@ class Hyperparameters(Immutable):
         correlation = self.prior_covariance / np.sqrt(np.outer(variances, variances))
         return np.asarray(variances * np.linalg.eigvalsh(correlation)[-1])
 
+    @cached_property
+    def prior_deviations(self) -> Array:
+        """(O,) [unit of the outputs] the roots of k(s, s) (x) B's diagonal."""
+        variances = np.diagonal(self.over_outputs(self.kernel.prior_variance))
+        return frozen(np.sqrt(variances))
+
     def over_outputs(self, blocks: Array) -> Array:
         """x (x) B of blocks (..., C, C): (..., O, O)."""
         wide = kron_identity(blocks, self.channel_outputs)
